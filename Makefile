@@ -1,0 +1,55 @@
+# Every target makes the environment that it needs from nothing but Python (>= 3.11), pip and make.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+
+.PHONY: help demo test lint format bench sample clean
+
+help:
+	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
+	@echo "make test    format, lint, types and tests"
+	@echo "make lint    format, lint and types only"
+	@echo "make bench   print speeds and sizes, each beside a baseline measured in the same run"
+	@echo "make sample  record the bundled sample again (runs SUMO)"
+
+# One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
+$(VENV)/.base: pyproject.toml
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) 2>/dev/null || { \
+	  rm -rf $(VENV) && $(PYTHON) -m pip install -q --user --break-system-packages virtualenv && \
+	  $(PYTHON) -m virtualenv -q $(VENV); }
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[viz]'
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.base
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -U 'pip>=25.1'
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --group dev -e '.[arrow]'
+	@touch $@
+
+$(VENV)/.sample: $(VENV)/.base
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[sample]'
+	@touch $@
+
+demo: $(VENV)/.base
+	@$(BIN)/sgstore demo
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/basedpyright
+
+format: $(VENV)/.dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+test: lint
+	$(BIN)/python -m pytest
+
+bench: $(VENV)/.dev
+	$(BIN)/python -m bench
+
+sample: $(VENV)/.sample
+	$(BIN)/python samples/town/record.py
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info demo-out
