@@ -1,0 +1,212 @@
+"""Every error that sgstore raises on purpose.
+
+::
+
+    SgstoreError                 its message is complete and fit to be shown as it is
+    ├── TraceError               a recording: file, channel, time, offset; what was expected
+    ├── MapError                 a road map: road id and element
+    ├── ConfigError              a setting: its name, its value, what would be right
+    ├── StoreError               a store: cannot be opened, other schema version, no such trace or frame
+    │   └── SqlError             a statement of the user's that the database refuses
+    ├── QueryError               a query text: span, reason, hint
+    │   ├── QuerySyntaxError     expected something else here
+    │   └── QueryNameError       unknown label, relation, attribute, variable; did you mean …?
+    ├── ExportError              a clip or file that cannot be written
+    └── MissingExtraError        an optional package that is not installed, and how to install it
+
+Errors of third-party packages are translated by the module that owns the package, ``from`` the original.
+A mistake in calling the library stays ``ValueError`` or ``TypeError``. Anything else that escapes is a bug.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class SgstoreError(Exception):
+    """Anything that sgstore refuses to do; the message says what is wrong and what would be right."""
+
+
+class TraceError(SgstoreError):
+    """A recording cannot be read, in whole or in part.
+
+    Parameters
+    ----------
+    reason : str
+        What is wrong, and what would be right.
+    path : str or Path, optional
+        The file.
+    channel : str, optional
+        Topic of the channel at fault.
+    time_ns : int, optional
+        Log time of the message at fault; ns.
+    offset : int, optional
+        Byte offset in the file.
+    """
+
+    def __init__(
+        self,
+        reason: str,
+        *,
+        path: str | Path | None = None,
+        channel: str | None = None,
+        time_ns: int | None = None,
+        offset: int | None = None,
+    ) -> None:
+        self.reason = reason
+        self.path = path
+        self.channel = channel
+        self.time_ns = time_ns
+        self.offset = offset
+        where = [
+            text
+            for value, text in (
+                (path, f"{path}"),
+                (channel, f"channel {channel!r}"),
+                (time_ns, f"at {time_ns} ns"),
+                (offset, f"byte {offset}"),
+            )
+            if value is not None
+        ]
+        super().__init__(f"{', '.join(where)}: {reason}" if where else reason)
+
+
+class MapError(SgstoreError):
+    """A road map cannot be read, in whole or in part.
+
+    Parameters
+    ----------
+    reason : str
+        What is wrong, and what would be right.
+    road : str, optional
+        Id of the road at fault.
+    element : str, optional
+        The element at fault, as a path of tags: ``road/lanes/laneSection``.
+    """
+
+    def __init__(self, reason: str, *, road: str | None = None, element: str | None = None) -> None:
+        self.reason = reason
+        self.road = road
+        self.element = element
+        where = [f"road {road!r}"] if road is not None else []
+        where += [f"<{element}>"] if element is not None else []
+        super().__init__(f"{', '.join(where)}: {reason}" if where else reason)
+
+
+class ConfigError(SgstoreError):
+    """A setting is unknown, of the wrong type, or out of range."""
+
+
+class StoreError(SgstoreError):
+    """A store cannot be opened, or lacks what was asked of it."""
+
+
+class SqlError(StoreError):
+    """A statement of the user's that the database refuses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Part of a query text.
+
+    Attributes
+    ----------
+    start, end : int
+        Offsets in characters; ``end`` is not included.
+    """
+
+    start: int
+    end: int
+
+
+class QueryError(SgstoreError):
+    """A query text that cannot be answered.
+
+    Parameters
+    ----------
+    reason : str
+        What is wrong, in one sentence, without position.
+    text : str, optional
+        The whole query.
+    span : Span, optional
+        The part of it at fault.
+    hint : str, optional
+        What would be right: ``did you mean 'near'?``.
+
+    Notes
+    -----
+    The message shows the line with carets under the span, for a terminal. ``as_dict`` gives the
+    same as data, for a user interface.
+    """
+
+    def __init__(
+        self, reason: str, *, text: str = "", span: Span | None = None, hint: str | None = None
+    ) -> None:
+        self.reason = reason
+        self.text = text
+        self.span = span
+        self.hint = hint
+        super().__init__(_with_carets(reason, text, span, hint))
+
+    def as_dict(self) -> dict[str, object]:
+        """The error as data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``."""
+        line, column = position(self.text, self.span.start) if self.span else (None, None)
+        return {
+            "error": type(self).__name__,
+            "reason": self.reason,
+            "hint": self.hint,
+            "start": self.span.start if self.span else None,
+            "end": self.span.end if self.span else None,
+            "line": line,
+            "column": column,
+        }
+
+
+class QuerySyntaxError(QueryError):
+    """The text is not a sentence of the language."""
+
+
+class QueryNameError(QueryError):
+    """A name that the catalogue does not know, or a variable that is not bound."""
+
+
+class ExportError(SgstoreError):
+    """A clip or a file that cannot be written."""
+
+
+class MissingExtraError(SgstoreError):
+    """An optional package is not installed.
+
+    Parameters
+    ----------
+    purpose : str
+        What needed it: ``drawing``.
+    extra : str
+        The extra that brings it: ``viz``.
+    """
+
+    def __init__(self, purpose: str, extra: str) -> None:
+        self.extra = extra
+        super().__init__(f"{purpose} needs an optional package: pip install 'sgstore[{extra}]'")
+
+
+def position(text: str, offset: int) -> tuple[int, int]:
+    """Line and column of an offset, both counted from 1."""
+    before = text[:offset]
+    return before.count("\n") + 1, offset - (before.rfind("\n") + 1) + 1
+
+
+def _with_carets(reason: str, text: str, span: Span | None, hint: str | None) -> str:
+    lines = [reason]
+    if span is not None and text:
+        number, column = position(text, span.start)
+        source = (text.splitlines() or [""])[number - 1 : number] or [""]
+        width = max(1, min(span.end - span.start, len(source[0]) - column + 1))
+        lines += [f"  {source[0]}", "  " + " " * (column - 1) + "^" * width]
+    if hint:
+        lines.append(hint)
+    return "\n".join(lines)

@@ -1,0 +1,163 @@
+"""Scene graphs as columns: a block of many frames for the store, a single frame for people and networkx."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import networkx as nx
+    import numpy as np
+
+    from sgstore.world import Codes, Floats, FrameBlock, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Edges of the graphs of a block, one row an edge and frame; shape (E,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    relation : int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : int64
+        Node ids: 0 and above in the trace, below zero in the map.
+    """
+
+    frame: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class Presence:
+    """Which static nodes are in the graph of which frame; shape (M,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    node : int64
+        Node id; static entities of the trace (0 and above) and parts of the map (below zero).
+    """
+
+    frame: Ints
+    node: Ints
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class LaneStates:
+    """How entities lie in lanes: the attributes of their ``isIn`` edges; shape (K,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    node, lane : int64
+        Node ids of the entity and of the lane.
+    overlap : float64
+        Share of the footprint that lies in the lane, 0 … 1.
+    offset : float64
+        Lateral offset of the box's centre from the lane's centre line, positive to the left of the
+        lane's direction; m.
+    heading_error : float64
+        Heading of the entity less the lane's direction, in (-π, π]; rad.
+    primary : bool
+        Whether it is the one lane that the entity is in above all: centre inside, then heading, then overlap.
+    """
+
+    frame: Ints
+    node: Ints
+    lane: Ints
+    overlap: Floats
+    offset: Floats
+    heading_error: Floats
+    primary: np.ndarray[Any, np.dtype[np.bool_]]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class GraphBlock:
+    """Scene graphs of the frames of a block.
+
+    Attributes
+    ----------
+    frames : FrameBlock
+        The frames, with only those states that are nodes of their graphs (in range).
+    presence : Presence
+        The static nodes of each graph. A static edge of the map holds where both its ends are present.
+    edges : Edges
+        All other edges.
+    lanes : LaneStates
+        Attributes of the ``isIn`` edges from entities to lanes.
+    """
+
+    frames: FrameBlock
+    presence: Presence
+    edges: Edges
+    lanes: LaneStates
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneGraph:
+    """The scene graph of one frame: ``(V, E, Ego, kind, rel, att)`` of the paper, as records.
+
+    Attributes
+    ----------
+    frame_id : int
+    trace : str
+        Name of the trace.
+    seq, time_ns : int
+    ego : int or None
+        Node id of the ego.
+    nodes : dict
+        Node id → attributes in outward units (m, s, m/s, degrees): ``kind``, ``name``, ``is_ego``, and
+        whatever is known (``x``, ``y``, ``heading``, ``speed``, ``light_state``, …). Missing ones are left out.
+    edges : list of tuple
+        ``(src, relation, dst, attributes)``.
+    """
+
+    frame_id: int
+    trace: str
+    seq: int
+    time_ns: int
+    ego: int | None
+    nodes: dict[int, dict[str, Any]]
+    edges: list[tuple[int, str, int, dict[str, Any]]]
+
+    def to_networkx(self) -> nx.MultiDiGraph[int]:
+        """The graph as a ``networkx.MultiDiGraph``.
+
+        Returns
+        -------
+        networkx.MultiDiGraph
+            Node ids as nodes with their attributes; an edge's key and its attribute ``relation`` are the
+            relation. The graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``ego``.
+        """
+        import networkx as nx  # half a second to import: only when asked for
+
+        graph: nx.MultiDiGraph[int] = nx.MultiDiGraph(
+            frame_id=self.frame_id,
+            trace=self.trace,
+            seq=self.seq,
+            time_ns=self.time_ns,
+            ego=self.ego,
+        )
+        graph.add_nodes_from(self.nodes.items())
+        for src, relation, dst, attributes in self.edges:
+            graph.add_edge(src, dst, key=relation, relation=relation, **attributes)
+        return graph

@@ -1,0 +1,187 @@
+"""Kinds, relations and the states of lights: the closed catalogue of names.
+
+A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Both are
+closed: a store holds these and no others, as enumerations whose order is the order here (the
+*code* of a name is its index). ``vocabulary.toml`` maps the type names of simulators to kinds; a
+type that nothing maps becomes ``unknown``, never nothing.
+
+Names are compared without regard to case and underscores (``TrafficLight`` is ``traffic_light``);
+the canonical spelling is stored and printed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+ENTITY_KINDS: Final = (
+    "car",
+    "truck",
+    "van",
+    "bus",
+    "motorcycle",
+    "bicycle",
+    "trailer",
+    "train",
+    "person",
+    "animal",
+    "traffic_light",
+    "stop_sign",
+    "yield_sign",
+    "speed_limit",
+    "sign",
+    "prop",
+    "building",
+    "pole",
+    "barrier",
+    "vegetation",
+    "unknown",
+)
+"""Kinds of entities: what has a pose and, mostly, a box."""
+
+MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint")
+"""Kinds of the parts of a road map. ``off_road`` is a single node: whatever is not a driving lane."""
+
+KINDS: Final = ENTITY_KINDS + MAP_KINDS
+
+VEHICLES: Final = ("car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train")
+SIGNALS: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
+
+SUPER_KINDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "vehicle": VEHICLES,
+    "two_wheeler": ("motorcycle", "bicycle"),
+    "vru": ("person", "bicycle", "motorcycle"),
+    "signal": SIGNALS,
+    "entity": ENTITY_KINDS,
+}
+"""Labels that stand for several kinds. ``vru``: vulnerable road users."""
+
+LABEL_ALIASES: Final[Mapping[str, str]] = {"pedestrian": "person", "walker": "person"}
+"""Other words for a kind, as users of Scenic, CARLA and nuScenes know them."""
+
+PROXIMITY: Final = ("safety_hazard", "near_coll", "super_near", "very_near", "near", "visible")
+DIRECTIONS: Final = ("inDFrontOf", "inSFrontOf", "atSRearOf", "atDRearOf")
+
+RELATIONS: Final = (
+    "isIn",
+    "travelsTo",
+    "laneChange",
+    "opposes",
+    "toLeftOf",
+    "toRightOf",
+    "conflictsWith",
+    "controlsTrafficOf",
+    "mayAffect",
+    *PROXIMITY,
+    *DIRECTIONS,
+    "leads",
+    "follows",
+    "overlaps",
+    "sees",
+)
+
+RELATION_ALIASES: Final[Mapping[str, str]] = {
+    "collides": "overlaps",
+    "safe_hazard": "safety_hazard",
+}
+"""``safe_hazard`` is the spelling of CARLASGG's documentation and of SceneFlow."""
+
+LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
+"""What a traffic light shows. ``flashing``: a bulb that flashes, whatever its colour."""
+
+SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service")
+"""Special kinds, beside the kind: CARLASGG's ``special_type`` and OSI's vehicle roles."""
+
+VEHICLE_LIGHTS: Final = (
+    "light_left",
+    "light_right",
+    "light_brake",
+    "light_reverse",
+    "light_position",
+    "light_low_beam",
+    "light_high_beam",
+    "light_fog",
+    "light_interior",
+    "light_special1",
+    "light_special2",
+)
+"""Lights of a vehicle; the index is the bit of a light in a mask (hazard lights are left and right)."""
+
+KIND_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(KINDS)}
+RELATION_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(RELATIONS)}
+LIGHT_STATE_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(LIGHT_STATES)}
+
+
+def folded(name: str) -> str:
+    """A name without case and underscores, as names are compared."""
+    return name.replace("_", "").lower()
+
+
+_RELATIONS_FOLDED: Final = {folded(name): name for name in RELATIONS} | {
+    folded(alias): name for alias, name in RELATION_ALIASES.items()
+}
+_LABELS_FOLDED: Final[Mapping[str, tuple[str, ...]]] = (
+    {folded(name): (name,) for name in KINDS}
+    | {folded(name): kinds for name, kinds in SUPER_KINDS.items()}
+    | {folded(alias): (name,) for alias, name in LABEL_ALIASES.items()}
+)
+
+
+def relation_named(name: str) -> str | None:
+    """The relation that a user's name means, or ``None``."""
+    return _RELATIONS_FOLDED.get(folded(name))
+
+
+def kinds_labelled(label: str) -> tuple[str, ...] | None:
+    """The kinds that a label stands for, or ``None``. ``Ego`` is a mark, not a label of kinds."""
+    return _LABELS_FOLDED.get(folded(label))
+
+
+def labels() -> tuple[str, ...]:
+    """Every label that a pattern may use, in CamelCase, ``Ego`` first."""
+    names = (*KINDS, *SUPER_KINDS, *LABEL_ALIASES)
+    return ("Ego", *("".join(part.capitalize() for part in name.split("_")) for name in names))
+
+
+def suggestion(name: str, known: Iterable[str]) -> str | None:
+    """The known name that is most like ``name``, or ``None`` if none is alike."""
+    by_folded = {folded(candidate): candidate for candidate in known}
+    close = difflib.get_close_matches(folded(name), by_folded, n=1, cutoff=0.6)
+    return by_folded[close[0]] if close else None
+
+
+@dataclass(frozen=True, slots=True)
+class TypeMeaning:
+    """What the type name of a simulator means.
+
+    Attributes
+    ----------
+    kind : str
+        One of :data:`ENTITY_KINDS`.
+    special : str
+        One of :data:`SPECIALS`, or the empty string.
+    subkind : str
+        What a prop or an unknown is (``cone``, ``traffic_warning``), or the empty string.
+    """
+
+    kind: str
+    special: str = ""
+    subkind: str = ""
+
+
+@cache
+def type_meanings() -> Mapping[str, TypeMeaning]:
+    """The shipped table: type name in lower case → its meaning."""
+    text = resources.files("sgstore").joinpath("vocabulary.toml").read_text(encoding="utf-8")
+    return {
+        name.lower(): TypeMeaning(**meaning)
+        for table in tomllib.loads(text).values()
+        for name, meaning in table.items()
+    }

@@ -1,0 +1,348 @@
+"""What a simulator said: frames of a trace as arrays, and where its messages stand in the file.
+
+No behaviour: these are the values that readers hand to the scene graph generator and to the store.
+Conventions of axes, units and signs are those of :mod:`sgstore.geometry`: OpenDRIVE's inertial
+axes, metres, radians, seconds, ``int64`` nanoseconds. A missing number is NaN, a missing code -1.
+
+A *node id* names an entity within its trace: 0, 1, 2, … in the order of appearance. Ids below zero
+belong to the road map (:mod:`sgstore.roads`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Codes = NDArray[np.int8]
+Bools = NDArray[np.bool_]
+
+BUCKET_FRAMES = 60
+"""Frames that one mask of the store covers; blocks that start at multiples of it are stored best."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entities:
+    """What does not change about the entities that a block sees for the first time, in order of node id.
+
+    Attributes
+    ----------
+    first : int
+        Node id of the first row; the following rows follow in steps of one.
+    ident : tuple of str
+        The simulator's own id.
+    kind : (n,) int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    special, subkind, type_name : tuple of str
+        Special kind, subkind, and the simulator's own type name; empty where there is none.
+    static : (n,) bool
+        Whether it never moves: its pose comes once, in :attr:`FrameBlock.scenery`.
+    map_ref : tuple of str
+        Id of the OpenDRIVE signal or object that this entity is, or the empty string.
+    """
+
+    first: int
+    ident: tuple[str, ...]
+    kind: Codes
+    special: tuple[str, ...]
+    subkind: tuple[str, ...]
+    type_name: tuple[str, ...]
+    static: Bools
+    map_ref: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.ident)
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """States of entities, one row an entity and instant. All arrays have shape (N,).
+
+    Attributes
+    ----------
+    node : int64
+        Node id.
+    x, y, z : float64
+        Centre of the box; m.
+    heading, pitch, roll : float64
+        Orientation; rad.
+    vx, vy, vz, ax, ay, az : float64
+        Velocity and acceleration in map axes; m/s, m/s².
+    yaw_rate : float64
+        rad/s.
+    length, width, height : float64
+        Full extents of the box; m.
+    lights : int64
+        Lights of a vehicle: bit i is :data:`sgstore.vocabulary.VEHICLE_LIGHTS` [i]; -1: not known.
+    light_state : int8
+        What a traffic light shows: code of :data:`sgstore.vocabulary.LIGHT_STATES`; -1: no light.
+    steer, throttle, brake : float64
+        Control inputs, for the ego where the trace has them; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+    derived : int64
+        Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
+    """
+
+    node: Ints
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    pitch: Floats
+    roll: Floats
+    vx: Floats
+    vy: Floats
+    vz: Floats
+    ax: Floats
+    ay: Floats
+    az: Floats
+    yaw_rate: Floats
+    length: Floats
+    width: Floats
+    height: Floats
+    lights: Ints
+    light_state: Codes
+    steer: Floats
+    throttle: Floats
+    brake: Floats
+    derived: Ints
+
+    def __post_init__(self) -> None:
+        for column in fields(self):
+            shape = getattr(self, column.name).shape
+            if shape != self.node.shape or len(shape) != 1:
+                raise ValueError(f"{column.name} has shape {shape}, expected {self.node.shape}")
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def take(self, rows: NDArray[np.intp] | Bools) -> States:
+        """Some of the rows, in the order given."""
+        return States(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    @classmethod
+    def of(cls, **columns: NDArray[np.generic]) -> States:
+        """States from the columns at hand (``node`` at least); all others are missing."""
+        n = len(columns["node"])
+        missing = {
+            "lights": np.full(n, -1, np.int64),
+            "light_state": np.full(n, -1, np.int8),
+            "derived": np.zeros(n, np.int64),
+        }
+        return cls(
+            **{
+                f.name: columns.get(f.name, missing.get(f.name, np.full(n, np.nan)))
+                for f in fields(cls)
+            }  # pyright: ignore[reportArgumentType]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRefs:
+    """Where messages stand in the file of their trace; one row a message, shape (M,).
+
+    Attributes
+    ----------
+    channel : int64
+        Index into :attr:`TraceInfo.channels`.
+    log_time_ns : int64
+        As MCAP has it.
+    chunk_offset : int64
+        Byte offset of the chunk record in the file; -1: the message is in no chunk.
+    offset : int64
+        Byte offset of the message record (its opcode) in the chunk's records, uncompressed, or in the file.
+    length : int64
+        Bytes of the message's data, without the record's head.
+    """
+
+    channel: Ints
+    log_time_ns: Ints
+    chunk_offset: Ints
+    offset: Ints
+    length: Ints
+
+    def __len__(self) -> int:
+        return len(self.channel)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameBlock:
+    """Consecutive frames of a trace; frame f owns the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
+
+    Attributes
+    ----------
+    seq : (F,) int64
+        Number of the frame in its trace, from 0, without gaps.
+    time_ns : (F,) int64
+        Simulation time; may jump backwards where a recording does.
+    log_time_ns : (F,) int64
+        Log time of the leading message; payloads are joined by it.
+    offsets : (F + 1,) int64
+        Rows of each frame in ``states``.
+    states : States
+        Every entity that moves or changes (traffic lights too), in and out of range.
+    ego : (F,) int64
+        Node id of the ego, -1 where it is absent.
+    entities : Entities
+        Entities that appear in this block for the first time.
+    scenery : States
+        Poses of the static ones among them; they stay for the rest of the trace.
+    messages : MessageRefs
+        The messages read with this block, of all channels that are not latched.
+    """
+
+    seq: Ints
+    time_ns: Ints
+    log_time_ns: Ints
+    offsets: Ints
+    states: States
+    ego: Ints
+    entities: Entities
+    scenery: States
+    messages: MessageRefs
+
+    def __post_init__(self) -> None:
+        frames = len(self.seq)
+        if not len(self.time_ns) == len(self.log_time_ns) == len(self.ego) == frames:
+            raise ValueError("seq, time_ns, log_time_ns and ego must have one row a frame")
+        if len(self.offsets) != frames + 1 or self.offsets[-1] != len(self.states):
+            raise ValueError("offsets must have one more row than frames and end at the last state")
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    @property
+    def frame_of(self) -> Ints:
+        """(N,) int64: the frame, counted in this block, that each state belongs to."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel of a trace.
+
+    Attributes
+    ----------
+    id : int
+        The channel's id in the file.
+    topic, schema, schema_encoding, message_encoding : str
+        As the file has them.
+    messages : int
+        Number of messages as the file's statistics say, -1 where it has none.
+    role : str
+        ``ground_truth``, ``map``, or ``payload``.
+    """
+
+    id: int
+    topic: str
+    schema: str
+    schema_encoding: str
+    message_encoding: str
+    messages: int
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class TraceInfo:
+    """What is known of a recording before its frames are read.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    size, mtime_ns : int
+        Its size in bytes and time of change; what later tells that it was replaced.
+    digest : str
+        SHA-256 of the whole file, in hexadecimal digits.
+    flavour : str
+        Name of the reader: ``osi``.
+    channels : tuple of Channel
+    ego : str
+        The simulator's id of the ego; empty if there is none.
+    map_text, map_name : str
+        OpenDRIVE text that the trace carries and what the trace calls it; empty if it carries none.
+    context : MessageRefs
+        Messages that later ones depend on: maps, latched messages, those that carry static data. A clip
+        must bring the ones before its start.
+    """
+
+    path: Path
+    size: int
+    mtime_ns: int
+    digest: str
+    flavour: str
+    channels: tuple[Channel, ...]
+    ego: str
+    map_text: str
+    map_name: str
+    context: MessageRefs
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Something in a recording that could not be used, and was not passed over in silence.
+
+    Attributes
+    ----------
+    reason : str
+        What was wrong.
+    messages, bytes : int
+        How much was lost; -1 where it cannot be known.
+    start_ns, end_ns : int
+        Log times between which it was lost; -1 where they cannot be known.
+    offset : int
+        Byte offset in the file, -1 where there is none.
+    """
+
+    reason: str
+    messages: int = -1
+    bytes: int = -1
+    start_ns: int = -1
+    end_ns: int = -1
+    offset: int = -1
+
+
+@dataclass(slots=True)
+class TraceReport:
+    """What reading a trace brought to light; filled while its blocks are read.
+
+    Attributes
+    ----------
+    frames, states : int
+        How many were read.
+    unknown_types : dict
+        Type names that no mapping knows → how many entities bear them.
+    warnings : list of str
+        What is odd but lost nothing.
+    losses : list of Loss
+        What could not be used.
+    """
+
+    frames: int = 0
+    states: int = 0
+    unknown_types: dict[str, int] = field(default_factory=dict[str, int])
+    warnings: list[str] = field(default_factory=list[str])
+    losses: list[Loss] = field(default_factory=list[Loss])
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """An interval of a trace, both ends included.
+
+    Attributes
+    ----------
+    trace : str
+        Name of the trace in its store.
+    start_ns, end_ns : int
+        Log times; ns.
+    """
+
+    trace: str
+    start_ns: int
+    end_ns: int
