@@ -1,0 +1,128 @@
+"""OpenDRIVE text → RoadMap.
+
+``document`` reads the text into tables · ``planview`` evaluates reference lines · ``lanes`` stacks lanes on
+them · ``links`` finds where traffic flows on · ``nodes`` and its kin make nodes and relations of it all.
+A road with a defect is left out and named in the map's warnings: the text is then read once more
+without it, so that no later step has to know. Only a map without any usable road is an error.
+
+OpenDRIVE 1.4 to 1.8 (ASAM) are read alike. Superelevation, crossfall and the height of kerbs are not: a lane
+lies at the elevation of its reference line, which is what storeys are told apart by.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, Final
+
+import numpy as np
+import shapely
+
+from sgstore.errors import MapError
+from sgstore.opendrive.document import Document, Spoiled, read_document
+from sgstore.opendrive.lanes import odd_sections, read_lanes, surface
+from sgstore.opendrive.links import Network, flows
+from sgstore.opendrive.marks import read_lane_changes
+from sgstore.opendrive.nodes import (
+    FIRST_LANE,
+    containment,
+    edges_of,
+    flow_edges,
+    lane_nodes,
+    neighbours,
+    road_nodes,
+    road_types,
+)
+from sgstore.opendrive.objects import read_objects
+from sgstore.opendrive.planview import read_plan_view
+from sgstore.opendrive.signals import read_controllers, read_signals
+from sgstore.roads import MapNodes, RoadMap
+
+__all__ = ["read_map"]
+
+_ROUNDS: Final = 8
+"""Readings of a text: each leaves out the roads that the one before found defects in."""
+
+
+def read_map(text: str, name: str) -> RoadMap:
+    """The road map that an OpenDRIVE text describes.
+
+    Parameters
+    ----------
+    text : str
+        The text of an ``.xodr`` file. Untrusted: time and memory are bounded by its length.
+    name : str
+        What people call it; empty: the name in its header, or the first digits of its digest.
+
+    Returns
+    -------
+    RoadMap
+        Roads with a defect are left out; its ``warnings`` say which, and why.
+
+    Raises
+    ------
+    MapError
+        The text is no XML or no OpenDRIVE, exceeds a bound, or has no road that can be used.
+    """
+    skip: dict[int, MapError] = {}
+    for _ in range(_ROUNDS):
+        document = read_document(text, frozenset(skip))
+        if not len(document["road"]):
+            break
+        try:
+            return _build(document, text, name, [str(error) for error in skip.values()])
+        except Spoiled as spoiled:
+            found = {document.ordinals[row]: error for row, error in spoiled.roads.items()}
+            skip |= found
+    if skip:
+        first = next(iter(skip.values()))
+        more = f" (and {len(skip) - 1} more such roads)" if len(skip) > 1 else ""
+        raise MapError(f"{first.reason}{more}", road=first.road, element=first.element) from first
+    raise MapError("has no road", element="OpenDRIVE")
+
+
+def _build(document: Document, text: str, name: str, warnings: list[str]) -> RoadMap:
+    plan = read_plan_view(document)
+    lanes = read_lanes(document)
+    document.settle()
+    ribbons = surface(document, lanes, plan)
+    network = Network.of(document, lanes)
+    surfaces = lane_nodes(document, lanes, ribbons)
+    signals = read_signals(document, plan, network)
+    crosswalks, scenery = read_objects(document, plan, network.warnings)
+    before = [
+        MapNodes.of("off_road", ["off_road"]),
+        surfaces,
+        *road_nodes(document),
+        crosswalks.nodes,
+    ]
+    nodes = MapNodes.joined([*before, signals.nodes, scenery.nodes])
+    first_signal = sum(map(len, before))
+    lane_changes = read_lane_changes(document, lanes, ribbons)
+    edges = [
+        *neighbours(lanes, ribbons),
+        *flow_edges(lanes, surfaces, ribbons, flows(document, network)),
+        *containment(document, lanes),
+        ("laneChange", FIRST_LANE + lane_changes.lane, FIRST_LANE + lane_changes.to),
+        signals.edges(first_signal),
+    ]
+    shapes = np.full(len(nodes), None, object)
+    poles: Any = shapely.points(signals.nodes.x, signals.nodes.y)
+    beside = [*crosswalks.shapes, *poles, *scenery.shapes]
+    shapes[len(nodes) - len(beside) :] = beside
+    document.settle()
+    return RoadMap(
+        name=name or _header_name(document) or hashlib.sha256(text.encode()).hexdigest()[:12],
+        text=text,
+        nodes=nodes,
+        edges=edges_of(edges),
+        ribbons=ribbons,
+        shapes=shapes,
+        lane_changes=lane_changes,
+        road_types=road_types(document),
+        controllers=read_controllers(document),
+        warnings=[*warnings, *odd_sections(document), *network.warnings],
+    )
+
+
+def _header_name(document: Document) -> str:
+    return next(iter(document["header"].texts("name")), "").strip()
