@@ -1,0 +1,375 @@
+"""Messages in CDR, read by their structure: one as a record, or a sequence of many as columns.
+
+CDR writes values one after another, each aligned to its own size, counted from the first byte behind a head
+of four. So where a value stands depends on every string and sequence before it. A message that comes now
+and then is read value by value (:func:`decode`). For long sequences of structures there is :class:`Table`:
+the layout of one element is learned, value by value; an element that begins at the same alignment and in
+which every length says the same has the same layout, and there are mostly many of these in a row, so that
+their numbers are columns of a matrix.
+
+Messages come from strangers: a length is held against the bytes that are left before anything is made of
+it, and what a message may become is bounded. What fails is a :class:`TraceError` for this message.
+
+Source: OMG DDS Interoperability Wire Protocol 2.5, section 10 (plain CDR); rosidl, "legacy interface
+definition".
+"""
+
+from __future__ import annotations
+
+import struct as binary
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import TraceError
+from sgstore.traces.ros2msg import LENGTH, Number, Sequence, Struct, Text, least, members
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sgstore.traces.ros2msg import Type
+    from sgstore.world import Floats
+
+Data = bytes | bytearray | memoryview
+
+HEAD: Final = 4
+"""Bytes before the values: how these are encoded, and options that plain CDR has none of."""
+MAX_VALUES: Final = 1_000_000
+"""Most values of a message that is read one by one, without numbers in arrays."""
+MAX_ROWS: Final = 100_000
+"""Most elements of a sequence that is read as columns."""
+
+_ORDERS: Final = {0: ">", 1: "<"}
+"""First two bytes of a message → order of the bytes of its numbers."""
+_MAX_LAYOUTS: Final = 16
+"""Layouts that are remembered for each alignment; the oldest is forgotten."""
+_MAX_PREFIXES: Final = 64
+"""Lengths in an element whose layout is worth remembering."""
+
+
+def decode(kind: Struct, data: Data) -> dict[str, Any]:
+    """A message as a record: numbers, texts, arrays of numbers, lists and records in it.
+
+    Raises
+    ------
+    TraceError
+        The message is cut, lies about a length, exceeds a bound of its definition or :data:`MAX_VALUES`,
+        or is in another encoding than plain CDR.
+    """
+    return _Reader.of(data).struct(kind)
+
+
+def number(record: dict[str, Any], path: str) -> float:
+    """The number at a path (``pose.position.x``) of a record; NaN if there is none."""
+    value = _at(record, path)
+    return float(value) if isinstance(value, (int, float)) else float("nan")
+
+
+def text(record: dict[str, Any], path: str) -> str:
+    """The text at a path of a record; empty if there is none."""
+    value = _at(record, path)
+    return value if isinstance(value, str) else ""
+
+
+def records(record: dict[str, Any], path: str) -> list[dict[str, Any]]:
+    """The records in the list at a path of a record; none if there is no such list."""
+    value = _at(record, path)
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def _at(record: Any, path: str) -> Any:
+    for name in path.split("."):
+        if not isinstance(record, dict):
+            return None
+        record = record.get(name)
+    return record
+
+
+@cache
+def _unpacker(code: str) -> Callable[..., tuple[Any, ...]]:
+    return binary.Struct(code).unpack_from
+
+
+@dataclass(slots=True)
+class _Reader:
+    """A message and how far it has been read.
+
+    ``values``: what follows the head; ``order``: of the bytes of numbers; ``place``: the next byte;
+    ``left``: how many more values may be made of it.
+    """
+
+    values: memoryview
+    order: str
+    place: int = 0
+    left: int = MAX_VALUES
+
+    @classmethod
+    def of(cls, data: Data) -> _Reader:
+        head = bytes(data[:HEAD])
+        kind = int.from_bytes(head[:2], "big")
+        if len(head) < HEAD:
+            raise TraceError(f"a message of {len(head)} bytes, which is no CDR")
+        if kind not in _ORDERS:
+            raise TraceError(
+                f"a message in encoding 0x{kind:04x}; expected plain CDR, 0x0000 or 0x0001"
+            )
+        return cls(memoryview(data)[HEAD:], _ORDERS[kind])
+
+    def take(self, size: int, align: int) -> int:
+        """The place of the next ``size`` bytes, which begin at a multiple of ``align``."""
+        start = self.place + -self.place % align
+        if start + size > len(self.values):
+            raise TraceError(
+                f"a message of {len(self.values)} bytes ends before its {start + size}th"
+            )
+        self.place = start + size
+        return start
+
+    def number(self, kind: Number) -> Any:
+        start = self.take(kind.size, kind.size)
+        return _unpacker(self.order + kind.code)(self.values, start)[0]
+
+    def length(self, least_size: int, bound: int, what: str) -> int:
+        """The length of what follows, of at least ``least_size`` bytes each."""
+        count = _unpacker(self.order + "I")(self.values, self.take(LENGTH, LENGTH))[0]
+        left = len(self.values) - self.place
+        if count * least_size > left:
+            raise TraceError(f"a {what} claims a length of {count} where {left} bytes are left")
+        if 0 <= bound < count:
+            raise TraceError(f"a {what} has a length of {count}; its definition allows {bound}")
+        return count
+
+    def text(self, kind: Text) -> str:
+        """A string; bytes that are no UTF-8 become U+FFFD."""
+        count = self.length(1, kind.bound + 1 if kind.bound >= 0 else -1, "string")
+        start = self.take(count, 1)
+        return (
+            bytes(self.values[start : start + count]).removesuffix(b"\0").decode(errors="replace")
+        )
+
+    def value(self, kind: Type) -> Any:
+        match kind:
+            case Number():
+                return self.number(kind)
+            case Text():
+                return self.text(kind)
+            case Struct():
+                return self.struct(kind)
+            case Sequence():
+                return self.sequence(kind)
+
+    def struct(self, kind: Struct) -> dict[str, Any]:
+        return {name: self.value(inner) for name, inner in kind.fields}
+
+    def count(self, kind: Sequence) -> int:
+        """How many elements follow."""
+        smallest = least(kind.element)
+        if kind.count < 0:
+            return self.length(smallest, kind.bound, "sequence")
+        if kind.count * smallest > len(self.values) - self.place:
+            raise TraceError(f"a message ends inside an array of {kind.count} elements")
+        return kind.count
+
+    def sequence(self, kind: Sequence) -> Any:
+        count, element = self.count(kind), kind.element
+        if isinstance(element, Number):
+            # An empty sequence has no first element that would be aligned.
+            start = self.take(count * element.size, element.size if count else 1)
+            return np.frombuffer(self.values, _dtype(self.order, element), count, start)
+        self.spend(count * members(element))
+        return [self.value(element) for _ in range(count)]
+
+    def spend(self, values: int) -> None:
+        """Keep account of the values that are made of a message."""
+        self.left -= values
+        if self.left < 0:
+            raise TraceError(f"a message of more than {MAX_VALUES} values")
+
+
+def _dtype(order: str, kind: Number) -> np.dtype[Any]:
+    return np.dtype(order + kind.code.replace("?", "B"))
+
+
+@dataclass(slots=True)
+class _Layout:
+    """Where things stand in an element that begins at a given alignment.
+
+    ``size``: bytes from its begin to that of the next; ``prefixes``: place and value of each length in it;
+    ``runs``: first column, place, number and type of numbers that stand side by side.
+    """
+
+    size: int
+    prefixes: list[tuple[int, int]]
+    runs: list[tuple[int, int, int, np.dtype[Any]]]
+
+    def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
+        """How many of the elements from a place on have this layout, one after another."""
+        for offset, expected in self.prefixes:
+            lengths = np.ndarray((most,), order + "u4", values, place + offset, (self.size,))
+            other = lengths != expected
+            if other.any():
+                most = int(np.argmax(other))
+                if not most:
+                    break
+        return most
+
+    def copy(self, values: memoryview, place: int, to: Floats) -> None:
+        """Copy the numbers of as many elements as there are rows in ``to``."""
+        for column, offset, count, dtype in self.runs:
+            numbers: Any = np.ndarray(
+                (len(to), count), dtype, values, place + offset, (self.size, dtype.itemsize)
+            )
+            to[:, column : column + count] = numbers
+
+
+class Table:
+    """Reads a sequence of structures in messages of one kind as columns.
+
+    Parameters
+    ----------
+    kind : Struct
+        Of the messages.
+    sequence : str
+        The field that is a sequence of structures.
+    columns : tuple of str
+        Paths of the numbers in an element: ``pose.position.x``, ``shape.dimensions[0]``.
+
+    Raises
+    ------
+    TraceError
+        There is no such sequence.
+    """
+
+    def __init__(self, kind: Struct, sequence: str, columns: tuple[str, ...]) -> None:
+        names = [name for name, _ in kind.fields]
+        found = dict(kind.fields).get(sequence)
+        if not isinstance(found, Sequence) or not isinstance(found.element, Struct):
+            raise TraceError(f"{kind.name} has no sequence of structures {sequence!r}")
+        self._head = kind.fields[: names.index(sequence)]
+        self._sequence = found
+        self._element: Struct = found.element
+        self._columns = {path: column for column, path in enumerate(columns)}
+        self._align = found.element.align
+        self._layouts: dict[tuple[str, int], list[_Layout]] = {}
+
+    def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
+        """The fields before the sequence, and the numbers in it.
+
+        Returns
+        -------
+        head : dict
+            As :func:`decode` gives them.
+        numbers : (n, columns) float64
+            NaN where an element lacks a number: its structure has none of that path, or a sequence in it is
+            too short.
+
+        Raises
+        ------
+        TraceError
+            As :func:`decode`; or there are more than :data:`MAX_ROWS` elements.
+        """
+        reader = _Reader.of(data)
+        head = {name: reader.value(kind) for name, kind in self._head}
+        count = reader.count(self._sequence)
+        if count > MAX_ROWS:
+            raise TraceError(f"a sequence of {count} elements; at most {MAX_ROWS} are read")
+        numbers = np.full((count, len(self._columns)), np.nan)
+        row = 0
+        while row < count:
+            row += self._some(reader, numbers[row:])
+        return head, numbers
+
+    def _some(self, reader: _Reader, to: Floats) -> int:
+        """Read the next element, and those behind it that are alike; how many these are."""
+        values, order, place = reader.values, reader.order, reader.place
+        layouts = self._layouts.setdefault((order, place % self._align), [])
+        for layout in layouts:
+            most = min(len(to), (len(values) - place) // layout.size)
+            # Of a size that is no multiple of the alignment, the next element is aligned differently.
+            most = min(most, 1) if layout.size % self._align else most
+            alike = layout.agreeing(values, order, place, most)
+            if alike:
+                break
+        else:
+            layout, alike = self._learn(reader), 1
+            if len(layout.prefixes) <= _MAX_PREFIXES:
+                layouts.insert(0, layout)
+                del layouts[_MAX_LAYOUTS:]
+        layout.copy(values, place, to[:alike])
+        reader.place = place + alike * layout.size
+        return alike
+
+    def _learn(self, reader: _Reader) -> _Layout:
+        walk = _Walk(reader, self._columns, reader.place)
+        walk.step(self._element, "")
+        return _Layout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
+
+
+class _Walk:
+    """A walk through one element, which takes note of where things stand."""
+
+    def __init__(self, reader: _Reader, columns: dict[str, int], start: int) -> None:
+        self.start = start
+        self.prefixes: list[tuple[int, int]] = []
+        self.found: dict[int, tuple[int, np.dtype[Any]]] = {}
+        self._reader = reader
+        self._columns = columns
+
+    def step(self, kind: Type, path: str) -> None:
+        """Walk over a value."""
+        reader = self._reader
+        match kind:
+            case Number(_, size):
+                self._note(path, reader.take(size, size), kind)
+            case Text():
+                start = reader.place
+                reader.text(kind)
+                self._prefix(start)
+            case Struct(fields=fields):
+                reader.spend(kind.members)
+                for name, inner in fields:
+                    self.step(inner, f"{path}.{name}" if path else name)
+            case Sequence():
+                self._sequence(kind, path)
+
+    def _sequence(self, kind: Sequence, path: str) -> None:
+        reader, element = self._reader, kind.element
+        start = reader.place
+        count = reader.count(kind)
+        if kind.count < 0:
+            self._prefix(start)
+        if not isinstance(element, Number):
+            reader.spend(count * members(element))
+            for index in range(count):
+                self.step(element, f"{path}[{index}]")
+        elif count:
+            first = reader.take(count * element.size, element.size)
+            for index in range(min(count, len(self._columns))):
+                self._note(f"{path}[{index}]", first + index * element.size, element)
+
+    def _note(self, path: str, place: int, kind: Number) -> None:
+        column = self._columns.get(path)
+        if column is not None:
+            self.found[column] = place - self.start, _dtype(self._reader.order, kind)
+
+    def _prefix(self, start: int) -> None:
+        place = start + -start % LENGTH
+        length = _unpacker(self._reader.order + "I")(self._reader.values, place)[0]
+        self.prefixes.append((place - self.start, length))
+
+
+def _side_by_side(
+    found: dict[int, tuple[int, np.dtype[Any]]],
+) -> list[tuple[int, int, int, np.dtype[Any]]]:
+    """Numbers that follow one another in columns and bytes, as runs."""
+    runs: list[tuple[int, int, int, np.dtype[Any]]] = []
+    for column, (place, dtype) in sorted(found.items()):
+        if runs:
+            first, start, count, kind = runs[-1]
+            if (column, place, dtype) == (first + count, start + count * dtype.itemsize, kind):
+                runs[-1] = (first, start, count + 1, kind)
+                continue
+        runs.append((column, place, 1, dtype))
+    return runs

@@ -1,0 +1,423 @@
+"""Chunks of an MCAP file, decompressed under guard, and the messages in them as columns.
+
+A chunk comes from a stranger. Its header says how large it is and how large it becomes; either may
+be a lie, and 65 kB can become 2 GB. So what a chunk declares is held against a limit before a byte
+is decompressed, what comes out is held against what was declared, a dictionary window larger than
+the chunk could need is refused, and a record must end where the chunk does. What fails is refused
+as a whole with a :class:`TraceError` that names the offset; the walk over the file
+(:mod:`sgstore.traces.mcap_file`) makes a loss of it and goes on.
+
+Source: MCAP specification, format version 0 (mcap.dev/spec).
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from array import array
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+
+from sgstore.errors import TraceError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sgstore.world import Ints
+
+MAX_CHUNK: Final = 256 << 20
+"""Greatest size of a chunk, stored or decompressed, and of a message outside chunks; bytes."""
+
+MAX_RECORDS: Final = 2_000_000
+"""Greatest number of records in a chunk: more than 60 MB of the smallest messages."""
+
+MIN_WINDOW: Final = 32 << 20
+"""Window that a zstd frame may always ask for; bytes. Larger ones only as large as the chunk itself."""
+
+READ_ERRORS: Final = (
+    McapError,
+    struct.error,
+    zstandard.ZstdError,
+    RuntimeError,  # what lz4.frame raises
+    ValueError,  # among them UnicodeDecodeError
+    KeyError,
+    IndexError,
+    OverflowError,
+    EOFError,
+    MemoryError,
+    OSError,
+)
+"""Whatever the parsers and decompressors below are known to raise on bytes that are not what they seem."""
+
+HEAD: Final = struct.Struct("<BQ")
+"""Head of every record: opcode, length of what follows."""
+
+MESSAGE_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""Head of a message record, packed: 31 bytes, then the data."""
+
+CHUNK_FIELDS: Final = struct.Struct("<QQQI")
+_PIECE: Final = 1 << 20
+_LZ4_PIECE: Final = 16 << 20  # its decompressor copies what is left of the input for every piece
+_LAST_NS: Final = (1 << 63) - 1
+_MESSAGE: Final = int(Opcode.MESSAGE)
+_MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
+_DEFINITIONS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
+
+
+class StrictStream(ReadDataStream):
+    """The parser's stream, but a text or number that ends early is an error instead of a shorter one."""
+
+    def __init__(self, record: bytes | memoryview) -> None:
+        super().__init__(BytesIO(record))
+
+    def read(self, length: int) -> bytes:
+        """Exactly ``length`` bytes."""
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """Messages that stand together in a file: those of a chunk, or a run outside chunks; shape (n,).
+
+    Attributes
+    ----------
+    chunk_offset : int
+        Byte offset of the chunk record in the file, -1 outside chunks.
+    channel, sequence : int64
+        Channel id in the file; sequence number.
+    log_time_ns : int64
+    publish_time_ns : uint64
+    offset : int64
+        Byte offset of the record in the chunk, uncompressed, or in the file.
+    length : int64
+        Bytes of the message's data.
+    read : callable
+        ``read(position, length)``: bytes at a position counted as ``offset`` is.
+    """
+
+    chunk_offset: int
+    channel: Ints
+    sequence: Ints
+    log_time_ns: Ints
+    publish_time_ns: np.ndarray[tuple[int], np.dtype[np.uint64]]
+    offset: Ints
+    length: Ints
+    read: Callable[[int, int], memoryview]
+
+    def __len__(self) -> int:
+        return len(self.channel)
+
+    def data(self, row: int) -> memoryview:
+        """The data of one message."""
+        return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
+
+    def span(self, start: int, stop: int) -> Messages:
+        """The messages from one row up to another."""
+        return self.take(slice(start, stop))
+
+    def take(self, rows: NDArray[np.bool_] | slice) -> Messages:
+        """Some of the messages."""
+        return Messages(
+            self.chunk_offset,
+            self.channel[rows],
+            self.sequence[rows],
+            self.log_time_ns[rows],
+            self.publish_time_ns[rows],
+            self.offset[rows],
+            self.length[rows],
+            self.read,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """What a chunk record says before its records come.
+
+    Attributes
+    ----------
+    offset : int
+        Byte offset of the record in the file.
+    start_ns, end_ns : int
+        Least and greatest log time of its messages.
+    size, crc : int
+        Size and CRC-32 of the records, uncompressed; a CRC of 0 stands for none.
+    compression : str
+        ``zstd``, ``lz4``, or empty.
+    data_offset, data_length : int
+        Where the records begin in the file, and how many bytes they take there.
+    """
+
+    offset: int
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    data_offset: int
+    data_length: int
+
+
+def read_chunk_head(file: BinaryIO, offset: int) -> ChunkHead:
+    """The head of the chunk record at an offset, the offset of its data with it.
+
+    Raises
+    ------
+    TraceError
+        There is no chunk record, or its head contradicts itself.
+    """
+    file.seek(offset)
+    try:
+        opcode, length = HEAD.unpack(file.read(HEAD.size))
+        start, end, size, crc = CHUNK_FIELDS.unpack(file.read(CHUNK_FIELDS.size))
+        (name_length,) = struct.unpack("<I", file.read(4))
+        if opcode != Opcode.CHUNK or name_length > 64:
+            raise TraceError("expected a chunk record", offset=offset)
+        compression = file.read(name_length).decode()
+        (data_length,) = struct.unpack("<Q", file.read(8))
+    except (struct.error, UnicodeDecodeError) as error:
+        raise TraceError("the head of this chunk is cut or malformed", offset=offset) from error
+    head_length = CHUNK_FIELDS.size + 4 + name_length + 8
+    if head_length + data_length != length:
+        reason = f"the chunk record is {length} bytes long but its parts take {head_length + data_length}"
+        raise TraceError(reason, offset=offset)
+    data_offset = offset + HEAD.size + head_length
+    return ChunkHead(offset, start, end, size, crc, compression, data_offset, data_length)
+
+
+def read_records(file: BinaryIO, head: ChunkHead, *, verify: bool = True) -> bytes | bytearray:
+    """The records of a chunk, decompressed and, if the chunk has a checksum, verified.
+
+    Raises
+    ------
+    TraceError
+        The chunk is too large, cut, not what it declares, or damaged.
+    """
+    if head.size > MAX_CHUNK or head.data_length > MAX_CHUNK:
+        largest = max(head.size, head.data_length)
+        reason = f"the chunk declares {largest} bytes; at most {MAX_CHUNK} are read"
+        raise TraceError(reason, offset=head.offset)
+    file.seek(head.data_offset)
+    stored = file.read(head.data_length)
+    if len(stored) != head.data_length:
+        raise TraceError("the file ends inside this chunk", offset=head.offset)
+    try:
+        records = decompress(stored, head.compression, head.size)
+    except TraceError as error:
+        raise TraceError(error.reason, offset=head.offset) from error
+    if verify and head.crc and zlib.crc32(records) != head.crc:
+        reason = "the chunk does not match its checksum"
+        raise TraceError(reason, offset=head.offset)
+    return records
+
+
+def decompress(stored: bytes, compression: str, size: int) -> bytes | bytearray:
+    """What a chunk's bytes become: exactly ``size`` bytes, and never more of them in memory.
+
+    Raises
+    ------
+    TraceError
+        They become more or fewer, cannot be decompressed, or the compression is not known.
+    """
+    if compression not in _DECOMPRESS:
+        raise TraceError(f"the compression {compression!r} is not known; known: zstd, lz4, none")
+    try:
+        records = _DECOMPRESS[compression](stored, size)
+    except READ_ERRORS as error:
+        reason = f"the chunk cannot be decompressed ({compression}): {error}"
+        raise TraceError(reason) from error
+    if len(records) != size:
+        many = "more" if len(records) > size else f"only {len(records)}"
+        raise TraceError(f"the chunk declares {size} bytes but holds {many}")
+    return records
+
+
+def decompress_head(stored: bytes, compression: str, size: int) -> bytes:
+    """As much as a chunk gives whose end is missing: at most ``size`` bytes, none if nothing can be had."""
+    pieces: list[bytes] = []
+    left = size
+    with suppress(*READ_ERRORS):  # the missing end, met at last: what came before it stands
+        if compression == "zstd":
+            reader = _zstd(size).stream_reader(stored, read_across_frames=True)
+            while left > 0 and (piece := reader.read(min(left, 1 << 16))):
+                pieces.append(piece)
+                left -= len(piece)
+        elif compression == "lz4":
+            decompressor = lz4.frame.LZ4FrameDecompressor()
+            for start in range(0, len(stored), 1 << 12):
+                piece = decompressor.decompress(stored[start : start + (1 << 12)], max_length=left)
+                pieces.append(piece)
+                left -= len(piece)
+        elif not compression:
+            pieces.append(stored)
+    return b"".join(pieces)[:size]
+
+
+def _zstd(size: int) -> zstandard.ZstdDecompressor:
+    return zstandard.ZstdDecompressor(max_window_size=max(size, MIN_WINDOW))
+
+
+def _from_zstd(stored: bytes, size: int) -> bytes | bytearray:
+    declared = zstandard.get_frame_parameters(stored).content_size
+    if declared == size:
+        return _zstd(size).decompress(stored)
+    if declared != zstandard.CONTENTSIZE_UNKNOWN and declared > size:
+        # A one-shot decompressor would allocate what the frame declares before it looks further.
+        raise TraceError(f"the chunk declares {size} bytes, the zstd frame in it {declared}")
+    records = bytearray()
+    with _zstd(size).stream_reader(stored, read_across_frames=True) as reader:
+        while piece := reader.read(min(_PIECE, size + 1 - len(records))):
+            records += piece
+    return records
+
+
+def _from_lz4(stored: bytes, size: int) -> bytes | bytearray:
+    records = bytearray()
+    while stored and len(records) <= size:
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        piece = decompressor.decompress(stored, max_length=_lz4_piece(records, size))
+        while piece:
+            records += piece
+            if decompressor.eof or len(records) > size:
+                break
+            piece = decompressor.decompress(b"", max_length=_lz4_piece(records, size))
+        if not decompressor.eof:
+            break  # too much, or the input ends before the frame does
+        stored = bytes(decompressor.unused_data or b"")
+    return records
+
+
+def _lz4_piece(records: bytearray, size: int) -> int:
+    return min(_LZ4_PIECE, size + 1 - len(records))
+
+
+_DECOMPRESS: Final[dict[str, Callable[[bytes, int], bytes | bytearray]]] = {
+    "zstd": _from_zstd,
+    "lz4": _from_lz4,
+    "": lambda stored, _size: stored,
+}
+
+
+def parse_records(
+    records: bytes | bytearray, chunk_offset: int, *, whole: bool = True
+) -> tuple[Messages, list[tuple[int, memoryview]]]:
+    """The records of a chunk: its messages as columns, and the definitions among them.
+
+    Parameters
+    ----------
+    records : bytes or bytearray
+    chunk_offset : int
+        Byte offset of the chunk in the file.
+    whole : bool
+        Whether the records must end where the bytes do. Otherwise what is left at the end is passed over.
+
+    Returns
+    -------
+    messages : Messages
+    definitions : list of tuple
+        Opcode and content of every schema and channel record, in order.
+
+    Raises
+    ------
+    TraceError
+        A record does not fit, or there are too many.
+    """
+    offsets, definitions, end = _frame_records(records)
+    if whole and end != len(records):
+        reason = (
+            f"the records of this chunk break off at byte {end} of {len(records)},"
+            f" or are more than {MAX_RECORDS}"
+        )
+        raise TraceError(reason, offset=chunk_offset)
+    view = memoryview(records)
+    heads = _message_heads(view, offsets)
+    messages = message_columns(
+        heads, offsets, chunk_offset, lambda at, length: view[at : at + length]
+    )
+    return messages, [(opcode, view[start:stop]) for opcode, start, stop in definitions]
+
+
+def message_columns(
+    heads: NDArray[np.void],
+    offsets: Ints,
+    chunk_offset: int,
+    read: Callable[[int, int], memoryview],
+) -> Messages:
+    """Message records as columns.
+
+    Parameters
+    ----------
+    heads : (n,) of :data:`MESSAGE_HEAD`
+    offsets : (n,) int64
+        Where each record begins.
+    chunk_offset, read
+        As :class:`Messages` has them.
+
+    Raises
+    ------
+    TraceError
+        A log time lies beyond what 64 bits with a sign can hold: the year 2262.
+    """
+    if len(heads) and int(heads["log_time"].max()) > _LAST_NS:
+        reason = f"a message bears the log time {int(heads['log_time'].max())} ns"
+        raise TraceError(reason, offset=max(chunk_offset, 0))
+    return Messages(
+        chunk_offset=chunk_offset,
+        channel=heads["channel"].astype(np.int64),
+        sequence=heads["sequence"].astype(np.int64),
+        log_time_ns=heads["log_time"].astype(np.int64),
+        publish_time_ns=heads["publish_time"].astype(np.uint64),
+        offset=offsets,
+        length=heads["length"].astype(np.int64) - (MESSAGE_HEAD.itemsize - HEAD.size),
+        read=read,
+    )
+
+
+def _frame_records(records: bytes | bytearray) -> tuple[Ints, list[tuple[int, int, int]], int]:
+    """Offsets of the messages, spans of the definitions, and where the last whole record ends."""
+    offsets = array("q")
+    definitions: list[tuple[int, int, int]] = []
+    position, total, head_at = 0, len(records), HEAD.unpack_from
+    for _ in range(MAX_RECORDS):
+        start = position + HEAD.size
+        if start > total:
+            break
+        opcode, length = head_at(records, position)
+        stop = start + length
+        if opcode == _MESSAGE and length >= _MESSAGE_FIELDS and stop <= total:
+            offsets.append(position)
+        elif opcode in {0, _MESSAGE} or stop > total:
+            break
+        elif opcode in _DEFINITIONS:
+            definitions.append((opcode, start, stop))
+        position = stop
+    return np.frombuffer(offsets, np.int64), definitions, position
+
+
+def _message_heads(view: memoryview, offsets: Ints) -> NDArray[np.void]:
+    if not len(offsets):
+        return np.empty(0, MESSAGE_HEAD)
+    rows = np.frombuffer(view, np.uint8)[offsets[:, None] + np.arange(MESSAGE_HEAD.itemsize)]
+    return np.ascontiguousarray(rows).view(MESSAGE_HEAD)[:, 0]

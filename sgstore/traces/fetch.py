@@ -1,0 +1,93 @@
+"""Files of recordings: opened with care, hashed, and asked for one message by its place."""
+
+from __future__ import annotations
+
+import hashlib
+import stat
+from typing import TYPE_CHECKING
+
+from mcap.opcode import Opcode
+
+from sgstore.errors import TraceError
+from sgstore.traces.chunks import (
+    HEAD,
+    MAX_CHUNK,
+    MESSAGE_HEAD,
+    READ_ERRORS,
+    read_chunk_head,
+    read_records,
+)
+
+if TYPE_CHECKING:
+    from io import BufferedReader
+    from pathlib import Path
+
+
+def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
+    """The data of one message, by its place; see :class:`sgstore.world.MessageRefs`.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened, the chunk is damaged, or there is no message of that length: the file
+        was replaced.
+    """
+    record = b""
+    with open_regular(path) as file:
+        try:
+            if chunk_offset < 0:
+                file.seek(offset)
+                record = file.read(min(MESSAGE_HEAD.itemsize + length, MAX_CHUNK))
+            else:
+                records = read_records(file, read_chunk_head(file, chunk_offset))
+                record = bytes(records[offset : offset + MESSAGE_HEAD.itemsize + length])
+            opcode, found = HEAD.unpack_from(record)
+        except TraceError as error:
+            raise TraceError(error.reason, path=path, offset=chunk_offset) from error
+        except READ_ERRORS:  # an offset outside the file or the chunk
+            opcode, found = 0, 0
+    fields = MESSAGE_HEAD.itemsize - HEAD.size
+    if (opcode, found, len(record)) != (
+        Opcode.MESSAGE,
+        fields + length,
+        HEAD.size + fields + length,
+    ):
+        reason = f"no message of {length} bytes at {offset} there: the file was replaced"
+        raise TraceError(reason, path=path, offset=max(chunk_offset, 0))
+    return record[MESSAGE_HEAD.itemsize :]
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a whole file, in hexadecimal digits.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be read.
+    """
+    with open_regular(path) as file:
+        try:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """A regular file, opened for reading. Pipes and devices, which one would wait for, are refused.
+
+    Raises
+    ------
+    TraceError
+        There is no such file, it is a folder or a device, or it may not be read.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise TraceError("a folder; expected an MCAP recording", path=path)
+        if not stat.S_ISREG(mode):
+            raise TraceError("not a regular file; expected an MCAP recording", path=path)
+        return path.open("rb")
+    except FileNotFoundError as error:
+        raise TraceError("no such file", path=path) from error
+    except (OSError, ValueError) as error:
+        raise TraceError(f"cannot be opened: {error}", path=path) from error

@@ -1,0 +1,433 @@
+"""From decoded messages to blocks of frames: what every flavour of recording shares.
+
+A flavour decodes a message into :class:`FrameRows` and enters what it meets into a :class:`Roster`.
+:func:`assemble` makes blocks of that, one frame ahead of what it hands out: a velocity that the
+recording lacks is the difference of two positions, and the second of them may belong to the first
+frame of the next block. So a value never depends on where a block begins or ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+
+import numpy as np
+
+from sgstore.vocabulary import KIND_CODE
+from sgstore.world import Entities, FrameBlock, MessageRefs, States
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from numpy.typing import NDArray
+
+    from sgstore.traces.chunks import Messages
+    from sgstore.vocabulary import TypeMeaning
+    from sgstore.world import Bools, Floats, Ints, TraceReport
+
+Raw = TypeVar("Raw")
+
+NAN: Final = float("nan")
+POSE: Final = (
+    "x",
+    "y",
+    "z",
+    "heading",
+    "pitch",
+    "roll",
+    "vx",
+    "vy",
+    "vz",
+    "ax",
+    "ay",
+    "az",
+    "yaw_rate",
+    "length",
+    "width",
+    "height",
+)
+"""Columns of :attr:`FrameRows.values`, in order; units as in :class:`sgstore.world.States`."""
+
+FAR: Final = 1e9
+"""Greatest coordinate of anything on earth, in any projection; m. Beyond it a pose is not usable."""
+
+_X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = 0, 3, 6, 9, 12
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRows:
+    """One frame, decoded.
+
+    Attributes
+    ----------
+    time_ns, log_time_ns : int
+        Simulation time; log time of the leading message.
+    ego : int
+        Node id, -1 where it is absent.
+    node, lights, light_state : (n,) int64
+        As in :class:`sgstore.world.States`.
+    values : (n, 16) float64
+        Columns :data:`POSE`.
+    controls : tuple of float
+        Steer, throttle, brake of the ego; NaN where the recording has none.
+    """
+
+    time_ns: int
+    log_time_ns: int
+    ego: int
+    node: Ints
+    values: Floats
+    lights: Ints
+    light_state: Ints
+    controls: tuple[float, float, float] = (NAN, NAN, NAN)
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+
+@dataclass(slots=True)
+class Roster:
+    """The entities of a trace in the order in which they were met; the index is the node id.
+
+    Attributes
+    ----------
+    report : TraceReport
+        Takes up the type names that nothing maps.
+    """
+
+    report: TraceReport
+    size: int = 0
+    _first: int = 0
+    _rows: list[tuple[str, int, str, str, str, bool, str]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+    _poses: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
+    _idents: set[str] = field(default_factory=set[str])
+
+    def enter(
+        self,
+        ident: str,
+        meaning: TypeMeaning,
+        type_name: str,
+        map_ref: str = "",
+        pose: tuple[float, ...] | None = None,
+    ) -> int:
+        """Enter an entity and return its node id.
+
+        Parameters
+        ----------
+        ident : str
+            The simulator's own id; where another entity bears it too, the kind is appended.
+        meaning : TypeMeaning
+        type_name, map_ref : str
+        pose : tuple of float, optional
+            Columns :data:`POSE` of an entity that never moves.
+        """
+        if ident in self._idents:
+            ident = f"{ident}:{meaning.kind}"
+        while ident in self._idents:
+            ident += "'"
+        self._idents.add(ident)
+        if meaning.kind == "unknown" and not meaning.subkind:
+            self.count_unknown(type_name)
+        node = self.size
+        if pose is not None:
+            self._poses[node] = pose
+        row = (
+            ident,
+            KIND_CODE[meaning.kind],
+            meaning.special,
+            meaning.subkind,
+            type_name,
+            pose is not None,
+            map_ref,
+        )
+        self._rows.append(row)
+        self.size += 1
+        return node
+
+    def count_unknown(self, type_name: str) -> None:
+        """Count an entity whose type name nothing maps."""
+        unknown = self.report.unknown_types
+        unknown[type_name] = unknown.get(type_name, 0) + 1
+
+    def take(self, upto: int) -> tuple[Entities, States]:
+        """The entities that were not taken yet, up to a node id, and the poses of the static ones."""
+        count = upto - self._first
+        rows, self._rows = self._rows[:count], self._rows[count:]
+        columns = tuple(zip(*rows, strict=True)) if rows else ((),) * 7
+        entities = Entities(
+            first=self._first,
+            ident=columns[0],
+            kind=np.array(columns[1], np.int8),
+            special=columns[2],
+            subkind=columns[3],
+            type_name=columns[4],
+            static=np.array(columns[5], np.bool_),
+            map_ref=columns[6],
+        )
+        nodes = [node for node in range(self._first, upto) if node in self._poses]
+        values = np.array([self._poses.pop(node) for node in nodes], np.float64)
+        self._first = upto
+        return entities, _states(np.array(nodes, np.int64), values.reshape(-1, len(POSE)))
+
+
+class Decoder(Protocol[Raw]):
+    """Messages → frames, in two steps, so that the numbers of many frames can be read at once.
+
+    Attributes
+    ----------
+    roster : Roster
+        Takes up entities while messages are decoded.
+    """
+
+    roster: Roster
+
+    def decode(self, run: Messages, row: int) -> Raw | None:
+        """The frame that a message is, or ``None`` if it is none."""
+        ...
+
+    def complete(self, frames: list[Raw]) -> list[FrameRows]:
+        """The same frames with their numbers."""
+        ...
+
+
+def assemble(
+    runs: Iterable[Messages],
+    size: int,
+    leading: int,
+    decoder: Decoder[Raw],
+    refs: Callable[[Messages], MessageRefs],
+) -> Iterator[FrameBlock]:
+    """Blocks of frames from the messages of a recording.
+
+    Parameters
+    ----------
+    runs : iterable of Messages
+        In file order.
+    size : int
+        Frames of a block; the last may have fewer.
+    leading : int
+        Channel id whose messages are frames.
+    decoder : Decoder
+    refs : callable
+        The references of those messages that belong to frames.
+
+    Yields
+    ------
+    FrameBlock
+        Its messages are those that stand in the file from its first frame up to the next block's.
+    """
+    raw: list[Raw] = []
+    taken: list[MessageRefs] = []
+    done: list[
+        FrameRows
+    ] = []  # the frame before the block, and its first, which was looked ahead to
+    first = 0
+    for run in runs:
+        start = 0
+        for row in np.flatnonzero(run.channel == leading):
+            known = decoder.roster.size
+            frame = decoder.decode(run, int(row))
+            if frame is None:
+                continue
+            raw.append(frame)
+            if len(raw) + (first > 0) > size:
+                taken.append(refs(run.span(start, int(row))))
+                start = int(row)
+                done += decoder.complete(raw)
+                yield _block(first, done, size, taken, decoder.roster.take(known))
+                first, done = first + size, done[-2:]
+                raw, taken = [], []
+        taken.append(refs(run.span(start, len(run))))
+    done += decoder.complete(raw)
+    left = len(done) - (first > 0)
+    if left:
+        yield _block(first, done, left, taken, decoder.roster.take(decoder.roster.size))
+
+
+def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
+    """The same blocks, while a report counts their frames and states and watches their clock."""
+    last: int | None = None
+    back, still = 0, 0
+    for block in blocks:
+        report.frames += len(block)
+        report.states += len(block.states)
+        times = block.time_ns if last is None else np.concatenate([[last], block.time_ns])
+        steps = np.diff(times)
+        back += int((steps < 0).sum())
+        still += int((steps == 0).sum())
+        last = int(block.time_ns[-1])
+        yield block
+    if back:
+        report.warnings.append(f"simulation time runs backwards {back} times")
+    if still:
+        report.warnings.append(f"simulation time stands still {still} times")
+
+
+def _block(
+    first: int,
+    window: list[FrameRows],
+    size: int,
+    refs: list[MessageRefs],
+    entered: tuple[Entities, States],
+) -> FrameBlock:
+    """The block of ``size`` frames in a window, which has the frames before and behind it too, if any."""
+    skipped = int(first > 0)
+    frames = window[skipped : skipped + size]
+    counts = np.array([len(frame) for frame in frames], np.int64)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    skip = len(window[0]) if skipped else 0
+    rows = slice(skip, skip + int(offsets[-1]))
+    values, derived = derive(
+        np.concatenate([frame.node for frame in window]),
+        np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
+        np.array([frame.time_ns for frame in window], np.int64),
+        _finite(np.concatenate([frame.values for frame in window])),
+        np.concatenate([frame.light_state for frame in window]) >= 0,
+        rows,
+    )
+    nodes = np.concatenate([frame.node for frame in frames])
+    ego = np.array([frame.ego for frame in frames], np.int64)
+    entities, scenery = entered
+    return FrameBlock(
+        seq=np.arange(first, first + len(frames)),
+        time_ns=np.array([frame.time_ns for frame in frames], np.int64),
+        log_time_ns=np.array([frame.log_time_ns for frame in frames], np.int64),
+        offsets=offsets,
+        states=_states(
+            nodes,
+            values,
+            lights=np.concatenate([frame.lights for frame in frames]),
+            light_state=np.concatenate([frame.light_state for frame in frames]).astype(np.int8),
+            derived=derived,
+            **_controls(nodes, ego, frames, counts),
+        ),
+        ego=ego,
+        entities=entities,
+        scenery=scenery,
+        messages=MessageRefs(
+            *(
+                np.concatenate([getattr(part, column.name) for part in refs])
+                for column in fields(MessageRefs)
+            )
+        ),
+    )
+
+
+def _finite(values: Floats) -> Floats:
+    values[np.isinf(values)] = np.nan
+    return values
+
+
+def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> dict[str, Floats]:
+    """Control inputs in the rows of the ego; nothing where no frame has any."""
+    inputs = np.array([frame.controls for frame in frames], np.float64)
+    if np.isnan(inputs).all():
+        return {}
+    columns = np.repeat(inputs, counts, axis=0)
+    columns[nodes != np.repeat(ego, counts)] = np.nan
+    return {"steer": columns[:, 0], "throttle": columns[:, 1], "brake": columns[:, 2]}
+
+
+def _states(node: Ints, values: Floats, **more: NDArray[np.generic]) -> States:
+    columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(POSE)}
+    return States.of(node=node, **columns, **more)
+
+
+def derive(
+    node: Ints, frame: Ints, time_ns: Ints, values: Floats, fixed: Bools, rows: slice
+) -> tuple[Floats, Ints]:
+    """Velocities, accelerations and yaw rates that a recording lacks, by differences.
+
+    Parameters
+    ----------
+    node, frame : (n,) int64
+        Node id and frame of each row; frames ascend, a node comes once in a frame.
+    time_ns : (F,) int64
+        Time of each frame.
+    values : (n, 16) float64
+        Columns :data:`POSE`; NaN is what is lacking.
+    fixed : (n,) bool
+        Rows of what does not move; nothing is derived for them.
+    rows : slice
+        The rows that are wanted; those outside it are only differed from.
+
+    Returns
+    -------
+    values : (m, 16) float64
+        The wanted rows. A velocity is the difference of the positions one frame before and one behind,
+        or of one of them and this, where the entity is not in the other or time stands still; NaN if in
+        neither. An acceleration is the difference of velocities likewise if they were read, else the
+        second difference of positions, which needs both neighbours.
+    derived : (m,) int64
+        Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate.
+    """
+    wanted = values[rows].copy()
+    derived = np.zeros(len(wanted), np.int64)
+    lacking = np.isnan(wanted[:, [_VELOCITY, _ACCELERATION, _YAW_RATE]]) & ~fixed[rows, None]
+    if not lacking.any():
+        return wanted, derived
+    steps = _neighbours(node, frame, time_ns, rows)
+    columns = (
+        (_VELOCITY, 3, _slope(values[:, _X : _X + 3], rows, steps)),
+        (_ACCELERATION, 3, _accelerations(values, rows, steps)),
+        (_YAW_RATE, 1, _slope(values[:, [_HEADING]], rows, steps, turn=2 * np.pi)),
+    )
+    for bit, (column, width, slopes) in enumerate(columns):
+        found = lacking[:, bit] & np.isfinite(slopes).all(axis=1)
+        wanted[found, column : column + width] = slopes[found]
+        derived |= found.astype(np.int64) << bit
+    return wanted, derived
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """Rows of the same node one frame before and behind; steps of time to them, NaN where there is none."""
+
+    before: Ints
+    behind: Ints
+    since: Floats
+    until: Floats
+
+
+def _neighbours(node: Ints, frame: Ints, time_ns: Ints, rows: slice) -> _Steps:
+    span = int(node.max()) + 1
+    keys = frame * span + node
+    order = np.argsort(keys)
+    sorted_keys = keys[order]
+    found: list[Ints] = []
+    steps: list[Floats] = []
+    for side in (-1, 1):
+        key = keys[rows] + side * span
+        at = np.minimum(np.searchsorted(sorted_keys, key), len(keys) - 1)
+        there = order[at]
+        step = side * (time_ns[frame[there]] - time_ns[frame[rows]]) / 1e9
+        found.append(there)
+        steps.append(np.where((sorted_keys[at] == key) & (step > 0), step, np.nan))
+    return _Steps(found[0], found[1], steps[0], steps[1])
+
+
+def _slope(values: Floats, rows: slice, steps: _Steps, turn: float = 0.0) -> Floats:
+    """Slope at each row: over both steps where there are two, else over the one there is.
+
+    ``turn``: values are the same modulo this, and differences the smallest that there are.
+    """
+    back = values[rows] - values[steps.before]
+    forth = values[steps.behind] - values[rows]
+    if turn:
+        back = back - turn * np.round(back / turn)
+        forth = forth - turn * np.round(forth / turn)
+    since, until = steps.since[:, None], steps.until[:, None]
+    both = (back + forth) / (since + until)
+    slopes = np.where(np.isfinite(both), both, back / since)
+    return np.where(np.isfinite(slopes), slopes, forth / until)
+
+
+def _accelerations(values: Floats, rows: slice, steps: _Steps) -> Floats:
+    velocity = values[:, _VELOCITY : _VELOCITY + 3]
+    position = values[:, _X : _X + 3]
+    since, until = steps.since[:, None], steps.until[:, None]
+    back = (position[rows] - position[steps.before]) / since
+    forth = (position[steps.behind] - position[rows]) / until
+    bend = 2 * (forth - back) / (since + until)
+    read = np.isfinite(velocity[rows]).all(axis=1, keepdims=True)
+    return np.where(read, _slope(velocity, rows, steps), bend)

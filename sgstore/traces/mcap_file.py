@@ -1,0 +1,564 @@
+"""The guarded reader of MCAP files: everything that can be had, and the name of what cannot.
+
+A file is walked record by record in the order in which it was written, one chunk in memory at a
+time. The summary at its end, where there is one, is a help and not an authority: it gives the
+definitions of channels early, and the places of chunks, so that the walk finds its way again behind
+a record that is damaged. Without a summary the walk is all there is, and enough.
+
+What can be wrong, and what comes of it:
+
+* A chunk is damaged, lies about its size, or is too large: it is passed over and reported as a
+  :class:`~sgstore.world.Loss` (bytes, time span, messages where message indexes tell), and the walk
+  goes on behind it.
+* The file ends early: every whole record is kept, and of a chunk that is cut the whole messages.
+* A record's length leads astray: the walk goes on at the next chunk that the summary names.
+* It is no MCAP file at all: a :class:`TraceError`.
+
+Nothing else escapes: whatever the parsers below raise becomes one or the other.
+
+Source: MCAP specification, format version 0 (mcap.dev/spec).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from array import array
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Header, Metadata, Schema
+
+from sgstore.errors import TraceError
+from sgstore.traces.chunks import (
+    CHUNK_FIELDS,
+    HEAD,
+    MAX_CHUNK,
+    MESSAGE_HEAD,
+    READ_ERRORS,
+    ChunkHead,
+    Messages,
+    StrictStream,
+    decompress_head,
+    message_columns,
+    parse_records,
+    read_chunk_head,
+    read_records,
+)
+from sgstore.traces.fetch import open_regular
+from sgstore.traces.summary import MAGIC, Summary, read_summary
+from sgstore.world import Loss, TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+CLIP: Final = "sgstore.clip"
+"""Name of the metadata record that makes a file a clip of another: ``start_ns``, ``end_ns`` of its interval."""
+MAX_DEFINITION: Final = 16 << 20
+"""Greatest size of a schema, channel or metadata record; bytes."""
+MAX_DEFINITIONS: Final = 64 << 20
+"""Greatest size of all schemas, channels and metadata of a file together; bytes."""
+MAX_LOSSES: Final = 1000
+"""Losses that are listed one by one; the last of them stands for all that follow."""
+RUN_MESSAGES: Final = 1024
+"""Messages outside chunks that are handed on together."""
+
+_PIECE: Final = 1 << 20
+_MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
+_LAST_NS: Final = (1 << 63) - 1
+_HOLDS_CONTENT: Final = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.MESSAGE,
+        Opcode.CHUNK,
+        Opcode.ATTACHMENT,
+        Opcode.METADATA,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A record of the file: where it begins, and its length with its head; bytes."""
+
+    offset: int
+    length: int
+
+
+@dataclass(slots=True)
+class _Walk:
+    """Where a walk is, and what it has found.
+
+    ``pending`` is a chunk that was lost: the message indexes behind it tell what was in it.
+    """
+
+    report: TraceReport
+    wanted: Callable[[int], bool] | None = None
+    position: int = len(MAGIC)
+    run: array[int] = field(default_factory=lambda: array("q"))
+    pending: Loss | None = None
+    messages: int = 0
+    chunks: int = 0
+    unverified: int = 0
+    closed: bool = False
+
+
+class McapFile:
+    """An MCAP file that is read once or more often, from its beginning.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path, size, mtime_ns
+        The file, its size in bytes, its time of change.
+    profile, library : str
+        As the header has them.
+    schemas, channels : dict
+        Records by their id. Filled from the summary, and while the file is walked.
+    metadata : dict
+        Metadata records by their place; filled while the file is walked.
+    attachments : list of Place
+        Attachments are not read; filled while the file is walked.
+    counts : dict or None
+        Channel id → messages as the file's statistics say.
+    compression : str
+        That of the first chunk; ``zstd`` before a chunk was met.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened or is no MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.metadata: dict[Place, Metadata] = {}
+        self.attachments: list[Place] = []
+        self.counts: dict[int, int] | None
+        self.compression = "zstd"
+        self._verified: set[int] = set()
+        self._definition_bytes = 0
+        self._file = open_regular(path)
+        try:
+            status = os.fstat(self._file.fileno())
+            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            self.profile, self.library = self._header()
+            self._use(read_summary(self._file, self.size))
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Log times, both included, that a clip is of; of any other file all there are.
+
+        What a clip holds from outside them was carried in because later messages depend on it.
+        """
+        window = (0, _LAST_NS)
+        for place in sorted(self.metadata, key=lambda place: place.offset):
+            record = self.metadata[place]
+            start, end = record.metadata.get("start_ns", ""), record.metadata.get("end_ns", "")
+            if record.name == CLIP and start.isdecimal() and end.isdecimal():
+                window = (int(start), int(end))
+        return window
+
+    def walk(
+        self, report: TraceReport, wanted: Callable[[int], bool] | None = None
+    ) -> Iterator[Messages]:
+        """All messages in file order, chunk by chunk; what cannot be read goes to ``report``.
+
+        Parameters
+        ----------
+        report : TraceReport
+        wanted : callable, optional
+            Whether the chunk at an offset is wanted; others are passed over.
+
+        Raises
+        ------
+        TraceError
+            The definitions of channels exceed all measure, or the file cannot be read any more.
+        """
+        walk = _Walk(report, wanted)
+        try:
+            while not walk.closed:
+                head = self._head(walk.position)
+                if head is None:
+                    break
+                yield from self._step(walk, *head)
+            yield from self._flush(walk)
+        except READ_ERRORS as error:
+            raise TraceError(f"cannot be read: {error}", path=self.path) from error
+        self._settle(walk)
+        self._closing_words(walk)
+
+    def pieces(self, place: Place) -> Iterator[memoryview]:
+        """The bytes of a record, with its head, piece by piece.
+
+        Raises
+        ------
+        TraceError
+            The file has become shorter.
+        """
+        for start in range(0, place.length, _PIECE):
+            yield self._at(place.offset + start, min(_PIECE, place.length - start))
+
+    def _header(self) -> tuple[str, str]:
+        start = self._file.read(len(MAGIC))
+        if not start:
+            raise TraceError("the file is empty; expected an MCAP recording", path=self.path)
+        if start != MAGIC:
+            reason = f"not an MCAP file: it begins with {start!r}, expected {MAGIC!r}"
+            raise TraceError(reason, path=self.path)
+        try:
+            opcode, length = HEAD.unpack(self._file.read(HEAD.size))
+            if opcode != Opcode.HEADER or length > MAX_DEFINITION:
+                raise TraceError("expected the header of an MCAP file", path=self.path, offset=8)
+            header = Header.read(StrictStream(self._file.read(length)))
+        except READ_ERRORS as error:
+            reason = "the header of this MCAP file is cut or malformed"
+            raise TraceError(reason, path=self.path, offset=len(MAGIC)) from error
+        return header.profile, header.library
+
+    def _use(self, summary: Summary) -> None:
+        self.schemas.update(summary.schemas)
+        self.channels.update(summary.channels)
+        self.counts = summary.counts
+        self._chunk_offsets = summary.chunk_offsets
+        self._summary_fault = summary.fault
+
+    # The walk ------------------------------------------------------------------------------------------------
+
+    def _head(self, position: int) -> tuple[int, int] | None:
+        """Opcode and length of the record at a position; ``None`` where no whole head is left."""
+        self._file.seek(position)
+        head = self._file.read(HEAD.size)
+        return HEAD.unpack(head) if len(head) == HEAD.size else None
+
+    def _step(self, walk: _Walk, opcode: int, length: int) -> Iterator[Messages]:
+        """What one record gives; the walk stands behind it afterwards."""
+        start = walk.position
+        stop = start + HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX:
+            self._settle(walk)
+        astray = self._chunk_behind(start, min(stop, self.size))
+        if opcode == 0 or stop > self.size or (astray is not None and opcode != Opcode.CHUNK):
+            yield from self._flush(walk)
+            yield from self._broken(walk, opcode, length)
+            return
+        walk.position = stop
+        match opcode:
+            case Opcode.MESSAGE:
+                yield from self._single(walk, start, length)
+            case Opcode.CHUNK:
+                yield from self._flush(walk)
+                yield from self._chunk(walk, Place(start, stop - start), astray)
+            case Opcode.MESSAGE_INDEX:
+                self._count(walk, length)
+            case Opcode.DATA_END | Opcode.FOOTER:
+                yield from self._end(walk, start)
+            case _:
+                self._define_at(walk, opcode, Place(start, stop - start))
+
+    def _single(self, walk: _Walk, start: int, length: int) -> Iterator[Messages]:
+        if length < MESSAGE_HEAD.itemsize - HEAD.size or length > MAX_CHUNK:
+            reason = f"a message of {length} bytes"
+            _lose(walk.report, Loss(reason, 1, length + HEAD.size, offset=start))
+            return
+        walk.run.append(start)
+        if len(walk.run) >= RUN_MESSAGES:
+            yield from self._flush(walk)
+
+    def _flush(self, walk: _Walk) -> Iterator[Messages]:
+        """The messages outside chunks that were met since the last time."""
+        if not walk.run:
+            return
+        offsets = np.frombuffer(walk.run, np.int64)
+        walk.run = array("q")
+        walk.messages += len(offsets)
+        heads = b"".join(self._at(int(at), MESSAGE_HEAD.itemsize) for at in offsets)
+        try:
+            messages = message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
+        except TraceError as error:
+            loss = Loss(error.reason, len(offsets), offset=int(offsets[0]))
+            _lose(walk.report, loss)
+            return
+        yield from self._known(walk, messages)
+
+    def _end(self, walk: _Walk, start: int) -> Iterator[Messages]:
+        """The end of the data; not believed where the summary names chunks behind it."""
+        yield from self._flush(walk)
+        resume = self._chunk_behind(start, self.size)
+        walk.closed = resume is None
+        if resume is not None:
+            reason = "damage: the data seem to end here, but the summary names chunks behind"
+            _lose(walk.report, Loss(reason, bytes=resume - start, offset=start))
+            walk.position = resume
+
+    def _chunk(self, walk: _Walk, place: Place, astray: int | None) -> Iterator[Messages]:
+        """The messages of a chunk. ``astray``: a chunk that the summary says begins within it."""
+        if walk.wanted is not None and not walk.wanted(place.offset):
+            return
+        walk.chunks += 1
+        head = None
+        try:
+            head = read_chunk_head(self._file, place.offset)
+            if walk.chunks == 1:
+                self.compression = head.compression
+            walk.unverified += head.crc == 0
+            records = read_records(self._file, head, verify=place.offset not in self._verified)
+            messages, definitions = parse_records(records, place.offset)
+            self._verified.add(place.offset)
+        except TraceError as error:
+            if astray is not None:
+                walk.position = astray
+                place = Place(place.offset, astray - place.offset)
+            walk.pending = _loss_of_chunk(error.reason, place, head)
+            return
+        walk.messages += len(messages)
+        for opcode, content in definitions:
+            self._define(walk, opcode, content, place.offset)
+        yield from self._known(walk, messages)
+
+    def _known(self, walk: _Walk, messages: Messages) -> Iterator[Messages]:
+        """The messages, without those of channels that were never defined."""
+        ids = np.unique(messages.channel)
+        unknown = [int(number) for number in ids if int(number) not in self.channels]
+        if unknown:
+            lost = np.isin(messages.channel, unknown)
+            times = messages.log_time_ns[lost]
+            loss = Loss(
+                f"messages of channels that the file does not define: {unknown[:10]}",
+                messages=int(lost.sum()),
+                bytes=int(messages.length[lost].sum()),
+                start_ns=int(times.min()),
+                end_ns=int(times.max()),
+                offset=max(messages.chunk_offset, -1),
+            )
+            _lose(walk.report, loss)
+            messages = messages.take(~lost)
+        if len(messages):
+            yield messages
+
+    # What went wrong -----------------------------------------------------------------------------------------
+
+    def _chunk_behind(self, start: int, stop: int) -> int | None:
+        """Offset of the first chunk that begins behind ``start`` and before ``stop``, as the summary has it.
+
+        The summary is believed where there is the head of a chunk indeed.
+        """
+        if not len(self._chunk_offsets):
+            return None
+        first, last = np.searchsorted(self._chunk_offsets, [start + 1, stop])
+        for offset in self._chunk_offsets[first:last]:
+            with suppress(TraceError):
+                return read_chunk_head(self._file, int(offset)).offset
+        return None
+
+    def _broken(self, walk: _Walk, opcode: int, length: int) -> Iterator[Messages]:
+        """A record whose length cannot be: go on behind it where the summary says, or end here."""
+        resume = self._chunk_behind(walk.position, self.size)
+        start = walk.position
+        stop = self.size if resume is None else resume
+        walk.position = stop
+        name = _name(opcode)
+        if resume is not None:
+            reason = (
+                f"damage: a record ({name}) of {length} bytes where at most {stop - start} are left"
+            )
+            _lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+        elif opcode == Opcode.CHUNK:
+            yield from self._cut_chunk(walk, start)
+        elif opcode in _HOLDS_CONTENT:
+            reason = f"the file ends inside a record ({name}): {stop - start} of {length + HEAD.size} bytes"
+            messages = 1 if opcode == Opcode.MESSAGE else 0
+            _lose(walk.report, Loss(reason, messages, stop - start, offset=start))
+        elif opcode == 0 or opcode > Opcode.DATA_END:
+            reason = f"the bytes from here to the end are no MCAP records (opcode {opcode})"
+            _lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+
+    def _cut_chunk(self, walk: _Walk, start: int) -> Iterator[Messages]:
+        """The whole messages of a chunk whose end is missing."""
+        kept = None
+        head, stored = self._head_of_cut_chunk(start)
+        if head is not None:
+            records = decompress_head(stored, head.compression, min(head.size, MAX_CHUNK))
+            try:
+                kept, definitions = parse_records(records, start, whole=False)
+                for opcode, content in definitions:
+                    self._define(walk, opcode, content, start)
+            except TraceError:
+                kept = None
+        count = 0 if kept is None else len(kept)
+        walk.messages += count
+        reason = f"the file ends inside a chunk; its first {count} messages were kept"
+        _lose(walk.report, _loss_of_chunk(reason, Place(start, self.size - start), head))
+        if kept is not None:
+            yield from self._known(walk, kept)
+
+    def _head_of_cut_chunk(self, start: int) -> tuple[ChunkHead | None, bytes]:
+        rest = bytes(self._at(start, min(self.size - start, MAX_CHUNK)))
+        try:
+            begin, end, size, crc = CHUNK_FIELDS.unpack_from(rest, HEAD.size)
+            at = HEAD.size + CHUNK_FIELDS.size
+            (length,) = struct.unpack_from("<I", rest, at)
+            compression = rest[at + 4 : at + 4 + length].decode()
+            at += 4 + length + 8
+        except (struct.error, UnicodeDecodeError):
+            return None, b""
+        return ChunkHead(start, begin, end, size, crc, compression, start + at, 0), rest[at:]
+
+    def _count(self, walk: _Walk, length: int) -> None:
+        """Add the messages that a message index names to those that were lost with its chunk."""
+        if walk.pending is None:
+            return
+        entries = max(length - 6, 0) // 16
+        walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
+
+    def _settle(self, walk: _Walk) -> None:
+        """Report a chunk that was lost, now that its message indexes are read."""
+        if walk.pending is not None:
+            _lose(walk.report, walk.pending)
+            walk.pending = None
+
+    def _closing_words(self, walk: _Walk) -> None:
+        """Report what is odd about the file as a whole but lost nothing."""
+        warn = walk.report.warnings.append
+        left = self.size - walk.position
+        if not walk.closed:
+            if 0 < left < HEAD.size:
+                _lose(walk.report, Loss("the file ends inside the head of a record", bytes=left))
+            warn("the recording was not closed: it has no end of data")
+        elif self._summary_fault:
+            warn(self._summary_fault)
+        told = sum(self.counts.values()) if self.counts else 0
+        if told > walk.messages and not walk.report.losses and walk.wanted is None:
+            reason = f"the file's statistics tell of {told} messages, {walk.messages} were found"
+            _lose(walk.report, Loss(reason, told - walk.messages))
+        if walk.chunks and walk.unverified == walk.chunks:
+            warn("no chunk has a checksum: damage that leaves a chunk readable cannot be noticed")
+
+    # Definitions -----------------------------------------------------------------------------
+
+    def _define_at(self, walk: _Walk, opcode: int, place: Place) -> None:
+        if opcode == Opcode.ATTACHMENT:
+            if place not in self.attachments[-1:]:
+                self.attachments.append(place)
+        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
+            if place.length > MAX_DEFINITION:
+                reason = f"a definition ({_name(opcode)}) of {place.length} bytes"
+                _lose(walk.report, Loss(reason, 0, place.length, offset=place.offset))
+                return
+            content = self._at(place.offset + HEAD.size, place.length - HEAD.size)
+            self._define(walk, opcode, content, place.offset, place)
+
+    def _define(
+        self,
+        walk: _Walk,
+        opcode: int,
+        content: memoryview,
+        offset: int,
+        place: Place | None = None,
+    ) -> None:
+        """Take up a schema, a channel or a metadata record; the first one of an id stands."""
+        try:
+            odd = self._take_up(opcode, content, place)
+        except READ_ERRORS as error:
+            reason = f"a definition ({_name(opcode)}) is malformed: {error!r}"
+            _lose(walk.report, Loss(reason, 0, len(content), offset=offset))
+            return
+        if odd and odd not in walk.report.warnings:
+            walk.report.warnings.append(odd)
+
+    def _take_up(self, opcode: int, content: memoryview, place: Place | None = None) -> str:
+        """Take up a definition; returns what is odd about it, or an empty text."""
+        stream = StrictStream(content)
+        if opcode == Opcode.METADATA and place is not None:
+            if place not in self.metadata:
+                self._weigh(len(content))
+                self.metadata[place] = Metadata.read(stream)
+            return ""
+        record = Schema.read(stream) if opcode == Opcode.SCHEMA else Channel.read(stream)
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if record.id not in known:
+            self._weigh(len(content))
+            known[record.id] = record
+        elif known[record.id] != record:
+            return (
+                f"{_name(opcode)} {record.id} is defined twice, differently; the first one counts"
+            )
+        return ""
+
+    def _weigh(self, length: int) -> None:
+        self._definition_bytes += length
+        if self._definition_bytes > MAX_DEFINITIONS:
+            reason = f"more than {MAX_DEFINITIONS} bytes of schemas, channels and metadata"
+            raise TraceError(reason, path=self.path)
+
+    def _at(self, position: int, length: int) -> memoryview:
+        """Bytes of the file.
+
+        Raises
+        ------
+        TraceError
+            The file has become shorter since it was opened.
+        """
+        self._file.seek(position)
+        data = self._file.read(length)
+        if len(data) != length:
+            raise TraceError("the file became shorter while it was read", path=self.path)
+        return memoryview(data)
+
+
+def _lose(report: TraceReport, loss: Loss) -> None:
+    """Report a loss; when there are very many, the last one stands for the rest."""
+    if len(report.losses) < MAX_LOSSES:
+        report.losses.append(loss)
+        return
+    last = report.losses[-1]
+    many = last.messages >= 0 and loss.messages >= 0
+    report.losses[-1] = Loss(
+        "further damage of the same kinds",
+        messages=last.messages + loss.messages if many else -1,
+        bytes=max(last.bytes, 0) + max(loss.bytes, 0),
+        start_ns=last.start_ns,
+        end_ns=max(last.end_ns, loss.end_ns),
+        offset=last.offset,
+    )
+
+
+def _loss_of_chunk(reason: str, place: Place, head: ChunkHead | None) -> Loss:
+    known = head is not None and head.start_ns <= head.end_ns <= _LAST_NS
+    return Loss(
+        reason,
+        bytes=place.length,
+        start_ns=head.start_ns if head and known else -1,
+        end_ns=head.end_ns if head and known else -1,
+        offset=place.offset,
+    )
+
+
+def _name(opcode: int) -> str:
+    try:
+        return Opcode(opcode).name.lower().replace("_", " ")
+    except ValueError:
+        return f"opcode {opcode}"

@@ -1,0 +1,221 @@
+"""Which fields of OSI are read; what is not read is not parsed.
+
+A ground truth is mostly lanes and boundaries, and a sensor view may carry whole pictures. Fields that
+nobody here reads are taken out of the descriptors, so that protobuf keeps their bytes as they are: it
+parses a static-heavy message several times faster, and a message made of a hundred million empty points
+costs no more than its own size. What is read is bounded by number before it is parsed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from google.protobuf import descriptor_pb2
+
+MAX_GROUND_TRUTH: Final = 32 << 20
+"""Greatest size of a ground truth; bytes. One with all lanes of a town takes 1.4 MB."""
+MAX_OBJECTS: Final = 100_000
+"""Greatest number of objects (vehicles, lights, lanes, …) of a ground truth."""
+SMALL: Final = 64 << 10
+"""A message up to this size cannot hold so many that it mattered; bytes."""
+
+_VECTOR: Final = dict.fromkeys(("x", "y", "z"))
+_ANGLES: Final = dict.fromkeys(("roll", "pitch", "yaw"))
+_EXTENTS: Final = dict.fromkeys(("length", "width", "height"))
+_ID: Final = {"id": {"value": None}}
+_REFERENCES: Final = {"source_reference": {"type": None, "identifier": None}}
+_STATIC_BASE: Final = {"dimension": _EXTENTS, "position": _VECTOR, "orientation": _ANGLES}
+_LIGHT_STATE: Final = dict.fromkeys(
+    (
+        "indicator_state",
+        "front_fog_light",
+        "rear_fog_light",
+        "head_light",
+        "high_beam",
+        "reversing_light",
+        "brake_light_state",
+        "emergency_vehicle_illumination",
+        "service_vehicle_illumination",
+    )
+)
+_TIME: Final = {"seconds": None, "nanos": None}
+
+GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
+    "timestamp": _TIME,
+    "host_vehicle_id": {"value": None},
+    "moving_object": {
+        **_ID,
+        "base": {
+            **_STATIC_BASE,
+            "velocity": _VECTOR,
+            "acceleration": _VECTOR,
+            "orientation_rate": _ANGLES,
+        },
+        "type": None,
+        "vehicle_classification": {"type": None, "light_state": _LIGHT_STATE, "role": None},
+        **_REFERENCES,
+    },
+    "stationary_object": {
+        **_ID,
+        "base": _STATIC_BASE,
+        "classification": {"type": None},
+        **_REFERENCES,
+    },
+    "traffic_sign": {
+        **_ID,
+        "main_sign": {"base": _STATIC_BASE, "classification": {"type": None}},
+        **_REFERENCES,
+    },
+    "traffic_light": {
+        **_ID,
+        "base": _STATIC_BASE,
+        "classification": dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
+        **_REFERENCES,
+    },
+    "road_marking": _ID,
+    "lane_boundary": _ID,
+    "lane": _ID,
+    "reference_line": _ID,
+    "logical_lane_boundary": _ID,
+    "logical_lane": _ID,
+}
+"""Fields of ``osi3.GroundTruth`` that are read, and theirs; ``None``: as it is."""
+
+SENSOR_VIEW_FIELDS: Final[dict[str, Any]] = {
+    "timestamp": _TIME,
+    "host_vehicle_id": {"value": None},
+    "host_vehicle_data": {
+        "vehicle_powertrain": {"pedal_position_acceleration": None},
+        "vehicle_brake_system": {"pedal_position_brake": None},
+    },
+    "global_ground_truth": GROUND_TRUTH_FIELDS,
+}
+
+
+def prune(
+    files: list[descriptor_pb2.FileDescriptorProto], root: str, fields: dict[str, Any]
+) -> None:
+    """Take the fields that are not read out of the descriptors of a message type.
+
+    Parameters
+    ----------
+    files : list of FileDescriptorProto
+        Changed.
+    root : str
+        Full name of the type.
+    fields : dict
+        Names of the fields to be read → those of their messages. Of a type that is met in several places
+        all are kept that one of them reads.
+    """
+    types = {
+        name: message
+        for file in files
+        for name, message in _named(file.message_type, f"{file.package}." if file.package else "")
+    }
+    kept: dict[str, set[str]] = {}
+    waiting = [(root, fields)]
+    while waiting:
+        name, wanted = waiting.pop()
+        kept.setdefault(name, set()).update(wanted)
+        for field in types[name].field if name in types else ():
+            inner = wanted.get(field.name)
+            if inner is not None and field.type_name:
+                waiting.append((field.type_name.removeprefix("."), inner))
+    for name, names in kept.items():
+        message = types.get(name)
+        if message is not None and not message.oneof_decl:
+            fields_left = [field for field in message.field if field.name in names]
+            del message.field[:]
+            message.field.extend(fields_left)
+
+
+def _named(messages: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Message types with their full names, those within others too."""
+    for message in messages:
+        name = prefix + message.name
+        yield name, message
+        yield from _named(message.nested_type, f"{name}.")
+
+
+def check_size(data: bytes, truth: int) -> None:
+    """Refuse a message whose ground truth is too large, or of too many parts, to be parsed.
+
+    Parameters
+    ----------
+    data : bytes
+        The message.
+    truth : int
+        Number of the field that is the ground truth; 0: the message is it.
+
+    Raises
+    ------
+    ValueError
+        It is too large, or malformed.
+    """
+    if len(data) <= SMALL:
+        return
+    spans = [(0, len(data))]
+    if truth:
+        spans = [(a, b) for number, _, a, b in fields_of(data, 0, len(data)) if number == truth]
+    size = sum(stop - start for start, stop in spans)
+    if size > MAX_GROUND_TRUTH:
+        raise ValueError(f"a ground truth of {size} bytes; at most {MAX_GROUND_TRUTH} are read")
+    for start, stop in spans:
+        for count, _ in enumerate(fields_of(data, start, stop)):
+            if count > MAX_OBJECTS:
+                raise ValueError(f"more than {MAX_OBJECTS} objects in a ground truth")
+
+
+def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int, int, int]]:
+    """Fields of a protobuf message: number, wire type, where the content begins, where it ends.
+
+    Raises
+    ------
+    ValueError
+        The message is malformed.
+
+    Notes
+    -----
+    Source: protobuf encoding (protobuf.dev/programming-guides/encoding).
+    """
+    while position < stop:
+        tag, start = _varint(data, position, stop)
+        wire = tag & 7
+        if wire == 2:
+            length, start = _varint(data, start, stop)
+        elif wire == 0:
+            length = _varint(data, start, stop)[1] - start
+        elif wire in _WIDTHS:
+            length = _WIDTHS[wire]
+        else:
+            raise ValueError(f"wire type {wire}")
+        position = start + length
+        if position > stop:
+            raise ValueError("a field does not fit")
+        yield tag >> 3, wire, start, position
+
+
+_WIDTHS: Final = {1: 8, 3: 0, 4: 0, 5: 4}
+"""Bytes of a content by its wire type; those of a group are fields of their own."""
+
+
+def _varint(data: bytes, position: int, stop: int) -> tuple[int, int]:
+    """A number of variable length, and where it ends.
+
+    Raises
+    ------
+    ValueError
+        It does not end.
+    """
+    value, shift = 0, 0
+    while position < stop and shift < 70:
+        byte = data[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position
+        shift += 7
+    raise ValueError("a number that does not end")

@@ -1,0 +1,1090 @@
+"""OSI recordings, held against what protobuf itself reads and against drives whose numbers are known."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from functools import cache
+from itertools import pairwise
+from time import process_time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Schema
+from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
+
+from sgstore.errors import TraceError
+from sgstore.traces import READERS, open_trace, read_message
+from sgstore.traces.frames import POSE, derive
+from sgstore.traces.osi_bases import Bases
+from sgstore.traces.osi_lights import lit, shown
+from sgstore.traces.osi_schema import message_class
+from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
+from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+REAL = [
+    *(
+        f"esmini/{n}"
+        for n in ("cut-in", "highway_merge", "pedestrian", "swarm_Town04", "traffic_lights")
+    ),
+    "osi_converter/MovingHostWith3DModel",
+    "osi_converter/MovingHostWithStopLine",
+    "osi_converter/disappearingVehicle",
+    "osi_converter/testBrakeAndIndicatorLights",
+    "omega_prime/osi_centerline_example",
+    "sumo/Town10HD_sumo_osi",
+]
+
+
+@cache
+def read(
+    path: Path, size: int = 60, ego: str = ""
+) -> tuple[TraceInfo, list[FrameBlock], TraceReport]:
+    with open_trace(path, ego=ego) as trace:
+        blocks = list(trace.blocks(size))
+        return trace.info, blocks, trace.report
+
+
+def idents(blocks: list[FrameBlock]) -> list[str]:
+    return [ident for block in blocks for ident in block.entities.ident]
+
+
+def column(blocks: list[FrameBlock], name: str) -> np.ndarray[Any, Any]:
+    return np.concatenate([getattr(block.states, name) for block in blocks])
+
+
+def of(blocks: list[FrameBlock], ident: str) -> States:
+    """The states of one entity."""
+    node = idents(blocks).index(ident)
+    rows = column(blocks, "node") == node
+    columns = {name: column(blocks, name)[rows] for name in States.__dataclass_fields__}
+    return States(**columns)
+
+
+def kind(blocks: list[FrameBlock], ident: str) -> str:
+    codes = np.concatenate([block.entities.kind for block in blocks])
+    return KINDS[codes[idents(blocks).index(ident)]]
+
+
+def entity(blocks: list[FrameBlock], ident: str, name: str) -> Any:
+    return [v for block in blocks for v in getattr(block.entities, name)][
+        idents(blocks).index(ident)
+    ]
+
+
+# What protobuf reads ---------------------------------------------------------------------------------
+
+
+def truths(path: Path) -> list[tuple[int, Any]]:
+    """Log time and ground truth of every message, by the official reader and protobuf."""
+    classes: dict[int, Any] = {}
+    found: list[tuple[int, Any]] = []
+    with path.open("rb") as stream:
+        for schema, _, message in make_reader(stream).iter_messages(log_time_order=False):
+            assert schema is not None
+            if "Map" in schema.name:
+                continue
+            if schema.id not in classes:
+                pool = descriptor_pool.DescriptorPool()
+                for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                    pool.Add(file)
+                found_type = pool.FindMessageTypeByName(schema.name)
+                classes[schema.id] = message_factory.GetMessageClass(found_type)
+            parsed = classes[schema.id].FromString(message.data)
+            parsed = parsed.global_ground_truth if "View" in schema.name else parsed
+            found.append((message.log_time, parsed))
+    return found
+
+
+def expected_row(thing: Any) -> dict[str, float]:
+    base = thing.base
+    row = {
+        "x": base.position.x,
+        "y": base.position.y,
+        "z": base.position.z,
+        "heading": math.remainder(base.orientation.yaw, 2 * math.pi),
+        "pitch": base.orientation.pitch,
+        "roll": base.orientation.roll,
+        "length": base.dimension.length,
+        "width": base.dimension.width,
+        "height": base.dimension.height,
+    }
+    if base.HasField("velocity"):
+        row |= {f"v{axis}": getattr(base.velocity, axis) for axis in "xyz"}
+    if base.HasField("acceleration"):
+        row |= {f"a{axis}": getattr(base.acceleration, axis) for axis in "xyz"}
+    if base.HasField("orientation_rate"):
+        row["yaw_rate"] = base.orientation_rate.yaw
+    return row
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", REAL)
+def test_every_value_of_a_real_recording_is_what_protobuf_reads(data: Path, name: str) -> None:
+    path = data / "traces" / f"{name}.mcap"
+    _, blocks, report = read(path)
+    names = idents(blocks)
+    moving = column(blocks, "light_state") < 0
+    offsets = np.cumsum([0, *(n for block in blocks for n in np.diff(block.offsets))])
+
+    messages = truths(path)
+
+    assert report.losses == []
+    assert report.frames == len(messages)
+    assert np.concatenate([b.log_time_ns for b in blocks]).tolist() == [t for t, _ in messages]
+    assert np.concatenate([b.time_ns for b in blocks]).tolist() == [
+        g.timestamp.seconds * 10**9 + g.timestamp.nanos for _, g in messages
+    ]
+    wanted = [thing for _, ground in messages for thing in ground.moving_object]
+    assert [names[n] for n in column(blocks, "node")[moving]] == [str(o.id.value) for o in wanted]
+    per_frame = [int(moving[a:b].sum()) for a, b in pairwise(offsets)]
+    assert per_frame == [len(ground.moving_object) for _, ground in messages]
+    rows = [expected_row(thing) for thing in wanted]
+    for attribute in POSE:
+        known = np.array([attribute in row for row in rows])
+        expected = np.array([row.get(attribute, math.nan) for row in rows])
+        found = column(blocks, attribute)[moving]
+        assert np.abs(found[known] - expected[known]).max(initial=0) <= 1e-9
+        bit = {"vx": 1, "vy": 1, "vz": 1, "ax": 2, "ay": 2, "az": 2, "yaw_rate": 4}.get(
+            attribute, 0
+        )
+        if not known.all():  # what the recording lacks is derived and says so, or is missing
+            derived = (column(blocks, "derived")[moving] & bit) != 0
+            assert (derived | np.isnan(found))[~known].all()
+            assert not derived[known].any()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", REAL)
+def test_static_things_of_a_real_recording_are_all_there(data: Path, name: str) -> None:
+    path = data / "traces" / f"{name}.mcap"
+    _, blocks, _ = read(path)
+    static = np.concatenate([block.entities.static for block in blocks])
+    found = {ident for ident, still in zip(idents(blocks), static, strict=True) if still}
+
+    things = {
+        str(thing.id.value): thing
+        for _, ground in truths(path)
+        for thing in (*ground.stationary_object, *ground.traffic_sign)
+    }
+
+    assert found == set(things)
+    for block in blocks:
+        for row, node in enumerate(block.scenery.node):
+            base = things[idents(blocks)[node]].base
+            assert block.scenery.x[row] == base.position.x
+            assert block.scenery.length[row] == base.dimension.length
+
+
+@pytest.mark.data
+def test_the_lights_of_esmini_become_three_heads_that_change(data: Path) -> None:
+    info, blocks, _ = read(data / "traces/esmini/traffic_lights.mcap")
+    heads = [i for i in idents(blocks) if kind(blocks, i) == "traffic_light"]
+    states = {h: of(blocks, h).light_state for h in heads}
+    time = np.concatenate([block.time_ns for block in blocks]) / 1e9
+
+    def sequence(head: str) -> list[tuple[str, float]]:
+        at = [0, *(np.flatnonzero(np.diff(states[head])) + 1)]
+        return [(LIGHT_STATES[states[head][i]], round(float(time[i]), 1)) for i in at]
+
+    assert heads == ["32", "36", "39"]
+    assert [entity(blocks, h, "map_ref") for h in heads] == ["1", "2", "3"]
+    assert [entity(blocks, h, "subkind") for h in heads] == ["", "pedestrian", "pedestrian"]
+    assert sequence("32") == [("green", 0.0), ("yellow", 3.6), ("red", 6.6), ("green", 16.6)]
+    assert sequence("36") == sequence("39")
+    assert sequence("36")[:2] == [("red", 0.0), ("green", 9.6)]
+    assert all(len(state) == 602 for state in states.values())
+    # three bulbs of 0.267 m each, the middle one at 3.8 m
+    assert of(blocks, "32").z[0] == pytest.approx(3.8)
+    assert of(blocks, "32").height[0] == pytest.approx(0.8)
+    assert info.ego == "133"
+
+
+@pytest.mark.data
+def test_maps_and_hosts_of_real_recordings_are_found(data: Path) -> None:
+    found = {}
+    for name in REAL:
+        info, blocks, _ = read(data / "traces" / f"{name}.mcap")
+        here = sum(int((block.ego >= 0).sum()) for block in blocks)
+        found[name.partition("/")[2]] = (info.ego, info.map_name, here)
+
+    assert found == {
+        "cut-in": ("36", "e6mini.xodr", 441),
+        "highway_merge": ("81", "soderleden.xodr", 286),
+        "pedestrian": ("121", "fabriksgatan.xodr", 287),
+        "swarm_Town04": ("6292", "Town04.xodr", 602),
+        "traffic_lights": ("133", "fabriksgatan_traffic_lights.xodr", 602),
+        "MovingHostWith3DModel": ("0", "", 702),
+        "MovingHostWithStopLine": ("0", "", 152),
+        "disappearingVehicle": ("1", "", 364),
+        "testBrakeAndIndicatorLights": ("0", "", 502),
+        "osi_centerline_example": ("225", "", 91),
+        "Town10HD_sumo_osi": ("1", "Town10HD.xodr", 600),
+    }
+
+
+@pytest.mark.data
+def test_indicators_and_brake_lights_of_a_real_recording_are_read(data: Path) -> None:
+    path = data / "traces/osi_converter/testBrakeAndIndicatorLights.mcap"
+    _, blocks, _ = read(path)
+    moving = column(blocks, "light_state") < 0
+
+    expected = []
+    for _, ground in truths(path):
+        for thing in ground.moving_object:
+            state = thing.vehicle_classification.light_state
+            left, right = state.indicator_state in {3, 5}, state.indicator_state in {4, 5}
+            expected.append(left | right << 1 | (state.brake_light_state in {3, 4}) << 2)
+
+    assert column(blocks, "lights")[moving].tolist() == expected
+    assert {0, 1, 4, 5} <= set(expected)
+
+
+# The laws of every reader --------------------------------------------------------------------------
+
+EXAMPLES = {"osi": lambda path: drive(path, frames=25, chunk_size=3000)}
+each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+
+
+@pytest.fixture
+def example(tmp_path: Path, reader: Any) -> Path:
+    return EXAMPLES[reader.name](tmp_path / "example.mcap")
+
+
+@each_reader
+def test_a_reader_is_found_by_the_schemas(example: Path, reader: Any) -> None:
+    info, _, report = read(example)
+
+    assert info.flavour == reader.name
+    assert report.frames == 25
+    assert report.losses == []
+    assert report.warnings == []
+
+
+@each_reader
+def test_frames_are_numbered_and_times_increase(example: Path, reader: Any) -> None:
+    _, blocks, _ = read(example, 7)
+
+    assert [block.seq[0] for block in blocks] == [0, 7, 14, 21]
+    assert np.concatenate([block.seq for block in blocks]).tolist() == list(range(25))
+    assert (np.diff(np.concatenate([block.time_ns for block in blocks])) > 0).all()
+    assert (np.diff(np.concatenate([block.log_time_ns for block in blocks])) > 0).all()
+
+
+@each_reader
+def test_ids_are_unique_and_entities_come_in_order_before_their_states(
+    example: Path, reader: Any
+) -> None:
+    _, blocks, _ = read(example, 4)
+    known = 0
+    for block in blocks:
+        assert block.entities.first == known
+        known += len(block.entities)
+        assert block.states.node.max() < known
+        for frame in range(len(block)):
+            nodes = block.states.node[block.offsets[frame] : block.offsets[frame + 1]]
+            assert len(set(nodes)) == len(nodes)
+
+    assert len(set(idents(blocks))) == len(idents(blocks)) == known
+
+
+@each_reader
+def test_numbers_are_plausible_in_si_units(example: Path, reader: Any) -> None:
+    _, blocks, _ = read(example)
+
+    assert np.nanmax(np.abs(column(blocks, "heading"))) <= math.pi
+    assert np.nanmax(np.abs(column(blocks, "vx"))) < 100
+    assert np.nanmin(column(blocks, "length")) >= 0
+    assert all((block.ego >= 0).all() for block in blocks)
+
+
+@each_reader
+@pytest.mark.parametrize("size", [1, 2, 5, 24, 25, 26])
+def test_nothing_depends_on_where_a_block_ends(example: Path, reader: Any, size: int) -> None:
+    _, whole, _ = read(example)
+    _, blocks, _ = read(example, size)
+
+    assert idents(blocks) == idents(whole)
+    for name in States.__dataclass_fields__:
+        np.testing.assert_array_equal(column(blocks, name), column(whole, name))
+    assert sum(len(block.messages) for block in blocks) == sum(len(b.messages) for b in whole)
+
+
+@each_reader
+def test_every_message_of_a_block_is_read_back_by_its_place(example: Path, reader: Any) -> None:
+    info, blocks, _ = read(example, 7)
+    with example.open("rb") as stream:
+        official = {
+            (channel.topic, message.log_time): message.data
+            for _, channel, message in make_reader(stream).iter_messages()
+        }
+    found = {}
+    for block in [*blocks]:
+        refs = block.messages
+        for row in range(len(refs)):
+            channel = info.channels[refs.channel[row]]
+            found[channel.topic, int(refs.log_time_ns[row])] = read_message(
+                example,
+                chunk_offset=int(refs.chunk_offset[row]),
+                offset=int(refs.offset[row]),
+                length=int(refs.length[row]),
+            )
+
+    assert found == {key: data for key, data in official.items() if key[0] != "map"}
+
+
+@each_reader
+def test_reading_again_gives_the_same(example: Path, reader: Any) -> None:
+    with open_trace(example) as trace:
+        first, second = list(trace.blocks()), list(trace.blocks())
+
+        assert trace.report.frames == 25
+        assert trace.info.digest == read(example)[0].digest
+    for name in States.__dataclass_fields__:
+        np.testing.assert_array_equal(column(first, name), column(second, name))
+
+
+# Moving objects --------------------------------------------------------------------------------------
+
+
+def record(path: Path, frames: list[dict[str, Any]]) -> Path:
+    """A recording with a frame each 0.1 s, each as the words of ``ground_truth``."""
+    with Recorder(path) as recorder:
+        for i, words in enumerate(frames):
+            recorder.ground_truth(i * 0.1, **words)
+    return path
+
+
+def test_a_sub_message_that_is_missing_is_missing_and_one_that_is_empty_is_zero(
+    tmp_path: Path,
+) -> None:
+    bare, empty = car(1), car(2)
+    bare.base.ClearField("orientation")
+    bare.base.ClearField("dimension")
+    for name in ("orientation", "velocity", "acceleration", "orientation_rate", "dimension"):
+        getattr(empty.base, name).Clear()
+        getattr(empty.base, name).SetInParent()
+    _, blocks, _ = read(record(tmp_path / "a.mcap", [{"moving": [bare, empty]}]))
+
+    for name in POSE[3:]:
+        assert np.isnan(getattr(of(blocks, "1"), name)[0])
+        assert getattr(of(blocks, "2"), name)[0] == 0
+
+
+def test_a_velocity_that_is_missing_is_the_slope_of_the_positions(tmp_path: Path) -> None:
+    # x = t², y = 3t: the central difference of a parabola is its slope exactly.
+    time = np.arange(12) * 0.1
+    frames = [{"moving": [car(1, t * t, 3 * t), car(2, v=(9, 0), a=(1, 0))]} for t in time]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames), 5)
+    states = of(blocks, "1")
+
+    assert states.vx[1:-1] == pytest.approx(2 * time[1:-1])
+    assert states.vy == pytest.approx(3)
+    assert states.vx[[0, -1]] == pytest.approx([0.1, 2.1])  # one side only
+    assert states.ax[1:-1] == pytest.approx(2)
+    assert np.isnan(states.ax[[0, -1]]).all()
+    assert states.derived.tolist() == [5, *[7] * 10, 5]  # the heading stands still: rate 0, derived
+    assert of(blocks, "2").vx.tolist() == [9.0] * 12
+    assert (of(blocks, "2").derived & 3 == 0).all()
+
+
+def test_an_acceleration_that_is_missing_is_the_slope_of_velocities_that_were_read(
+    tmp_path: Path,
+) -> None:
+    frames = [{"moving": [car(1, 0.0, v=(i * i, 0))]} for i in range(6)]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames), 2)
+    states = of(blocks, "1")
+
+    assert states.ax[1:-1] == pytest.approx([20, 40, 60, 80])
+    assert states.ax[[0, -1]] == pytest.approx([10, 90])
+    assert (states.derived & 1 == 0).all()
+
+
+def test_a_yaw_rate_crosses_the_seam_of_the_circle(tmp_path: Path) -> None:
+    frames = [{"moving": [car(1, yaw=math.pi - 0.15 + 0.1 * i)]} for i in range(4)]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames))
+
+    assert of(blocks, "1").yaw_rate == pytest.approx(1.0)
+    assert (np.abs(of(blocks, "1").heading) <= math.pi).all()
+
+
+def test_an_object_that_was_away_is_not_differed_across_the_gap(tmp_path: Path) -> None:
+    frames = [{"moving": [car(1, float(i))] if i not in {3, 4} else []} for i in range(8)]
+    frames[6]["moving"] = []
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames), 3)
+    states = of(blocks, "1")
+
+    assert states.vx[:3] == pytest.approx(10)
+    assert np.isnan(states.vx[3:]).all()  # the frames 5 and 7 have no neighbour
+    assert states.derived.tolist() == [5, 7, 5, 0, 0]
+
+
+def test_time_that_stands_still_gives_no_slope(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i, stamp in enumerate([0.0, 0.1, 0.1, 0.2, 0.1]):
+            recorder.ground_truth(i * 0.1, [car(1, float(i))], stamp=stamp)
+    _, blocks, report = read(path)
+
+    assert of(blocks, "1").vx == pytest.approx([10, 10, 10, 10, np.nan], nan_ok=True)
+    assert report.warnings[:2] == [
+        "simulation time runs backwards 1 times",
+        "simulation time stands still 1 times",
+    ]
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf, 1e300])
+@pytest.mark.parametrize("part", ["position.x", "position.z", "orientation.yaw"])
+def test_a_pose_that_is_no_pose_is_left_out_and_its_entity_named(
+    tmp_path: Path, part: str, broken: float
+) -> None:
+    bad = car(5, 7.0)
+    group, name = part.split(".")
+    setattr(getattr(bad.base, group), name, broken)
+    frames = [{"moving": [car(4), bad if i in {2, 3} else car(5)]} for i in range(5)]
+    _, blocks, report = read(record(tmp_path / "a.mcap", frames), 2)
+
+    (loss,) = report.losses
+    assert loss.reason == "moving object 5 has no usable pose: 2 states were left out"
+    assert (loss.start_ns, loss.end_ns) == (ns(0.2), ns(0.3))
+    assert len(of(blocks, "5")) == 3
+    assert len(of(blocks, "4")) == 5
+    assert report.frames == 5
+
+
+def test_an_object_without_position_is_left_out(tmp_path: Path) -> None:
+    bad = OSI.MovingObject(type=2)
+    bad.id.value = 5
+    _, blocks, report = read(record(tmp_path / "a.mcap", [{"moving": [car(4), bad]}]))
+
+    assert len(column(blocks, "x")) == 1
+    assert "moving object 5" in report.losses[0].reason
+
+
+def test_an_id_that_comes_twice_in_a_frame_names_its_first_object(tmp_path: Path) -> None:
+    frames = [{"moving": [car(1, 5.0), car(2), car(1, 9.0)]}]
+    _, blocks, report = read(record(tmp_path / "a.mcap", frames))
+
+    assert of(blocks, "1").x.tolist() == [5.0]
+    assert "moving object 1 comes more than once in a frame" in report.losses[0].reason
+
+
+def test_kinds_roles_and_types_that_nobody_knows(tmp_path: Path) -> None:
+    ambulance, odd, other = car(1, type=6, role=3), car(2, type=0), car(3)
+    other.type = 1
+    raw = car(4).SerializeToString().replace(b"\x18\x02", b"\x18\x63", 1)  # type 99
+    alien = OSI.MovingObject.FromString(raw)
+    wheels = [car(10 + i, type=t) for i, t in enumerate((7, 10, 11, 12, 13))]
+    things = [ambulance, odd, other, alien, person(5), *wheels]
+    _, blocks, report = read(record(tmp_path / "a.mcap", [{"moving": things}]))
+
+    assert [kind(blocks, str(i)) for i in (1, 2, 3, 4, 5)] == [
+        "van",
+        "unknown",
+        "unknown",
+        "unknown",
+        "person",
+    ]
+    assert [kind(blocks, str(10 + i)) for i in range(5)] == [
+        "truck",
+        "motorcycle",
+        "bicycle",
+        "bus",
+        "train",
+    ]
+    assert entity(blocks, "1", "special") == "emergency"
+    assert report.unknown_types == {"TYPE_VEHICLE": 1, "TYPE_OTHER": 1, "TYPE_99": 1}
+    assert len(column(blocks, "x")) == 10
+
+
+def test_lights_of_vehicles_are_bits_and_unknown_where_there_are_none(tmp_path: Path) -> None:
+    def lamps(ident: int, **states: int) -> Any:
+        thing = car(ident)
+        light = thing.vehicle_classification.light_state
+        light.SetInParent()
+        for name, value in states.items():
+            setattr(light, name, value)
+        return thing
+
+    things = {
+        1: lamps(1, indicator_state=3),
+        2: lamps(2, indicator_state=4, brake_light_state=4),
+        3: lamps(3, indicator_state=5),
+        4: lamps(4, indicator_state=2, brake_light_state=2),
+        5: lamps(5, reversing_light=3, head_light=3, high_beam=3),
+        6: lamps(6, rear_fog_light=3, front_fog_light=2),
+        7: lamps(7, emergency_vehicle_illumination=4, service_vehicle_illumination=6),
+        8: lamps(8),
+        9: car(9),
+    }
+    _, blocks, _ = read(record(tmp_path / "a.mcap", [{"moving": list(things.values())}]))
+
+    def lit_of(ident: int) -> set[str]:
+        bits = int(of(blocks, str(ident)).lights[0])
+        return {name for bit, name in enumerate(VEHICLE_LIGHTS) if bits >> bit & 1}
+
+    assert lit_of(1) == {"light_left"}
+    assert lit_of(2) == {"light_right", "light_brake"}
+    assert lit_of(3) == {"light_left", "light_right"}
+    assert lit_of(4) == set()
+    assert lit_of(5) == {"light_reverse", "light_low_beam", "light_high_beam"}
+    assert lit_of(6) == {"light_fog"}
+    assert lit_of(7) == {"light_special1", "light_special2"}
+    assert of(blocks, "8").lights[0] == of(blocks, "9").lights[0] == -1
+    assert of(blocks, "4").lights[0] == 0
+
+
+def test_pedals_of_a_sensor_view_are_the_egos_and_nobody_elses(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.sensor_view(0.0, [car(0), car(2)], host=0, throttle=0.25)
+        recorder.sensor_view(0.1, [car(0), car(2)], host=0)
+    _, blocks, _ = read(path)
+
+    assert of(blocks, "0").throttle == pytest.approx([0.25, np.nan], nan_ok=True)
+    assert of(blocks, "0").brake == pytest.approx([0.75, np.nan], nan_ok=True)
+    assert np.isnan(of(blocks, "0").steer).all()
+    assert np.isnan(of(blocks, "2").throttle).all()
+
+
+numbers = st.floats(-1e6, 1e6)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    st.lists(
+        st.fixed_dictionaries(
+            {},
+            optional={
+                part: st.fixed_dictionaries(
+                    {}, optional=dict.fromkeys(("x", "y", "z", "yaw", "roll", "length"), numbers)
+                )
+                for part in (
+                    "position",
+                    "orientation",
+                    "velocity",
+                    "acceleration",
+                    "orientation_rate",
+                    "dimension",
+                    "base_polygon",
+                )
+            },
+        ),
+        max_size=12,
+    )
+)
+def test_bases_read_from_bytes_are_what_their_attributes_say(
+    parts: list[dict[str, dict[str, float]]],
+) -> None:
+    bases = []
+    for told in parts:
+        base = OSI.BaseMoving()
+        for part, values in told.items():
+            inner = base.base_polygon.add() if part == "base_polygon" else getattr(base, part)
+            inner.SetInParent()
+            for name, value in values.items():
+                if name in inner.DESCRIPTOR.fields_by_name:
+                    setattr(inner, name, value)
+        bases.append(base)
+
+    values, usable = Bases(OSI.BaseMoving.DESCRIPTOR).read([b.SerializeToString() for b in bases])
+
+    sources = {
+        **{name: ("position", name) for name in "xyz"},
+        "heading": ("orientation", "yaw"),
+        "pitch": ("orientation", "pitch"),
+        "roll": ("orientation", "roll"),
+        **{f"v{axis}": ("velocity", axis) for axis in "xyz"},
+        **{f"a{axis}": ("acceleration", axis) for axis in "xyz"},
+        "yaw_rate": ("orientation_rate", "yaw"),
+        **{name: ("dimension", name) for name in ("length", "width", "height")},
+    }
+    for row, base in enumerate(bases):
+        assert usable[row] == base.HasField("position")
+        for place, name in enumerate(POSE):
+            part, inner = sources[name]
+            expected = getattr(getattr(base, part), inner) if base.HasField(part) else math.nan
+            assert values[row, place] == pytest.approx(expected, nan_ok=True, abs=0, rel=0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.sets(st.integers(0, 4)), min_size=1, max_size=7),
+    st.lists(st.integers(-1, 3), min_size=7, max_size=7),
+    st.data(),
+)
+def test_derived_velocities_are_those_of_the_textbook(
+    present: list[set[int]], steps: list[int], draw: Any
+) -> None:
+    time = np.cumsum([0, *steps])[: len(present)] * 10**8
+    node, frame, x = [], [], []
+    for f, nodes in enumerate(present):
+        for n in sorted(nodes, reverse=True):
+            node.append(n)
+            frame.append(f)
+            x.append(draw.draw(st.floats(-100, 100)))
+    values = np.full((len(node), len(POSE)), np.nan)
+    values[:, :4] = np.array(x, float).reshape(-1, 1)
+    at = {(f, n): v for f, n, v in zip(frame, node, x, strict=True)}
+
+    found, derived = derive(
+        np.array(node, np.int64),
+        np.array(frame, np.int64),
+        time,
+        values,
+        np.zeros(len(node), np.bool_),
+        slice(0, len(node)),
+    )
+
+    for row, (f, n) in enumerate(zip(frame, node, strict=True)):
+        known = [
+            (time[g], at[g, n])
+            for g in (f - 1, f, f + 1)
+            if (g, n) in at and (g == f or (time[g] - time[f]) * (g - f) > 0)
+        ]
+        if len(known) == 1:
+            assert np.isnan(found[row, 6])
+            assert derived[row] & 1 == 0
+        else:
+            (t0, x0), (t1, x1) = known[0], known[-1]
+            assert found[row, 6] == pytest.approx((x1 - x0) / ((t1 - t0) / 1e9), abs=1e-9)
+            assert derived[row] & 1
+
+
+# Lights and static things ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bulbs", "state"),
+    [
+        pytest.param([(2, 3), (3, 2), (4, 2)], "red", id="red"),
+        pytest.param([(2, 2), (3, 3), (4, 2)], "yellow", id="yellow"),
+        pytest.param([(2, 2), (3, 2), (4, 3)], "green", id="green"),
+        pytest.param([(2, 3), (3, 3), (4, 2)], "red_yellow", id="red with yellow"),
+        pytest.param([(2, 2), (3, 4), (4, 2)], "flashing", id="yellow flashing"),
+        pytest.param([(2, 2), (3, 2), (4, 2)], "off", id="nothing lit"),
+        pytest.param([(2, 3), (4, 3)], "red", id="red with a green arrow"),
+        pytest.param([(6, 3)], "unknown", id="white"),
+        pytest.param([(2, 0)], "unknown", id="mode unknown"),
+        pytest.param([(4, 5)], "green", id="green counting down"),
+    ],
+)
+def test_a_head_shows_what_its_lit_bulbs_show(bulbs: list[tuple[int, int]], state: str) -> None:
+    assert LIGHT_STATES[shown(lit(mode, colour) for colour, mode in bulbs)] == state
+
+
+def test_bulbs_one_above_another_are_one_head_and_others_are_not(tmp_path: Path) -> None:
+    column_of_three = [bulb(i, i, 3 if i == 2 else 2, (5.004, 1, 4.5 - 0.3 * i)) for i in (2, 3, 4)]
+    nudged = bulb(5, 4, 2, (5.011, 1, 3.0))
+    aside = bulb(6, 2, 3, (5.5, 1, 3.9))
+    turned = bulb(7, 4, 3, (5.004, 1, 3.9))
+    turned.base.orientation.yaw = 2.5
+    lights = [*column_of_three, nudged, aside, turned]
+    frames = [{"moving": [car(1)], "lights": lights, "host": 1}]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames))
+
+    heads = [i for i in idents(blocks) if kind(blocks, i) == "traffic_light"]
+    assert heads == ["2", "6", "7"]
+    assert [LIGHT_STATES[of(blocks, h).light_state[0]] for h in heads] == ["red", "red", "green"]
+    assert of(blocks, "2").z[0] == pytest.approx((3.9 + 0.15 + 3.0 - 0.15) / 2)
+    assert of(blocks, "2").height[0] == pytest.approx(1.2)
+
+
+def test_bulbs_of_one_signal_are_one_head_wherever_they_stand(tmp_path: Path) -> None:
+    lights = [bulb(2, 2, 2, (5, 1, 4), ref="s1"), bulb(3, 4, 3, (6, 1, 4), ref="s1")]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", [{"moving": [car(1)], "lights": lights}]))
+
+    assert kind(blocks, "2") == "traffic_light"
+    assert entity(blocks, "2", "map_ref") == "s1"
+    assert LIGHT_STATES[of(blocks, "2").light_state[0]] == "green"
+    assert not entity(blocks, "2", "static")
+
+
+def test_a_head_goes_on_showing_what_it_showed_while_frames_are_silent(tmp_path: Path) -> None:
+    red = [bulb(2, 2, 3, (5, 1, 4)), bulb(4, 4, 2, (5, 1, 3.7))]
+    only_green = [bulb(4, 4, 3, (5, 1, 3.7))]
+    no_red = [bulb(2, 2, 2, (5, 1, 4))]
+    frames = [{"moving": [car(1)], "lights": x} for x in (red, [], only_green, [], no_red, [])]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames), 2)
+
+    states = [LIGHT_STATES[s] for s in of(blocks, "2").light_state]
+    assert states == ["red", "red", "red", "red", "green", "green"]  # red with green is red
+
+
+def test_a_bulb_out_of_service_is_off(tmp_path: Path) -> None:
+    dark = bulb(2, 2, 3, (5, 1, 4))
+    dark.classification.is_out_of_service = True
+    _, blocks, _ = read(record(tmp_path / "a.mcap", [{"moving": [car(1)], "lights": [dark]}]))
+
+    assert LIGHT_STATES[of(blocks, "2").light_state[0]] == "off"
+
+
+def test_a_light_without_place_is_an_entity_without_states_and_said_to_be(tmp_path: Path) -> None:
+    lights = [bulb(2, 2, 3), bulb(3, 2, 3, ref="9")]
+    frames = [{"moving": [car(1)], "lights": lights, "host": 1}]
+    _, blocks, report = read(record(tmp_path / "a.mcap", frames))
+
+    assert len(of(blocks, "2")) == 0
+    assert len(of(blocks, "3")) == 1
+    assert np.isnan(of(blocks, "3").x[0])
+    assert "1 traffic lights have neither a position" in report.warnings[0]
+
+
+def test_static_things_come_once_with_their_first_frame_and_stay(tmp_path: Path) -> None:
+    statics = {"houses": [house(50, 30.0), house(51, 5.0, 4)], "signs": [sign(60, 17, 20.0)]}
+    frames = [{"moving": [car(1)], **(statics if i in {1, 3} else {})} for i in range(5)]
+    frames[4] |= {"signs": [sign(61, 16)]}
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames), 2)
+
+    assert [block.entities.ident for block in blocks] == [("1", "50", "51", "60"), (), ("61",)]
+    assert blocks[0].scenery.node.tolist() == [1, 2, 3]
+    assert blocks[0].scenery.x.tolist() == [30.0, 5.0, 20.0]
+    assert blocks[0].scenery.heading.tolist() == [0.25, 0.25, 0.5]
+    assert blocks[2].scenery.node.tolist() == [4]
+    assert set(column(blocks, "node")) == {0}
+    assert entity(blocks, "50", "map_ref") == "50"
+
+
+def test_signs_are_what_their_type_says_and_unknown_ones_survive(tmp_path: Path) -> None:
+    raw = sign(5, 17).SerializeToString().replace(b"\x10\x11", b"\x10\x7b", 1)  # type 123
+    signs = [
+        sign(1, 17),
+        sign(2, 16),
+        sign(3, 52),
+        sign(4, 29),
+        OSI.TrafficSign.FromString(raw),
+        sign(6, 0),
+        sign(7, 140),
+    ]
+    _, blocks, report = read(record(tmp_path / "a.mcap", [{"moving": [car(9)], "signs": signs}]))
+
+    assert [kind(blocks, str(i)) for i in range(1, 8)] == [
+        "stop_sign",
+        "yield_sign",
+        "speed_limit",
+        "sign",
+        "sign",
+        "sign",
+        "prop",
+    ]
+    assert entity(blocks, "5", "type_name") == "TYPE_123"
+    assert report.unknown_types == {"TYPE_123": 1, "TYPE_UNKNOWN": 1}
+
+
+def test_a_static_thing_without_a_place_is_a_loss_once(tmp_path: Path) -> None:
+    lost = house(50)
+    lost.base.position.x = math.nan
+    frames = [{"moving": [car(1)], "houses": [lost]}] * 3
+    _, blocks, report = read(record(tmp_path / "a.mcap", frames))
+
+    assert idents(blocks) == ["1"]
+    assert report.losses[0].reason.startswith("stationary object 50 has no usable pose")
+
+
+def test_ids_that_two_things_share_are_told_apart(tmp_path: Path) -> None:
+    frames = [{"moving": [car(5)], "houses": [house(5)], "signs": [sign(5, 17)]}]
+    _, blocks, _ = read(record(tmp_path / "a.mcap", frames))
+
+    assert idents(blocks) == ["5", "5:building", "5:stop_sign"]
+
+
+# The ego, the map, what later messages depend on -----------------------------------------------------
+
+
+def test_the_host_vehicle_is_the_ego_and_zero_is_an_id(tmp_path: Path) -> None:
+    frames = [{"moving": [car(3), car(0)] if i else [car(3)], "host": 0} for i in range(3)]
+    info, blocks, _ = read(record(tmp_path / "a.mcap", frames))
+
+    assert info.ego == "0"
+    assert blocks[0].ego.tolist() == [-1, 1, 1]
+
+
+@pytest.mark.parametrize("host", [None, 77])
+def test_a_host_that_is_not_there_means_no_ego_and_is_said(
+    tmp_path: Path, host: int | None
+) -> None:
+    info, blocks, report = read(record(tmp_path / "a.mcap", [{"moving": [car(3)], "host": host}]))
+
+    assert info.ego == ""
+    assert blocks[0].ego.tolist() == [-1]
+    assert any("no ego" in warning for warning in report.warnings)
+
+
+def test_the_host_of_a_sensor_view_comes_before_that_of_the_truth_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        view = OSI.SensorView()
+        view.host_vehicle_id.value = 2
+        view.global_ground_truth.CopyFrom(ground_truth(0.0, [car(1), car(2)], host=1))
+        recorder.write(recorder.channel("v", "osi3.SensorView"), 0.0, view.SerializeToString())
+
+    assert read(path)[0].ego == "2"
+
+
+def test_the_ego_can_be_named_by_id_or_name(tmp_path: Path) -> None:
+    frames = [
+        {"moving": [car(3, name="Rival"), car(7)] if i == 2 else [car(7)], "host": 7}
+        for i in range(4)
+    ]
+    path = record(tmp_path / "a.mcap", frames)
+
+    assert read(path, 60, "3")[0].ego == read(path, 60, "Rival")[0].ego == "3"
+    assert read(path, 60, "Rival")[1][0].ego.tolist() == [-1, -1, 1, -1]
+
+
+def test_an_ego_that_nothing_bears_is_answered_with_what_there_is(tmp_path: Path) -> None:
+    frames = [{"moving": [car(3, name="Rival"), car(7)]}]
+    path = record(tmp_path / "a.mcap", frames)
+
+    with pytest.raises(TraceError, match=r"'hero'; there are: 3 \(Rival\), 7"):
+        open_trace(path, ego="hero")
+
+
+def test_a_name_that_two_objects_bear_names_neither(tmp_path: Path) -> None:
+    frames = [{"moving": [car(3, name="Car"), car(7, name="Car")]}]
+    path = record(tmp_path / "a.mcap", frames)
+
+    with pytest.raises(TraceError, match="several objects are named 'Car': ids 3, 7"):
+        open_trace(path, ego="Car")
+
+
+def test_a_map_is_found_wherever_it_stands(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, chunk_size=300) as recorder:
+        for i in range(9):
+            recorder.ground_truth(i * 0.1, [car(1)], host=1)
+        recorder.map("<OpenDRIVE late='yes'/>", 0.9, "C:\\maps\\town.xodr")
+    info, _, report = read(path)
+
+    assert info.map_text == "<OpenDRIVE late='yes'/>"
+    assert info.map_name == "town.xodr"
+    assert [channel.role for channel in info.channels] == ["ground_truth", "map"]
+    assert report.warnings == []
+
+
+def test_of_two_maps_the_first_counts_and_it_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.map("<OpenDRIVE n='1'/>")
+        recorder.map("<OpenDRIVE n='2'/>")
+        recorder.ground_truth(0.0, [car(1)], host=1)
+    info, _, report = read(path)
+
+    assert info.map_text == "<OpenDRIVE n='1'/>"
+    assert report.warnings == ["the recording carries more than one road map; the first one counts"]
+
+
+def context_times(path: Path) -> list[float]:
+    return [time / 1e9 for time in read(path)[0].context.log_time_ns.tolist()]
+
+
+def test_static_data_that_is_told_once_is_context(tmp_path: Path) -> None:
+    frames: list[dict[str, Any]] = [{"moving": [car(1)]} for _ in range(8)]
+    frames[0] |= {"lanes": [1, 2], "houses": [house(50)]}
+    frames[2] |= {"lanes": [1, 2]}  # nothing new
+    frames[5] |= {"houses": [house(51)]}
+
+    assert context_times(record(tmp_path / "a.mcap", frames)) == [0.0, 0.5]
+
+
+def test_static_data_that_every_message_repeats_is_no_context(tmp_path: Path) -> None:
+    frames = [
+        {"moving": [car(1)], "lanes": [1, 2], "houses": [house(50)] if i > 3 else []}
+        for i in range(8)
+    ]
+
+    assert context_times(record(tmp_path / "a.mcap", frames)) == []
+
+
+def test_lights_that_are_told_only_when_they_change_are_context(tmp_path: Path) -> None:
+    told = [bulb(2, 2, 3, (5, 1, 4))]
+    frames = [{"moving": [car(1)], "lights": told if i in {0, 4, 7} else []} for i in range(8)]
+
+    assert context_times(record(tmp_path / "a.mcap", frames)) == [0.0, 0.4]
+
+
+def test_what_a_channel_tells_once_and_at_the_beginning_is_context(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.camera(0.0, topic="calibration")
+        for i in range(30):
+            recorder.ground_truth(i * 0.1, [car(1)], host=1)
+            recorder.camera(i * 0.1)
+        recorder.camera(2.5, topic="collision")
+
+    info, blocks, _ = read(path)
+    (topic,) = [info.channels[channel].topic for channel in info.context.channel]
+    assert topic == "calibration"
+    assert sum(len(block.messages) for block in blocks) == 62
+
+
+def test_the_channel_with_most_frames_leads_and_a_truth_before_a_view(tmp_path: Path) -> None:
+    path, other = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    with Recorder(path) as recorder:
+        recorder.ground_truth(0.0, [car(1)])
+        for i in range(3):
+            recorder.sensor_view(i * 0.1, [car(1), car(2)])
+    with Recorder(other) as recorder:
+        for i in range(3):
+            recorder.sensor_view(i * 0.1, [car(1), car(2)])
+            recorder.ground_truth(i * 0.1, [car(1)])
+
+    roles = {channel.topic: channel.role for channel in read(path)[0].channels}
+    assert roles == {"truth": "payload", "view": "ground_truth"}
+    roles = {channel.topic: channel.role for channel in read(other)[0].channels}
+    assert roles == {"view": "payload", "truth": "ground_truth"}
+
+
+def test_messages_outside_the_interval_of_a_clip_are_no_frames(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.writer.add_metadata(
+            "sgstore.clip", {"start_ns": str(ns(0.3)), "end_ns": str(ns(0.5))}
+        )
+        for i in range(8):
+            statics = (
+                {"houses": [house(50)], "lights": [bulb(2, 2, 3, (1, 1, 1))]} if i == 0 else {}
+            )
+            recorder.ground_truth(
+                i * 0.1, [car(1), *([car(9)] if i == 1 else [])], host=1, **statics
+            )
+            recorder.camera(i * 0.1)
+    _, blocks, report = read(path)
+
+    assert blocks[0].log_time_ns.tolist() == [ns(0.3), ns(0.4), ns(0.5)]
+    assert report.frames == 3
+    assert idents(blocks) == ["50", "2", "1"]
+    assert LIGHT_STATES[of(blocks, "2").light_state[0]] == "red"
+    assert len(blocks[0].messages) == 6
+
+
+# Recordings that cannot be read ----------------------------------------------------------------------
+
+
+def test_a_recording_without_ground_truth_is_answered_with_its_channels(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.camera(0.0)
+        recorder.map("<OpenDRIVE/>")
+
+    with pytest.raises(TraceError, match=r"'camera' \(pictures.Image\), 'map'"):
+        open_trace(path)
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_a_recording_without_messages_is_refused(tmp_path: Path, summary: bool) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, summary=summary) as recorder:
+        recorder.channel("truth", "osi3.GroundTruth")
+
+    with pytest.raises(TraceError, match=r"no ground truth message|no channel has any message"):
+        open_trace(path)
+
+
+def test_messages_that_cannot_be_read_are_losses_and_the_others_frames(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i in range(5):
+            recorder.ground_truth(i * 0.1, [car(1, i)], host=1)
+            if i == 2:
+                recorder.write(recorder.channels["truth"], 0.25, b"\xff\xff\xff")
+    _, _, report = read(path)
+
+    assert report.frames == 5
+    (loss,) = report.losses
+    assert (loss.messages, loss.bytes, loss.start_ns) == (1, 3, ns(0.25))
+    assert "cannot be read" in loss.reason
+
+
+def test_a_message_of_countless_objects_is_a_loss_and_costs_little(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.ground_truth(0.0, [car(1)], host=1)
+        recorder.write(recorder.channels["truth"], 0.1, b"\x2a\x00" * 3_000_000)
+        recorder.sensor_view(0.2, [])
+
+    tracemalloc.start()
+    start = process_time()
+    _, _, report = read(path)
+    cost, peak = process_time() - start, tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert report.frames == 1
+    assert "more than 100000 objects" in report.losses[0].reason
+    assert cost < 2
+    assert peak < 64 << 20
+
+
+def test_what_nobody_reads_is_not_parsed() -> None:
+    schema = Schema(1, OSI.files.SerializeToString(), "protobuf", "osi3.GroundTruth")
+    ground = ground_truth(0.0, [car(1)], lanes=[4])
+    ground.lane[0].classification.centerline.add().x = 5.0
+
+    read_back = message_class(schema).FromString(ground.SerializeToString())
+
+    assert [name.name for name, _ in read_back.lane[0].ListFields()] == ["id"]
+    assert read_back.SerializeToString() == ground.SerializeToString()  # kept, as bytes
+
+
+def test_a_schema_that_lacks_what_all_versions_have_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, files=Osi({"BaseMoving.position"}).files) as recorder:
+        recorder.ground_truth(0.0, [car(1)])
+
+    with pytest.raises(TraceError, match=r"no field moving_object\.base\.position"):
+        open_trace(path)
+
+
+def test_an_older_schema_without_what_came_later_is_read(tmp_path: Path) -> None:
+    later = {
+        "BaseMoving.orientation_rate",
+        "VehicleClassification.light_state",
+        "VehicleClassification.role",
+        "MovingObject.source_reference",
+        "TrafficLight.source_reference",
+        "BulbClassification.is_out_of_service",
+        "GroundTruth.stationary_object",
+        "GroundTruth.lane",
+        "GroundTruth.host_vehicle_id",
+    }
+    path = tmp_path / "a.mcap"
+    with Recorder(path, files=Osi(later).files) as recorder:
+        recorder.ground_truth(0.0, [car(1, 3.0)], lights=[bulb(2, 2, 3, (1, 1, 1))], host=1)
+    info, blocks, report = read(path)
+
+    assert info.ego == ""
+    assert of(blocks, "1").x.tolist() == [3.0]
+    assert kind(blocks, "2") == "traffic_light"
+    assert report.losses == []
+
+
+def test_a_frame_without_time_takes_its_log_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.ground_truth(0.5, [car(1)], host=1, stamp=None)
+    _, blocks, report = read(path)
+
+    assert blocks[0].time_ns.tolist() == [ns(0.5)]
+    assert "1 frames bear no time of their own" in report.warnings[0]
+
+
+def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path: Path) -> None:
+    def peak(frames: int) -> int:
+        path = drive(tmp_path / f"{frames}.mcap", frames, camera=False, chunk_size=1 << 16)
+        with open_trace(path) as trace:
+            tracemalloc.start()
+            for _ in trace.blocks():
+                pass
+            highest = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+        return highest
+
+    assert peak(3000) < 1.3 * peak(600)
