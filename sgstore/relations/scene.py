@@ -1,0 +1,199 @@
+"""What a family of relations sees: the bodies of many frames, the related pairs among them, the map under them.
+
+All of it is computed once for a block and shared by the families. A *body* is an entity in one frame: one
+that stands still in sixty frames is sixty bodies, so that nothing but array arithmetic is needed on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from sgstore.graph import Edges
+from sgstore.vocabulary import KIND_CODE, RELATION_CODE, SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.roads import LaneHits
+    from sgstore.world import Bools, Codes, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """Entities in the graphs of a block, one row an entity and frame, in no order that matters; shape (N,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    node : int64
+        Node id.
+    kind : int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    moves : bool
+        False for scenery.
+    x, y, z, heading, length, width : float64
+        The box; m, m, m, rad, m, m.
+    bottom : float64
+        Height of its lower side; m.
+    """
+
+    frame: Ints
+    node: Ints
+    kind: Codes
+    moves: Bools
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    length: Floats
+    width: Floats
+    bottom: Floats
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    @property
+    def boxes(self) -> Floats:
+        """(N, 5): ``x, y, heading, length, width``."""
+        return np.stack([self.x, self.y, self.heading, self.length, self.width], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Ordered pairs of bodies that are related, each with its mirror image; shape (K,).
+
+    Attributes
+    ----------
+    a, b : intp
+        Rows of :class:`Bodies`, in the same frame.
+    distance : float64
+        Between the centres, in space; m.
+    bearing : float64
+        Of b from a, in (-π, π]; rad. NaN where a's heading is missing; 0 where the centres coincide.
+    """
+
+    a: NDArray[np.intp]
+    b: NDArray[np.intp]
+    distance: Floats
+    bearing: Floats
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """The map under and around the bodies of a block.
+
+    Attributes
+    ----------
+    hits : LaneHits
+        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`. Signals touch none.
+    crosswalks : tuple of int64 arrays
+        Rows of :class:`Bodies` and node ids of the crosswalks that they touch.
+    off_road : intp array
+        Rows of the bodies that touch no driving lane.
+    present : (F, K) bool
+        Which nodes of the map are in which graph; column i is node -1 - i.
+    controls : tuple of int64 arrays
+        Node ids of signals of the trace, ascending, and of a lane that each applies to.
+    """
+
+    hits: LaneHits
+    crosswalks: tuple[Ints, Ints]
+    off_road: NDArray[np.intp]
+    present: Bools
+    controls: tuple[Ints, Ints]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The frames of a block, ready for the families of relations.
+
+    Attributes
+    ----------
+    config : Config
+    bodies : Bodies
+    pairs : Pairs
+    ground : Ground or None
+        None without a map.
+    """
+
+    config: Config
+    bodies: Bodies
+    pairs: Pairs
+    ground: Ground | None
+
+
+class Family(NamedTuple):
+    """Relations that are computed together.
+
+    Attributes
+    ----------
+    names : function
+        The relations that it yields under a config.
+    needs_map : bool
+        Whether it knows nothing without a map. Then :attr:`Scene.ground` is not None.
+    edges : function
+        The edges of a scene; pure.
+    """
+
+    names: Callable[[Config], tuple[str, ...]]
+    needs_map: bool
+    edges: Callable[[Scene], Edges]
+
+
+def edges_between(
+    scene: Scene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
+) -> Edges:
+    """Edges from body to body (rows), all with one relation or each with its own code."""
+    bodies = scene.bodies
+    return Edges(bodies.frame[src], _codes(relation, len(src)), bodies.node[src], bodies.node[dst])
+
+
+def edges_to_map(scene: Scene, relation: str, src: NDArray[np.intp] | Ints, dst: Ints) -> Edges:
+    """Edges from bodies (rows) to nodes of the map (node ids)."""
+    bodies = scene.bodies
+    return Edges(bodies.frame[src], _codes(relation, len(src)), bodies.node[src], dst)
+
+
+def _codes(relation: str | Codes, count: int) -> Codes:
+    if isinstance(relation, str):
+        return np.full(count, RELATION_CODE[relation], np.int8)
+    return relation
+
+
+def kinds_mask(names: tuple[str, ...]) -> Bools:
+    """Table by kind code: whether the kind is one of those named."""
+    table = np.zeros(len(KIND_CODE), np.bool_)
+    table[[KIND_CODE[name] for name in names]] = True
+    return table
+
+
+IS_SIGNAL: Final = kinds_mask(SIGNALS)
+
+
+def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Many ranges in one array.
+
+    Returns
+    -------
+    owner, index : (sum of counts,) intp
+        For each range i in turn, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
+    """
+    owner = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return owner, np.arange(len(owner)) + (starts - before)[owner]
+
+
+def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """All matches of ``wanted`` in ascending ``keys``: rows of ``wanted``, ascending, and rows of ``keys``."""
+    start = np.searchsorted(keys, wanted)
+    return spread(start, np.searchsorted(keys, wanted, side="right") - start)

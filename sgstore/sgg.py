@@ -1,0 +1,236 @@
+"""The scene graph generator: frames of a trace and a road map in, scene graphs out, a block at a time.
+
+What is in a graph. The range of an ego is a circle about its centre, whatever the direction and the storey; an
+entity is in it when its footprint comes within the radius. What has no extent counts as a point, and what has
+no position is in no range. *Frames without an ego*, or with one whose position is missing, have no range: their
+graphs hold all entities and the whole map, and no relations of an ego. Parts of the map are present as
+:meth:`sgstore.relations.survey.Survey.ground` says; the static edges among them are the map's own.
+
+A relation that cannot be computed, because a heading or a position is missing, is absent; what a trace cannot
+answer at all is said by :attr:`SceneGraphGenerator.answers`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.geometry import gap_to_points
+from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
+from sgstore.relations import RELATIONS
+from sgstore.relations.pairs import related_pairs
+from sgstore.relations.scene import Bodies, Scene
+from sgstore.relations.survey import Survey
+from sgstore.vocabulary import RELATIONS as VOCABULARY
+from sgstore.world import States
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.relations.scene import Ground
+    from sgstore.roads import RoadMap
+    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
+
+    Rows = NDArray[np.intp]
+
+MAP_RELATIONS: Final = ("isIn", "travelsTo", "opposes", "toLeftOf", "toRightOf")
+"""Relations among parts of a map that every map answers."""
+
+
+class SceneGraphGenerator:
+    """Scene graphs of one trace.
+
+    Parameters
+    ----------
+    road_map : RoadMap or None
+        None: there are no parts of a map in the graphs, and no relation that needs one.
+    config : Config
+
+    Attributes
+    ----------
+    answers : tuple of str
+        The relations that these graphs can hold, in the vocabulary's order; of the others nothing is known.
+
+    Notes
+    -----
+    Blocks come in the order of the trace. Between them the generator keeps what it must know of the entities
+    it has met (kinds, scenery) and no more; a block of one frame gives the same graph as a block of many.
+    """
+
+    def __init__(self, road_map: RoadMap | None, config: Config) -> None:
+        self._config = config
+        self._survey = None if road_map is None else Survey(road_map)
+        self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
+        self._kinds: Codes = np.zeros(0, np.int8)
+        self._scenery = States.of(node=np.zeros(0, np.int64))
+        self.answers = self._answers(road_map)
+
+    def _answers(self, road_map: RoadMap | None) -> tuple[str, ...]:
+        names = {name for family in self._families for name in family.names(self._config)}
+        if road_map is not None:
+            codes = np.unique(road_map.edges.relation).tolist()
+            names.update(MAP_RELATIONS, (VOCABULARY[code] for code in codes))
+        return tuple(name for name in VOCABULARY if name in names)
+
+    # Positions come from files and may be absurd; what cannot be computed of them is absent.
+    @np.errstate(over="ignore", invalid="ignore")
+    def block(self, frames: FrameBlock) -> GraphBlock:
+        """The scene graphs of the next frames.
+
+        Raises
+        ------
+        ValueError
+            A state belongs to a node that no block has introduced, or nodes are not introduced one after
+            another: a defect of the reader.
+        """
+        self._learn(frames)
+        ego = _ego_rows(frames)
+        scenery = self._scenery_in_range(frames, ego)
+        frames, ego = _in_range(frames, ego, self._config.range.radius)
+        bodies = self._bodies(frames, *scenery)
+        ground = None
+        if self._survey is not None:
+            ground = self._survey.ground(bodies, ego, self._config.range.radius)
+        pairs = related_pairs(bodies, ego, self._config.pairs)
+        scene = Scene(self._config, bodies, pairs, ground)
+        return GraphBlock(
+            frames=frames,
+            presence=_presence(bodies, ground),
+            edges=_chained([family.edges(scene) for family in self._families]),
+            lanes=_lane_states(bodies, ground),
+        )
+
+    def _learn(self, frames: FrameBlock) -> None:
+        entities, nodes = frames.entities, frames.states.node
+        if len(entities):
+            if entities.first != len(self._kinds):
+                raise ValueError(f"new entities begin at {entities.first}, not {len(self._kinds)}")
+            self._kinds = np.concatenate([self._kinds, entities.kind])
+            if self._survey is not None:
+                self._survey.learn(entities, frames.scenery)
+        if len(frames.scenery):
+            self._scenery = _stacked(self._scenery, frames.scenery)
+        for of in (nodes, frames.scenery.node):
+            strange = of[(of < 0) | (of >= len(self._kinds))]
+            if len(strange):
+                raise ValueError(f"a state of node {strange[0]}, which no block has introduced")
+
+    def _scenery_in_range(self, frames: FrameBlock, ego: Rows) -> tuple[Ints, Rows]:
+        """Frames and rows of the scenery: all of it where there is no ego."""
+        scenery, radius = self._scenery, self._config.range.radius
+        if not len(scenery):
+            return np.zeros(0, np.int64), np.zeros(0, np.intp)
+        reach = radius + np.nan_to_num(np.hypot(scenery.length, scenery.width)) / 2
+        x, y = _centres(frames, ego)
+        # A generous cut by circles first; where there is no ego, the comparison with NaN keeps all.
+        far = np.subtract.outer(x, scenery.x) ** 2 + np.subtract.outer(y, scenery.y) ** 2
+        frame, row = np.nonzero(~(far > (reach * (1 + 1e-9)) ** 2))
+        near = _within(scenery, row, x[frame], y[frame], radius)
+        return frame[near], row[near]
+
+    def _bodies(self, frames: FrameBlock, frame: Ints, row: Rows) -> Bodies:
+        """The states of a block and the scenery that stands in it, as rows of one table."""
+        states, scenery = frames.states, self._scenery
+        boxes = (
+            np.concatenate([getattr(states, name), getattr(scenery, name)[row]])
+            for name in ("node", "x", "y", "z", "heading", "length", "width", "height")
+        )
+        node, x, y, z, heading, length, width, height = boxes
+        return Bodies(
+            frame=np.concatenate([frames.frame_of, frame]),
+            node=node,
+            kind=self._kinds[node],
+            moves=np.arange(len(node)) < len(states),
+            x=x,
+            y=y,
+            z=z,
+            heading=heading,
+            length=length,
+            width=width,
+            bottom=z - np.nan_to_num(height) / 2,
+        )
+
+
+def _ego_rows(frames: FrameBlock) -> Rows:
+    """(F,): row of the ego's state in each frame; -1 where it has none, or no position."""
+    states = frames.states
+    rows = np.flatnonzero(states.node == np.repeat(frames.ego, np.diff(frames.offsets)))
+    rows = rows[np.isfinite(states.x[rows]) & np.isfinite(states.y[rows])]
+    ego = np.full(len(frames), -1)
+    ego[frames.frame_of[rows]] = rows
+    return ego
+
+
+def _centres(frames: FrameBlock, ego: Rows) -> tuple[Floats, Floats]:
+    """Centres of the ranges of the frames; NaN where there is no ego."""
+    x, y = np.append(frames.states.x, np.nan), np.append(frames.states.y, np.nan)
+    return x[ego], y[ego]
+
+
+def _within(states: States, rows: Rows, x: Floats, y: Floats, radius: float) -> Bools:
+    """Whether footprints (rows of states) come within a radius of their points; true where the point is NaN."""
+    boxes = np.stack([states.heading, states.length, states.width], axis=1)[rows]
+    boxes[np.isnan(boxes).any(axis=1)] = 0
+    boxes = np.column_stack([states.x[rows], states.y[rows], boxes])
+    return (gap_to_points(boxes, x, y) <= radius) | np.isnan(x)
+
+
+def _in_range(frames: FrameBlock, ego: Rows, radius: float) -> tuple[FrameBlock, Rows]:
+    """The frames with only the states in range, and the rows of their egos among these."""
+    x, y = _centres(frames, ego)
+    frame = frames.frame_of
+    kept = np.flatnonzero(_within(frames.states, np.arange(len(frame)), x[frame], y[frame], radius))
+    here = np.where(ego < 0, -1, np.searchsorted(kept, ego))
+    # An ego that is named but has no state is no node of its graph.
+    seen = np.zeros(len(frames), np.bool_)
+    named = frames.states.node == np.repeat(frames.ego, np.diff(frames.offsets))
+    seen[frame[named]] = True
+    reduced = replace(
+        frames,
+        offsets=np.searchsorted(kept, frames.offsets),
+        states=frames.states.take(kept),
+        ego=np.where(seen, frames.ego, -1),
+    )
+    return reduced, here
+
+
+def _presence(bodies: Bodies, ground: Ground | None) -> Presence:
+    """The static nodes of the graphs: scenery, and parts of the map."""
+    still = np.flatnonzero(~bodies.moves)
+    frame, column = np.nonzero(ground.present) if ground else (still[:0], still[:0])
+    return Presence(
+        np.concatenate([bodies.frame[still], frame]),
+        np.concatenate([bodies.node[still], -1 - column]),
+    )
+
+
+def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
+    if ground is None:
+        none = np.zeros(0, np.int64)
+        empty = np.zeros(0)
+        return LaneStates(none, none, none, empty, empty, empty, np.zeros(0, np.bool_))
+    hits = ground.hits
+    return LaneStates(
+        frame=bodies.frame[hits.row],
+        node=bodies.node[hits.row],
+        lane=hits.lane,
+        overlap=hits.overlap,
+        offset=hits.offset,
+        heading_error=hits.heading_error,
+        primary=hits.primary,
+    )
+
+
+def _chained(parts: list[Edges]) -> Edges:
+    return Edges(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Edges)))
+
+
+def _stacked(first: States, second: States) -> States:
+    columns = {
+        f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+        for f in fields(States)
+    }
+    return States(**columns)

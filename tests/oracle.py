@@ -1,0 +1,552 @@
+"""Exhaustive search over networkx graphs, as plain as can be: what the compiler's SQL is held against.
+
+``python -m oracle 10000`` (in this folder) tries that many random patterns on random worlds.
+
+A pattern is searched by assigning every node of the graph to every node of the pattern, in order. Nothing is
+clever here: what a label, an edge or a condition means is written down once more, from the documentation.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sgstore.lang import syntax as s
+from sgstore.lang.parser import parse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import networkx as nx
+    from oracle_worlds import Frame, World
+
+VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train"}
+MAP_KINDS = {"lane", "road", "junction", "crosswalk", "offroad", "waypoint"}
+GROUPS = {
+    "vehicle": VEHICLES,
+    "vru": {"person", "bicycle", "motorcycle"},
+    "signal": {"trafficlight", "stopsign", "yieldsign", "speedlimit", "sign"},
+    "pedestrian": {"person"},
+}
+Binding = dict[str, Any]
+
+
+@dataclass
+class Search:
+    """One frame, and how it is searched."""
+
+    frame: Frame
+    graph: nx.MultiDiGraph
+    injective: bool
+
+    # Matches
+
+    def matches(self, block: s.Block, outside: Binding) -> Iterator[Binding]:
+        """Every assignment of nodes (and named edges) that makes the whole block true."""
+        nodes: dict[str, list[s.NodePattern]] = {}
+        names: dict[int, str] = {}
+        for path in block.paths:
+            for node in path.nodes:
+                name = node.name or f"#{id(node)}"
+                names[id(node)] = name
+                nodes.setdefault(name, []).append(node)
+        own = [name for name in nodes if name not in outside]
+        spoken_of = {n for n in free_names(block) if n in outside and outside[n] in self.graph}
+        choices = [[n for n in self.graph.nodes if self.fits(n, nodes[name])] for name in own]
+        if not all(self.fits(outside[name], nodes[name]) for name in nodes if name in outside):
+            return
+        for chosen in itertools.product(*choices):
+            binding = outside | dict(zip(own, chosen, strict=True))
+            if not self.injective or differ(binding, own, spoken_of):
+                yield from self.edges(block, names, binding, 0)
+
+    def fits(self, node: Any, patterns: list[s.NodePattern]) -> bool:
+        return all(
+            pattern.label is None or self.labelled(node, pattern.label) for pattern in patterns
+        )
+
+    def edges(
+        self, block: s.Block, names: dict[int, str], binding: Binding, number: int
+    ) -> Iterator[Binding]:
+        """Extensions of a binding of all nodes by the edge variables, where all edges exist."""
+        links = [
+            (path.edges[i], names[id(path.nodes[i])], names[id(path.nodes[i + 1])])
+            for path in block.paths
+            for i in range(len(path.edges))
+        ]
+        if number == len(links):
+            if self.conditions(block, names, binding):
+                yield binding
+            return
+        edge, left, right = links[number]
+        a, b = binding[left], binding[right]
+        ways = {"right": [(a, b)], "left": [(b, a)], "any": [(a, b), (b, a)]}[edge.direction]
+        found = [hit for way in ways for hit in self.linked(edge, *way, binding)]
+        if edge.name is None:
+            if found:
+                yield from self.edges(block, names, binding, number + 1)
+        else:
+            for relation in sorted({relation for relation, _ in found}):
+                attributes = next(a for r, a in found if r == relation)
+                bound = binding | {edge.name: Edge(relation, attributes)}
+                yield from self.edges(block, names, bound, number + 1)
+
+    def linked(
+        self, edge: s.EdgePattern, src: Any, dst: Any, binding: Binding
+    ) -> list[tuple[str, dict[str, Any]]]:
+        if edge.low is not None and edge.high is not None:
+            lengths = range(edge.low, edge.high + 1)
+            return [("", {})] if any(self.walks(edge, src, dst, n, [src]) for n in lengths) else []
+        hits: list[tuple[str, dict[str, Any]]] = []
+        for relation, attributes in self.graph.get_edge_data(src, dst, default={}).items():
+            if edge.label is None or related(relation, edge.label):
+                inner = binding | {
+                    "": Edge(relation, attributes),
+                    edge.name or "": Edge(relation, attributes),
+                }
+                tests = [
+                    equal(attributes.get(attribute_name(p.name)), self.value(p.value, inner))
+                    for p in edge.properties
+                ]
+                if edge.where is not None:
+                    tests.append(self.value(edge.where, inner))
+                if all(test is True for test in tests):
+                    hits.append((relation, attributes))
+        return hits
+
+    def walks(self, edge: s.EdgePattern, at: Any, dst: Any, length: int, seen: list[Any]) -> bool:
+        """Whether ``length`` edges lead from one node to the other; no node twice, if nodes differ."""
+        if length == 0:
+            return at == dst
+        steps = {
+            b
+            for _, b, r in self.graph.out_edges(at, keys=True)
+            if edge.label is None or related(r, edge.label)
+        }
+        if edge.direction == "any":
+            steps |= {
+                a
+                for a, _, r in self.graph.in_edges(at, keys=True)
+                if edge.label is None or related(r, edge.label)
+            }
+        for step in steps:
+            between = length > 1
+            if self.injective and between and (step in seen or step == dst):
+                continue
+            if self.walks(edge, step, dst, length - 1, [*seen, step]):
+                return True
+        return False
+
+    def conditions(self, block: s.Block, names: dict[int, str], binding: Binding) -> bool:
+        for path in block.paths:
+            for node in path.nodes:
+                at = binding[names[id(node)]]
+                for prop in node.properties:
+                    if (
+                        equal(self.attribute(at, prop.name), self.value(prop.value, binding))
+                        is not True
+                    ):
+                        return False
+                if node.where is not None and self.value(node.where, binding) is not True:
+                    return False
+        return block.where is None or self.value(block.where, binding) is True
+
+    def labelled(self, node: Any, label: s.LabelExpression) -> bool:
+        if isinstance(label, s.LabelLogic):
+            parts = [self.labelled(node, operand) for operand in label.operands]
+            return {"!": not parts[0], "&": all(parts), "|": any(parts)}[label.word]
+        name = label.name.replace("_", "").lower()
+        kind = self.graph.nodes[node]["kind"].replace("_", "")
+        if name == "ego":
+            return self.graph.nodes[node]["is_ego"]
+        if name == "entity":
+            return kind not in MAP_KINDS
+        return name == "%" or kind in GROUPS.get(name, {name})
+
+    def value(self, e: s.Expression, binding: Binding) -> Any:  # noqa: C901, PLR0911, PLR0912 - one case each
+        """The value of an expression; ``None`` is NULL."""
+        match e:
+            case s.Constant(value=value):
+                return value
+            case s.ListOf(items=items):
+                return [self.value(item, binding) for item in items]
+            case s.Variable(name=name):
+                return binding[name]
+            case s.AttributeOf(owner=owner, name=name):
+                return self.owned(owner.name, name, binding)
+            case s.Logic(word=word, operands=operands):
+                return logic(word, [self.value(operand, binding) for operand in operands])
+            case s.Comparison(word=word, left=left, right=right):
+                return compare(word, self.value(left, binding), self.value(right, binding))
+            case s.NullTest(operand=operand, negated=negated):
+                return (self.value(operand, binding) is None) != negated
+            case s.Membership(operand=operand, choices=choices, negated=negated):
+                return member(self.value(operand, binding), self.value(choices, binding), negated)
+            case s.Arithmetic(first=first, rest=rest):
+                result = self.value(first, binding)
+                for sign, term in rest:
+                    result = arithmetic(sign, result, self.value(term, binding))
+                return result
+            case s.Negative(operand=operand):
+                value = self.value(operand, binding)
+                return None if value is None else -value
+            case s.Call():
+                return self.call(e, binding)
+            case s.BlockExpression():
+                return self.block(e, binding)
+        raise NotImplementedError(e)
+
+    def owned(self, owner: str, name: str, binding: Binding) -> Any:
+        if owner == "frame" and owner not in binding:
+            start = self.frame.trace.frames[0].time_ns
+            frame = self.frame
+            return {"seq": frame.seq, "id": frame.frame_id, "t": (frame.time_ns - start) / 1e9}[
+                name
+            ]
+        if owner == "trace" and owner not in binding:
+            return {"name": self.frame.trace.name, "id": self.frame.trace.trace_id}[name]
+        bound = binding[owner]
+        if isinstance(bound, Edge):
+            return bound.attributes.get(attribute_name(name))
+        return self.attribute(bound, name)
+
+    def attribute(self, node: Any, name: str) -> Any:
+        attributes = self.graph.nodes[node]
+        return attributes.get("lane_type" if name == "type" else name)
+
+    def call(self, e: s.Call, binding: Binding) -> Any:
+        name = e.name
+        if name == "type":
+            return binding[e.arguments[0].name].relation  # type: ignore[union-attr]
+        values = [self.value(argument, binding) for argument in e.arguments]
+        if name == "abs":
+            return None if values[0] is None else abs(values[0])
+        if name == "coalesce":
+            return next((value for value in values if value is not None), None)
+        if name == "known":
+            return values[0] is not None
+        if name in {"min", "max"}:
+            return None if None in values else {"min": min, "max": max}[name](values)
+        return pair(name, self.graph.nodes[values[0]], self.graph.nodes[values[1]])
+
+    def block(self, e: s.BlockExpression, binding: Binding) -> Any:
+        matches = self.matches(e.block, binding)
+        if e.word == "EXISTS":
+            return next(matches, None) is not None
+        found = list(matches)
+        if e.word == "COUNT":
+            return len(found)
+        assert e.value is not None
+        values = [v for v in (self.value(e.value, match) for match in found) if v is not None]
+        if e.word == "SUM":
+            return float(sum(values))
+        if not values:
+            return None
+        return {"MIN": min, "MAX": max, "AVG": lambda v: sum(v) / len(v)}[e.word](values)
+
+
+@dataclass(frozen=True)
+class Edge:
+    relation: str
+    attributes: dict[str, Any]
+
+
+def attribute_name(name: str) -> str:
+    return {"primary": "is_primary", "offset": "lane_offset"}.get(name, name)
+
+
+def differ(binding: Binding, own: list[str], spoken_of: set[str]) -> bool:
+    nodes = [binding[name] for name in own]
+    others = {binding[name] for name in spoken_of}
+    return len(set(nodes)) == len(nodes) and not others & set(nodes)
+
+
+def related(relation: str, label: s.LabelExpression) -> bool:
+    if isinstance(label, s.LabelLogic):
+        parts = [related(relation, operand) for operand in label.operands]
+        return {"!": not parts[0], "&": all(parts), "|": any(parts)}[label.word]
+    return (
+        label.name == "%"
+        or label.name.replace("_", "").lower() == relation.replace("_", "").lower()
+    )
+
+
+def free_names(block: s.Block) -> set[str]:
+    """All names that occur in a block, or in blocks in it."""
+    if id(block) not in FREE:
+        FREE[id(block)] = block, names_in(block)
+    return FREE[id(block)][1]
+
+
+FREE: dict[int, tuple[s.Block, set[str]]] = {}
+
+
+def names_in(block: s.Block | s.Match) -> set[str]:
+    found: set[str] = set()
+
+    def visit(part: Any) -> None:
+        if isinstance(part, s.Variable):
+            found.add(part.name)
+        if isinstance(part, s.NodePattern) and part.name:
+            found.add(part.name)
+        if isinstance(part, (tuple, list)):
+            for item in part:
+                visit(item)
+        elif hasattr(part, "__dataclass_fields__"):
+            for name in part.__dataclass_fields__:
+                visit(getattr(part, name))
+
+    visit(block)
+    return found
+
+
+def logic(word: str, values: list[bool | None]) -> bool | None:
+    if word == "NOT":
+        return None if values[0] is None else not values[0]
+    if word == "IMPLIES":
+        return logic("OR", [logic("NOT", values[:1]), values[1]])
+    if word == "AND":
+        return False if False in values else None if None in values else True
+    if word == "OR":
+        return True if True in values else None if None in values else False
+    return None if None in values else sum(bool(v) for v in values) % 2 == 1
+
+
+def equal(a: Any, b: Any) -> bool | None:
+    return compare("=", a, b)
+
+
+def compare(word: str, a: Any, b: Any) -> bool | None:
+    if a is None or b is None:
+        return None
+    if isinstance(a, str) and isinstance(b, str) and word in {"=", "<>"}:
+        a, b = a.lower(), b.lower()
+    return {
+        "=": lambda: a == b,
+        "<>": lambda: a != b,
+        "<": lambda: a < b,
+        "<=": lambda: a <= b,
+        ">": lambda: a > b,
+        ">=": lambda: a >= b,
+        "STARTS WITH": lambda: a.startswith(b),
+        "ENDS WITH": lambda: a.endswith(b),
+        "CONTAINS": lambda: b in a,
+    }[word]()
+
+
+def member(value: Any, choices: list[Any], negated: bool) -> bool | None:
+    if value is None:
+        return None if choices else negated
+    folded = [choice.lower() if isinstance(choice, str) else choice for choice in choices]
+    return ((value.lower() if isinstance(value, str) else value) in folded) != negated
+
+
+def arithmetic(sign: str, a: Any, b: Any) -> Any:
+    if a is None or b is None or (sign in {"/", "%"} and b == 0):
+        return None
+    return {
+        "+": lambda: a + b,
+        "-": lambda: a - b,
+        "*": lambda: a * b,
+        "/": lambda: a / b,
+        "%": lambda: math.fmod(a, b),
+    }[sign]()
+
+
+def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
+    """Numbers of a pair that need no more than school geometry; the others have tests of their own."""
+    if any(n["kind"] in {"lane", "road", "junction", "crosswalk", "off_road"} for n in (a, b)):
+        return None
+    if any(axis not in n for n in (a, b) for axis in "xyz"):
+        return None
+    dx, dy, dz = (b[axis] - a[axis] for axis in "xyz")
+    if name == "dist":
+        return math.sqrt(dx * dx + dy * dy + dz * dz)
+    heading = math.radians(a["heading"])
+    if name == "lon":
+        return dx * math.cos(heading) + dy * math.sin(heading)
+    if name == "lat":
+        return dy * math.cos(heading) - dx * math.sin(heading)
+    raise NotImplementedError(name)
+
+
+def assignments(match: s.Match, world: World) -> Iterator[tuple[Search, Binding]]:
+    """Every match of a query in every frame of the traces that can answer it; ``ego`` bound if named."""
+    injective = not any(setting.name.lower() == "nodes" for setting in match.settings)
+    unknown_is_false = any(setting.name.lower() == "unknown" for setting in match.settings)
+    needed = set[str]() if unknown_is_false else relations_of(match)
+    for frame in world.frames:
+        if not needed <= {answer.lower() for answer in frame.trace.answers}:
+            continue
+        search = Search(frame, frame.graph, injective)
+        outside: Binding = {}
+        if "ego" in names_in(
+            match
+        ):  # it stands for a node of its own, as if (ego:Ego) were written
+            if frame.ego is None:
+                continue
+            outside["ego"] = frame.ego
+        for binding in search.matches(match.block, outside):
+            yield search, binding
+
+
+def answer(text: str, world: World) -> tuple[Counter[tuple[Any, ...]], set[int]]:
+    """Rows (frame, named nodes and relations of named edges) and frames of a query, whatever it returns."""
+    match = parse(text)[-1]
+    assert isinstance(match, s.Match)
+    rows: set[tuple[Any, ...]] = set()
+    for search, binding in assignments(match, world):
+        named = {k: v for k, v in binding.items() if not k.startswith("#") and k != "ego"}
+        values = [v.relation if isinstance(v, Edge) else v for _, v in sorted(named.items())]
+        rows.add((search.frame.frame_id, *values))
+    return Counter(rows), {row[0] for row in rows}
+
+
+def returned(text: str, world: World) -> Counter[tuple[Any, ...]]:
+    """The values after ``RETURN``, as often as they are returned."""
+    match = parse(text)[-1]
+    assert isinstance(match, s.Match)
+    assert match.returns is not None
+    items = [item.value for item in match.returns.items]
+    found = list(assignments(match, world))
+    counted = [is_counted(item) for item in items]
+    if not any(counted):
+        rows = [tuple(search.value(item, binding) for item in items) for search, binding in found]
+        return Counter(dict.fromkeys(rows, 1)) if match.returns.distinct else Counter(rows)
+    groups: dict[tuple[Any, ...], list[tuple[Search, Binding]]] = {}
+    for search, binding in found:
+        key = tuple(search.value(i, binding) for i, c in zip(items, counted, strict=True) if not c)
+        groups.setdefault(key, []).append((search, binding))
+    if all(counted):
+        groups.setdefault((), [])
+    rows = []
+    for key, members in groups.items():
+        plain = iter(key)
+        row = [over(i, members) if c else next(plain) for i, c in zip(items, counted, strict=True)]
+        rows.append(tuple(row))
+    return Counter(rows)
+
+
+def is_counted(item: Any) -> bool:
+    names = {"count", "min", "max", "avg", "sum"}
+    one = isinstance(item, s.Call) and len(item.arguments) == 1
+    return isinstance(item, s.CountAll) or (one and item.name.lower() in names)
+
+
+def over(item: Any, members: list[tuple[Search, Binding]]) -> Any:
+    """A count, or a value of all matches of a group."""
+    if isinstance(item, s.CountAll):
+        return len(members)
+    values = [search.value(item.arguments[0], binding) for search, binding in members]
+    known = [value for value in values if value is not None]
+    if item.name.lower() == "count":
+        return len(set(known)) if item.distinct else len(known)
+    if not known:
+        return None
+    mean = sum(known) / len(known) if item.name.lower() == "avg" else 0
+    return {"min": min, "max": max, "sum": sum, "avg": lambda _: mean}[item.name.lower()](known)
+
+
+def relations_of(part: Any) -> set[str]:
+    """Every relation that a query names."""
+    if isinstance(part, s.EdgePattern) and part.label is not None:
+        inner = relations_of(part.properties) | relations_of(part.where)
+        return inner | {label.name.lower() for label in labels_in(part.label) if label.name != "%"}
+    if isinstance(part, (tuple, list)):
+        return {name for item in part for name in relations_of(item)}
+    if hasattr(part, "__dataclass_fields__"):
+        return {
+            n for field in part.__dataclass_fields__ for n in relations_of(getattr(part, field))
+        }
+    return set()
+
+
+def labels_in(label: s.LabelExpression) -> list[s.Label]:
+    if isinstance(label, s.Label):
+        return [label]
+    return [found for operand in label.operands for found in labels_in(operand)]
+
+
+def disagreement(text: str, world: World) -> tuple[str, int]:
+    """What the compiled query and the search do not agree on (nothing, if all is well); number of frames."""
+    from sgstore.lang import compile_query
+
+    wanted, frames = answer(text, world)
+    compiled = compile_query(text, world.catalog)
+    statement = compiled.rows()
+    found = world.connection.execute(statement.sql, list(statement.values)).fetchall()
+    names = [name for name in statement.columns[5:] if not name.endswith(".name")]
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    keep = [statement.columns.index(names[i]) for i in order]
+    rows = Counter((row[0], *(row[i] for i in keep)) for row in found)
+    if rows != wanted:
+        return difference("rows", rows, wanted), 0
+    statement = compiled.count()
+    counted = world.connection.execute(statement.sql, list(statement.values)).fetchone()
+    if counted is None or counted[0] != len(frames):
+        return f"frames: counted {counted}, wanted {len(frames)}", 0
+    return "", len(frames)
+
+
+def disagreement_of_results(text: str, world: World) -> tuple[str, int]:
+    """As above, of a query that returns values."""
+    from sgstore.lang import compile_query
+
+    wanted = rounded(returned(text, world))
+    statement = compile_query(text, world.catalog).rows()
+    found = world.connection.execute(statement.sql, list(statement.values)).fetchall()
+    rows = rounded(Counter(found))
+    return ("" if rows == wanted else difference("results", rows, wanted)), len(wanted)
+
+
+def rounded(rows: Counter[tuple[Any, ...]]) -> Counter[tuple[Any, ...]]:
+    result = Counter[tuple[Any, ...]]()
+    for row, number in rows.items():
+        result[tuple(round(v, 6) if isinstance(v, float) else v for v in row)] += number
+    return result
+
+
+def difference(what: str, found: Counter[Any], wanted: Counter[Any]) -> str:
+    more, less = found - wanted, wanted - found
+    return f"{what}: {len(found)}, wanted {len(wanted)}\n too many {more}\n missing {less}"
+
+
+def try_many(first: int, count: int) -> dict[str, int]:
+    """Random queries on random worlds; how many, how many have a match, how many are refused."""
+    from oracle_patterns import Writer
+    from oracle_worlds import random_world
+
+    from sgstore.errors import QueryError
+
+    seen = Counter[str]()
+    for number in range(first, first + count):
+        if (number - first) % 25 == 0:
+            world = random_world(number, static=number % 2 == 0)
+        writer = Writer(number)
+        text = writer.query()
+        try:
+            if number % 3:
+                problem, frames = disagreement(text, world)
+            else:
+                text += writer.results()
+                problem, frames = disagreement_of_results(text, world)
+        except QueryError as error:
+            seen["refused"] += 1
+            seen[error.reason.split("'")[0]] += 1
+            continue
+        except Exception as error:
+            error.add_note(f"pattern {number}, world {number - (number - first) % 25}: {text}")
+            raise
+        seen["tried"] += 1
+        seen["matched"] += frames > 0
+        assert not problem, f"pattern {number}: {text}\n{problem}"
+    return dict(seen)
+
+
+if __name__ == "__main__":
+    arguments = [int(argument) for argument in sys.argv[1:]] or [1000]
+    print(try_many(arguments[1] if len(arguments) > 1 else 0, arguments[0]))

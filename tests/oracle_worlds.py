@@ -1,0 +1,464 @@
+"""Random small worlds: as networkx graphs, frame by frame, and as the tables of a store.
+
+The graphs are what an exhaustive search reads; the tables are what the compiler's SQL reads. Both are written
+here from the same plain records, with nothing of the store's code in between.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import networkx as nx
+
+from sgstore.lang import Catalog, TraceFacts
+
+SCHEMA = (Path(__file__).parents[1] / "sgstore" / "schema.sql").read_text(encoding="utf-8")
+
+MAP_NODES: dict[int, dict[str, Any]] = {
+    -1: {"kind": "off_road", "name": "off_road"},
+    -2: {"kind": "lane", "name": "1/0/-1", "lane_type": "driving", "width": 3.5, "road": "1"},
+    -3: {"kind": "lane", "name": "1/0/1", "lane_type": "driving", "width": 3.0, "road": "1"},
+    -4: {"kind": "lane", "name": "2/0/-1", "lane_type": "sidewalk", "width": 2.0, "turn": "left"},
+    -5: {"kind": "road", "name": "1"},
+    -6: {"kind": "junction", "name": "7"},
+    -7: {"kind": "crosswalk", "name": "c"},
+    -8: {
+        "kind": "stop_sign",
+        "name": "s8",
+        "road": "1",
+        "x": 103.0,
+        "y": 201.0,
+        "z": 0.0,
+        "heading": 0.0,
+    },
+}
+MAP_NODES[-4]["junction"] = "7"
+MAP_EDGES = [
+    (-2, "isIn", -5),
+    (-3, "isIn", -5),
+    (-4, "isIn", -5),
+    (-5, "isIn", -6),
+    (-2, "opposes", -3),
+    (-3, "opposes", -2),
+    (-2, "travelsTo", -4),
+    (-4, "travelsTo", -3),
+    (-3, "travelsTo", -2),
+    (-8, "controlsTrafficOf", -2),
+]
+KINDS = ("car", "car", "truck", "person", "bicycle", "traffic_light")
+RELATIONS = ("near", "near", "visible", "inDFrontOf", "toLeftOf")
+ORIGIN = (100.0, 200.0, 0.0)
+STATE = (
+    *(
+        "x",
+        "y",
+        "z",
+        "heading",
+        "pitch",
+        "roll",
+        "speed",
+        "vx",
+        "vy",
+        "vz",
+        "ax",
+        "ay",
+        "az",
+        "yaw_rate",
+    ),
+    *(
+        "length",
+        "width",
+        "height",
+        "lights",
+        "light_state",
+        "steer",
+        "throttle",
+        "brake",
+        "derived",
+    ),
+    *("special", "subkind"),
+)
+
+
+@dataclass
+class Frame:
+    frame_id: int
+    trace: Trace
+    seq: int
+    time_ns: int
+    ego: int | None
+    states: dict[int, dict[str, Any]]
+    present: set[int]
+    edges: list[tuple[int, str, int, dict[str, Any]]]
+
+    @cached_property
+    def graph(self) -> nx.MultiDiGraph:
+        """The frame as the store's own graphs are: attributes in outward units, missing ones left out."""
+        graph = nx.MultiDiGraph(
+            frame_id=self.frame_id,
+            trace=self.trace.name,
+            seq=self.seq,
+            time_ns=self.time_ns,
+            ego=self.ego,
+        )
+        for node, state in self.states.items():
+            graph.add_node(node, **outward(self.trace, node, state, self.ego))
+        for node in self.present:
+            graph.add_node(node, **lasting(self.trace, node))
+        for src, relation, dst, attributes in self.edges:
+            graph.add_edge(src, dst, key=relation, relation=relation, **attributes)
+        for src, relation, dst in MAP_EDGES:
+            if {src, dst} <= self.present:
+                graph.add_edge(src, dst, key=relation, relation=relation)
+        return graph
+
+
+@dataclass
+class Trace:
+    trace_id: int
+    name: str
+    ego: int
+    answers: tuple[str, ...]
+    entities: dict[int, dict[str, Any]]
+    frames: list[Frame] = field(default_factory=list)
+
+
+def outward(trace: Trace, node: int, state: dict[str, Any], ego: int | None) -> dict[str, Any]:
+    """Attributes of a moving entity as people see them."""
+    entity = trace.entities[node]
+    found = {key: value for key, value in state.items() if value is not None}
+    for key in ("heading", "yaw_rate"):
+        if key in found:
+            found[key] = math.degrees(found[key])
+    found |= {axis: found[axis] + shift for axis, shift in zip("xyz", ORIGIN, strict=True)}
+    if "lights" in found:
+        lights = found.pop("lights")
+        found |= {"light_left": bool(lights & 1), "light_right": bool(lights & 2)}
+    found |= {"kind": entity["kind"], "name": f"{entity['kind']} {node}", "id": node}
+    found |= {"is_ego": node == ego, "is_static": False, "ident": entity["ident"]}
+    return found
+
+
+def lasting(trace: Trace, node: int) -> dict[str, Any]:
+    """Attributes of a static entity or of a part of the map."""
+    common = {"id": node, "is_ego": False, "is_static": True}
+    if node < 0:
+        found = {**MAP_NODES[node], **common}
+        if "heading" in found:
+            found["heading"] = math.degrees(found["heading"])
+        if found["kind"] == "lane":
+            found["in_junction"] = "junction" in found
+        return found
+    entity = trace.entities[node]
+    found = {key: value for key, value in entity.items() if value is not None and key != "static"}
+    found |= {axis: found[axis] + shift for axis, shift in zip("xyz", ORIGIN, strict=True)}
+    found["heading"] = math.degrees(found["heading"])
+    return {**found, **common, "name": f"{entity['kind']} {node}"}
+
+
+@dataclass
+class World:
+    """Traces, a database that holds them, and the catalogue of it."""
+
+    traces: list[Trace]
+    connection: duckdb.DuckDBPyConnection
+
+    @cached_property
+    def frames(self) -> list[Frame]:
+        return [frame for trace in self.traces for frame in trace.frames]
+
+    @cached_property
+    def catalog(self) -> Catalog:
+        return catalog_of(self.connection)
+
+
+def catalog_of(connection: duckdb.DuckDBPyConnection) -> Catalog:
+    def triples(table: str) -> dict[tuple[str, str, str], int]:
+        sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM {table} GROUP BY ALL"
+        return {(str(r), str(s), str(d)): n for r, s, d, n in connection.execute(sql).fetchall()}
+
+    def kinds(sql: str) -> frozenset[str]:
+        return frozenset(str(kind) for (kind,) in connection.execute(sql).fetchall())
+
+    traces = connection.execute("SELECT trace_id, name, ego, answers FROM trace").fetchall()
+    return Catalog(
+        edges=triples("edge"),
+        map_edges=triples("map_edge"),
+        moving=kinds("SELECT DISTINCT kind FROM state"),
+        fixed=kinds("SELECT DISTINCT kind FROM entity WHERE is_static"),
+        mapped=kinds("SELECT DISTINCT kind FROM map_node"),
+        traces=tuple(TraceFacts(i, name, ego or "", frozenset(a)) for i, name, ego, a in traces),
+    )
+
+
+def random_world(
+    seed: int, *, traces: int = 2, frames: int = 9, static: bool = True, path: Path | None = None
+) -> World:
+    """A world whose frames lie on both sides of the end of a bucket; in memory, or in an empty store's file."""
+    rng = random.Random(seed)
+    made = [random_trace(rng, number + 1, frames, static=static) for number in range(traces)]
+    connection = duckdb.connect(str(path or ":memory:"))
+    if path is None:
+        connection.execute(SCHEMA)
+    store_all(connection, made, rng)
+    return World(made, connection)
+
+
+def random_trace(rng: random.Random, number: int, frames: int, *, static: bool) -> Trace:
+    count = rng.randint(3, 5)
+    entities: dict[int, dict[str, Any]] = {}
+    for node in range(count):
+        kind = "car" if node == 0 else rng.choice(KINDS)
+        special = rng.choice((None, None, "emergency", "taxi"))
+        subkind = rng.choice((None, "cone"))
+        entities[node] = {"kind": kind, "static": False, "ident": f"id{node}"}
+        entities[node] |= {"special": special, "subkind": subkind}
+    if static:
+        pose = {
+            "x": 3.0,
+            "y": -2.0,
+            "z": 0.5,
+            "heading": 0.5,
+            "length": 4.0,
+            "width": 2.0,
+            "height": 1.0,
+        }
+        kind = rng.choice(("car", "prop"))
+        entities[count] = {"kind": kind, "static": True, "ident": "still", "special": None}
+        entities[count] |= {"subkind": rng.choice((None, "cone")), **pose}
+    answers = tuple(
+        r for r in ("isIn", "near", "visible", "opposes", "travelsTo") if rng.random() < 0.95
+    )
+    answers += ("inDFrontOf", "toLeftOf", "controlsTrafficOf")
+    trace = Trace(number, f"trace{number}", 0, answers, entities)
+    first = 60 - rng.randint(1, frames - 1)
+    time_ns = 0
+    for seq in range(first, first + frames):
+        time_ns += rng.choice((100, 100, 100, 900)) * 1_000_000
+        trace.frames.append(random_frame(rng, trace, seq, time_ns))
+    return trace
+
+
+def random_frame(rng: random.Random, trace: Trace, seq: int, time_ns: int) -> Frame:
+    moving = [n for n, e in trace.entities.items() if not e["static"] and rng.random() < 0.85]
+    still = {n for n, e in trace.entities.items() if e["static"] and rng.random() < 0.8}
+    present = still | {node for node in MAP_NODES if rng.random() < 0.85}
+    states = {node: random_state(rng, trace.entities[node]) for node in moving}
+    edges: list[tuple[int, str, int, dict[str, Any]]] = []
+    everything = [*moving, *still]
+    for src in everything:
+        for dst in everything:
+            chosen = dict.fromkeys((rng.choice(RELATIONS), rng.choice(RELATIONS)))
+            edges += [(src, r, dst, {}) for r in chosen if src != dst and rng.random() < 0.35]
+        for place in sorted(present & {-1, -2, -3, -4, -7}):
+            if rng.random() < 0.35:
+                lane = MAP_NODES[place]["kind"] == "lane"
+                edges.append((src, "isIn", place, lane_state(rng) if lane else {}))
+        if trace.entities[src]["kind"] == "traffic_light":
+            edges += [
+                (src, "controlsTrafficOf", n, {})
+                for n in sorted(present & {-2, -3})
+                if rng.random() < 0.6
+            ]
+    bucket = (trace.trace_id << 18) + seq // 60
+    ego = trace.ego if trace.ego in moving else None
+    return Frame(bucket * 64 + seq % 60, trace, seq, time_ns, ego, states, present, edges)
+
+
+def lane_state(rng: random.Random) -> dict[str, Any]:
+    return {
+        "overlap": rng.choice((0.25, 0.5, 1.0)),
+        "lane_offset": rng.choice((-0.5, 0.0, 0.5)),
+        "heading_error": 0.0,
+        "is_primary": rng.random() < 0.5,
+    }
+
+
+def random_state(rng: random.Random, entity: dict[str, Any]) -> dict[str, Any]:
+    def some(*values: Any) -> Any:
+        return rng.choice((*values, None))
+
+    state: dict[str, Any] = {
+        "x": rng.choice((0.0, 3.0, 6.5, -4.0, 12.0)),
+        "y": rng.choice((0.0, 2.5, -3.0, 7.0)),
+        "z": rng.choice((0.0, 0.0, 3.0)),
+        "heading": rng.choice((0.0, 0.5, -1.5, 3.0)),
+        "speed": some(0.0, 1.0, 5.0, 10.0),
+        "vx": some(0.0, 2.0, -2.0),
+        "vy": some(0.0, 1.0),
+        "length": some(4.0, 2.0),
+        "width": some(2.0, 1.0),
+        "special": entity["special"],
+        "subkind": entity["subkind"],
+    }
+    if entity["kind"] in {"car", "truck", "bicycle"}:
+        state["lights"] = some(0, 1, 2, 3)
+    if entity["kind"] == "traffic_light":
+        state["light_state"] = some("red", "green", "off")
+    return state
+
+
+def store_all(
+    connection: duckdb.DuckDBPyConnection, traces: list[Trace], rng: random.Random
+) -> None:
+    connection.execute("INSERT INTO map (map_id, digest, name, text) VALUES (3, 'd', 'town', '')")
+    connection.execute("INSERT INTO config VALUES (1, 'c', '{}')")
+    columns = (
+        "lane_type",
+        "road",
+        "section",
+        "lane",
+        "junction",
+        "turn",
+        "x",
+        "y",
+        "z",
+        "heading",
+        "width",
+    )
+    for node, attributes in MAP_NODES.items():
+        row = {"map_id": 3, "node_id": node, "kind": attributes["kind"], "name": attributes["name"]}
+        insert(connection, "map_node", [row | {c: attributes.get(c) for c in columns}])
+    insert(
+        connection,
+        "map_edge",
+        [
+            {"map_id": 3, "relation": r, "src": s, "dst": d}
+            | {"src_kind": MAP_NODES[s]["kind"], "dst_kind": MAP_NODES[d]["kind"]}
+            for s, r, d in MAP_EDGES
+        ],
+    )
+    for trace in traces:
+        store_trace(connection, trace, rng)
+
+
+def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random.Random) -> None:
+    times = [frame.time_ns for frame in trace.frames]
+    row = {
+        "trace_id": trace.trace_id,
+        "name": trace.name,
+        "ego": f"hero{trace.trace_id}",
+        "map_id": 3,
+    }
+    row |= {
+        "frames": len(times),
+        "start_ns": times[0],
+        "end_ns": times[-1],
+        "period_ns": 100_000_000,
+    }
+    row |= {"answers": list(trace.answers), "flavour": "osi", "uri": f"/{trace.name}.mcap"}
+    row |= {
+        "config_id": 1,
+        "report": "{}",
+        "size": 1,
+        "mtime_ns": 1,
+        "digest": f"t{trace.trace_id}",
+    }
+    row |= {"ingested_at": "2026-01-01", "version": "test"}
+    row |= dict(zip(("origin_x", "origin_y", "origin_z"), ORIGIN, strict=True))
+    insert(connection, "trace", [row])
+    insert(
+        connection,
+        "entity",
+        [
+            {key: value for key, value in entity.items() if key != "static"}
+            | {"trace_id": trace.trace_id, "node_id": node, "is_static": entity["static"]}
+            for node, entity in trace.entities.items()
+        ],
+    )
+    insert(connection, "frame", [frame_row(frame) for frame in trace.frames])
+    insert(connection, "state", [row for frame in trace.frames for row in state_rows(frame)])
+    insert(connection, "lane_state", [row for frame in trace.frames for row in lane_rows(frame)])
+    store_masks(connection, trace, rng)
+
+
+def frame_row(frame: Frame) -> dict[str, Any]:
+    row = {"trace_id": frame.trace.trace_id, "map_id": 3, "bucket": frame.frame_id >> 6}
+    row |= {"frame_id": frame.frame_id, "bit": frame.frame_id & 63, "seq": frame.seq}
+    return row | {"time_ns": frame.time_ns, "log_time_ns": frame.time_ns + 5, "ego": frame.ego}
+
+
+def state_rows(frame: Frame) -> list[dict[str, Any]]:
+    entities = frame.trace.entities
+    return [
+        {column: state.get(column) for column in STATE}
+        | {"frame_id": frame.frame_id, "node_id": node, "kind": entities[node]["kind"]}
+        | {"is_ego": node == frame.ego}
+        for node, state in frame.states.items()
+    ]
+
+
+def lane_rows(frame: Frame) -> list[dict[str, Any]]:
+    entities = frame.trace.entities
+    return [
+        {"frame_id": frame.frame_id, "node_id": src, "lane": dst, "kind": entities[src]["kind"]}
+        | attributes
+        for src, _, dst, attributes in frame.edges
+        if attributes
+    ]
+
+
+def store_masks(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random.Random) -> None:
+    """Edges and static nodes as masks; now and then one mask in two rows, as a store may have them."""
+    masks: dict[tuple[Any, ...], int] = {}
+    nodes: dict[tuple[Any, ...], int] = {}
+    valid: dict[int, int] = {}
+    kinds = {n: e["kind"] for n, e in trace.entities.items()} | {
+        n: m["kind"] for n, m in MAP_NODES.items()
+    }
+    for frame in trace.frames:
+        bucket, bit = frame.frame_id >> 6, 1 << (frame.frame_id & 63)
+        valid[bucket] = valid.get(bucket, 0) | bit
+        for src, relation, dst, _ in frame.edges:
+            key = (
+                relation,
+                src == frame.ego,
+                dst == frame.ego,
+                kinds[src],
+                kinds[dst],
+                bucket,
+                src,
+                dst,
+            )
+            masks[key] = masks.get(key, 0) | bit
+        for node in frame.present:
+            key = (kinds[node], bucket, node)
+            nodes[key] = nodes.get(key, 0) | bit
+    names = ("relation", "src_is_ego", "dst_is_ego", "src_kind", "dst_kind", "bucket", "src", "dst")
+    rows = [
+        dict(zip(names, key, strict=True)) | {"mask": part}
+        for key, mask in masks.items()
+        for part in parts_of(mask, rng)
+    ]
+    insert(connection, "edge", rows)
+    rows = [
+        dict(zip(("kind", "bucket", "node_id"), k, strict=True)) | {"mask": m}
+        for k, m in nodes.items()
+    ]
+    insert(connection, "node", rows)
+    base = {"trace_id": trace.trace_id, "map_id": 3}
+    insert(connection, "bucket", [base | {"bucket": b, "valid": v} for b, v in valid.items()])
+
+
+def parts_of(mask: int, rng: random.Random) -> list[int]:
+    one = mask & rng.getrandbits(60)
+    return [part for part in (one, mask - one) if part] if rng.random() < 0.2 else [mask]
+
+
+def insert(connection: duckdb.DuckDBPyConnection, table: str, rows: list[dict[str, Any]]) -> None:
+    if not rows:
+        return
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    columns = ", ".join(f'"{name}"' for name in names)
+    marks = f"({', '.join('?' for _ in names)})"
+    for start in range(0, len(rows), 200):
+        part = rows[start : start + 200]
+        values = [row.get(name) for row in part for name in names]
+        sql = f"INSERT INTO {table} ({columns}) VALUES {', '.join([marks] * len(part))}"
+        connection.execute(sql, values)
