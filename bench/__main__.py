@@ -1,0 +1,19 @@
+"""``python -m bench [--quick] [NAME …]``: speeds and sizes, each beside a baseline measured in the same run."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+from bench.measure import show
+
+TITLES = {
+    "ingest": "Ingest: a recording into a store",
+    "sgg": "The scene graph generator",
+    "roads": "Road maps: reading, and asking which lanes footprints touch",
+    "store": "The store: size, and columns beside rows",
+}
+
+names = [name for name in sys.argv[1:] if not name.startswith("-")] or list(TITLES)
+for name in names:
+    show(TITLES[name], import_module(f"bench.{name}").run("--quick" in sys.argv))

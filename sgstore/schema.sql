@@ -1,0 +1,247 @@
+-- sgstore: what is in a store, version 1.
+--
+-- Users' SQL sees the VIEWS at the end of this file: frames, nodes, edges, pairs, lanes, entities, payloads.
+-- They are public and keep their columns. The TABLES are inside and may change with the version.
+--
+-- Ids. A trace is one recording seen from one ego. Its trace_id is 39 bits of a digest of both, so it is the same
+-- in every store. Its frames are numbered by seq = 0, 1, 2, …; 60 consecutive frames are a bucket:
+--     bucket   = trace_id · 2^18 + seq // 60         never spans traces
+--     frame_id = bucket · 64 + seq % 60              so trace_id = frame_id >> 24, bucket = frame_id >> 6
+-- A node_id names a node within its trace: 0 and above are entities of the trace, below zero parts of its map
+-- (-1 is off_road). A mask holds 60 frames of a bucket: bit i is the frame with seq % 60 = i.
+--
+-- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
+--
+-- Changes
+--   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
+--     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
+--   * map_id, channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
+--   * What may be missing is NULL everywhere: texts too (never the empty string).
+
+CREATE TYPE kind AS ENUM (
+  'car', 'truck', 'van', 'bus', 'motorcycle', 'bicycle', 'trailer', 'train', 'person', 'animal',
+  'traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign', 'prop', 'building', 'pole', 'barrier', 'vegetation', 'unknown',
+  'lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint');
+
+CREATE TYPE relation AS ENUM (
+  'isIn', 'travelsTo', 'laneChange', 'opposes', 'toLeftOf', 'toRightOf', 'conflictsWith', 'controlsTrafficOf', 'mayAffect',
+  'safety_hazard', 'near_coll', 'super_near', 'very_near', 'near', 'visible',
+  'inDFrontOf', 'inSFrontOf', 'atSRearOf', 'atDRearOf', 'leads', 'follows', 'overlaps', 'sees');
+
+CREATE TYPE light_state AS ENUM ('unknown', 'off', 'red', 'yellow', 'green', 'red_yellow', 'flashing');
+
+-- What the store is -----------------------------------------------------------------------------------------------
+
+CREATE TABLE store_info (key VARCHAR, value VARCHAR);          -- schema_version, created_by
+
+CREATE TABLE config (config_id INTEGER, digest VARCHAR, settings JSON);   -- one row for each set of settings in use
+
+-- Traces ----------------------------------------------------------------------------------------------------------
+
+CREATE TABLE trace (
+  trace_id   BIGINT,      -- 39 bits of sha256(digest, ego)
+  name       VARCHAR,     -- unique; the file's name without its ending
+  uri        VARCHAR,     -- absolute path of the file when it was ingested
+  size       BIGINT,      -- of the file; with mtime_ns it tells that the file was replaced
+  mtime_ns   BIGINT,
+  digest     VARCHAR,     -- SHA-256 of the whole file
+  flavour    VARCHAR,     -- the reader: 'osi'
+  ego        VARCHAR,     -- the simulator's id of the ego, NULL without one
+  map_id     INTEGER,     -- NULL without a map
+  config_id  INTEGER,
+  frames     INTEGER,
+  start_ns   BIGINT,      -- simulation time of the first and of the last frame
+  end_ns     BIGINT,
+  period_ns  BIGINT,      -- median difference of consecutive frames
+  origin_x   DOUBLE,      -- positions in state are relative to it
+  origin_y   DOUBLE,
+  origin_z   DOUBLE,
+  answers    VARCHAR[],   -- relations that this trace can answer; of the others nothing is known
+  report     JSON,        -- what reading it brought to light: losses, warnings, unknown types
+  ingested_at TIMESTAMP,
+  version    VARCHAR      -- of sgstore
+);
+
+CREATE TABLE channel (                                         -- channels of the traces' files
+  trace_id BIGINT, channel_id INTEGER, topic VARCHAR, schema VARCHAR, schema_encoding VARCHAR, message_encoding VARCHAR,
+  role VARCHAR);                                               -- ground_truth, map, payload
+
+CREATE TABLE context (                                         -- messages that later ones depend on: maps, static data
+  trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT, chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
+
+CREATE TABLE entity (                                          -- what does not change about an entity of a trace
+  trace_id BIGINT, node_id INTEGER, kind kind, ident VARCHAR, special VARCHAR, subkind VARCHAR, type_name VARCHAR,
+  is_static BOOLEAN, map_ref VARCHAR,
+  x FLOAT, y FLOAT, z FLOAT, heading FLOAT, length FLOAT, width FLOAT, height FLOAT);   -- pose of the static ones, else NULL
+
+-- Frames ----------------------------------------------------------------------------------------------------------
+
+CREATE TABLE bucket (bucket BIGINT, trace_id BIGINT, map_id INTEGER, valid BIGINT);    -- valid: mask of its frames
+
+CREATE TABLE frame (                                           -- ordered by frame_id
+  frame_id BIGINT, bucket BIGINT, bit TINYINT, trace_id BIGINT, map_id INTEGER, seq INTEGER,
+  time_ns BIGINT, log_time_ns BIGINT, ego INTEGER);            -- ego: node_id, NULL where it is absent
+
+CREATE TABLE state (                                           -- ordered by kind, bucket, node_id, frame_id
+  kind kind, frame_id BIGINT, node_id INTEGER, is_ego BOOLEAN,
+  x FLOAT, y FLOAT, z FLOAT,                                   -- about the trace's origin
+  heading FLOAT, pitch FLOAT, roll FLOAT,                      -- rad
+  speed FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, ax FLOAT, ay FLOAT, az FLOAT, yaw_rate FLOAT,
+  length FLOAT, width FLOAT, height FLOAT,
+  lights SMALLINT, light_state light_state, steer FLOAT, throttle FLOAT, brake FLOAT, derived TINYINT,
+  special VARCHAR, subkind VARCHAR);                           -- as in entity
+
+CREATE TABLE node (kind kind, bucket BIGINT, node_id INTEGER, mask BIGINT);             -- presence of static nodes
+
+CREATE TABLE edge (                                            -- ordered by all columns, in this order
+  relation relation, src_is_ego BOOLEAN, dst_is_ego BOOLEAN, src_kind kind, dst_kind kind,
+  bucket BIGINT, src INTEGER, dst INTEGER, mask BIGINT);
+
+CREATE TABLE lane_state (                                      -- attributes of isIn edges from entities to lanes
+  kind kind, frame_id BIGINT, node_id INTEGER, lane INTEGER,
+  overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN);   -- offset to the left, m; rad
+
+CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
+  bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
+  chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
+
+-- Maps: once each, whatever the number of traces on them ----------------------------------------------------------
+
+CREATE TABLE map (map_id INTEGER, digest VARCHAR, name VARCHAR, text VARCHAR);
+
+CREATE TABLE map_node (
+  map_id INTEGER, node_id INTEGER, kind kind, name VARCHAR,   -- name: 'road/section/lane' of a lane, else the id in the map
+  x DOUBLE, y DOUBLE, z DOUBLE, heading DOUBLE,                -- a point on it, and its direction there
+  lane_type VARCHAR, road VARCHAR, section INTEGER, lane INTEGER, junction VARCHAR, turn VARCHAR,
+  length DOUBLE, width DOUBLE, speed_limit DOUBLE);            -- m, m (mean), m/s
+
+CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
+  map_id INTEGER, relation relation, src_kind kind, dst_kind kind, src INTEGER, dst INTEGER);
+
+-- For the compiler ------------------------------------------------------------------------------------------------
+
+CREATE TABLE bits (bit TINYINT, m BIGINT);                     -- 0 … 59 and 1 << bit
+INSERT INTO bits SELECT range::TINYINT, 1::BIGINT << range FROM range(60);
+
+-- The public views -------------------------------------------------------------------------------------------------
+--
+-- One row per thing per frame; metres, seconds, m/s, degrees; a heading or bearing is counter-clockwise, in (-180, 180].
+-- They are written so that filters on frame_id, relation and kinds reach the scans of the tables, and so that joining
+-- them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).
+
+CREATE VIEW frames AS
+SELECT f.frame_id, f.trace_id, f.seq, f.time_ns, f.ego, t.name AS trace, (f.time_ns - t.start_ns) / 1e9 AS t, f.log_time_ns, m.name AS map
+FROM frame f JOIN trace t ON t.trace_id = f.trace_id LEFT JOIN map m ON m.map_id = f.map_id;
+
+COMMENT ON VIEW frames IS 'One row a frame. ego: node_id of the ego, NULL where it is absent; trace: name of the recording; t: seconds since the trace began; log_time_ns: of the leading message; map: name of the road map, NULL without one.';
+
+CREATE VIEW nodes AS
+SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS name, s.special, s.subkind, false AS is_static,
+       t.origin_x + s.x AS x, t.origin_y + s.y AS y, t.origin_z + s.z AS z,
+       degrees(s.heading) AS heading, degrees(s.pitch) AS pitch, degrees(s.roll) AS roll, s.speed, s.vx, s.vy, s.vz,
+       s.ax * cos(s.heading) + s.ay * sin(s.heading) AS accel, s.ax, s.ay, s.az, degrees(s.yaw_rate) AS yaw_rate,
+       s.length, s.width, s.height, s.light_state,
+       (s.lights & 1) <> 0 AS light_left, (s.lights & 2) <> 0 AS light_right, (s.lights & 4) <> 0 AS light_brake,
+       (s.lights & 8) <> 0 AS light_reverse, (s.lights & 16) <> 0 AS light_position, (s.lights & 32) <> 0 AS light_low_beam,
+       (s.lights & 64) <> 0 AS light_high_beam, (s.lights & 128) <> 0 AS light_fog, (s.lights & 256) <> 0 AS light_interior,
+       (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake,
+       (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
+       NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
+       NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit
+FROM state s JOIN trace t ON t.trace_id = s.frame_id >> 24
+UNION ALL
+SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
+       NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
+       NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
+       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit
+FROM frame f JOIN (
+  SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
+         m.length, m.width, NULL::FLOAT AS height, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit
+  FROM bucket b JOIN node k ON k.bucket = b.bucket JOIN map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
+  UNION ALL
+  SELECT k.bucket, k.mask, k.node_id, k.kind, k.kind || ' ' || k.node_id, e.special, e.subkind,
+         t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+  FROM node k JOIN trace t ON t.trace_id = k.bucket >> 18 JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
+) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
+
+COMMENT ON VIEW nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s; accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+
+CREATE VIEW edges AS
+SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego
+FROM frame f JOIN (
+  SELECT bucket, mask, src, relation, dst, src_kind, dst_kind, src_is_ego, dst_is_ego FROM edge
+  UNION ALL
+  SELECT b.bucket, s.mask & d.mask, m.src, m.relation, m.dst, m.src_kind, m.dst_kind, false, false
+  FROM bucket b JOIN node s ON s.bucket = b.bucket JOIN map_edge m ON m.map_id = b.map_id AND m.src = s.node_id
+       JOIN node d ON d.bucket = b.bucket AND d.node_id = m.dst
+  WHERE (s.mask & d.mask) <> 0
+) e ON e.bucket = f.bucket AND (e.mask & (1::BIGINT << f.bit)) <> 0;
+
+COMMENT ON VIEW edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst).';
+
+CREATE VIEW lane_states AS
+SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary
+FROM lane_state;
+
+COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all.';
+
+-- Pairs are not stored: they are functions of two states. The same formulas as geometry.py (a test holds them together);
+-- each layer names what the next one needs, because DuckDB shares named columns and not repeated expressions. Around the
+-- centre of a lies the octagon that both boxes make (Minkowski sum); s1 … s4: how far b's centre is beyond the edges across
+-- a's axes and b's, t1 … t4: how far past their ends.
+CREATE VIEW pairs AS
+SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * ceil((bearing - 180) / 360) AS bearing,
+       turned - 360 * ceil((turned - 180) / 360) AS rel_heading, px AS lon, py AS lat, closing_speed,
+       CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS ttc,
+       CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
+       src_kind, dst_kind, src_is_ego, dst_is_ego
+FROM (
+  SELECT *, CASE WHEN la + wa + lb + wb IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
+      CASE WHEN s1 > 0 THEN s1 * s1 + greatest(t1, 0) * greatest(t1, 0) END, CASE WHEN s2 > 0 THEN s2 * s2 + greatest(t2, 0) * greatest(t2, 0) END,
+      CASE WHEN s3 > 0 THEN s3 * s3 + greatest(t3, 0) * greatest(t3, 0) END, CASE WHEN s4 > 0 THEN s4 * s4 + greatest(t4, 0) * greatest(t4, 0) END)) END AS gap
+  FROM (
+    SELECT *,
+        abs(px) - la - lb * co - wb * si AS s1, abs(CASE WHEN px < 0 THEN -py ELSE py END - k * (lb * si - wb * co)) - wa AS t1,
+        abs(py) - wa - lb * si - wb * co AS s2, abs(CASE WHEN py < 0 THEN -px ELSE px END - k * (lb * co - wb * si)) - la AS t2,
+        abs(qx) - lb - la * co - wa * si AS s3, abs(CASE WHEN qx < 0 THEN -qy ELSE qy END + k * (la * si - wa * co)) - wb AS t3,
+        abs(qy) - wb - la * si - wa * co AS s4, abs(CASE WHEN qy < 0 THEN -qx ELSE qx END + k * (la * co - wa * si)) - lb AS t4
+    FROM (
+      SELECT *, dx * ca + dy * sa AS px, dy * ca - dx * sa AS py, dx * cb + dy * sb AS qx, dy * cb - dx * sb AS qy,
+          abs(c) AS co, abs(s) AS si, CASE WHEN c * s < 0 THEN -1 ELSE 1 END AS k,
+          -(dx * dvx + dy * dvy) / nullif(sqrt(dd), 0) AS closing_speed
+      FROM (
+        SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd,
+            CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned
+        FROM (
+          SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
+              b.x::DOUBLE - a.x AS dx, b.y::DOUBLE - a.y AS dy, b.z::DOUBLE - a.z AS dz, b.vx::DOUBLE - a.vx AS dvx, b.vy::DOUBLE - a.vy AS dvy,
+              a.heading::DOUBLE AS ha, b.heading::DOUBLE AS hb,
+              cos(a.heading::DOUBLE) AS ca, sin(a.heading::DOUBLE) AS sa, cos(b.heading::DOUBLE) AS cb, sin(b.heading::DOUBLE) AS sb,
+              a.length::DOUBLE / 2 AS la, a.width::DOUBLE / 2 AS wa, b.length::DOUBLE / 2 AS lb, b.width::DOUBLE / 2 AS wb,
+              sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
+          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))));
+
+COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s.';
+
+CREATE VIEW lanes AS
+SELECT m.name AS map, n.node_id, n.name, n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.x, n.y, n.z, degrees(n.heading) AS heading,
+       n.length, n.width, n.speed_limit
+FROM map_node n JOIN map m ON m.map_id = n.map_id
+WHERE n.kind = 'lane';
+
+COMMENT ON VIEW lanes IS 'One row a lane of a road map. name: road/section/lane; x, y, z, heading: a point of its centre line and the direction of travel there, m and degrees; width: mean, m; speed_limit: m/s; turn: where a lane in a junction leads. node_id is unique in its map.';
+
+CREATE VIEW entities AS
+SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.ident, e.special, e.subkind, e.type_name, e.is_static, e.map_ref,
+       t.origin_x + e.x AS x, t.origin_y + e.y AS y, t.origin_z + e.z AS z, degrees(e.heading) AS heading, e.length, e.width, e.height
+FROM entity e JOIN trace t ON t.trace_id = e.trace_id;
+
+COMMENT ON VIEW entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is.';
+
+CREATE VIEW payloads AS
+SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, t.uri AS file,
+       p.chunk_offset, p."offset" AS message_offset, p.length
+FROM frame f JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
+     JOIN channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN trace t ON t.trace_id = f.trace_id;
+
+COMMENT ON VIEW payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';

@@ -1,0 +1,16 @@
+"""The store: one DuckDB file, and the only room that knows DuckDB.
+
+``file`` is its face · ``access`` lets readers and writers share the file · ``rows`` runs statements, users'
+too · ``traces`` names traces and frames · ``scenes`` puts one graph together · ``packing`` turns the graphs
+of a block into columns and masks · ``segment`` builds a trace aside, in tables that wait in ``staging`` and a
+``folder`` beside the store; ``payloads`` joins its messages to its frames, ``publishing`` brings it in ·
+``schema`` makes an empty store from ``schema.sql`` · ``parquet`` writes rows to a file.
+"""
+
+from sgstore.store.file import StoreFile
+from sgstore.store.parquet import write_parquet
+from sgstore.store.rows import Batches, Rows
+from sgstore.store.segment import Segment
+from sgstore.store.traces import FrameRef, StoredTrace
+
+__all__ = ["Batches", "FrameRef", "Rows", "Segment", "StoreFile", "StoredTrace", "write_parquet"]

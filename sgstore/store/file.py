@@ -1,0 +1,412 @@
+"""A store: one DuckDB file, opened only while it is read or published to."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import StoreError, TraceError
+from sgstore.store import rows, schema
+from sgstore.store.access import Access, default_memory, spill_folder, translated
+from sgstore.store.folder import Folder
+from sgstore.store.publishing import copy_sorted, remove
+from sgstore.store.rows import Batches, Rows
+from sgstore.store.scenes import Scenes
+from sgstore.store.segment import Segment
+from sgstore.store.staging import scratch
+from sgstore.store.traces import (
+    FrameRef,
+    Identity,
+    StoredTrace,
+    already_stored,
+    frame_named,
+    stored_traces,
+    trace_named,
+)
+from sgstore.vocabulary import suggestion
+from sgstore.world import Channel, MessageRefs
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.graph import SceneGraph
+    from sgstore.lang import Catalog
+    from sgstore.roads import RoadMap
+    from sgstore.store.rows import Parameters
+    from sgstore.world import TraceInfo
+
+WAIT_S: Final = 60.0
+"""How long to wait for others that read or write; s."""
+
+BATCH: Final = 10_000
+"""Rows of a batch."""
+
+
+class StoreFile:
+    """A store, by its path. It is opened only while something is asked of it or published to it.
+
+    Parameters
+    ----------
+    path : str or Path
+    memory : int
+        Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is
+        less. Beyond it the database spills to temporary files.
+    wait_s : float
+        How long to wait for others that write, or read while this one writes; s.
+
+    Raises
+    ------
+    StoreError
+        There is no such file, it is no store, or one of another version.
+    """
+
+    def __init__(self, path: str | Path, *, memory: int = 0, wait_s: float = WAIT_S) -> None:
+        self.path = Path(path)
+        self._memory = memory or default_memory()
+        self._access = Access(self.path, memory=self._memory, wait_s=wait_s)
+        self._scenes = Scenes()
+        self._seen: set[tuple[str, int, int]] = set()
+        with self._reading() as connection:
+            schema.check_version(connection, self.path)
+
+    @classmethod
+    def create(cls, path: str | Path, *, memory: int = 0, wait_s: float = WAIT_S) -> StoreFile:
+        """The store at a path, made empty if nothing is there.
+
+        Raises
+        ------
+        StoreError
+            What is there is no store, or one of another version; or its folder cannot be written.
+        """
+        path = Path(path)
+        if not path.exists():
+            schema.create(path)
+        return cls(path, memory=memory, wait_s=wait_s)
+
+    @contextmanager
+    def snapshot(self) -> Generator[None]:
+        """Keep the store open for several questions: they see the same state, and cost less."""
+        with self._reading():
+            yield
+
+    def rows(self, sql: str, parameters: Parameters | None = None) -> Rows:
+        """All rows of a statement of ours.
+
+        Parameters
+        ----------
+        sql : str
+            Trusted; users' statements go through :meth:`user_sql`.
+        parameters : sequence or mapping, optional
+            Values of ``?`` or of ``$name``.
+
+        Raises
+        ------
+        StoreError
+            The database refuses it.
+        """
+        with self._reading() as connection:
+            return rows.run(connection, sql, parameters)
+
+    def arrays(
+        self, sql: str, parameters: Parameters | None = None
+    ) -> dict[str, NDArray[np.generic]]:
+        """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL."""
+        with self._reading() as connection:
+            return rows.arrays(connection, sql, parameters)
+
+    @contextmanager
+    def batches(
+        self, sql: str, parameters: Parameters | None = None, size: int = BATCH
+    ) -> Generator[Batches]:
+        """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
+        with self._reading() as connection:
+            yield Batches(connection.execute(sql, parameters or None), size)
+
+    def user_sql(
+        self, sql: str, *, timeout_s: float | None = None, max_rows: int | None = None
+    ) -> Rows:
+        """All rows of a statement of a user's.
+
+        Parameters
+        ----------
+        sql : str
+            One statement that only reads. It sees the store and no files, and cannot change settings.
+        timeout_s : float, optional
+            When to stop it; s.
+        max_rows : int, optional
+            How many rows to give; ``Rows.truncated`` tells whether there are more.
+
+        Raises
+        ------
+        SqlError
+            It is not one statement that only reads, the database refuses it, or it runs for too long.
+        """
+        size = BATCH if max_rows is None else max(min(BATCH, max_rows + 1), 1)
+        values: list[tuple[Any, ...]] = []
+        with self.user_batches(sql, timeout_s=timeout_s, size=size) as batches:
+            for batch in batches:
+                values += batch.values
+                if max_rows is not None and len(values) > max_rows:
+                    break
+        more = max_rows is not None and len(values) > max_rows
+        return Rows(batches.columns, batches.types, values[:max_rows], truncated=more)
+
+    @contextmanager
+    def user_batches(
+        self, sql: str, *, timeout_s: float | None = None, size: int = BATCH
+    ) -> Generator[Batches]:
+        """The rows of a statement of a user's as a stream; see :meth:`user_sql`."""
+        with (
+            self._reading() as connection,
+            rows.user_statement(connection, sql, timeout_s=timeout_s, size=size) as batches,
+        ):
+            yield batches
+
+    def catalog(self) -> Catalog:
+        """What the store holds, as the compiler of queries wants to know it."""
+        from sgstore.lang import Catalog, TraceFacts  # the whole compiler: only for who wants one
+
+        with self._reading() as connection:
+
+            def counted(table: str) -> dict[tuple[str, str, str], int]:
+                sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM {table} GROUP BY ALL"
+                return {(r, a, b): n for r, a, b, n in connection.execute(sql).fetchall()}
+
+            def kinds(of: str) -> frozenset[str]:
+                found = connection.execute(f"SELECT DISTINCT kind FROM {of}").fetchall()
+                return frozenset(kind for (kind,) in found)
+
+            return Catalog(
+                edges=counted("edge"),
+                map_edges=counted("map_edge"),
+                moving=kinds("entity WHERE NOT is_static"),
+                fixed=kinds("entity WHERE is_static"),
+                mapped=kinds("map_node"),
+                traces=tuple(
+                    TraceFacts(t.trace_id, t.name, t.ego, frozenset(t.answers))
+                    for t in stored_traces(connection)
+                ),
+            )
+
+    def traces(self) -> tuple[StoredTrace, ...]:
+        """All traces, in the order in which they came."""
+        with self._reading() as connection:
+            return stored_traces(connection)
+
+    def trace(self, ref: int | str) -> StoredTrace:
+        """A trace by its name, its id, or a unique beginning of its name.
+
+        Raises
+        ------
+        StoreError
+            None or several are meant; it says which there are.
+        """
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(ref))
+            return next(t for t in stored_traces(connection) if t.trace_id == trace_id)
+
+    def frame(self, ref: int | str) -> FrameRef:
+        """A frame by its id, ``TRACE#SEQ``, or ``TRACE@12.3s``: the last one at or before that time.
+
+        Parameters
+        ----------
+        ref : int or str
+            TRACE is what :meth:`trace` takes; the time is seconds since the trace began.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame; it says which there are.
+        """
+        with self._reading() as connection:
+            return frame_named(connection, ref)
+
+    def graph(self, ref: int | str) -> SceneGraph:
+        """The scene graph of a frame, as :meth:`frame` takes it: all that the views show of it.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame.
+        """
+        with self._reading() as connection:
+            return self._scenes.graph(connection, frame_named(connection, ref))
+
+    def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
+        """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = (
+                "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
+                " WHERE t.trace_id = ?"
+            )
+            return connection.execute(sql, [trace_id]).fetchone()
+
+    def channels(self, trace: int | str) -> tuple[Channel, ...]:
+        """Channels of the recording of a trace; ``messages`` is -1."""
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = (
+                "SELECT channel_id, coalesce(topic, ''), coalesce(schema, ''), coalesce(schema_encoding, ''),"
+                " coalesce(message_encoding, ''), -1, role FROM channel WHERE trace_id = ? ORDER BY channel_id"
+            )
+            return tuple(Channel(*row) for row in connection.execute(sql, [trace_id]).fetchall())
+
+    def context(self, trace: int | str) -> MessageRefs:
+        """Places of the messages that later ones of a trace depend on; ``channel`` counts :meth:`channels`."""
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = (
+                "WITH number AS (SELECT channel_id, row_number() OVER (ORDER BY channel_id) - 1 AS channel"
+                " FROM channel WHERE trace_id = $trace)"
+                ' SELECT n.channel, c.log_time_ns, c.chunk_offset, c."offset", c.length'
+                " FROM context c JOIN number n ON n.channel_id = c.channel_id WHERE c.trace_id = $trace"
+                ' ORDER BY c.log_time_ns, c.chunk_offset, c."offset"'
+            )
+            columns = rows.arrays(connection, sql, {"trace": trace_id})
+            return MessageRefs(*(column.astype(np.int64) for column in columns.values()))
+
+    def payload(self, ref: int | str, channel: str) -> bytes:
+        """The data of the message of a channel that belongs to a frame, read from the recording.
+
+        Parameters
+        ----------
+        ref : int or str
+            What :meth:`frame` takes.
+        channel : str
+            Topic.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame or channel, or no message of the channel belongs to the frame.
+        TraceError
+            The recording is gone, was replaced, or is damaged there.
+        """
+        from sgstore.traces import read_message
+
+        with self._reading() as connection:
+            frame = frame_named(connection, ref)
+            found = connection.execute(
+                "SELECT chunk_offset, message_offset, length FROM payloads"
+                " WHERE frame_id = ? AND channel = ? ORDER BY abs(offset_s) LIMIT 1",
+                [frame.frame_id, channel],
+            ).fetchone()
+            if found is None:
+                raise _no_payload(connection, frame, channel)
+            sql = "SELECT uri, size, mtime_ns, digest FROM trace WHERE trace_id = ?"
+            (recording,) = connection.execute(sql, [frame.trace_id]).fetchall()
+        path = self._unchanged(*recording)
+        chunk_offset, offset, length = found
+        return read_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
+
+    def _unchanged(self, uri: str, size: int, mtime_ns: int, digest: str) -> Path:
+        """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
+        from sgstore.traces import digest_of
+
+        path = Path(uri)
+        try:
+            now = path.stat()
+        except OSError as error:
+            raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
+        mark = (uri, now.st_size, now.st_mtime_ns)
+        if mark != (uri, size, mtime_ns) and mark not in self._seen:
+            if now.st_size != size or digest_of(path) != digest:
+                raise TraceError("not the file that was ingested; ingest it anew", path=path)
+            self._seen.add(mark)
+        return path
+
+    def stored(self, info: TraceInfo, config: Config, road_map: RoadMap | None) -> str | None:
+        """The name under which the store has a recording already; ``None`` if it has it not.
+
+        Raises
+        ------
+        StoreError
+            It has it with another config or map, or another trace has its id.
+        """
+        with self._reading() as connection:
+            return already_stored(connection, Identity.of(info, config, road_map))
+
+    def segment(
+        self,
+        info: TraceInfo,
+        config: Config,
+        *,
+        road_map: RoadMap | None = None,
+        answers: tuple[str, ...] = (),
+    ) -> Segment:
+        """A place to build the graphs of a trace, aside from the store, until they are published.
+
+        Parameters
+        ----------
+        info : TraceInfo
+        config : Config
+            What the graphs are made with.
+        road_map : RoadMap, optional
+            The map that they lie on.
+        answers : tuple of str
+            Relations that they can hold.
+        """
+        identity = Identity.of(info, config, road_map)
+        return Segment(self._access, info, identity, road_map, answers)
+
+    def remove(self, trace: int | str) -> StoredTrace:
+        """Delete a trace, in one transaction, with the settings and the map that no other trace has.
+
+        Raises
+        ------
+        StoreError
+            There is no such trace, or others keep the store for too long.
+        """
+        gone = self.trace(trace)
+        with scratch(spill_folder()) as connection, self._access.writing(connection):
+            remove(connection, gone.trace_id)
+        return gone
+
+    def compact(self) -> None:
+        """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
+
+        Traces come one behind the other, so that a scan for one relation looks into all of them; and what was
+        removed leaves holes. Answers are the same. It is worth its time after many traces have come or gone.
+
+        Raises
+        ------
+        StoreError
+            Others keep the store for too long, or there is no room for a second one.
+        """
+        database = scratch(spill_folder(), memory=self._memory, threads=os.cpu_count() or 1)
+        with (
+            Folder(self.path) as beside,
+            database as connection,
+            self._access.attached(connection),
+        ):
+            schema.attach_empty(connection, beside.path / "store")
+            copy_sorted(connection)
+            connection.execute("DETACH fresh")
+            (beside.path / "store").replace(self.path)
+
+    @contextmanager
+    def _reading(self) -> Generator[DuckDBPyConnection]:
+        with self._access.reading() as connection, translated(self.path):
+            yield connection
+
+
+def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -> StoreError:
+    sql = "SELECT topic, role FROM channel WHERE trace_id = ? ORDER BY topic"
+    roles = dict(connection.execute(sql, [frame.trace_id]).fetchall())
+    if channel not in roles:
+        like = suggestion(channel, [topic for topic in roles if topic])
+        hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(map(repr, roles))}"
+        return StoreError(f"no channel {channel!r} in {frame.trace!r}; {hint}")
+    reason = "no message near enough in time"
+    if roles[channel] == "map":
+        reason = "it holds the map, which belongs to all frames"
+    return StoreError(f"no message of {channel!r} belongs to {frame.trace}#{frame.seq}: {reason}")

@@ -1,0 +1,119 @@
+"""Which message of each channel belongs to a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.config import Payloads
+    from sgstore.world import Channel, Ints
+
+_SAMPLE: Final = 8192
+"""Messages from which the period of a channel is told: its first ones, so that memory stays bounded."""
+
+JOIN: Final = """
+WITH wanted AS (
+  SELECT f.bucket, f.bit, f.log_time_ns, c.channel_id, c.tolerance_ns
+  FROM frame f CROSS JOIN tolerance c),
+said AS (  -- of messages of one time the last one in the file
+  SELECT channel, log_time_ns,
+         max(struct_pack(chunk_offset := chunk_offset, "offset" := "offset", length := length)) AS place
+  FROM {messages} GROUP BY ALL),
+found AS (
+  SELECT w.*, b.log_time_ns AS before_ns, b.place AS before, a.log_time_ns AS after_ns, a.place AS after
+  FROM wanted w
+    ASOF LEFT JOIN said b ON b.channel = w.channel_id AND b.log_time_ns <= w.log_time_ns
+    ASOF LEFT JOIN said a ON a.channel = w.channel_id AND a.log_time_ns >= w.log_time_ns),
+chosen AS (
+  SELECT *, $nearest
+         AND coalesce(after_ns - log_time_ns < log_time_ns - before_ns, after_ns IS NOT NULL) AS later
+  FROM found),
+joined AS (
+  SELECT bucket, bit, channel_id, log_time_ns AS frame_ns, tolerance_ns,
+         CASE WHEN later THEN after_ns ELSE before_ns END AS log_time_ns,
+         CASE WHEN later THEN after ELSE before END AS place
+  FROM chosen)
+SELECT bucket, bit, bucket >> 18 AS trace_id, channel_id, log_time_ns,
+       place.chunk_offset AS chunk_offset, place."offset" AS "offset", place.length AS length
+FROM joined WHERE abs(log_time_ns - frame_ns) <= tolerance_ns
+"""
+"""Messages of sensors: the nearest in log time, the earlier of two that are equally near; or the latest."""
+
+OWN: Final = """
+SELECT f.bucket, f.bit, f.bucket >> 18, m.channel, m.log_time_ns, m.chunk_offset, m."offset", m.length
+FROM (SELECT *, row_number() OVER (PARTITION BY log_time_ns ORDER BY frame_id) AS turn FROM frame) f
+JOIN (SELECT *, row_number() OVER (PARTITION BY log_time_ns ORDER BY chunk_offset, "offset") AS turn
+      FROM {messages} WHERE channel IN (SELECT unnest($leading))) m
+  ON m.log_time_ns = f.log_time_ns AND m.turn = f.turn
+"""
+"""The messages that frames are: of frames of one time the first is the first message, and so on."""
+
+
+@dataclass(slots=True)
+class Periods:
+    """How often the messages of channels come, told from the first ones.
+
+    Attributes
+    ----------
+    times : dict
+        Channel id → log times of its first messages, in pieces; ns. -1: the frames themselves.
+    counts : dict
+        Channel id → how many these are.
+    """
+
+    times: dict[int, list[Ints]] = field(default_factory=dict[int, "list[Ints]"])
+    counts: dict[int, int] = field(default_factory=dict[int, int])
+
+    def see(self, channel: int, log_time_ns: Ints) -> None:
+        """Take note of messages."""
+        count = self.counts.get(channel, 0)
+        if count <= _SAMPLE and len(log_time_ns):
+            piece = log_time_ns[: _SAMPLE + 1 - count]
+            self.times.setdefault(channel, []).append(piece)
+            self.counts[channel] = count + len(piece)
+
+    def of(self, channel: int) -> float:
+        """Median difference of log times; ns. 0 if there are fewer than two messages."""
+        times = np.sort(np.concatenate(self.times.get(channel, [np.zeros(0, np.int64)])))
+        return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+
+
+FRAMES: Final = -1
+"""The frames themselves, as a channel of :class:`Periods`."""
+
+
+def join(
+    connection: DuckDBPyConnection,
+    messages: str,
+    channels: tuple[Channel, ...],
+    periods: Periods,
+    settings: Payloads,
+) -> None:
+    """Fill the table ``payload`` of a trace; ``messages`` is a statement that gives all that were seen."""
+    nearest, said = settings.join == "nearest", f"({messages})"
+    connection.execute(
+        "CREATE OR REPLACE TEMP TABLE tolerance (channel_id INTEGER, tolerance_ns BIGINT)"
+    )
+    leading = [c.id for c in channels if c.role == "ground_truth"]
+    sensors = [c.id for c in channels if c.role == "payload"]
+    if sensors:
+        for channel in sensors:
+            allowed = tolerance_ns(periods, channel, settings)
+            connection.execute("INSERT INTO tolerance VALUES (?, ?)", [channel, allowed])
+        connection.execute(
+            f"INSERT INTO payload BY NAME {JOIN.format(messages=said)}", {"nearest": nearest}
+        )
+    connection.execute(f"INSERT INTO payload {OWN.format(messages=said)}", {"leading": leading})
+
+
+def tolerance_ns(periods: Periods, channel: int, settings: Payloads) -> int:
+    """Greatest difference of log times between a frame and its message; ns."""
+    if settings.tolerance:
+        return round(settings.tolerance * 1e9)
+    period = max(periods.of(channel), periods.of(FRAMES))
+    return int(period / 2 if settings.join == "nearest" else period)

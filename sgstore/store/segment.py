@@ -1,0 +1,210 @@
+"""A trace on its way into a store: built aside, block by block, and published in one short transaction.
+
+The store itself is touched only to publish: then a trace is in it, with everything that belongs to it, or not
+at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from sgstore.errors import StoreError
+from sgstore.store import packing, payloads
+from sgstore.store.access import translated
+from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
+from sgstore.store.publishing import publish
+from sgstore.store.staging import Staging
+from sgstore.world import BUCKET_FRAMES
+
+if TYPE_CHECKING:
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.store.access import Access
+    from sgstore.store.packing import Columns
+    from sgstore.store.traces import Identity
+    from sgstore.world import TraceInfo, TraceReport
+
+
+class Segment:
+    """The graphs of one trace, until they are published. Made by :meth:`StoreFile.segment`.
+
+    Parameters
+    ----------
+    access : Access
+    info : TraceInfo
+    identity : Identity
+        What the trace is in the store, and the settings it was read with.
+    road_map : RoadMap or None
+    answers : tuple of str
+        Relations that the generator can answer.
+
+    Notes
+    -----
+    Use it as a context manager: what was not published when it is left is forgotten.
+    """
+
+    def __init__(
+        self,
+        access: Access,
+        info: TraceInfo,
+        identity: Identity,
+        road_map: RoadMap | None,
+        answers: tuple[str, ...],
+    ) -> None:
+        self._access = access
+        self._info = info
+        self._identity = identity
+        self._answers = answers
+        self._road_map = road_map
+        self._channel_ids = np.array([c.id for c in info.channels], np.int64)
+        self._kinds = NodeKinds(
+            entities=np.zeros(0, np.int8),
+            map=np.zeros(0, np.int8) if road_map is None else road_map.nodes.kind,
+        )
+        self._origin: Origin | None = None
+        self._periods = payloads.Periods()
+        self._next_seq = 0
+        self._staging = Staging(access.path)
+        try:
+            self._insert_about()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Forget the segment. What was published stays."""
+        self._staging.close()
+
+    def append(self, graph: GraphBlock) -> None:
+        """Add the next frames of the trace.
+
+        Raises
+        ------
+        StoreError
+            The trace is longer than a store can number, or the disk is full.
+        ValueError
+            Frames are not consecutive, or nodes were not introduced: a defect of the caller.
+        """
+        frames = graph.frames
+        if not len(frames):
+            return
+        seq = self._next_seq + np.arange(len(frames))
+        if not np.array_equal(frames.seq, seq):
+            raise ValueError(f"expected frames {seq[0]} … {seq[-1]}, got seq {frames.seq}")
+        if seq[-1] >= MAX_FRAMES:
+            raise StoreError(f"{self._info.path}: more than {MAX_FRAMES} frames in one trace")
+        self._staging.settle(whole=self._next_seq % BUCKET_FRAMES == 0)
+        self._next_seq += len(frames)
+        self._kinds.learn(frames.entities)
+        self._origin = self._origin or packing.origin_of(graph)
+        self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
+        self._see_messages(graph)
+
+    def publish(self, report: TraceReport) -> str:
+        """Bring the trace into the store, in one transaction.
+
+        Returns
+        -------
+        str
+            The name of the trace in the store.
+
+        Raises
+        ------
+        StoreError
+            The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
+        ValueError
+            There are no frames.
+        """
+        if not self._next_seq:
+            raise ValueError("a trace without frames")
+        staging = self._staging
+        with translated(self._access.path):
+            payloads.join(
+                staging.connection,
+                staging.all_messages(),
+                self._info.channels,
+                self._periods,
+                self._identity.payloads,
+            )
+            with self._access.writing(staging.connection):
+                values = self._trace_values(report)
+                return publish(staging, self._info, self._identity, values, self._road_map)
+
+    def _trace_values(self, report: TraceReport) -> dict[str, Any]:
+        origin = self._origin or Origin(0.0, 0.0, 0.0)
+        return {
+            "origin_x": origin.x,
+            "origin_y": origin.y,
+            "origin_z": origin.z,
+            "answers": list(self._answers),
+            "report": packing.as_json(asdict(report)),
+        }
+
+    def _insert_about(self) -> None:
+        """What is known before the first frame."""
+        insert = self._staging.insert
+        insert("channel", _channel_columns(self._info))
+        context = packing.message_columns(self._info.context, self._channel_ids)
+        context["channel_id"] = context.pop("channel")
+        insert("context", context)
+        if self._road_map is not None:
+            insert("map_node", _map_node_columns(self._road_map))
+            insert("map_edge", _map_edge_columns(self._road_map))
+
+    def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
+        kinds, insert = self._kinds, self._staging.insert
+        insert("frame", packing.frame_columns(graph, trace_id))
+        insert("entity", packing.entity_columns(graph, origin))
+        insert("state", packing.state_columns(graph, trace_id, kinds, origin))
+        insert("node", packing.node_columns(graph, trace_id, kinds))
+        insert("edge", packing.edge_columns(graph, trace_id, kinds))
+        insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
+
+    def _see_messages(self, graph: GraphBlock) -> None:
+        messages = packing.message_columns(graph.frames.messages, self._channel_ids)
+        self._staging.insert("message", messages)
+        self._periods.see(payloads.FRAMES, graph.frames.log_time_ns)
+        channel = messages["channel"]
+        for number in np.unique(channel).tolist():
+            self._periods.see(number, messages["log_time_ns"][channel == number])
+
+
+def _channel_columns(info: TraceInfo) -> Columns:
+    names = ("topic", "schema", "schema_encoding", "message_encoding", "role")
+    columns: Columns = {name: texts(getattr(c, name) for c in info.channels) for name in names}
+    return columns | {"channel_id": np.array([c.id for c in info.channels], np.int64)}
+
+
+def _map_node_columns(road_map: RoadMap) -> Columns:
+    nodes = road_map.nodes
+    count = len(nodes)
+    is_lane = np.array([bool(kind) for kind in nodes.lane_type], np.bool_)
+    columns: Columns = {
+        name: texts(getattr(nodes, name))
+        for name in ("name", "lane_type", "road", "junction", "turn")
+    }
+    for name in ("x", "y", "z", "heading", "length", "width", "speed_limit"):
+        columns[name] = getattr(nodes, name)
+    for name in ("section", "lane"):
+        columns[name] = packing.unless(getattr(nodes, name), ~is_lane)
+    return columns | {"node_id": -1 - np.arange(count), "kind": nodes.kind}
+
+
+def _map_edge_columns(road_map: RoadMap) -> Columns:
+    edges, kind = road_map.edges, road_map.nodes.kind
+    return {
+        "relation": edges.relation,
+        "src": edges.src,
+        "dst": edges.dst,
+        "src_kind": kind[-1 - edges.src],
+        "dst_kind": kind[-1 - edges.dst],
+    }

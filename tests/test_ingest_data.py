@@ -1,0 +1,101 @@
+"""Real recordings of many producers into one store."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.reader import make_reader
+
+from sgstore.ingest import TraceOutcome, ingest
+from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.data
+
+FLAVOURS = ("osi_converter/*.mcap", "omega_prime/*.mcap", "esmini/*.mcap", "sumo/*.mcap")
+
+
+@pytest.fixture(scope="module")
+def ingested(data, tmp_path_factory) -> Iterator[tuple[StoreFile, list[TraceOutcome]]]:
+    paths = [path for flavour in FLAVOURS for path in sorted((data / "traces").glob(flavour))]
+    place = tmp_path_factory.mktemp("data") / "s.db"
+    outcomes = ingest(place, paths)
+    store = StoreFile(place)
+    with store.snapshot():
+        yield store, outcomes
+
+
+def said(path: Path, topic: str) -> dict[int, bytes]:
+    """Messages of a channel by log time, as the official reader reads them."""
+    with path.open("rb") as stream:
+        return {m.log_time: m.data for _, _, m in make_reader(stream).iter_messages(topics=[topic])}
+
+
+def test_everything_comes_in_without_a_loss(ingested) -> None:
+    _, outcomes = ingested
+
+    assert len(outcomes) == 11
+    assert {o.path.stem: (o.status, o.losses, o.error) for o in outcomes} == {
+        o.path.stem: ("added", [], None) for o in outcomes
+    }
+
+
+def test_each_message_of_the_leading_channel_is_a_frame_and_is_read_back(ingested) -> None:
+    store, _ = ingested
+    for trace in store.traces():
+        (leading,) = (c.topic for c in store.channels(trace.trace_id) if c.role == "ground_truth")
+        messages = said(trace.path, leading)
+        sql = "SELECT frame_id, log_time_ns FROM frames WHERE trace_id = ? ORDER BY seq"
+        frames = store.rows(sql, [trace.trace_id]).values
+
+        assert [time for _, time in frames] == sorted(messages)
+        for frame, time in frames[:: max(len(frames) // 5, 1)]:
+            assert store.payload(frame, leading) == messages[time]
+
+
+def test_lights_change_their_state(ingested) -> None:
+    store, _ = ingested
+    sql = """
+      SELECT n.name, count(DISTINCT n.light_state) FROM nodes n JOIN frames USING (frame_id)
+      WHERE trace = 'traffic_lights' AND n.kind = 'traffic_light' AND NOT n.is_static GROUP BY n.name
+    """
+
+    assert max(states for _, states in store.rows(sql)) > 1
+
+
+def test_vehicles_of_the_swarm_drive_on_driving_lanes(ingested) -> None:
+    store, _ = ingested
+    vehicles = "n.kind IN ('car', 'truck', 'van', 'bus', 'motorcycle', 'trailer')"
+    sql = f"""
+      WITH swarm AS (
+        SELECT n.frame_id, n.node_id, f.map FROM nodes n JOIN frames f USING (frame_id)
+        WHERE f.trace = 'swarm_Town04' AND NOT n.is_static AND {vehicles})
+      SELECT count(DISTINCT (s.frame_id, s.node_id)) FILTER (l.lane_type = 'driving'),
+             count(DISTINCT (s.frame_id, s.node_id))
+      FROM swarm s LEFT JOIN edges e ON e.frame_id = s.frame_id AND e.src = s.node_id AND e.relation = 'isIn'
+           LEFT JOIN lanes l ON l.map = s.map AND l.node_id = e.dst
+    """
+
+    ((on_lanes, samples),) = store.rows(sql).values
+
+    assert on_lanes / samples >= 0.97
+
+
+def test_graphs_are_what_the_views_show(ingested) -> None:
+    store, _ = ingested
+    for trace in store.traces():
+        for seq in (0, trace.frames // 2, trace.frames - 1):
+            graph = store.graph(f"{trace.name}#{seq}")
+            edges = store.rows(
+                "SELECT src, relation, dst FROM edges WHERE frame_id = ?", [graph.frame_id]
+            )
+            nodes = store.rows("SELECT node_id FROM nodes WHERE frame_id = ?", [graph.frame_id])
+
+            assert Counter((s, r, d) for s, r, d, _ in graph.edges) == Counter(edges)
+            assert Counter((node,) for node in graph.nodes) == Counter(nodes)
+            assert {end for s, _, d, _ in graph.edges for end in (s, d)} <= graph.nodes.keys()

@@ -1,0 +1,94 @@
+"""The schema against the vocabulary, and what it promises in public."""
+
+from __future__ import annotations
+
+import duckdb
+import pytest
+
+from sgstore.store.schema import schema_sql, tables_sql
+from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATIONS, VEHICLE_LIGHTS
+from sgstore.world import BUCKET_FRAMES
+
+VIEWS = {
+    "frames": "frame_id trace_id seq time_ns ego trace t log_time_ns map",
+    "nodes": "frame_id node_id kind is_ego name special subkind is_static x y z heading pitch roll speed"
+    " vx vy vz accel ax ay az yaw_rate length width height light_state",
+    "edges": "frame_id src relation dst src_kind dst_kind src_is_ego dst_is_ego",
+    "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary",
+    "pairs": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
+    " rel_speed src_kind dst_kind src_is_ego dst_is_ego",
+    "lanes": "map node_id name lane_type road section lane junction turn x y z heading length width",
+    "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",
+    "payloads": "frame_id channel log_time_ns offset_s schema file chunk_offset message_offset length",
+}
+
+
+@pytest.fixture(scope="module")
+def empty() -> duckdb.DuckDBPyConnection:
+    connection = duckdb.connect()
+    connection.execute(schema_sql())
+    return connection
+
+
+@pytest.mark.parametrize(
+    ("enum", "names"),
+    [("kind", KINDS), ("relation", RELATIONS), ("light_state", LIGHT_STATES)],
+)
+def test_enumerations_are_the_vocabulary_in_its_order(empty, enum, names) -> None:
+    (values,) = empty.execute(f"SELECT enum_range(NULL::{enum})").fetchone()
+
+    assert tuple(values) == names
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_public_views_keep_their_columns(empty, view) -> None:
+    columns = [c[0] for c in empty.execute(f"SELECT * FROM {view}").description]
+
+    assert columns[: len(VIEWS[view].split())] == VIEWS[view].split()
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_column_of_a_public_view_needs_no_quotes(empty, view) -> None:
+    for column in empty.execute(f"SELECT * FROM {view}").description:
+        empty.execute(f"SELECT {column[0]} FROM {view}")
+
+
+def test_every_view_is_public_and_commented(empty) -> None:
+    found = empty.execute(
+        "SELECT view_name, comment FROM duckdb_views() WHERE NOT internal"
+    ).fetchall()
+
+    assert {name for name, _ in found} == set(VIEWS)
+    assert all(comment for _, comment in found)
+
+
+def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty) -> None:
+    columns = [c[0] for c in empty.execute("SELECT * FROM nodes").description]
+    empty.execute("INSERT INTO trace BY NAME SELECT 0 AS trace_id")
+    for bit in range(len(VEHICLE_LIGHTS)):
+        empty.execute(f"INSERT INTO state BY NAME SELECT {bit} AS frame_id, {1 << bit} AS lights")
+    lights = ", ".join(c for c in columns if c.startswith("light_") and c != "light_state")
+    rows = empty.execute(f"SELECT {lights} FROM nodes ORDER BY frame_id").fetchall()
+    empty.execute("DELETE FROM state")
+
+    assert lights == ", ".join(VEHICLE_LIGHTS)
+    assert [row.index(True) for row in rows] == list(range(len(VEHICLE_LIGHTS)))
+    assert all(row.count(True) == 1 for row in rows)
+
+
+def test_bits_are_those_of_the_frames_of_a_bucket(empty) -> None:
+    assert empty.execute("SELECT bit, m FROM bits ORDER BY bit").fetchall() == [
+        (bit, 1 << bit) for bit in range(BUCKET_FRAMES)
+    ]
+
+
+def test_no_table_has_keys_that_loading_would_pay_for(empty) -> None:
+    assert empty.execute("SELECT count(*) FROM duckdb_constraints()").fetchone() == (0,)
+
+
+def test_tables_come_before_the_views() -> None:
+    connection = duckdb.connect()
+    connection.execute(tables_sql())
+
+    assert "CREATE TABLE edge" in tables_sql()
+    assert "VIEW" not in tables_sql().split("VIEWS at the end")[1]

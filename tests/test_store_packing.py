@@ -1,0 +1,142 @@
+"""Masks and columns against sets and loops."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from graph_blocks import RandomTrace, map_stub
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sgstore.store.packing import (
+    NodeKinds,
+    Origin,
+    edge_columns,
+    frame_ids,
+    masks_of,
+    origin_of,
+    state_columns,
+)
+from sgstore.vocabulary import RELATIONS
+from sgstore.world import BUCKET_FRAMES
+
+SMALL = st.integers(-3, 3)
+FAR = st.integers(-(1 << 31), 1 << 31)
+
+
+@given(st.lists(st.tuples(SMALL, SMALL, SMALL, st.integers(0, 59)), max_size=60))
+def test_a_mask_holds_the_bits_of_all_rows_with_its_key(rows) -> None:
+    expected: dict[tuple[int, ...], set[int]] = defaultdict(set)
+    for *key, bit in rows:
+        expected[tuple(key)].add(bit)
+    table = np.array(rows, np.int64).reshape(-1, 4)
+
+    first, mask = masks_of(table[:, :3].T, table[:, 3])
+
+    found = {
+        tuple(table[row, :3].tolist()): {bit for bit in range(60) if value >> bit & 1}
+        for row, value in zip(first, mask.tolist(), strict=True)
+    }
+    assert found == expected
+    assert list(found) == sorted(found)
+
+
+@given(st.lists(st.tuples(FAR, FAR, FAR), min_size=1, max_size=20))
+def test_keys_that_are_far_apart_are_told_apart(rows) -> None:
+    table = np.array(rows, np.int64)
+
+    first, mask = masks_of(table.T, np.zeros(len(rows), np.int64))
+
+    assert [tuple(row) for row in table[first].tolist()] == sorted(set(rows))
+    assert set(mask.tolist()) == {1}
+
+
+def test_an_edge_that_holds_in_many_frames_is_one_row_a_bucket() -> None:
+    trace = RandomTrace(seed=3, frames=130, size=120, road_map=map_stub())
+    kinds = NodeKinds(np.zeros(0, np.int8), trace.road_map.nodes.kind)
+    kinds.learn(trace.blocks[0].frames.entities)
+    expected: dict[tuple[object, ...], int] = defaultdict(int)
+    frames, edges = trace.blocks[0].frames, trace.blocks[0].edges
+    for frame, relation, src, dst in zip(
+        *(a.tolist() for a in (edges.frame, edges.relation, edges.src, edges.dst)), strict=True
+    ):
+        ego = frames.ego[frame]
+        marks = (bool(src == ego), bool(dst == ego and ego >= 0))
+        expected[(relation, *marks, src, dst, frame // BUCKET_FRAMES)] |= 1 << frame % BUCKET_FRAMES
+
+    columns = edge_columns(trace.blocks[0], 5, kinds)
+
+    found = {
+        (r, a, b, s, d, bucket - (5 << 18)): mask
+        for r, a, b, s, d, bucket, mask in zip(
+            *(
+                columns[name].tolist()
+                for name in ["relation", "src_is_ego", "dst_is_ego", "src", "dst", "bucket", "mask"]
+            ),
+            strict=True,
+        )
+    }
+    assert found == expected
+    assert len(found) == len(columns["mask"])
+
+
+def test_off_road_is_not_the_ego_of_a_frame_without_one() -> None:
+    trace = RandomTrace(seed=4, frames=60, road_map=map_stub())
+    block = trace.blocks[0]
+    block.frames.ego[:] = -1
+    kinds = NodeKinds(np.zeros(0, np.int8), trace.road_map.nodes.kind)
+    kinds.learn(block.frames.entities)
+
+    assert (block.edges.dst == -1).any()
+    assert not edge_columns(block, 0, kinds)["dst_is_ego"].any()
+
+
+def test_ids_of_frames_are_what_the_schema_says() -> None:
+    trace_id, seq = (1 << 39) - 1, np.array([0, 59, 60, 61, BUCKET_FRAMES * (1 << 18) - 1])
+
+    ids = frame_ids(trace_id, seq)
+
+    assert (ids >> 24 == trace_id).all()
+    assert ((ids >> 6) == (trace_id << 18) + seq // 60).all()
+    assert (ids & 63 == seq % 60).all()
+    assert ids[-1] == (1 << 63) - 1 - 4  # the last id there can be: bit 59 of the last bucket
+
+
+def test_headings_are_cut_to_a_turn_also_as_short_floats() -> None:
+    trace = RandomTrace(seed=5, frames=60)
+    heading = trace.blocks[0].frames.states.heading
+    heading[:4] = [np.pi, -np.pi, 3 * np.pi, np.nextafter(np.pi, 4)]
+    kinds = NodeKinds(np.zeros(0, np.int8), np.zeros(0, np.int8))
+    kinds.learn(trace.blocks[0].frames.entities)
+
+    stored = state_columns(trace.blocks[0], 0, kinds, Origin(0, 0, 0))["heading"]
+
+    assert stored.dtype == np.float32
+    assert np.nanmax(np.abs(stored.astype(float))) <= np.pi
+    assert np.degrees(stored[:3].astype(float)) == pytest.approx([180, 180, 180])
+
+
+def test_positions_are_about_the_ego_s_first_one_in_whole_metres() -> None:
+    block = RandomTrace(seed=6, frames=60).blocks[0]
+    states = block.frames.states
+    first = np.flatnonzero(states.node == 0)[0]
+
+    origin = origin_of(block)
+
+    assert origin == Origin(
+        *(float(np.round(getattr(states, axis)[first])) for axis in ("x", "y", "z"))
+    )
+
+
+def test_a_block_without_positions_has_no_origin() -> None:
+    block = RandomTrace(seed=7, frames=60).blocks[0]
+    block.frames.states.x[:] = np.nan
+    block.frames.scenery.y[:] = np.inf
+
+    assert origin_of(block) is None
+
+
+def test_relations_fit_their_codes() -> None:
+    assert len(RELATIONS) < 1 << 7

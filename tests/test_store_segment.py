@@ -1,0 +1,417 @@
+"""Segments: a trace comes into a store as a whole, once, and nothing is left beside it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from graph_blocks import RandomTrace, map_stub, publish, trace_info
+
+from sgstore.config import Config, Range
+from sgstore.errors import StoreError
+from sgstore.store import StoreFile, staging
+from sgstore.store.traces import trace_id_of
+from sgstore.world import TraceReport
+
+TABLES = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
+TABLES += ("lane_state", "payload", "map", "map_node", "map_edge", "config")
+
+
+def content(store: StoreFile) -> dict[str, list[tuple[Any, ...]]]:
+    """All rows of all tables, but for when they came."""
+    without = {"trace": "EXCLUDE (ingested_at)"}
+    with store.snapshot():
+        return {
+            table: store.rows(f"SELECT * {without.get(table, '')} FROM {table} ORDER BY ALL").values
+            for table in TABLES
+        }
+
+
+@pytest.fixture
+def store(tmp_path) -> StoreFile:
+    return StoreFile.create(tmp_path / "s.db")
+
+
+def beside(store: StoreFile) -> list[str]:
+    return sorted(p.name for p in store.path.parent.iterdir() if p != store.path)
+
+
+def test_a_trace_is_not_in_the_store_before_it_is_published(store) -> None:
+    trace = RandomTrace(frames=130)
+    with store.segment(trace.info, Config()) as segment:
+        for graph in trace.blocks:
+            segment.append(graph)
+            assert store.traces() == ()
+        segment.publish(TraceReport())
+
+    assert len(store.traces()) == 1
+    assert beside(store) == []
+
+
+def test_what_is_not_published_is_forgotten(store) -> None:
+    trace = RandomTrace(frames=130)
+    with store.segment(trace.info, Config()) as segment:
+        segment.append(trace.blocks[0])
+        assert beside(store) != []
+
+    assert store.traces() == ()
+    assert beside(store) == []
+
+
+@pytest.mark.parametrize("size", [1, 61])
+def test_blocks_of_any_size_give_the_same_store(tmp_path, size) -> None:
+    stores = [StoreFile.create(tmp_path / name) for name in ("whole.db", "cut.db")]
+    roads = map_stub()
+    whole = RandomTrace(5, frames=75, size=75, road_map=roads)
+    publish(stores[0], whole)
+    cut = RandomTrace(5, frames=75, size=75, road_map=roads)
+    cut.blocks = [piece for block in cut.blocks for piece in pieces(block, size)]
+    publish(stores[1], cut)
+
+    assert content(stores[0]) == content(stores[1])
+
+
+@pytest.mark.parametrize("name", ["s.db", "it's [1]*.db"])
+def test_parts_that_wait_in_files_are_published_like_those_in_memory(
+    tmp_path, monkeypatch, name
+) -> None:
+    found = []
+    for rows, place in ((10**9, "memory.db"), (1, name)):
+        monkeypatch.setattr(staging, "PART_ROWS", rows)
+        store = StoreFile.create(tmp_path / place)
+        publish(store, RandomTrace(5, frames=200, road_map=map_stub()))
+        found.append(content(store))
+        assert beside(store) == [] or len(found) > 1
+
+    assert found[0] == found[1]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["memory.db", name])
+
+
+def test_a_trace_with_more_entities_than_are_sampled_comes_in(store) -> None:
+    publish(store, RandomTrace(frames=2, moving=2500))
+
+    sql = "SELECT count(*), count(special), count(map_ref) FROM entities"
+    assert store.rows(sql).values == [
+        (2500 + standing(store), (2500 + standing(store) + 1) // 3, 0)
+    ]
+
+
+def standing(store: StoreFile) -> int:
+    return store.rows("SELECT count(*) FROM entities WHERE is_static").values[0][0]
+
+
+def pieces(graph: Any, size: int) -> list[Any]:
+    """A block cut into smaller ones."""
+    found = []
+    for first in range(0, len(graph), size):
+        end = min(first + size, len(graph))
+        frames = graph.frames
+        rows = slice(*frames.offsets[[first, end]].tolist())
+        entities, scenery = frames.entities, frames.scenery
+        if first:
+            none = entities.kind[:0]
+            entities = type(entities)(len(entities), (), none, (), (), (), entities.static[:0], ())
+            scenery = scenery.take(np.zeros(0, np.intp))
+        found.append(
+            type(graph)(
+                frames=replace(
+                    frames,
+                    **{
+                        name: getattr(frames, name)[first:end]
+                        for name in ("seq", "time_ns", "log_time_ns", "ego")
+                    },
+                    offsets=frames.offsets[first : end + 1] - frames.offsets[first],
+                    states=frames.states.take(np.arange(rows.start, rows.stop)),
+                    entities=entities,
+                    scenery=scenery,
+                ),
+                presence=_cut(graph.presence, first, end),
+                edges=_cut(graph.edges, first, end),
+                lanes=_cut(graph.lanes, first, end),
+            )
+        )
+    return found
+
+
+def _cut(part: Any, first: int, end: int) -> Any:
+    here = (part.frame >= first) & (part.frame < end)
+    columns = {name: getattr(part, name)[here] for name in type(part).__dataclass_fields__}
+    return type(part)(**columns | {"frame": columns["frame"] - first})
+
+
+def test_the_same_trace_is_told_to_be_there(store) -> None:
+    trace = RandomTrace(frames=3, path="drive")
+    assert store.stored(trace.info, Config(), None) is None
+
+    publish(store, trace)
+
+    assert store.stored(trace.info, Config(), None) == "drive"
+
+
+def test_a_trace_that_comes_twice_at_once_comes_once(store) -> None:
+    first, second = RandomTrace(frames=3, path="drive"), RandomTrace(frames=3, path="drive")
+    with store.segment(second.info, Config()) as late:
+        late.append(second.blocks[0])
+        publish(store, first)
+        before = content(store)
+
+        with pytest.raises(StoreError, match="came into the store meanwhile, as 'drive'"):
+            late.publish(TraceReport())
+
+    assert content(store) == before
+
+
+@pytest.mark.parametrize(
+    ("config", "roads", "what"),
+    [
+        (Config(range=Range(9.0)), None, "other settings"),
+        (Config(), map_stub(seed=9), "another road map"),
+    ],
+)
+def test_the_same_trace_read_otherwise_is_refused(store, config, roads, what) -> None:
+    trace = RandomTrace(frames=3, path="drive")
+    publish(store, trace)
+
+    with pytest.raises(
+        StoreError, match=f"already in the store as 'drive', read with {what}; remove"
+    ):
+        store.stored(trace.info, config, roads)
+
+
+def test_another_ego_is_another_trace(store) -> None:
+    publish(store, RandomTrace(frames=3, path="drive"))
+    publish(store, RandomTrace(frames=3, path="drive", ego="17"))
+
+    assert [(t.name, t.ego) for t in store.traces()] == [("drive", "0"), ("drive~2", "17")]
+
+
+def test_traces_of_one_name_are_numbered(store) -> None:
+    names = [publish(store, RandomTrace(seed, frames=3, path="drive")) for seed in range(3)]
+
+    assert names == ["drive", "drive~2", "drive~3"]
+
+
+def test_maps_of_one_name_are_numbered_and_equal_maps_are_one(store) -> None:
+    for seed, roads in enumerate((map_stub(1), map_stub(2), map_stub(1))):
+        publish(store, RandomTrace(seed, frames=3, road_map=roads, path=f"d{seed}"))
+
+    assert [t.map for t in store.traces()] == ["stub", "stub~2", "stub"]
+    assert store.rows("SELECT count(*) FROM map_node").values == [(2 * len(map_stub(1).nodes),)]
+
+
+def test_two_traces_with_one_id_are_not_mixed(store) -> None:
+    trace = RandomTrace(frames=3, path="drive")
+    publish(store, trace)
+    writer = store  # an id is 39 bits of a digest: one that collides is made up
+    other = trace_info(path="other", digest="e" * 64)
+    import duckdb
+
+    with duckdb.connect(str(store.path)) as connection:
+        taken = trace_id_of(other.digest, other.ego)
+        connection.execute(f"UPDATE trace SET trace_id = {taken}")
+
+    with pytest.raises(StoreError, match="is taken by another trace, 'drive', by chance"):
+        writer.stored(other, Config(), None)
+
+
+def test_the_id_of_a_trace_is_39_bits_of_a_digest_of_recording_and_ego() -> None:
+    import hashlib
+
+    number = int(hashlib.sha256(b"abc\x0042").hexdigest(), 16)
+
+    assert trace_id_of("abc", "42") == number >> (256 - 39)
+
+
+def test_frames_out_of_order_are_a_defect_of_the_caller(store) -> None:
+    trace = RandomTrace(frames=130)
+    with (
+        store.segment(trace.info, Config()) as segment,
+        pytest.raises(ValueError, match="expected frames 0"),
+    ):
+        segment.append(trace.blocks[1])
+
+
+def test_a_trace_without_frames_is_a_defect_of_the_caller(store) -> None:
+    with (
+        store.segment(trace_info(), Config()) as segment,
+        pytest.raises(ValueError, match="a trace without frames"),
+    ):
+        segment.publish(TraceReport())
+
+
+def test_texts_that_are_no_unicode_are_kept_as_far_as_they_are(store) -> None:
+    trace = RandomTrace(frames=3, path="/r/drive\udcff.mcap", ego="\udcff")
+    entities = trace.blocks[0].frames.entities
+    odd = ("\ud800", "nul\0", "'; DROP TABLE trace; --", *entities.ident[3:])
+    trace.blocks[0] = replace(
+        trace.blocks[0],
+        frames=replace(
+            trace.blocks[0].frames, entities=replace(entities, ident=odd[: len(entities)])
+        ),
+    )
+    with store.segment(trace.info, Config(ego="\ud800")) as segment:
+        for graph in trace.blocks:
+            segment.append(graph)
+        segment.publish(TraceReport(warnings=["odd: \ud800"]))
+
+    found = store.rows("SELECT ident FROM entities ORDER BY node_id LIMIT 2").values
+    assert found == [("?",), ("nul\0",)]
+    (stored,) = store.traces()
+    assert (stored.name, stored.ego) == ("drive?", "?")
+    assert (stored.report["warnings"], stored.settings["ego"]) == (["odd: ?"], "?")
+
+
+def test_a_trace_without_anything_in_it_is_still_its_frames(store) -> None:
+    trace = RandomTrace(frames=70)
+    for graph in trace.blocks:
+        for column in (graph.frames.states.x, graph.frames.states.y, graph.frames.scenery.x):
+            column[:] = np.nan
+    publish(store, trace)
+
+    assert store.rows("SELECT count(*), count(x) FROM nodes").values[0][1] == 0
+    assert store.rows("SELECT count(*) FROM frames").values == [(70,)]
+
+
+def test_bits_of_a_bucket_are_its_frames(store) -> None:
+    publish(store, RandomTrace(frames=65))
+
+    assert store.rows("SELECT valid FROM bucket ORDER BY bucket").values == [
+        ((1 << 60) - 1,),
+        (0b11111,),
+    ]
+
+
+# Killed, and full
+
+
+KILLED = """
+import os, sys, signal
+sys.path[:0] = {path!r}
+from graph_blocks import RandomTrace, publish
+from sgstore.store import StoreFile, staging
+store = StoreFile({store!r})
+publish(store, RandomTrace(1, frames=130, path="first"))
+lines = 0
+def line(frame, event, argument):
+    global lines
+    if "sgstore/store" not in frame.f_code.co_filename:
+        return None
+    if event == "line":
+        lines += 1
+        if lines == {at}:
+            os.kill(os.getpid(), signal.SIGKILL)
+    return line
+sys.settrace(line)
+publish(store, RandomTrace(2, frames=130, path="second"))
+sys.settrace(None)
+print(lines)
+"""
+"""Between any two lines of the store a process may die."""
+
+
+def killed_at(store: StoreFile, at: int) -> subprocess.CompletedProcess[str]:
+    code = textwrap.dedent(KILLED).format(
+        path=[str(Path(__file__).parent)], store=str(store.path), at=at
+    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_a_killed_run_leaves_a_whole_store(tmp_path) -> None:
+    whole = StoreFile.create(tmp_path / "whole.db")
+    lines = int(killed_at(whole, 10**9).stdout)
+    after = content(whole)
+    whole.remove("second")
+    before = content(whole)
+    seen = set()
+    # Most of the lines make the segment; the last hundred or so are the transaction and what comes after it.
+    for at in (lines // 3, lines - 30, lines - 20):
+        store = StoreFile.create(tmp_path / f"{at}.db")
+
+        run = killed_at(store, at)
+
+        assert run.returncode == -signal.SIGKILL, run.stderr
+        names = [trace.name for trace in store.traces()]
+        assert content(store) == (after if "second" in names else before)
+        seen.add("second" in names)
+        publish(store, RandomTrace(2 if "second" not in names else 3, frames=130, path="second"))
+        assert "second" in names or content(store) == after
+        assert [p.name for p in tmp_path.iterdir() if p.name.startswith(f"{at}.db.")] == []
+    assert seen == {True, False}
+
+
+def test_what_a_dead_process_left_is_removed_and_what_a_living_one_has_is_not(store) -> None:
+    dead = store.path.with_name(f"{store.path.name}.segment-1-dead")
+    (dead / "spill").mkdir(parents=True)
+    trace = RandomTrace(frames=3, path="a")
+    with store.segment(trace.info, Config()) as living:
+        publish(store, RandomTrace(9, frames=3, path="b"))
+
+        assert not dead.exists()
+        assert len(beside(store)) == 1
+        living.append(trace.blocks[0])
+        living.publish(TraceReport())
+
+    assert {t.name for t in store.traces()} == {"a", "b"}
+    assert beside(store) == []
+
+
+FULL = """
+import resource, signal, sys
+sys.path[:0] = {path!r}
+from pathlib import Path
+from graph_blocks import RandomTrace, publish
+from sgstore.errors import StoreError
+from sgstore.store import StoreFile, staging
+store = StoreFile({store!r})
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+most = {most}
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+try:
+    publish(store, RandomTrace(2, frames=130, path="second"))
+except StoreError as error:
+    print(error)
+"""
+
+
+def test_a_store_that_is_compacted_is_replaced_in_one_step(store) -> None:
+    publish(store, RandomTrace(1, frames=70, path="a"))
+    publish(store, RandomTrace(2, frames=70, path="b"))
+    store.remove("a")
+    before, size = content(store), store.path.stat().st_size
+
+    store.compact()
+
+    assert content(store) == before
+    assert store.path.stat().st_size <= size
+    assert beside(store) == []
+
+
+@pytest.mark.parametrize(
+    ("room", "is_in"),
+    [
+        pytest.param(-(1 << 30), False, id="full when the trace should come in"),
+        pytest.param(100_000, True, id="full when it is in and should be moved to its place"),
+    ],
+)
+def test_a_disk_that_is_full_leaves_a_whole_store(store, room, is_in) -> None:
+    publish(store, RandomTrace(1, frames=130, path="first"))
+    before = content(store)
+    most = max(store.path.stat().st_size + room, 20_000)
+    code = FULL.format(path=[str(Path(__file__).parent)], store=str(store.path), most=most)
+
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+    assert (f"{store.path}: " in run.stdout) != is_in, run.stderr
+    assert len(store.traces()) == 1 + is_in
+    assert is_in or content(store) == before
+    assert [name for name in beside(store) if "segment" in name] == []
+    publish(store, RandomTrace(3, frames=130, path="third"))
+    assert len(store.traces()) == 2 + is_in
+    assert beside(store) == []

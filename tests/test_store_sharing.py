@@ -1,0 +1,240 @@
+"""One writer, many readers, threads and processes: everyone waits for the others, nobody for ever."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import duckdb
+import pytest
+from graph_blocks import RandomTrace, publish
+
+from sgstore.errors import StoreError
+from sgstore.store import StoreFile
+from sgstore.store.access import Access
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+TORN = """
+  SELECT (SELECT coalesce(sum(frames), 0) FROM trace) = (SELECT count(*) FROM frame)
+     AND (SELECT count(*) FROM trace) = (SELECT count(DISTINCT trace_id) FROM bucket)
+"""
+"""True of a store that holds whole traces only."""
+
+
+@pytest.fixture
+def store(tmp_path) -> StoreFile:
+    store = StoreFile.create(tmp_path / "s.db")
+    publish(store, RandomTrace(1, frames=5, path="first"))
+    return store
+
+
+@contextmanager
+def process(code: str, **values: object) -> Iterator[subprocess.Popen[str]]:
+    """A process that has begun: it has printed a line. Its end is waited for."""
+    code = textwrap.dedent(code).format(path=[str(Path(__file__).parent)], **values)
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout is not None
+        assert child.stderr is not None
+        if not child.stdout.readline():
+            raise AssertionError(child.stderr.read())
+        yield child
+        _, errors = child.communicate(timeout=20)
+        assert child.returncode == 0, errors
+
+
+READS = """
+import sys, time
+sys.path[:0] = {path!r}
+from sgstore.store import StoreFile
+store = StoreFile({store!r})
+with store.snapshot():
+    print("reading", flush=True)
+    time.sleep({seconds})
+    assert len(store.traces()) == 1
+"""
+
+WRITES = """
+import duckdb, time
+connection = duckdb.connect({store!r})
+print("writing", flush=True)
+time.sleep({seconds})
+connection.close()
+"""
+
+
+def test_a_writer_waits_until_a_reader_is_done(store) -> None:
+    with process(READS, store=str(store.path), seconds=0.7):
+        start = time.perf_counter()
+        publish(store, RandomTrace(2, frames=5, path="second"))
+        waited = time.perf_counter() - start
+
+    assert waited > 0.5
+    assert len(store.traces()) == 2
+
+
+def test_a_reader_waits_until_a_writer_is_done(store) -> None:
+    with process(WRITES, store=str(store.path), seconds=0.7):
+        start = time.perf_counter()
+        assert len(store.traces()) == 1
+        waited = time.perf_counter() - start
+
+    assert waited > 0.4
+
+
+def test_a_reader_does_not_wait_for_ever(store) -> None:
+    with process(WRITES, store=str(store.path), seconds=0.8):
+        start = time.perf_counter()
+        with pytest.raises(StoreError, match="in use by another process for too long"):
+            StoreFile(store.path, wait_s=0.3)
+        waited = time.perf_counter() - start
+
+    assert 0.25 < waited < 0.75
+
+
+def test_a_writer_does_not_wait_for_ever_and_changes_nothing(store) -> None:
+    hasty = StoreFile(store.path, wait_s=0.3)
+    with (
+        process(READS, store=str(store.path), seconds=0.8),
+        pytest.raises(StoreError, match="in use by another process for too long"),
+    ):
+        publish(hasty, RandomTrace(2, frames=5, path="second"))
+
+    assert len(store.traces()) == 1
+    assert [p.name for p in store.path.parent.iterdir()] == [store.path.name]
+
+
+def test_readers_of_many_processes_read_at_once(store) -> None:
+    with process(READS, store=str(store.path), seconds=0.5):
+        start = time.perf_counter()
+        assert len(store.traces()) == 1
+        waited = time.perf_counter() - start
+
+    assert waited < 0.4
+
+
+READS_ON = """
+import sys, time
+sys.path[:0] = {path!r}
+from sgstore.store import StoreFile
+store = StoreFile({store!r})
+print("reading", flush=True)
+end = time.monotonic() + {seconds}
+count = 0
+while time.monotonic() < end:
+    assert store.rows({torn!r}).values == [(True,)]
+    with store.snapshot():
+        time.sleep(0.02)
+    count += 1
+assert count > 5, count
+"""
+
+
+def test_a_stream_of_readers_does_not_keep_a_writer_out(store) -> None:
+    slowest = 0.0
+    about = {"store": str(store.path), "seconds": 1.5, "torn": TORN}
+    with process(READS_ON, **about), process(READS_ON, **about), process(READS_ON, **about):
+        for seed in range(2, 5):
+            start = time.perf_counter()
+            publish(store, RandomTrace(seed, frames=5, path=f"t{seed}"))
+            slowest = max(slowest, time.perf_counter() - start)
+
+    assert slowest < 1.4
+    assert len(store.traces()) == 4
+
+
+def test_threads_read_while_one_writes_and_see_whole_traces(store) -> None:
+    stop, failures, reads = threading.Event(), [], []
+
+    def read() -> None:
+        try:
+            while not stop.is_set():
+                assert store.rows(TORN).values == [(True,)]
+                reads.append(len(store.traces()))
+        except BaseException as error:  # noqa: BLE001 (told below)
+            failures.append(error)
+
+    threads = [threading.Thread(target=read) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for seed in range(2, 6):
+        publish(store, RandomTrace(seed, frames=5, path=f"t{seed}"))
+    stop.set()
+    for thread in threads:
+        thread.join()
+
+    assert failures == []
+    assert len(set(reads)) > 1
+    assert len(store.traces()) == 5
+
+
+def test_a_snapshot_stays_as_it_is_while_others_publish(store) -> None:
+    with store.snapshot():
+        writer = threading.Thread(target=publish, args=(store, RandomTrace(2, frames=5, path="b")))
+        writer.start()
+        time.sleep(0.3)
+        seen = [len(store.traces()) for _ in range(3)]  # would wait for the writer who waits for us
+    writer.join()
+
+    assert seen == [1, 1, 1]
+    assert len(store.traces()) == 2
+
+
+def test_who_reads_cannot_write_at_once_and_is_told(store) -> None:
+    with (
+        store.snapshot(),
+        pytest.raises(StoreError, match="cannot be written while the same thread reads it"),
+    ):
+        publish(store, RandomTrace(2, frames=5, path="b"))
+
+
+def test_two_writers_take_turns(store) -> None:
+    threads = [
+        threading.Thread(target=publish, args=(store, RandomTrace(seed, frames=5, path=f"t{seed}")))
+        for seed in range(2, 6)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert len(store.traces()) == 5
+    assert store.rows(TORN).values == [(True,)]
+
+
+def test_the_lock_of_a_writer_holds_while_its_process_looks_elsewhere(store, tmp_path) -> None:
+    other = StoreFile.create(tmp_path / "other.db")
+    connection = duckdb.connect()
+    with Access(store.path, memory=1 << 28, wait_s=5).writing(connection):
+        other.traces()  # closes another file of this process
+        code = f"import duckdb; duckdb.connect({str(store.path)!r}, read_only=True)"
+        run = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=False
+        )
+
+    assert "Could not set lock" in run.stderr
+
+
+def test_no_write_ahead_log_is_left_at_rest(store) -> None:
+    publish(store, RandomTrace(2, frames=5, path="b"))
+
+    assert [p.name for p in store.path.parent.iterdir()] == [store.path.name]
+
+
+def test_the_file_is_free_between_questions(store) -> None:
+    store.traces()
+    publish(store, RandomTrace(2, frames=5, path="b"))
+    code = f"import duckdb; duckdb.connect({str(store.path)!r}).execute('DELETE FROM bits')"
+
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+    assert store.rows("SELECT * FROM bits").values == []

@@ -1,0 +1,208 @@
+"""Users' SQL: what reads is answered, what does anything else is refused, and the refusal says why."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from graph_blocks import RandomTrace, publish
+
+from sgstore.errors import SqlError, StoreError
+from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+RUNAWAY = "SELECT count(*) FROM range(1000000) a, range(1000000) b WHERE a.range * b.range = 7.5"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Iterator[StoreFile]:
+    store = StoreFile.create(tmp_path_factory.mktemp("store") / "s.db")
+    publish(store, RandomTrace(frames=130))
+    with store.snapshot():
+        yield store
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT count(*) FROM frames",
+        "select count(*) from frames;",
+        "-- how many\nSELECT count(*) FROM frames",
+        "FROM frames SELECT count(*)",
+        "WITH f AS (FROM frames) SELECT count(*) FROM f",
+        "SELECT sum(n) FROM (VALUES (100), (30)) v(n)",
+        "(SELECT count(*) FROM frames)",
+    ],
+)
+def test_one_statement_that_reads_is_answered(store, sql) -> None:
+    assert store.user_sql(sql).values == [(130,)]
+
+
+@pytest.mark.parametrize(
+    "sql",
+    ["DESCRIBE nodes", "SHOW TABLES", "SUMMARIZE frames", "EXPLAIN FROM edges", "TABLE frames"],
+)
+def test_what_describes_is_answered(store, sql) -> None:
+    assert len(store.user_sql(sql)) > 0
+
+
+def test_types_of_the_result_are_told(store) -> None:
+    rows = store.user_sql("SELECT frame_id, kind FROM nodes LIMIT 1")
+
+    assert rows.columns == ("frame_id", "kind")
+    assert (rows.types[0], rows.types[1][:4]) == ("BIGINT", "ENUM")
+    assert isinstance(rows.values[0][1], str)
+
+
+def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store) -> None:
+    some = store.user_sql("SELECT seq FROM frames ORDER BY seq", max_rows=7)
+    every = store.user_sql("SELECT seq FROM frames", max_rows=130)
+    none = store.user_sql("SELECT seq FROM frames", max_rows=0)
+
+    assert ([seq for (seq,) in some], some.truncated) == (list(range(7)), True)
+    assert (len(every), every.truncated) == (130, False)
+    assert (len(none), none.truncated) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("sql", "reason"),
+    [
+        ("INSERT INTO frame VALUES (1)", "INSERT is not allowed; expected SELECT"),
+        ("UPDATE trace SET name = 'x'", "UPDATE is not allowed"),
+        ("DELETE FROM trace", "DELETE is not allowed"),
+        ("DROP TABLE trace", "DROP is not allowed"),
+        ("ALTER TABLE trace ADD COLUMN x INT", "ALTER is not allowed"),
+        ("CREATE TABLE x AS SELECT 1", "CREATE is not allowed"),
+        ("CREATE TEMP TABLE x AS SELECT 1", "CREATE is not allowed"),
+        ("COPY frames TO '{out}'", "COPY is not allowed"),
+        ("COPY trace FROM '{secret}'", "COPY is not allowed"),
+        ("EXPORT DATABASE '{out}'", "EXPORT is not allowed"),
+        ("ATTACH '{out}'", "ATTACH is not allowed"),
+        ("DETACH s", "DETACH is not allowed"),
+        ("INSTALL httpfs", "is not allowed"),
+        ("LOAD httpfs", "LOAD is not allowed"),
+        ("SET memory_limit = '100GB'", "SET is not allowed"),
+        ("RESET memory_limit", "SET is not allowed"),
+        ("SET VARIABLE x = 1", "SET is not allowed"),
+        ("PRAGMA enable_profiling", "is not allowed"),
+        ("CALL pragma_version()", "CALL is not allowed"),
+        ("CHECKPOINT", "is not allowed"),
+        ("BEGIN", "TRANSACTION is not allowed"),
+        ("VACUUM", "VACUUM is not allowed"),
+        ("PREPARE p AS SELECT 1", "PREPARE is not allowed"),
+        ("USE memory", "is not allowed"),
+        ("SELECT 1; DROP TABLE trace", "expected one statement, found 2"),
+        ("SELECT 1; SELECT 2", "expected one statement, found 2"),
+        ("", "expected one statement, found 0"),
+        ("-- nothing", "expected one statement, found 0"),
+        ("SELECT * FROM read_csv('{secret}')", "disabled by configuration"),
+        ("SELECT * FROM read_text('{secret}')", "disabled by configuration"),
+        ("SELECT * FROM read_blob('{secret}')", "disabled by configuration"),
+        ("SELECT * FROM '{secret}'", "disabled by configuration|does not exist"),
+        ("SELECT * FROM parquet_scan('{secret}')", "disabled by configuration"),
+        ("SELECT * FROM glob('{secret}*')", "disabled by configuration"),
+        ("SELECT * FROM sniff_csv('{secret}')", "disabled by configuration"),
+        ("EXPLAIN ANALYZE COPY frames TO '{out}'", "disabled by configuration"),
+        ("EXPLAIN ANALYZE INSERT INTO bits VALUES (1, 1)", "read-only"),
+        ("EXPLAIN ANALYZE CREATE TABLE x AS SELECT 1", "read-only"),
+        ("SELECT * FROM store_in_python", "store_in_python does not exist"),
+        ("SELECT getenv('HOME')", "getenv does not exist"),
+        ("WITH x AS (INSERT INTO bits VALUES (1, 1) RETURNING bit) FROM x", "read-only|SELECT"),
+    ],
+)
+def test_nothing_but_reading_the_store_is_done(store, tmp_path, sql, reason) -> None:
+    store_in_python = {"a": [1]}  # what DuckDB would read if it were let
+    secret, out = tmp_path / "secret.csv", tmp_path / "out"
+    secret.write_text("a,b\n1,2\n")
+    before = store.path.read_bytes()
+
+    with pytest.raises(SqlError, match=reason):
+        store.user_sql(sql.format(secret=secret, out=out))
+
+    assert store.path.read_bytes() == before
+    assert not out.exists()
+    assert store_in_python
+
+
+def test_settings_are_the_same_for_the_next_statement(store) -> None:
+    sql = "SELECT value FROM duckdb_settings() WHERE name IN ('enable_external_access', 'lock_configuration')"
+
+    for _ in range(2):
+        assert sorted(store.user_sql(sql).values) == [("false",), ("true",)]
+
+
+@pytest.mark.parametrize(
+    ("sql", "parts"),
+    [
+        ("SELECT * FROM edge_s", ["edge_s does not exist", 'Did you mean "edges"', "LINE 1"]),
+        ("SELECT relatoin FROM edges", ['"relatoin" not found', "relation"]),
+        ("SELECT 1 FROM", ["syntax error"]),
+    ],
+)
+def test_a_mistake_is_told_as_the_database_tells_it(store, sql, parts) -> None:
+    with pytest.raises(SqlError) as caught:
+        store.user_sql(sql)
+
+    assert all(part.lower() in str(caught.value).lower() for part in parts), caught.value
+
+
+def test_a_time_with_a_zone_is_told_how_to_be_shown(store) -> None:
+    with pytest.raises(SqlError, match=r"cast them: now\(\)::TIMESTAMP"):
+        store.user_sql("SELECT now()")
+
+    assert len(store.user_sql("SELECT now()::TIMESTAMP")) == 1
+
+
+def test_a_runaway_statement_is_stopped_in_time(store) -> None:
+    start = time.perf_counter()
+
+    with pytest.raises(SqlError, match=r"stopped after 0.2 s: SELECT count"):
+        store.user_sql(RUNAWAY, timeout_s=0.2)
+
+    assert 0.2 <= time.perf_counter() - start < 1.0
+
+
+def test_a_stream_is_stopped_in_time_too(store) -> None:
+    sql = "SELECT a.range + b.range FROM range(1000000) a, range(1000000) b"
+
+    with (
+        pytest.raises(SqlError, match="stopped after"),
+        store.user_batches(sql, timeout_s=0.3, size=1000) as batches,
+    ):
+        for _ in batches:
+            pass
+
+
+def test_the_store_goes_on_after_a_statement_was_stopped(store) -> None:
+    with pytest.raises(SqlError):
+        store.user_sql(RUNAWAY, timeout_s=0.05)
+
+    assert store.user_sql("SELECT 1", timeout_s=10).values == [(1,)]
+
+
+def test_too_much_memory_is_refused_not_taken(tmp_path: Path) -> None:
+    StoreFile.create(tmp_path / "s.db")
+    small = StoreFile(tmp_path / "s.db", memory=64 << 20)
+    sql = "SELECT list(range) FROM range(20000000)"
+
+    with pytest.raises(SqlError, match=r"(?i)memory"):
+        small.user_sql(sql)
+
+
+@pytest.mark.parametrize("deep", ["(" * 100_000, "SELECT " + "-" * 100_000 + "1", "[" * 50_000])
+def test_deep_nonsense_is_an_error_not_a_crash(store, deep) -> None:
+    with pytest.raises(SqlError):
+        store.user_sql(deep)
+
+
+def test_a_statement_that_is_too_long_is_refused(store) -> None:
+    with pytest.raises(SqlError, match="1048576 are allowed"):
+        store.user_sql("SELECT 1" + " " * (1 << 20))
+
+
+def test_an_error_of_sql_is_an_error_of_the_store() -> None:
+    assert issubclass(SqlError, StoreError)
