@@ -1,0 +1,390 @@
+"""Syntax tree → bound query: labels, relations, attributes, variables and functions are known from here on.
+
+Everything that can be the user's fault is found here or in the parser, before any SQL exists.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryError, Span
+from sgstore.lang import bound as b
+from sgstore.lang import syntax as s
+from sgstore.lang.catalog import Catalog, Type
+from sgstore.lang.conditions import bind, condition, edge_attribute, node_attribute, parameter
+from sgstore.lang.names import RESERVED, Meaning, Names, ScopeBuilder, Session
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    RELATION_ALIASES,
+    RELATIONS,
+    folded,
+    kinds_labelled,
+    labels,
+    relation_named,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+_TEMPORAL_SETTINGS: Final = frozenset({"matches", "gaps", "end"})
+
+
+def bind_query(
+    text: str, statements: Sequence[s.Statement], catalog: Catalog, parameters: Mapping[str, Any]
+) -> b.Query:
+    """The meaning of a text: its one ``MATCH``, with the predicates that it defines.
+
+    Parameters
+    ----------
+    text : str
+        For messages.
+    statements : sequence of Statement
+        As parsed.
+    catalog : Catalog
+        Of the store that is asked.
+    parameters : mapping of str to value
+        Values of ``$name``.
+
+    Raises
+    ------
+    QueryNameError
+        A label, relation, attribute, variable, function or parameter is not known.
+    QueryError
+        Types do not fit, or a part belongs to the temporal layer.
+    """
+    session = Session(text, parameters)
+    match = _only_match(statements, session)
+    ego, unknown_is_false = _settings(match.settings, session, catalog)
+    names = Names(session, ScopeBuilder(session))
+    bind_block(match.block, names)
+    distinct = names.scope.distinct()  # before RETURN, which must not change what matches
+    result = _result(match.returns, names)
+    _refuse_unused(session)
+    return b.Query(
+        replace(names.scope.finished(), distinct=distinct),
+        result,
+        frozenset(session.relations),
+        session.injective,
+        ego,
+        unknown_is_false,
+    )
+
+
+def _only_match(statements: Sequence[s.Statement], session: Session) -> s.Match:
+    found: s.Match | None = None
+    for statement in statements:
+        if isinstance(statement, s.Define):
+            session.predicates[folded(statement.name)] = statement
+        elif isinstance(statement, s.Check):
+            session.temporal("CHECK", statement.span)
+        elif found is not None:
+            session.refuse("one MATCH at a time", statement.span)
+        else:
+            found = statement
+    if found is None:
+        session.refuse("nothing is asked", Span(0, len(session.text)), "add MATCH …")
+    if found.temporal:
+        session.temporal(*found.temporal)
+    return found
+
+
+def _settings(
+    settings: Sequence[s.Setting], session: Session, catalog: Catalog
+) -> tuple[str | None, bool]:
+    """The ego that was chosen, and whether what is unknown is false."""
+    ego, unknown_is_false = None, False
+    for setting in settings:
+        name, value = folded(setting.name), _setting_value(setting, session)
+        if name in _TEMPORAL_SETTINGS:
+            session.temporal(f"USING {setting.name}", setting.span)
+        if name == "nodes":
+            session.injective = _choice(setting, value, ("distinct", "any"), session) == "distinct"
+        elif name == "unknown":
+            unknown_is_false = _choice(setting, value, ("false",), session) == "false"
+        elif name == "ego":
+            egos = {trace.ego for trace in catalog.traces if trace.ego}
+            if value not in egos:
+                session.unknown("ego", value, setting.span, egos)
+            ego = value
+        else:
+            session.unknown("setting", setting.name, setting.span, ("NODES", "EGO", "UNKNOWN"))
+    return ego, unknown_is_false
+
+
+def _setting_value(setting: s.Setting, session: Session) -> str:
+    if isinstance(setting.value, str):
+        return setting.value
+    return str(parameter(setting.value, Names(session, ScopeBuilder(session))))
+
+
+def _choice(setting: s.Setting, value: str, known: tuple[str, ...], session: Session) -> str:
+    if value.lower() not in known:
+        session.unknown(f"value of {setting.name}", value, setting.span, known)
+    return value.lower()
+
+
+def _refuse_unused(session: Session) -> None:
+    unused = sorted(set(session.parameters) - session.used)
+    if unused:
+        raise QueryError(
+            f"the query has no parameter '{unused[0]}'",
+            hint=f"it would be written ${unused[0]}",
+        )
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+def bind_block(block: s.Block, names: Names) -> None:
+    """Bind the paths and the condition of a block into the scope of ``names``.
+
+    Names of all nodes and edges are known before any condition is bound, so that a condition inside a node
+    may speak of what stands further on.
+    """
+    pending: list[tuple[s.NodePattern | s.EdgePattern, str]] = []
+    for path in block.paths:
+        keys = [_node(node, names) for node in path.nodes]
+        pending += zip(path.nodes, keys, strict=True)
+        for edge, left, right in zip(path.edges, keys, keys[1:], strict=False):
+            pending.append((edge, _edge(edge, left, right, names)))
+    for pattern, key in pending:
+        _inline(pattern, key, names)
+    if block.where is not None:
+        names.scope.where += conjuncts(condition(block.where, names))
+
+
+def conjuncts(expression: b.Bound) -> list[b.Bound]:
+    """The conditions that an expression joins by ``AND``."""
+    if isinstance(expression, b.Operation) and expression.word == "AND":
+        return [part for operand in expression.operands for part in conjuncts(operand)]
+    return [expression]
+
+
+def _node(node: s.NodePattern, names: Names) -> str:
+    kinds = _kinds(node.label, names.session) if node.label else b.ANY
+    if not kinds:
+        names.session.refuse("no node can have this label", node.span)
+    key = _known_node(node, names)
+    if key is None:
+        key = names.scope.add(node.name, kinds, node.span, named=node.name is not None)
+        if node.name is not None:
+            names.meanings[node.name] = Meaning(node=key)
+        return key
+    if node.label:
+        names.scope.narrow(key, kinds)
+        if not names.scope.kinds(key):
+            names.session.refuse(f"'{node.name}' has two labels that no node has both", node.span)
+        if key in names.scope.outer:
+            names.scope.where.append(b.LabelTest(key, kinds))
+    return key
+
+
+def _known_node(node: s.NodePattern, names: Names) -> str | None:
+    """The key of a node that the pattern speaks of again; ``None`` for a new one."""
+    if node.name is None:
+        return None
+    if node.name in RESERVED:
+        names.session.refuse(f"'{node.name}' cannot name a node", node.name_span)
+    meaning = names.meaning(node.name)
+    if meaning is None:
+        return _bare_ego(node, names)
+    if meaning.node is None:
+        names.session.refuse(f"'{node.name}' is not a node", node.name_span)
+    names.scope.mention(meaning.node)
+    return meaning.node
+
+
+def _bare_ego(node: s.NodePattern, names: Names) -> str | None:
+    if node.name != "ego" or node.label:
+        return None
+    if names.scope.parent is None:
+        key = names.scope.add("ego", b.EGO, node.span, named=True)
+        names.meanings["ego"] = Meaning(node=key)
+        return key
+    return names.node("ego", node.name_span)
+
+
+def _edge(edge: s.EdgePattern, left: str, right: str, names: Names) -> str:
+    session = names.session
+    if edge.name is not None and names.meaning(edge.name) is not None:
+        session.refuse(f"'{edge.name}' is bound already", edge.span)
+    if edge.name is not None and edge.low is not None:
+        session.refuse("a repeated edge cannot have a name", edge.span)
+    relations = _relations(edge.label, session) if edge.label else b.ANY_RELATION
+    if not relations:
+        session.refuse("no edge can have this label: an edge has one relation", edge.span)
+    key = session.key(edge.name)
+    src, dst = (right, left) if edge.direction == "left" else (left, right)
+    low, high = edge.low or 1, edge.high or 1
+    if edge.name is not None:
+        names.meanings[edge.name] = Meaning(edge=key)
+    names.scope.edges.append(
+        b.Edge(
+            key,
+            src,
+            dst,
+            relations,
+            edge.direction == "any",
+            low,
+            high,
+            edge.name is not None,
+            edge.span,
+        )
+    )
+    return key
+
+
+def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: Names) -> None:
+    """The properties and the condition that stand inside a node or an edge."""
+    for prop in pattern.properties:
+        attribute_of = node_attribute if isinstance(pattern, s.NodePattern) else edge_attribute
+        attribute = attribute_of(key, prop.name, prop.name_span, names)
+        names.scope.where.append(_equality(attribute, prop, names))
+    if pattern.where is not None:
+        names.scope.where += conjuncts(condition(pattern.where, names))
+
+
+def _equality(attribute: b.Bound, prop: s.Property, names: Names) -> b.Bound:
+    """``name: value`` as a comparison; the attribute stands in it under a name that no query can write."""
+    inner = names.body({"": Meaning(value=attribute)})
+    inner.parent = names
+    span = Span(prop.name_span.start, prop.value.span.end)
+    return condition(s.Comparison("=", s.Variable("", prop.name_span), prop.value, span), inner)
+
+
+def _kinds(label: s.LabelExpression, session: Session) -> b.Kinds:
+    if isinstance(label, s.Label):
+        return _labelled(label, session)
+    operands = [_kinds(operand, session) for operand in label.operands]
+    result = operands[0]
+    for operand in operands[1:]:
+        result = result & operand if label.word == "&" else result | operand
+    return ~result if label.word == "!" else result
+
+
+def _labelled(label: s.Label, session: Session) -> b.Kinds:
+    if label.name == "%":
+        return b.ANY
+    if folded(label.name) == "ego":
+        return b.EGO
+    kinds = kinds_labelled(label.name)
+    if kinds is None:
+        if relation_named(label.name):
+            session.refuse(
+                f"'{label.name}' is a relation, not a label",
+                label.span,
+                f"write -[:{label.name}]->",
+            )
+        session.unknown("label", label.name, label.span, labels())
+    every = frozenset(kinds)
+    return b.Kinds(every & frozenset(ENTITY_KINDS), every)
+
+
+def _relations(label: s.LabelExpression, session: Session) -> frozenset[str]:
+    if isinstance(label, s.Label):
+        return _related(label, session)
+    operands = [_relations(operand, session) for operand in label.operands]
+    result = operands[0]
+    for operand in operands[1:]:
+        result = result & operand if label.word == "&" else result | operand
+    return b.ANY_RELATION - result if label.word == "!" else result
+
+
+def _related(label: s.Label, session: Session) -> frozenset[str]:
+    if label.name == "%":
+        return b.ANY_RELATION
+    relation = relation_named(label.name)
+    if relation is None:
+        if kinds_labelled(label.name):
+            session.refuse(f"'{label.name}' is a label of nodes, not a relation", label.span)
+        session.unknown("relation", label.name, label.span, (*RELATIONS, *RELATION_ALIASES))
+    session.relations.add(relation)
+    return frozenset({relation})
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+_FORMS: Final[dict[str, b.Form]] = {"intervals": "intervals", "clips": "clips"}
+
+
+def _result(returns: s.Returns | None, names: Names) -> b.Result:
+    if returns is None:
+        return b.Result()
+    inner = Names(names.session, names.scope, names.meanings, names.parent, aggregates=True)
+    item = _special(returns, names.session)
+    form = item.form if item is not None else "value"
+    result = b.Result(
+        form=_FORMS.get(form, "rows"),
+        columns=tuple(_column(item, inner) for item in returns.items if item.form == "value"),
+        whole=any(item.form == "all" for item in returns.items),
+        framed=form == "frames",
+        distinct=returns.distinct,
+        limit=returns.limit,
+        before=item.before if item else 0,
+        after=item.after if item else 0,
+    )
+    _check_result(result, returns, names.session)
+    order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
+    return replace(result, order=order, sample=_sampling(returns.sample, result, inner))
+
+
+def _special(returns: s.Returns, session: Session) -> s.Item | None:
+    """The one result that is no value: ``FRAMES``, ``INTERVALS`` or ``CLIPS``."""
+    special = [item for item in returns.items if item.form not in {"value", "all"}]
+    for item in special:
+        if item.form == "subgraphs":
+            session.unknown("result", "SUBGRAPHS", item.span, ("FRAMES", "INTERVALS", "CLIPS"))
+    if len(special) > 1:
+        session.refuse("one of FRAMES, INTERVALS and CLIPS at a time", special[1].span)
+    return special[0] if special else None
+
+
+def _column(item: s.Item, names: Names) -> b.Column:
+    assert item.value is not None  # noqa: S101 - the form of the item says so
+    value = bind(item.value, names)
+    if value.type is Type.list:
+        names.session.refuse("a list cannot be returned", item.span)
+    text = names.session.text[item.value.span.start : item.value.span.end]
+    return b.Column(item.name or " ".join(text.split()), value)
+
+
+def _key(value: s.Expression, result: b.Result, names: Names) -> b.Bound | str:
+    """What to order or to sample by: the name of a result, or a value of each match."""
+    known = (*result.names, *(column.name for column in result.columns))
+    if isinstance(value, s.Variable) and value.name in known and names.meaning(value.name) is None:
+        return value.name
+    if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
+        names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
+    found = bind(value, names)
+    same = next((column.name for column in result.columns if column.value == found), None)
+    if same is not None:
+        return same
+    counted = any(isinstance(part, b.Aggregate) for part in b.walk(found))
+    one_each = not (result.distinct or result.framed or result.aggregated)
+    if result.form != "rows" or not (result.aggregated if counted else one_each):
+        names.session.refuse(
+            "only by what is returned can these results be ordered or sampled",
+            value.span,
+            f"name one of: {', '.join(known)}",
+        )
+    return found
+
+
+def _sampling(sample: s.Sample | None, result: b.Result, names: Names) -> b.Sampling | None:
+    if sample is None:
+        return None
+    if result.aggregated or (result.distinct and not (result.whole or result.framed)):
+        names.session.refuse("SAMPLE chooses among matches, and these are not listed", sample.span)
+    return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))
+
+
+def _check_result(result: b.Result, returns: s.Returns, session: Session) -> None:
+    names = [*result.names, *(column.name for column in result.columns)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        session.refuse(f"two results are called '{twice}'", returns.span, "name them with AS")
+    listed = result.form != "rows" or result.whole or result.framed
+    if result.aggregated and listed:
+        session.refuse("matches are either counted or listed, not both", returns.span)

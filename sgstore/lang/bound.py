@@ -1,0 +1,421 @@
+"""Bound patterns: every name resolved, every value typed; what the stages after the binder share.
+
+A *scope* is what stands in one ``MATCH`` or one pair of braces: nodes, edges, conditions that all must be true,
+and which nodes must differ. Nodes have keys that are unique in the query whatever the case of letters; those of
+unnamed nodes begin with ``#``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from sgstore.lang.catalog import Attribute, Type
+from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from sgstore.errors import Span
+
+
+@dataclass(frozen=True, slots=True)
+class Kinds:
+    """What a node may be: its kinds if it is the ego, and its kinds if it is not."""
+
+    ego: frozenset[str]
+    other: frozenset[str]
+
+    def __and__(self, more: Kinds) -> Kinds:
+        return Kinds(self.ego & more.ego, self.other & more.other)
+
+    def __or__(self, more: Kinds) -> Kinds:
+        return Kinds(self.ego | more.ego, self.other | more.other)
+
+    def __invert__(self) -> Kinds:
+        return Kinds(ANY.ego - self.ego, ANY.other - self.other)
+
+    def __bool__(self) -> bool:
+        return bool(self.ego or self.other)
+
+    def only(self, kinds: frozenset[str]) -> Kinds:
+        """Those of some kinds."""
+        return Kinds(self.ego & kinds, self.other & kinds)
+
+    @property
+    def every(self) -> frozenset[str]:
+        """All kinds, whether ego or not."""
+        return self.ego | self.other
+
+
+ANY: Final = Kinds(frozenset(ENTITY_KINDS), frozenset(KINDS))
+EGO: Final = Kinds(frozenset(ENTITY_KINDS), frozenset())
+ANY_RELATION: Final = frozenset(RELATIONS)
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of a pattern.
+
+    Attributes
+    ----------
+    key : str
+    kinds : Kinds
+    role : str
+        ``named`` in the query and part of what is found; ``unnamed``, but counted; or ``hidden``: made by a
+        rewriting, only asked to exist.
+    span : Span
+    """
+
+    key: str
+    kinds: Kinds
+    role: Literal["named", "unnamed", "hidden"]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """An edge of a pattern, or a path of ``low`` to ``high`` edges.
+
+    Attributes
+    ----------
+    key : str
+        Its name in the query, or a number.
+    src, dst : str
+        Keys of its nodes.
+    relations : frozenset of str
+    both : bool
+        Whether it may also run from ``dst`` to ``src``.
+    low, high : int
+    named : bool
+        Whether its relation is part of a match.
+    span : Span
+    """
+
+    key: str
+    src: str
+    dst: str
+    relations: frozenset[str]
+    both: bool
+    low: int
+    high: int
+    named: bool
+    span: Span
+
+
+# Expressions --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A constant. ``closed``: a canonical word of the vocabulary, not a text of the user's."""
+
+    value: int | float | str | bool | None
+    type: Type
+    closed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """A list of constants, after ``IN``."""
+
+    items: tuple[Value, ...]
+    type: Type = Type.list
+
+
+@dataclass(frozen=True, slots=True)
+class NodeValue:
+    """A node itself."""
+
+    node: str
+    type: Type = Type.node
+
+
+@dataclass(frozen=True, slots=True)
+class NodeAttribute:
+    """An attribute of a node."""
+
+    node: str
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTest:
+    """Whether a node, bound outside, has a label."""
+
+    node: str
+    kinds: Kinds
+    type: Type = Type.boolean
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeRelation:
+    """The relation that an edge variable is bound to."""
+
+    edge: str
+    type: Type = Type.text
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeAttribute:
+    """An attribute of an edge from an entity to a lane."""
+
+    edge: str
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAttribute:
+    """``frame.name``."""
+
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class TraceAttribute:
+    """``trace.name``."""
+
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class PairNumber:
+    """A number of an ordered pair of entities."""
+
+    function: str
+    a: str
+    b: str
+    type: Type = Type.number
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """Anything that is computed of its operands: ``AND``, ``<``, ``+``, ``abs``, ``IN``, ``IS NULL``."""
+
+    word: str
+    operands: tuple[Bound, ...]
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class BlockValue:
+    """``EXISTS {…}``, ``COUNT {…}``, ``MIN {… | value}``; ``number`` tells the blocks of a query apart."""
+
+    word: str
+    scope: Scope
+    value: Bound | None
+    type: Type
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Aggregate:
+    """``COUNT(*)``, ``AVG(x)``, … over the matches of a query; ``COUNT(*)`` has no operand."""
+
+    word: str
+    operand: Bound | None
+    distinct: bool
+    type: Type
+
+
+Bound = (
+    Value
+    | Choices
+    | NodeValue
+    | NodeAttribute
+    | LabelTest
+    | EdgeRelation
+    | EdgeAttribute
+    | FrameAttribute
+    | TraceAttribute
+    | PairNumber
+    | Operation
+    | BlockValue
+    | Aggregate
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scope:
+    """What one ``MATCH`` or one block asks for. Two scopes are equal only if they are the same.
+
+    Attributes
+    ----------
+    nodes : mapping of str to Node
+        Its own nodes by key.
+    outer : mapping of str to Kinds
+        Nodes of scopes around it that it, or a block in it, speaks of; with what they may be here.
+    edges : tuple of Edge
+    where : tuple of Bound
+        Conditions; each must be true.
+    distinct : frozenset of pairs
+        Keys of nodes that must not be bound to the same node.
+    """
+
+    nodes: Mapping[str, Node]
+    outer: Mapping[str, Kinds]
+    edges: tuple[Edge, ...]
+    where: tuple[Bound, ...]
+    distinct: frozenset[tuple[str, str]]
+
+    def kinds(self, key: str) -> Kinds:
+        """What a node of this scope, or one that it speaks of, may be."""
+        return self.nodes[key].kinds if key in self.nodes else self.outer[key]
+
+
+# Queries ------------------------------------------------------------------------------------------
+
+FRAME_COLUMNS: Final = ("frame_id", "trace", "seq", "time_ns", "t")
+"""Columns that say which frame a row is of: ``t`` is seconds since the trace began."""
+
+INTERVAL_COLUMNS: Final = (
+    "trace",
+    "start_seq",
+    "end_seq",
+    "start_ns",
+    "end_ns",
+    "start",
+    "end",
+    "frames",
+)
+"""Columns of an interval: its ends by number, simulation time, and seconds since the trace began."""
+
+CLIP_COLUMNS: Final = ("trace", "start_ns", "end_ns")
+"""Columns of a clip: log times, offsets included."""
+
+Form = Literal["rows", "intervals", "clips"]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A value to return, and what it is called."""
+
+    name: str
+    value: Bound
+
+
+@dataclass(frozen=True, slots=True)
+class SortKey:
+    """What to order by: a value, or the name of a result."""
+
+    value: Bound | str
+    descending: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """At most ``number`` results of each value of ``per`` (of all, if it is ``None``)."""
+
+    number: int
+    per: Bound | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What to return of the matches.
+
+    Attributes
+    ----------
+    form : str
+        ``rows``, ``intervals`` or ``clips``.
+    columns : tuple of Column
+        Values returned; empty without ``RETURN``.
+    whole : bool
+        Whether frame and variables are returned too: without ``RETURN``, or for ``*``.
+    framed : bool
+        Whether the frame is returned with the values.
+    distinct : bool
+    order : tuple of SortKey
+    sample : Sampling or None
+    limit : int or None
+    before, after : int
+        Offsets of clips; ns, negative is earlier.
+    """
+
+    form: Form = "rows"
+    columns: tuple[Column, ...] = ()
+    whole: bool = True
+    framed: bool = False
+    distinct: bool = False
+    order: tuple[SortKey, ...] = ()
+    sample: Sampling | None = None
+    limit: int | None = None
+    before: int = 0
+    after: int = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns that are not values: those of frames, intervals or clips."""
+        if self.form != "rows":
+            return INTERVAL_COLUMNS if self.form == "intervals" else CLIP_COLUMNS
+        return FRAME_COLUMNS if self.whole or self.framed else ()
+
+    @property
+    def aggregated(self) -> bool:
+        """Whether it counts or sums over matches, rather than listing them."""
+        return any(isinstance(e, Aggregate) for c in self.columns for e in walk(c.value))
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """A bound query.
+
+    Attributes
+    ----------
+    scope : Scope
+        What stands in ``MATCH``.
+    result : Result
+    relations : frozenset of str
+        Relations that it names, anywhere: what a trace must be able to answer.
+    injective : bool
+        Whether different nodes of a pattern are bound to different nodes.
+    ego : str or None
+        The simulator's id of the ego that was chosen.
+    unknown_is_false : bool
+        Whether relations that a trace cannot answer count as absent.
+    """
+
+    scope: Scope
+    result: Result
+    relations: frozenset[str]
+    injective: bool = True
+    ego: str | None = None
+    unknown_is_false: bool = False
+
+
+def walk(expression: Bound) -> Iterator[Bound]:
+    """An expression and all its parts, but not what stands in the blocks in it."""
+    yield expression
+    match expression:
+        case Operation(operands=operands):
+            for operand in operands:
+                yield from walk(operand)
+        case Aggregate(operand=operand) if operand is not None:
+            yield from walk(operand)
+        case _:
+            pass
+
+
+def nodes_of(expression: Bound) -> frozenset[str]:
+    """Keys of the nodes that an expression speaks of; of a block's, those outside it."""
+    found: set[str] = set()
+    for part in walk(expression):
+        match part:
+            case NodeValue(node=node) | NodeAttribute(node=node) | LabelTest(node=node):
+                found.add(node)
+            case PairNumber(a=a, b=b):
+                found |= {a, b}
+            case BlockValue(scope=scope):
+                found |= set(scope.outer)
+            case _:
+                pass
+    return frozenset(found)
+
+
+def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
+    """The blocks in an expression, not those within them."""
+    return tuple(part for part in walk(expression) if isinstance(part, BlockValue))

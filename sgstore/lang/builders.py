@@ -1,0 +1,490 @@
+"""What the parser builds of each rule of the grammar.
+
+A builder is named for its rule (or for the alias of its alternative), takes the span and the children, and
+returns a part of the syntax tree. Signs and keywords are no children; an absent optional part is ``None``.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from sgstore.errors import Span
+from sgstore.lang import syntax as s
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Children = list[Any]
+
+_ESCAPES: Final = {"n": "\n", "t": "\t", "r": "\r"}
+_ESCAPED: Final = re.compile(r"\\(.)", re.DOTALL)
+_DURATION: Final = re.compile(r"([\d.]+)\s*(\w+)")
+
+
+class BuildError(Exception):
+    """A sentence of the grammar that the language refuses all the same."""
+
+    def __init__(self, reason: str, span: Span | None = None, hint: str | None = None) -> None:
+        self.reason = reason
+        self.span = span
+        self.hint = hint
+        super().__init__(reason)
+
+
+# Values -------------------------------------------------------------------------------------------
+
+
+def _number(span: Span, children: Children) -> s.Constant:
+    text: str = children[0].text
+    value = int(text) if text.isdigit() else float(text)
+    if abs(value) > 1e300:
+        raise BuildError("too large a number")
+    if isinstance(value, int) and value >= 2**63:
+        value = float(value)
+    return s.Constant(value, span)
+
+
+def _whole(token: Any) -> int:
+    if not token.text.isdigit() or len(token.text) > 9:
+        raise BuildError("expected a whole number", token.span)
+    return int(token.text)
+
+
+def _string(span: Span, children: Children) -> s.Constant:
+    return s.Constant(_unquoted(children[0].text), span)
+
+
+def _unquoted(text: str) -> str:
+    return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[1]), text[1:-1])
+
+
+def _truth(span: Span, children: Children) -> s.Constant:
+    return s.Constant(children[0].text.upper() == "TRUE", span)
+
+
+def _duration(span: Span, children: Children) -> s.Duration | s.Parameter:
+    token = children[0]
+    if token.name == "PARAM":
+        return s.Parameter(token.text[1:], span)
+    found = _DURATION.fullmatch(token.text)
+    assert found is not None, token.text  # noqa: S101 - the lexer's pattern is narrower
+    return s.Duration(float(found[1]), found[2].lower(), span)
+
+
+def _parameter(span: Span, children: Children) -> s.Parameter:
+    return s.Parameter(children[0].text[1:], span)
+
+
+def _variable(span: Span, children: Children) -> s.Variable:
+    return s.Variable(children[0].text, span)
+
+
+def _attribute(span: Span, children: Children) -> s.AttributeOf:
+    owner, name = children
+    if not isinstance(owner, s.Variable):
+        raise BuildError(f"only variables have attributes, so '.{name.text}' has no meaning here")
+    return s.AttributeOf(owner, name.text, span)
+
+
+def _arguments(_: Span, children: Children) -> tuple[s.Expression, ...]:
+    return tuple(children)
+
+
+def _list(span: Span, children: Children) -> s.ListOf:
+    return s.ListOf(children[0] or (), span)
+
+
+def _call(span: Span, children: Children) -> s.Call:
+    name, arguments = children
+    return s.Call(name.text, arguments or (), distinct=False, name_span=name.span, span=span)
+
+
+def _count_all(span: Span, _: Children) -> s.CountAll:
+    return s.CountAll(span)
+
+
+def _count_values(span: Span, children: Children) -> s.Call:
+    distinct, value = children
+    return s.Call("count", (value,), distinct is not None, Span(span.start, span.start + 5), span)
+
+
+# Conditions ---------------------------------------------------------------------------------------
+
+
+def _logic(
+    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"],
+) -> Callable[[Span, Children], s.Logic]:
+    return lambda span, children: s.Logic(word, tuple(children), span)
+
+
+def _compare(span: Span, children: Children) -> s.Comparison:
+    left, sign, right = children
+    return s.Comparison("<>" if sign.text == "!=" else sign.text, left, right, span)
+
+
+def _comparison(word: str) -> Callable[[Span, Children], s.Comparison]:
+    return lambda span, children: s.Comparison(word, children[0], children[1], span)
+
+
+def _null_test(*, negated: bool) -> Callable[[Span, Children], s.NullTest]:
+    return lambda span, children: s.NullTest(children[0], negated, span)
+
+
+def _membership(*, negated: bool) -> Callable[[Span, Children], s.Membership]:
+    return lambda span, children: s.Membership(children[0], children[1], negated, span)
+
+
+def _arithmetic(span: Span, children: Children) -> s.Arithmetic:
+    pairs = zip(children[1::2], children[2::2], strict=True)
+    return s.Arithmetic(children[0], tuple((sign.text, term) for sign, term in pairs), span)
+
+
+def _times(_: Span, children: Children) -> Any:
+    return children[0]
+
+
+def _sign(span: Span, children: Children) -> s.Expression:
+    sign, operand = children
+    return s.Negative(operand, span) if sign.text == "-" else operand
+
+
+def _temporal(span: Span, children: Children) -> s.Temporal:
+    word, _, operand = children
+    return s.Temporal(word.text.upper(), (operand,), Span(span.start, word.span.end))
+
+
+def _temporal_pair(_: Span, children: Children) -> s.Temporal:
+    left, word, _, right = children
+    return s.Temporal(word.text.upper(), (left, right), word.span)
+
+
+def _block_expression(word: str) -> Callable[[Span, Children], s.BlockExpression]:
+    return lambda span, children: s.BlockExpression(word, children[0], None, span)
+
+
+def _aggregate_block(span: Span, children: Children) -> s.BlockExpression:
+    word, block, value = children
+    return s.BlockExpression(word.text.upper(), block, value, span)
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+def _label(span: Span, children: Children) -> s.Label:
+    return s.Label(children[0].text, span)
+
+
+def _label_any(span: Span, _: Children) -> s.Label:
+    return s.Label("%", span)
+
+
+def _label_logic(word: Literal["!", "&", "|"]) -> Callable[[Span, Children], s.LabelLogic]:
+    return lambda span, children: s.LabelLogic(word, tuple(children), span)
+
+
+def _props(_: Span, children: Children) -> tuple[s.Property, ...]:
+    return tuple(children)
+
+
+def _prop(_: Span, children: Children) -> s.Property:
+    name, value = children
+    return s.Property(name.text, value, name.span)
+
+
+def _only(_: Span, children: Children) -> Any:
+    return children[0]
+
+
+def _node(span: Span, children: Children) -> s.NodePattern:
+    name, label, props, where = children
+    name_span = name.span if name else span
+    return s.NodePattern(name and name.text, label, props or (), where, name_span, span)
+
+
+def _edge_body(span: Span, children: Children) -> tuple[Any, ...]:
+    name, label, star, props, where = children
+    return name and name.text, label, star, props or (), where, span
+
+
+def _edge(direction: Literal["right", "left", "any"]) -> Callable[[Span, Children], s.EdgePattern]:
+    def build(span: Span, children: Children) -> s.EdgePattern:
+        (name, label, star, props, where, _), repeat = children
+        if star and repeat:
+            raise BuildError("an edge is repeated twice, by '*' and by '{…}'")
+        low, high = star or repeat or (None, None)
+        return s.EdgePattern(name, label, low, high, props, where, direction, span)
+
+    return build
+
+
+def _bare(direction: Literal["right", "left", "any"]) -> Callable[[Span, Children], s.EdgePattern]:
+    return lambda span, _: s.EdgePattern(None, None, None, None, (), None, direction, span)
+
+
+def _star(span: Span, children: Children) -> tuple[int, int]:
+    number, upto = children
+    digits = upto.text[2:].strip() if upto else ""
+    if not number and not upto:
+        raise _unbounded(span)
+    if upto and not digits:
+        raise _unbounded(span)
+    low = _whole(number) if number else 1
+    return _range(low, int(digits[:9]) if upto else low, span)
+
+
+def _repeat(span: Span, children: Children) -> tuple[int, int]:
+    low, high = children
+    if high is None:
+        raise _unbounded(span)
+    return _range(_whole(low), _whole(high), span)
+
+
+def _repeat_exactly(span: Span, children: Children) -> tuple[int, int]:
+    return _range(_whole(children[0]), _whole(children[0]), span)
+
+
+MAX_EDGES: Final = 10
+"""Longest path that one edge pattern may stand for."""
+
+
+def _unbounded(span: Span) -> BuildError:
+    return BuildError(
+        "a repeated edge needs an upper bound", span, f"write *1..{MAX_EDGES} for 1 to {MAX_EDGES}"
+    )
+
+
+def _range(low: int, high: int, span: Span) -> tuple[int, int]:
+    if not 1 <= low <= high:
+        raise BuildError(f"an edge cannot be repeated {low} to {high} times", span, "write *1..3")
+    if high > MAX_EDGES:
+        raise BuildError(f"a repeated edge stands for at most {MAX_EDGES} edges", span)
+    return low, high
+
+
+def _path(_: Span, children: Children) -> s.Path:
+    return s.Path(tuple(children[::2]), tuple(children[1::2]))
+
+
+def _patterns(_: Span, children: Children) -> tuple[s.Path, ...]:
+    return tuple(children)
+
+
+def _block_body(span: Span, children: Children) -> s.Block:
+    paths, where = children
+    return s.Block(paths, where, span)
+
+
+# Statements ---------------------------------------------------------------------------------------
+
+
+def _match_step(span: Span, children: Children) -> tuple[Any, ...]:
+    paths, where, hold, name = children
+    late = hold or name
+    return s.Block(paths, where, span), late
+
+
+def _temporal_part(word: str) -> Callable[[Span, Children], tuple[str, Span]]:
+    return lambda span, _: (word, span)
+
+
+def _holds_step(span: Span, _: Children) -> tuple[Any, ...]:
+    return s.Block((), None, span), ("HOLDS", Span(span.start, span.start + 5))
+
+
+def _absent_step(span: Span, children: Children) -> tuple[Any, ...]:
+    block, _ = children[0]
+    return block, ("NOT MATCH", Span(span.start, block.span.start + 5))
+
+
+def _link(span: Span, _: Children) -> tuple[str, Span]:
+    return "a sequence of steps", span
+
+
+def _sequence(_: Span, children: Children) -> tuple[Any, ...]:
+    """The first block, and the first temporal part of any."""
+    block, late = children[0]
+    return block, late or (children[1] if len(children) > 1 else None)
+
+
+def _match(span: Span, children: Children) -> s.Match:
+    settings, (block, late), returns, order, sample, limit = children
+    if returns or order or sample or limit is not None:
+        distinct, items, at = returns or (False, (s.Item("all", None, None, 0, 0, span),), span)
+        returns = s.Returns(distinct, items, order or (), sample, limit, at)
+    return s.Match(settings or (), block, late, returns, span)
+
+
+def _check(span: Span, _: Children) -> s.Check:
+    return s.Check(Span(span.start, span.start + 5))
+
+
+def _using(_: Span, children: Children) -> tuple[s.Setting, ...]:
+    return tuple(children)
+
+
+def _setting(span: Span, children: Children) -> s.Setting:
+    name, value = children
+    if value.name == "PARAM":
+        return s.Setting(name.text, s.Parameter(value.text[1:], value.span), span)
+    text = _unquoted(value.text) if value.name == "STRING" else value.text
+    return s.Setting(name.text, text, span)
+
+
+def _define(span: Span, children: Children) -> s.Define:
+    _, name, parameters, body = children
+    scenario = isinstance(body, tuple)
+    return s.Define(name.text, parameters or (), None if scenario else body, name.span, span)
+
+
+def _param(_: Span, children: Children) -> s.Formal:
+    name, label, default = children
+    if label or default:
+        raise BuildError("the parameters of a predicate are names, without label or default")
+    return s.Formal(name.text, name.span)
+
+
+def _statements(_: Span, children: Children) -> tuple[Any, ...]:
+    return tuple(child for child in children if child is not None)
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+def _item(span: Span, children: Children) -> s.Item:
+    value, name = children
+    return s.Item("value", value, name and name.text, 0, 0, span)
+
+
+def _form(
+    form: Literal["all", "frames", "intervals", "subgraphs"],
+) -> Callable[[Span, Children], s.Item]:
+    return lambda span, _: s.Item(form, None, None, 0, 0, span)
+
+
+def _clips(span: Span, children: Children) -> s.Item:
+    return s.Item("clips", None, None, children[0], children[1], span)
+
+
+def _offset(span: Span, children: Children) -> int:
+    sign, duration = children
+    if not isinstance(duration, s.Duration) or duration.unit == "frames":
+        raise BuildError("the ends of clips are times such as -3s and +5s", span)
+    return -duration.ns if sign and sign.text == "-" else duration.ns
+
+
+def _sort(_: Span, children: Children) -> s.Sort:
+    value, direction = children
+    return s.Sort(value, bool(direction and direction.text.upper() == "DESC"))
+
+
+def _sample(span: Span, children: Children) -> s.Sample:
+    return s.Sample(_whole(children[0]), children[1], span)
+
+
+def _limit(_: Span, children: Children) -> int:
+    return _whole(children[0])
+
+
+def _returns(span: Span, children: Children) -> tuple[bool, tuple[s.Item, ...], Span]:
+    distinct, items = children
+    return distinct is not None, items, span
+
+
+BUILDERS: Final[dict[str, Callable[[Span, Children], Any]]] = {
+    "start": _statements,
+    "define": _define,
+    "params": _arguments,
+    "param": _param,
+    "match": _match,
+    "check": _check,
+    "quantifier": _only,
+    "qvar": _only,
+    "reset": _only,
+    "using": _using,
+    "setting": _setting,
+    "sequence": _sequence,
+    "absent_step": _absent_step,
+    "match_step": _match_step,
+    "holds_step": _holds_step,
+    "hold": _temporal_part("FOR"),
+    "step_name": _temporal_part("a name for a step"),
+    "link": _link,
+    "gap": _temporal_part("a bound"),
+    "where": _only,
+    "patterns": _patterns,
+    "path": _path,
+    "node": _node,
+    "edge_right": _edge("right"),
+    "edge_left": _edge("left"),
+    "edge_any": _edge("any"),
+    "bare_right": _bare("right"),
+    "bare_left": _bare("left"),
+    "bare_any": _bare("any"),
+    "edge_body": _edge_body,
+    "star": _star,
+    "repeat": _repeat,
+    "repeat_exactly": _repeat_exactly,
+    "label_expr": _only,
+    "label_or": _label_logic("|"),
+    "label_and": _label_logic("&"),
+    "label_neg": _label_logic("!"),
+    "label": _label,
+    "label_any": _label_any,
+    "props": _props,
+    "prop": _prop,
+    "implies": _logic("IMPLIES"),
+    "disjunction": _logic("OR"),
+    "exclusion": _logic("XOR"),
+    "conjunction": _logic("AND"),
+    "negation": _logic("NOT"),
+    "temporal": _temporal,
+    "temporal_pair": _temporal_pair,
+    "bound": _only,
+    "compare": _compare,
+    "equal": _comparison("="),
+    "is_null": _null_test(negated=False),
+    "is_known": _null_test(negated=True),
+    "is_in": _membership(negated=False),
+    "is_not_in": _membership(negated=True),
+    "starts_with": _comparison("STARTS WITH"),
+    "ends_with": _comparison("ENDS WITH"),
+    "contains": _comparison("CONTAINS"),
+    "resembles": _comparison("=~"),
+    "sum": _arithmetic,
+    "product": _arithmetic,
+    "times": _times,
+    "sign": _sign,
+    "attribute": _attribute,
+    "timespan": _duration,
+    "parameter": _parameter,
+    "variable": _variable,
+    "call": _call,
+    "count_all": _count_all,
+    "count_values": _count_values,
+    "exists": _block_expression("EXISTS"),
+    "count_block": _block_expression("COUNT"),
+    "aggregate_block": _aggregate_block,
+    "arguments": _arguments,
+    "list": _list,
+    "block": _only,
+    "block_body": _block_body,
+    "number": _number,
+    "string": _string,
+    "truth": _truth,
+    "null": lambda span, _: s.Constant(None, span),
+    "duration": _duration,
+    "returns": _returns,
+    "items": _arguments,
+    "item": _item,
+    "item_all": _form("all"),
+    "item_frames": _form("frames"),
+    "item_intervals": _form("intervals"),
+    "item_subgraphs": _form("subgraphs"),
+    "item_clips": _clips,
+    "offset": _offset,
+    "order": _arguments,
+    "sort": _sort,
+    "sample": _sample,
+    "limit": _limit,
+}

@@ -1,0 +1,411 @@
+"""What the compiler knows of a store: its vocabulary of attributes, and what it holds.
+
+The attributes are fixed by the schema and are the same for every store. A :class:`Catalog` says what one
+store holds: which kinds of nodes live where, which triples (relation, kind, kind) occur and how often, and
+what its traces can answer. It is a value; the compiler asks nothing of a database.
+
+A node lives in one of three places, and its attributes come from there:
+
+* an entity that moves or changes has a row in ``state`` for each frame, and its constants in ``entity``;
+* a static entity has everything in ``entity``, and its presence in ``node``;
+* a part of the road map has everything in ``map_node``, and its presence in ``node``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    KINDS,
+    LIGHT_STATES,
+    MAP_KINDS,
+    SIGNALS,
+    SPECIALS,
+    VEHICLE_LIGHTS,
+    VEHICLES,
+    folded,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+Triple = tuple[str, str, str]
+"""Relation, kind of the source, kind of the destination."""
+
+
+class Home(StrEnum):
+    """Where the values of an attribute live."""
+
+    state = "state"
+    """Of entities that move or change, frame by frame: table ``state``."""
+    entity = "entity"
+    """Constants of every entity, moving or static: table ``entity``."""
+    scenery = "scenery"
+    """Pose and size of static entities: also in table ``entity``."""
+    map = "map"
+    """Parts of the road map: table ``map_node``."""
+
+
+class Unit(StrEnum):
+    """How the value in the database becomes the value that people see."""
+
+    plain = "plain"
+    degrees = "degrees"
+    east = "east"
+    """A coordinate about the trace's origin; in ``map_node`` it is absolute already."""
+    north = "north"
+    up = "up"
+    light = "light"
+    """A bit of the mask of a vehicle's lights."""
+    derived = "derived"
+    """A bit that says which numbers were computed by differences."""
+    along = "along"
+    """Length of (ax, ay) along the heading."""
+    given = "given"
+    """True where there is a value."""
+    standing = "standing"
+    """Parts of the map never move."""
+    binding = "binding"
+    """The node id itself, in no table."""
+    whole = "whole"
+    """A whole number."""
+    label = "label"
+    """What people call the node: of a part of the map its name, of an entity its kind and id."""
+    seconds = "seconds"
+    """A time in nanoseconds; seen as seconds since the trace began."""
+    span = "span"
+    """A length of time in nanoseconds; seen in seconds."""
+
+
+class Type(StrEnum):
+    """Types of values in expressions."""
+
+    number = "number"
+    text = "text"
+    boolean = "boolean"
+    node = "node"
+    edge = "edge"
+    list = "list"
+    null = "NULL"
+
+
+DERIVED: Final = ("velocity", "acceleration", "yaw_rate")
+"""What may have been computed by differences; the index is the bit in ``state.derived``."""
+
+_ENTITIES: Final = frozenset(ENTITY_KINDS)
+_LANES: Final = frozenset({"lane"})
+_EVERY: Final = frozenset(KINDS)
+_ON_ROADS: Final = frozenset({"lane", "junction", "road", "crosswalk", *SIGNALS})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attribute:
+    """An attribute of nodes, edges, frames or traces; each is there once.
+
+    Attributes
+    ----------
+    name : str
+        Canonical spelling; compared without regard to case and underscores.
+    type : Type
+    columns : mapping of Home to str
+        Column in each home that has it.
+    unit : Unit
+        How the column becomes the value.
+    kinds : frozenset of str
+        Kinds of nodes that may have it.
+    values : tuple of str
+        All values that it can have, if they are a closed list.
+    meaning : str
+        For the documentation; with unit.
+    """
+
+    name: str
+    type: Type
+    columns: Mapping[Home, str]
+    meaning: str
+    unit: Unit = Unit.plain
+    kinds: frozenset[str] = _EVERY
+    values: tuple[str, ...] = ()
+
+
+def _state(name: str, meaning: str, unit: Unit = Unit.plain) -> Attribute:
+    return Attribute(name, Type.number, {Home.state: name}, meaning, unit, _ENTITIES)
+
+
+def _everywhere(name: str, meaning: str, unit: Unit) -> Attribute:
+    homes = {Home.state: name, Home.scenery: name, Home.map: name}
+    return Attribute(name, Type.number, homes, meaning, unit)
+
+
+def _constant(name: str, column: str, meaning: str, values: tuple[str, ...] = ()) -> Attribute:
+    return Attribute(
+        name, Type.text, {Home.entity: column}, meaning, kinds=_ENTITIES, values=values
+    )
+
+
+def _repeated(name: str, meaning: str, values: tuple[str, ...] = ()) -> Attribute:
+    """A constant of entities that their states repeat."""
+    homes = {Home.state: name, Home.entity: name}
+    return Attribute(name, Type.text, homes, meaning, kinds=_ENTITIES, values=values)
+
+
+def _control(name: str, meaning: str) -> Attribute:
+    kinds = frozenset(VEHICLES)
+    return Attribute(name, Type.number, {Home.state: name}, meaning, kinds=kinds)
+
+
+def _of_map(
+    name: str, kind: Type, meaning: str, kinds: frozenset[str], unit: Unit = Unit.plain
+) -> Attribute:
+    return Attribute(name, kind, {Home.map: name}, meaning, unit, kinds)
+
+
+def _named(attributes: Iterable[Attribute]) -> Mapping[str, Attribute]:
+    return {folded(attribute.name): attribute for attribute in attributes}
+
+
+NODE_ATTRIBUTES: Final = _named(
+    (
+        Attribute("id", Type.number, {}, "node id, unique in its trace", Unit.binding),
+        Attribute("name", Type.text, {}, "name of a part of the map; kind and id", Unit.label),
+        Attribute(
+            "kind",
+            Type.text,
+            {Home.entity: "kind", Home.map: "kind"},
+            "what it is",
+            values=KINDS,
+        ),
+        Attribute("is_ego", Type.boolean, {Home.state: "is_ego"}, "whether it is the ego"),
+        Attribute(
+            "type",
+            Type.text,
+            {Home.entity: "type_name", Home.map: "lane_type"},
+            "the simulator's type name; of a lane, its type in OpenDRIVE",
+            kinds=_ENTITIES | _LANES,
+        ),
+        _constant("ident", "ident", "the simulator's own id"),
+        _constant("type_name", "type_name", "the simulator's type name"),
+        _repeated("special", "special kind", SPECIALS),
+        _repeated("subkind", "what a prop or an unknown is"),
+        Attribute(
+            "is_static",
+            Type.boolean,
+            {Home.entity: "is_static", Home.map: "node_id"},
+            "whether it never moves",
+            Unit.standing,
+        ),
+        _everywhere("x", "east; m", Unit.east),
+        _everywhere("y", "north; m", Unit.north),
+        _everywhere("z", "up; m", Unit.up),
+        _everywhere("heading", "counter-clockwise from east; degrees", Unit.degrees),
+        _state("pitch", "degrees", Unit.degrees),
+        _state("roll", "degrees", Unit.degrees),
+        _state("speed", "m/s"),
+        _state("vx", "velocity to the east; m/s"),
+        _state("vy", "velocity to the north; m/s"),
+        _state("vz", "velocity upwards; m/s"),
+        _state("ax", "acceleration to the east; m/s²"),
+        _state("ay", "acceleration to the north; m/s²"),
+        _state("az", "acceleration upwards; m/s²"),
+        Attribute(
+            "accel",
+            Type.number,
+            {Home.state: "ax"},
+            "acceleration along the heading, braking is negative; m/s²",
+            Unit.along,
+            _ENTITIES,
+        ),
+        _state("yaw_rate", "degrees/s, positive to the left", Unit.degrees),
+        _everywhere("length", "of the box, or of the lane; m", Unit.plain),
+        _everywhere("width", "of the box, or the lane's mean; m", Unit.plain),
+        Attribute(
+            "height",
+            Type.number,
+            {Home.state: "height", Home.scenery: "height"},
+            "of the box; m",
+            kinds=_ENTITIES,
+        ),
+        *(
+            Attribute(
+                f"derived_{what}",
+                Type.boolean,
+                {Home.state: "derived"},
+                f"whether its {what} was computed by differences",
+                Unit.derived,
+                _ENTITIES,
+            )
+            for what in DERIVED
+        ),
+        *(
+            Attribute(
+                name,
+                Type.boolean,
+                {Home.state: "lights"},
+                "whether that light of the vehicle is on",
+                Unit.light,
+                frozenset(VEHICLES),
+            )
+            for name in VEHICLE_LIGHTS
+        ),
+        Attribute(
+            "light_state",
+            Type.text,
+            {Home.state: "light_state"},
+            "what a traffic light shows",
+            kinds=frozenset({"traffic_light"}),
+            values=LIGHT_STATES,
+        ),
+        _control("steer", "steering input, -1 … 1, positive to the left"),
+        _control("throttle", "0 … 1"),
+        _control("brake", "0 … 1"),
+        _of_map("lane_type", Type.text, "type of a lane in OpenDRIVE", _LANES),
+        _of_map("road", Type.text, "id of the road", _ON_ROADS),
+        _of_map(
+            "section", Type.number, "number of the lane section in its road", _LANES, Unit.whole
+        ),
+        _of_map("lane", Type.number, "number of the lane in its road", _LANES, Unit.whole),
+        _of_map("junction", Type.text, "id of the junction that it belongs to", _ON_ROADS),
+        Attribute(
+            "in_junction",
+            Type.boolean,
+            {Home.map: "junction"},
+            "whether it belongs to a junction",
+            Unit.given,
+            _ON_ROADS,
+        ),
+        Attribute(
+            "turn",
+            Type.text,
+            {Home.map: "turn"},
+            "where a lane in a junction leads",
+            kinds=_LANES,
+            values=("left", "right", "straight"),
+        ),
+        _of_map("speed_limit", Type.number, "m/s", _LANES | {"road"}),
+    )
+)
+"""Attributes of nodes by folded name, in the order of the documentation."""
+
+
+def _of_lane(name: str, kind: Type, column: str, meaning: str, unit: Unit) -> Attribute:
+    return Attribute(name, kind, {Home.state: column}, meaning, unit)
+
+
+EDGE_ATTRIBUTES: Final = _named(
+    (
+        _of_lane(
+            "overlap", Type.number, "overlap", "share of the footprint in the lane", Unit.plain
+        ),
+        _of_lane(
+            "lane_offset",
+            Type.number,
+            "lane_offset",
+            "of the centre, to the left of the lane's centre line; m",
+            Unit.plain,
+        ),
+        _of_lane(
+            "heading_error",
+            Type.number,
+            "heading_error",
+            "heading less the lane's direction; degrees",
+            Unit.degrees,
+        ),
+        _of_lane(
+            "is_primary",
+            Type.boolean,
+            "is_primary",
+            "the one lane that it is in above all",
+            Unit.plain,
+        ),
+    )
+)
+"""Attributes of ``isIn`` edges from entities to lanes (table ``lane_state``)."""
+
+EDGE_ALIASES: Final = {"offset": "laneoffset", "primary": "isprimary"}
+"""Shorter words for them, folded."""
+
+
+def _plain(name: str, kind: Type, column: str, meaning: str) -> Attribute:
+    return Attribute(name, kind, {Home.state: column}, meaning)
+
+
+FRAME_ATTRIBUTES: Final = _named(
+    (
+        _plain("id", Type.number, "frame_id", "frame_id, unique in every store"),
+        _plain("seq", Type.number, "seq", "number in its trace, from 0"),
+        _plain("time_ns", Type.number, "time_ns", "simulation time; ns"),
+        _plain("log_time_ns", Type.number, "log_time_ns", "log time of the leading message; ns"),
+        Attribute(
+            "t", Type.number, {Home.state: "time_ns"}, "since the trace began; s", Unit.seconds
+        ),
+    )
+)
+"""Attributes of ``frame`` by folded name (table ``frame``)."""
+
+TRACE_ATTRIBUTES: Final = _named(
+    (
+        _plain("id", Type.number, "trace_id", "unique in every store"),
+        _plain("name", Type.text, "name", "the file's name without its ending"),
+        _plain("uri", Type.text, "uri", "path of the file when it was ingested"),
+        _plain("flavour", Type.text, "flavour", "the reader: osi"),
+        _plain("ego", Type.text, "ego", "the simulator's id of the ego"),
+        _plain("frames", Type.number, "frames", "number of frames"),
+        Attribute("duration", Type.number, {Home.state: "end_ns"}, "s", Unit.seconds),
+        Attribute(
+            "period",
+            Type.number,
+            {Home.state: "period_ns"},
+            "median, between frames; s",
+            Unit.given,
+        ),
+        Attribute("map", Type.text, {Home.map: "name"}, "name of the road map"),
+    )
+)
+"""Attributes of ``trace`` by folded name (table ``trace``)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TraceFacts:
+    """What the compiler knows of a trace.
+
+    Attributes
+    ----------
+    trace_id : int
+    name : str
+    ego : str
+        The simulator's id of the ego; empty without one.
+    answers : frozenset of str
+        Relations that it can answer; of the others nothing is known.
+    """
+
+    trace_id: int
+    name: str
+    ego: str
+    answers: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Catalog:
+    """What a store holds, as far as the compiler cares.
+
+    Attributes
+    ----------
+    edges : mapping of Triple to int
+        Rows of table ``edge`` for each triple that occurs.
+    map_edges : mapping of Triple to int
+        Rows of table ``map_edge`` for each triple that occurs.
+    moving, fixed, mapped : frozenset of str
+        Kinds that occur in table ``state``, among the static ones of table ``entity``, and in table
+        ``map_node``.
+    traces : tuple of TraceFacts
+    """
+
+    edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
+    map_edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
+    moving: frozenset[str] = _ENTITIES
+    fixed: frozenset[str] = frozenset()
+    mapped: frozenset[str] = frozenset(MAP_KINDS)
+    traces: tuple[TraceFacts, ...] = ()

@@ -1,0 +1,159 @@
+"""Text → statements, by way of the stages: parse, bind, rewrite, emit. Each is a pure function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from sgstore.lang import results
+from sgstore.lang.binder import bind_query
+from sgstore.lang.bound import Column, FrameAttribute, Result
+from sgstore.lang.catalog import FRAME_ATTRIBUTES, Type
+from sgstore.lang.parser import parse
+from sgstore.lang.phases import traces_of
+from sgstore.lang.printing import query_text, statements_text
+from sgstore.lang.rewrite import rewritten
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.lang.bound import Query
+    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.phases import Window
+    from sgstore.lang.results import Statement
+
+
+@dataclass(frozen=True, slots=True)
+class Compiled:
+    """A query that can be asked of a store.
+
+    Attributes
+    ----------
+    text : str
+        As it was written.
+    bound : Query
+        As the binder gave it.
+    query : Query
+        Rewritten.
+    catalog : Catalog
+        What it was compiled against.
+    """
+
+    text: str
+    bound: Query
+    query: Query
+    catalog: Catalog
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of what it returns."""
+        return self.rows().columns
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the traces that cannot answer it."""
+        _, left = traces_of(self.query, self.catalog)
+        chosen = [t for t in self.catalog.traces if self.query.ego in {None, t.ego}]
+        return tuple(trace.name for trace in chosen if trace.trace_id in left)
+
+    def rows(self, window: Window | None = None) -> Statement:
+        """What it returns."""
+        return results.rows(self.query, self.catalog, window)
+
+    def frames(self, window: Window | None = None) -> Statement:
+        """The frames that match, each once, with their log times."""
+        return results.frames(self.query, self.catalog, window)
+
+    def bindings(self, window: Window | None = None) -> Statement:
+        """Frames and what the variables are bound to, whatever ``RETURN`` says."""
+        return results.rows(replace(self.query, result=Result()), self.catalog, window)
+
+    def intervals(self, window: Window | None = None) -> Statement:
+        """Intervals in which what it returns stays the same; without ``RETURN``, what it binds.
+
+        Of a query that returns rows these are all intervals, whatever its order and its limit.
+        """
+        query, result = self.query, self.query.result
+        if result.whole or result.aggregated:
+            query = results.with_bindings(query)
+        elif result.form == "rows":
+            result = Result(form="intervals", columns=result.columns, whole=False)
+            query = replace(query, result=result)
+        return results.intervals(query, self.catalog, window)
+
+    def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> Statement:
+        """Clips around the frames that match; the offsets of ``RETURN CLIPS`` win over those given.
+
+        Parameters
+        ----------
+        before_ns, after_ns : int
+            What is added before the first and after the last frame of each; ns.
+        window : Window, optional
+        """
+        result = self.query.result
+        if result.form != "clips":
+            result = Result(form="clips", whole=False, before=-before_ns, after=after_ns)
+        return results.intervals(replace(self.query, result=result), self.catalog, window)
+
+    @property
+    def in_windows(self) -> bool:
+        """Whether its rows can be had window by window: if none depends on those of other windows."""
+        result = self.query.result
+        framed = result.whole or result.framed or result.form != "rows"
+        across = result.distinct and not framed
+        return not (result.order or result.sample or result.aggregated or across)
+
+    @property
+    def limited_to_frames(self) -> Compiled | None:
+        """If it lists a limited number of rows: the query that says of each its frame and log time."""
+        result = self.query.result
+        if result.limit is None or result.form != "rows" or result.aggregated:
+            return None
+        time = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
+        columns = (*result.columns, Column(f":{results.LOG_TIME}", time))
+        result = replace(result, framed=True, columns=columns)
+        return replace(self, query=replace(self.query, result=result))
+
+    def stages(self) -> str:
+        """What became of the text, stage by stage."""
+        statements = parse(self.text)
+        statement = self.rows()
+        values = "".join(f"\n${i} = {v!r}" for i, v in enumerate(statement.values, start=1))
+        parts = (
+            ("parse", statements_text(statements)),
+            ("bind", query_text(self.bound)),
+            ("rewrite", query_text(self.query)),
+            ("emit", statement.sql + values),
+        )
+        return "\n\n".join(f"---- {name}\n{text}" for name, text in parts)
+
+    def count(self, window: Window | None = None) -> Statement:
+        """How many frames match."""
+        return results.count(self.query, self.catalog, window)
+
+
+def compile_query(
+    text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
+) -> Compiled:
+    """A query that can be asked of a store.
+
+    Parameters
+    ----------
+    text : str
+        One ``MATCH``, with the predicates that it needs.
+    catalog : Catalog
+        Of the store.
+    parameters : mapping of str to value
+        Values of ``$name``: numbers, texts, truth values, or lists of these.
+
+    Raises
+    ------
+    QuerySyntaxError
+        The text is not a sentence of the language.
+    QueryNameError
+        It names what is not known.
+    QueryError
+        Its types do not fit together.
+    """
+    bound = bind_query(text, parse(text), catalog, parameters or {})
+    return Compiled(text, bound, rewritten(bound, catalog), catalog)

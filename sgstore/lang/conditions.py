@@ -1,0 +1,414 @@
+"""Expressions: names resolved, types checked, words of the vocabulary in their canonical spelling."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryNameError, Span
+from sgstore.lang import bound as b
+from sgstore.lang import syntax as s
+from sgstore.lang.catalog import (
+    EDGE_ALIASES,
+    EDGE_ATTRIBUTES,
+    FRAME_ATTRIBUTES,
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Attribute,
+    Type,
+)
+from sgstore.lang.names import RESERVED, Names, hint_at
+from sgstore.vocabulary import KINDS, folded, kinds_labelled
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+_ORDERED: Final = frozenset({"<", "<=", ">", ">="})
+_TEXT_TESTS: Final = frozenset({"STARTS WITH", "ENDS WITH", "CONTAINS", "=~"})
+_NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+")
+
+
+def condition(expression: s.Expression, names: Names) -> b.Bound:
+    """A bound expression that is true, false or unknown.
+
+    Raises
+    ------
+    QueryError
+        It is something else.
+    """
+    found = bind(expression, names)
+    if found.type not in {Type.boolean, Type.null}:
+        names.session.refuse(
+            f"expected a condition, but this is a {found.type.value}", expression.span
+        )
+    return found
+
+
+def bind(expression: s.Expression, names: Names) -> b.Bound:
+    """A bound expression of any type.
+
+    Raises
+    ------
+    QueryNameError
+        It names what is not known.
+    QueryError
+        Its types do not fit together.
+    """
+    return _BINDERS[type(expression)](expression, names)
+
+
+# Values and names ---------------------------------------------------------------------------------
+
+
+def _constant(e: s.Constant, _: Names) -> b.Value:
+    return b.Value(e.value, _type_of(e.value))
+
+
+def _type_of(value: object) -> Type:
+    if value is None:
+        return Type.null
+    if isinstance(value, bool):
+        return Type.boolean
+    return Type.text if isinstance(value, str) else Type.number
+
+
+def _seconds(e: s.Duration, names: Names) -> b.Value:
+    if e.unit == "frames":
+        names.session.temporal("a number of frames", e.span)
+    return b.Value(e.ns / 1e9, Type.number)
+
+
+def _parameter(e: s.Parameter, names: Names) -> b.Bound:
+    value = parameter(e, names)
+    if isinstance(value, list | tuple):
+        return b.Choices(tuple(_checked(item, e, names) for item in value))
+    return _checked(value, e, names)
+
+
+def parameter(e: s.Parameter, names: Names) -> Any:
+    """The value that came with the query for a parameter.
+
+    Raises
+    ------
+    QueryNameError
+        None came.
+    """
+    session = names.session
+    if e.name not in session.parameters:
+        session.refuse(
+            f"the parameter ${e.name} has no value",
+            e.span,
+            f"give it one: find(…, {e.name}=…), or --param {e.name}=…",
+        )
+    session.used.add(e.name)
+    return session.parameters[e.name]
+
+
+def _checked(value: object, e: s.Parameter, names: Names) -> b.Value:
+    if value is not None and not isinstance(value, bool | int | float | str):
+        names.session.refuse(
+            f"the parameter '{e.name}' is {type(value).__name__}; expected a number, a text, "
+            "true or false, or a list of these",
+            e.span,
+        )
+    return b.Value(value, _type_of(value))
+
+
+def _variable(e: s.Variable, names: Names) -> b.Bound:
+    if e.name in RESERVED:
+        names.session.refuse(f"'{e.name}' has attributes, but is no value itself", e.span)
+    meaning = names.meaning(e.name)
+    if meaning is not None and meaning.value is not None:
+        return meaning.value
+    if meaning is not None and meaning.edge is not None:
+        names.session.refuse(f"'{e.name}' is an edge; its relation is type({e.name})", e.span)
+    return b.NodeValue(names.node(e.name, e.span))
+
+
+def _attribute(e: s.AttributeOf, names: Names) -> b.Bound:
+    owner = e.owner.name
+    if owner in RESERVED and names.meaning(owner) is None:
+        known, make = _OF_RESERVED[owner]
+        found = known.get(folded(e.name))
+        if found is None:
+            known_names = [attribute.name for attribute in known.values()]
+            names.session.unknown(f"attribute of {owner}", e.name, _tail(e), known_names)
+        return make(found, found.type)
+    meaning = names.meaning(owner)
+    if meaning is not None and meaning.edge is not None:
+        return edge_attribute(meaning.edge, e.name, _tail(e), names)
+    return node_attribute(names.node(owner, e.owner.span), e.name, _tail(e), names)
+
+
+_OF_RESERVED: Final[dict[str, tuple[Mapping[str, Attribute], Callable[..., b.Bound]]]] = {
+    "frame": (FRAME_ATTRIBUTES, b.FrameAttribute),
+    "trace": (TRACE_ATTRIBUTES, b.TraceAttribute),
+}
+
+
+def _tail(e: s.AttributeOf) -> Span:
+    return Span(e.span.end - len(e.name), e.span.end)
+
+
+def node_attribute(key: str, name: str, span: Span, names: Names) -> b.NodeAttribute:
+    """An attribute of a node.
+
+    Raises
+    ------
+    QueryNameError
+        There is none of that name, or not for nodes of these kinds.
+    """
+    kinds = names.scope.kinds(key).every
+    possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds]
+    found = NODE_ATTRIBUTES.get(folded(name))
+    if found is None:
+        names.session.unknown("attribute", name, span, possible)
+    if not found.kinds & kinds:
+        what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"
+        owners = [kind for kind in KINDS if kind in found.kinds]
+        hint = hint_at(name, possible)
+        if hint is None or not hint.startswith("did"):
+            hint = f"it belongs to: {', '.join(owners)}"
+        raise QueryNameError(
+            f"a {what} has no attribute '{found.name}'",
+            text=names.session.text,
+            span=span,
+            hint=hint,
+        )
+    return b.NodeAttribute(key, found, found.type)
+
+
+def edge_attribute(key: str, name: str, span: Span, names: Names) -> b.EdgeAttribute:
+    """An attribute of an edge.
+
+    Raises
+    ------
+    QueryNameError
+        There is none of that name.
+    QueryError
+        The edge is not one of those that have attributes: ``isIn``, by itself.
+    """
+    found = EDGE_ATTRIBUTES.get(EDGE_ALIASES.get(folded(name), folded(name)))
+    if found is None:
+        known = [attribute.name for attribute in EDGE_ATTRIBUTES.values()]
+        names.session.unknown("attribute of an edge", name, span, known)
+    edge = next((edge for edge in names.scope.edges if edge.key == key), None)
+    if edge is None:
+        names.session.refuse("an edge is known only in the pattern that binds it", span)
+    if edge.relations != frozenset({"isIn"}) or edge.high > 1:
+        names.session.refuse(
+            f"only isIn edges from an entity to a lane have '{found.name}'",
+            span,
+            "write -[:isIn]->",
+        )
+    return b.EdgeAttribute(key, found, found.type)
+
+
+def _list(e: s.ListOf, names: Names) -> b.Choices:
+    items = [bind(item, names) for item in e.items]
+    for item, written in zip(items, e.items, strict=True):
+        if not isinstance(item, b.Value):
+            names.session.refuse("a list holds constants and parameters only", written.span)
+    return b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
+
+
+# Logic --------------------------------------------------------------------------------------------
+
+
+def _logic(e: s.Logic, names: Names) -> b.Operation:
+    operands = tuple(condition(operand, names) for operand in e.operands)
+    return b.Operation(e.word, operands, Type.boolean)
+
+
+def _comparison(e: s.Comparison, names: Names) -> b.Operation:
+    left, right = bind(e.left, names), bind(e.right, names)
+    if e.word in _TEXT_TESTS:
+        return _text_test(e, left, right, names)
+    for side, written in ((left, e.left), (right, e.right)):
+        if side.type is Type.null:
+            names.session.refuse(
+                "a comparison with NULL is never true", written.span, "write IS NULL"
+            )
+        if side.type is Type.list:
+            names.session.refuse("a list cannot be compared", written.span, "write IN")
+    if left.type is not right.type:
+        names.session.refuse(
+            f"a {left.type.value} cannot be compared with a {right.type.value}", e.span
+        )
+    if e.word in _ORDERED and left.type in {Type.node, Type.boolean}:
+        names.session.refuse(f"a {left.type.value} is not more or less than another", e.span)
+    left, right = (
+        _canonical(left, right, e.left.span, names),
+        _canonical(right, left, e.right.span, names),
+    )
+    return b.Operation(e.word, (left, right), Type.boolean)
+
+
+def _canonical(value: b.Bound, other: b.Bound, span: Span, names: Names) -> b.Bound:
+    """A text that is compared with an attribute of a closed vocabulary, in the spelling of the store."""
+    known = _vocabulary(other)
+    if not known or not isinstance(value, b.Value) or not isinstance(value.value, str):
+        return value
+    by_folded = {folded(word): word for word in known}
+    word = by_folded.get(folded(value.value))
+    if word is None and isinstance(other, b.NodeAttribute) and other.attribute.name == "kind":
+        word = _kind(value.value, span, names)
+    if word is None:
+        names.session.unknown(_what(other), value.value, span, known)
+    return b.Value(word, Type.text, closed=True)
+
+
+def _vocabulary(expression: b.Bound) -> tuple[str, ...]:
+    match expression:
+        case b.NodeAttribute(attribute=attribute):
+            return attribute.values
+        case b.EdgeRelation():
+            return tuple(sorted(b.ANY_RELATION))
+        case _:
+            return ()
+
+
+def _what(expression: b.Bound) -> str:
+    return expression.attribute.name if isinstance(expression, b.NodeAttribute) else "relation"
+
+
+def _kind(word: str, span: Span, names: Names) -> str | None:
+    kinds = kinds_labelled(word)
+    if kinds and len(kinds) > 1:
+        names.session.refuse(
+            f"'{word}' is several kinds", span, f"use it as a label: (x:{word.capitalize()})"
+        )
+    return kinds[0] if kinds else None
+
+
+def _text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: Names) -> b.Operation:
+    for side, written in ((left, e.left), (right, e.right)):
+        if side.type is not Type.text:
+            names.session.refuse(
+                f"{e.word} compares texts, but this is a {side.type.value}", written.span
+            )
+    if e.word == "=~":
+        _check_regex(right, e.right.span, names)
+    return b.Operation(e.word, (left, right), Type.boolean)
+
+
+def _check_regex(pattern: b.Bound, span: Span, names: Names) -> None:
+    if not isinstance(pattern, b.Value):
+        names.session.refuse("the pattern after =~ must be a constant", span)
+    text = str(pattern.value)
+    try:
+        re.compile(text)
+    except re.error as error:
+        names.session.refuse(f"not a regular expression: {error}", span)
+    if _NOT_RE2.search(text):
+        names.session.refuse(
+            "not a regular expression that can be searched for",
+            span,
+            "no look-around, no back-references",
+        )
+
+
+def _null_test(e: s.NullTest, names: Names) -> b.Operation:
+    operand = bind(e.operand, names)
+    if operand.type in {Type.node, Type.list}:
+        names.session.refuse(f"a {operand.type.value} is never NULL", e.operand.span)
+    word = "IS NOT NULL" if e.negated else "IS NULL"
+    return b.Operation(word, (operand,), Type.boolean)
+
+
+def _membership(e: s.Membership, names: Names) -> b.Operation:
+    operand, choices = bind(e.operand, names), bind(e.choices, names)
+    if not isinstance(choices, b.Choices):
+        names.session.refuse("expected a list after IN", e.choices.span, "write IN ['a', 'b']")
+    for item in choices.items:
+        if item.type is Type.null:
+            names.session.refuse("NULL is in no list", e.choices.span)
+        if item.type is not operand.type:
+            names.session.refuse(
+                f"a {operand.type.value} cannot be in a list with a {item.type.value}", e.span
+            )
+    items = tuple(_canonical(item, operand, e.choices.span, names) for item in choices.items)
+    canonical = b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
+    found = b.Operation("IN", (operand, canonical), Type.boolean)
+    return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
+
+
+# Numbers ------------------------------------------------------------------------------------------
+
+
+def number(expression: s.Expression, names: Names) -> b.Bound:
+    """A bound expression that is a number."""
+    found = bind(expression, names)
+    if found.type is not Type.number:
+        names.session.refuse(
+            f"expected a number, but this is a {found.type.value}", expression.span
+        )
+    return found
+
+
+def _arithmetic(e: s.Arithmetic, names: Names) -> b.Bound:
+    result = number(e.first, names)
+    for sign, term in e.rest:
+        result = b.Operation(sign, (result, number(term, names)), Type.number)
+    return result
+
+
+def _negative(e: s.Negative, names: Names) -> b.Bound:
+    operand = number(e.operand, names)
+    if isinstance(operand, b.Value) and isinstance(operand.value, int | float):
+        return b.Value(-operand.value, Type.number)
+    return b.Operation("negative", (operand,), Type.number)
+
+
+def _count_all(e: s.CountAll, names: Names) -> b.Aggregate:
+    if not names.aggregates:
+        names.session.refuse(
+            "COUNT(*) may stand after RETURN only", e.span, "COUNT {…} counts in a condition"
+        )
+    return b.Aggregate("count", None, distinct=False, type=Type.number)
+
+
+# Calls, blocks and time ----------------------------------------------------------------------------------
+
+
+def _call(e: s.Call, names: Names) -> b.Bound:
+    from sgstore.lang.functions import call  # calls hold expressions, and expressions calls
+
+    return call(e, names)
+
+
+def _block(e: s.BlockExpression, names: Names) -> b.BlockValue:
+    from sgstore.lang.binder import (
+        bind_block,
+    )  # patterns hold expressions, and expressions patterns
+
+    session, inner = names.session, names.block()
+    bind_block(e.block, inner)
+    value = number(e.value, inner) if e.value is not None else None
+    kind = Type.boolean if e.word == "EXISTS" else Type.number
+    session.blocks += 1
+    return b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
+
+
+def _temporal(e: s.Temporal, names: Names) -> b.Bound:
+    names.session.temporal(e.word, e.span)
+
+
+_BINDERS: Final[dict[type, Callable[[Any, Names], b.Bound]]] = {
+    s.Constant: _constant,
+    s.Duration: _seconds,
+    s.Parameter: _parameter,
+    s.Variable: _variable,
+    s.AttributeOf: _attribute,
+    s.Call: _call,
+    s.CountAll: _count_all,
+    s.ListOf: _list,
+    s.Logic: _logic,
+    s.Comparison: _comparison,
+    s.NullTest: _null_test,
+    s.Membership: _membership,
+    s.Arithmetic: _arithmetic,
+    s.Negative: _negative,
+    s.BlockExpression: _block,
+    s.Temporal: _temporal,
+}

@@ -1,0 +1,416 @@
+"""Pieces of SQL text: values, attributes, conditions, and the numbers of pairs of entities.
+
+Portable SQL only: what stands here runs on DuckDB and can be carried to other engines. Every identifier is
+quoted, every value of the user's is bound; words of the vocabulary stand in the text.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.lang.bound import (
+    Aggregate,
+    BlockValue,
+    Bound,
+    Choices,
+    EdgeAttribute,
+    EdgeRelation,
+    FrameAttribute,
+    LabelTest,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    PairNumber,
+    TraceAttribute,
+    Value,
+)
+from sgstore.lang.catalog import DERIVED, Attribute, Home, Type, Unit
+from sgstore.vocabulary import VEHICLE_LIGHTS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.lang.bound import Edge
+
+
+def quoted(name: str) -> str:
+    """An identifier."""
+    return '"' + name.replace('"', '""') + '"'
+
+
+def word(text: str) -> str:
+    """A word of the vocabulary as a literal."""
+    return "'" + text.replace("'", "''") + "'"
+
+
+@dataclass(slots=True)
+class Values:
+    """The values of the user's that a statement binds, in order."""
+
+    items: list[Any] = field(default_factory=list[Any])
+
+    def add(self, value: object) -> str:
+        """The placeholder of a value."""
+        self.items.append(value)
+        return f"${len(self.items)}"
+
+
+@dataclass(slots=True)
+class Select:
+    """A statement in the making: one line for each column, table and condition."""
+
+    columns: list[str] = field(default_factory=list[str])
+    tables: list[str] = field(default_factory=list[str])
+    where: list[str] = field(default_factory=list[str])
+    group: list[str] = field(default_factory=list[str])
+    having: list[str] = field(default_factory=list[str])
+    order: list[str] = field(default_factory=list[str])
+    limit: int | None = None
+    distinct: bool = False
+
+    def text(self) -> str:
+        """The statement."""
+        head = "SELECT DISTINCT " if self.distinct else "SELECT "
+        lines = [head + ",\n  ".join(self.columns)]
+        lines += ["FROM " + "\n  ".join(self.tables)] if self.tables else []
+        lines += ["WHERE " + "\n  AND ".join(self.where)] if self.where else []
+        lines += ["GROUP BY " + ", ".join(self.group)] if self.group else []
+        lines += ["HAVING " + "\n  AND ".join(self.having)] if self.having else []
+        lines += ["ORDER BY " + ", ".join(self.order)] if self.order else []
+        lines += [f"LIMIT {self.limit}"] if self.limit is not None else []
+        return "\n".join(lines)
+
+    def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
+        """Add a table; without conditions it goes with every row."""
+        if not self.tables:
+            self.tables.append(table)
+            self.where += conditions
+        elif conditions:
+            self.tables.append(f"{how} {table} ON " + " AND ".join(conditions))
+        else:
+            self.tables.append(f"CROSS JOIN {table}")
+
+
+def indented(text: str) -> str:
+    """A statement within another."""
+    return "\n".join(f"    {line}" for line in text.splitlines())
+
+
+def nested(text: str, name: str) -> str:
+    """A statement as a table."""
+    return f"(\n{indented(text)}\n  ) AS {quoted(name)}"
+
+
+# Values of nodes ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Aliases:
+    """Aliases under which the tables of a node's attributes stand in a statement; ``None``: not there."""
+
+    state: str | None = None
+    entity: str | None = None
+    map: str | None = None
+    trace: str | None = None
+
+
+_ORIGINS: Final = {Unit.east: "origin_x", Unit.north: "origin_y", Unit.up: "origin_z"}
+_ABSENT: Final = {
+    Type.number: "CAST(NULL AS DOUBLE)",
+    Type.text: "CAST(NULL AS VARCHAR)",
+    Type.boolean: "CAST(NULL AS BOOLEAN)",
+}
+
+
+def attribute_text(attribute: Attribute, at: Aliases) -> str:
+    """The value of an attribute of a node that lives in one of some places."""
+    if attribute.unit is Unit.label:
+        return _label(at)
+    parts = [
+        _part(attribute, home, f"{alias}.{quoted(attribute.columns[home])}", alias, at.trace)
+        for home, alias in (
+            (Home.state, at.state),
+            (Home.entity, at.entity),
+            (Home.scenery, at.entity),
+            (Home.map, at.map),
+        )
+        if alias is not None and home in attribute.columns
+    ]
+    if attribute.name == "is_ego":
+        parts.append("FALSE")
+    if not parts:
+        return _ABSENT[attribute.type]
+    if attribute.values and len(parts) > 1:
+        parts = [f"CAST({part} AS VARCHAR)" for part in parts]
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def _part(attribute: Attribute, home: Home, column: str, alias: str, trace: str | None) -> str:
+    number = f"CAST({column} AS DOUBLE)"
+    unit = attribute.unit
+    if unit in _ORIGINS and home is not Home.map:
+        return f"({number} + {trace}.{quoted(_ORIGINS[unit])})"
+    if unit in _BITS:
+        bit = 2 ** _BITS[unit].index(attribute.name)
+        return f"({column} & {bit}) <> 0"
+    if unit is Unit.standing and home is Home.map:
+        return f"CASE WHEN {column} IS NOT NULL THEN TRUE END"
+    if unit is Unit.along:
+        ay, heading = (f"CAST({alias}.{quoted(c)} AS DOUBLE)" for c in ("ay", "heading"))
+        return f"({number} * cos({heading}) + {ay} * sin({heading}))"
+    if unit is Unit.given:
+        return f"CASE WHEN {alias}.{quoted('node_id')} IS NOT NULL THEN {column} IS NOT NULL END"
+    plain = number if attribute.type is Type.number else column
+    return _CONVERTED.get(unit, "{1}").format(column, plain)
+
+
+_BITS: Final = {
+    Unit.light: VEHICLE_LIGHTS,
+    Unit.derived: tuple(f"derived_{what}" for what in DERIVED),
+}
+_CONVERTED: Final = {Unit.degrees: "degrees({1})", Unit.whole: "CAST({0} AS BIGINT)"}
+
+
+def _label(at: Aliases) -> str:
+    parts: list[str] = []
+    if at.map:
+        parts.append(f"{at.map}.{quoted('name')}")
+    if at.entity:
+        kind = f"CAST({at.entity}.{quoted('kind')} AS VARCHAR)"
+        parts.append(f"{kind} || ' ' || CAST({at.entity}.{quoted('node_id')} AS VARCHAR)")
+    if not parts:
+        return _ABSENT[Type.text]
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, map_: str) -> str:
+    """The value of an attribute of the frame or of the trace."""
+    attribute = leaf.attribute
+    home, column = next(iter(attribute.columns.items()))
+    alias = map_ if home is Home.map else frame if isinstance(leaf, FrameAttribute) else trace
+    value = f"{alias}.{quoted(column)}"
+    match attribute.unit:
+        case Unit.seconds:
+            return f"(CAST({value} - {trace}.{quoted('start_ns')} AS DOUBLE) / 1e9)"
+        case Unit.span:
+            return f"(CAST({value} AS DOUBLE) / 1e9)"
+        case _:
+            return value
+
+
+# Expressions ---------------------------------------------------------------------------------------
+
+Leaf = (
+    NodeValue
+    | NodeAttribute
+    | EdgeRelation
+    | EdgeAttribute
+    | FrameAttribute
+    | TraceAttribute
+    | PairNumber
+    | BlockValue
+)
+"""What an expression is made of, as far as a statement must bring it as a column."""
+
+_INFIX: Final = frozenset({"AND", "OR"})
+_TESTS: Final = {
+    "STARTS WITH": "starts_with",
+    "ENDS WITH": "ends_with",
+    "CONTAINS": "contains",
+    "=~": "regexp_full_match",
+}
+_COMPARISONS: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
+
+
+def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: Values) -> str:
+    """An expression; ``leaf`` gives the text of the columns in it."""
+    match expression:
+        case Value():
+            return _value(expression, values)
+        case Operation():
+            return _operation(expression, leaf, values)
+        case Aggregate(word=name, operand=operand, distinct=distinct):
+            inner = "*" if operand is None else expression_text(operand, leaf, values)
+            return f"{name}({'DISTINCT ' * distinct}{inner})"
+        case NodeAttribute(attribute=attribute) if attribute.values:
+            return f"CAST({leaf(expression)} AS VARCHAR)"
+        case Choices() | LabelTest():
+            raise TypeError(f"{expression} is no column")
+        case _:
+            return leaf(expression)
+
+
+def _value(value: Value, values: Values) -> str:
+    if value.value is None:
+        return "NULL"
+    if isinstance(value.value, bool):
+        return "TRUE" if value.value else "FALSE"
+    if value.closed:
+        return word(str(value.value))
+    return values.add(value.value)
+
+
+def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: Values) -> str:
+    name = operation.word
+    if name in _COMPARISONS:
+        left, right = (_compared(o, operation, leaf, values) for o in operation.operands)
+        return f"{left} {name} {right}"
+    if name == "IN":
+        return _membership(operation, leaf, values)
+    parts = [expression_text(operand, leaf, values) for operand in operation.operands]
+    if name in _INFIX:
+        return "(" + f" {name} ".join(f"({part})" for part in parts) + ")"
+    if name == "XOR":  # unknown if one part is, as <> is
+        return reduce(lambda left, right: f"(({left}) <> ({right}))", parts)
+    if name in _TESTS:
+        return f"{_TESTS[name]}({parts[0]}, {parts[1]})"
+    return _function(name, parts)
+
+
+_TEMPLATES: Final = {
+    "NOT": "NOT ({0})",
+    "IMPLIES": "(NOT ({0}) OR ({1}))",
+    "IS NULL": "({0}) IS NULL",
+    "IS NOT NULL": "({0}) IS NOT NULL",
+    "negative": "(- {0})",
+    "/": "({0} / nullif({1}, 0))",
+    "%": "({0} % nullif({1}, 0))",
+    "+": "({0} + {1})",
+    "-": "({0} - {1})",
+    "*": "({0} * {1})",
+    "sqrt": "CASE WHEN {0} >= 0 THEN sqrt({0}) END",
+}
+
+
+def _function(name: str, parts: list[str]) -> str:
+    if name in _TEMPLATES:
+        return _TEMPLATES[name].format(*parts)
+    if name in {"min", "max"}:
+        known = " AND ".join(f"{part} IS NOT NULL" for part in parts)
+        extreme = {"min": "least", "max": "greatest"}[name]
+        return f"CASE WHEN {known} THEN {extreme}({', '.join(parts)}) END"
+    return f"{name}({', '.join(parts)})"
+
+
+def _compared(
+    operand: Bound, operation: Operation, leaf: Callable[[Leaf], str], values: Values
+) -> str:
+    """One side of a comparison: a column of the vocabulary is compared with its words as it is."""
+    closed = all(
+        (isinstance(o, Value) and o.closed) or (isinstance(o, NodeAttribute) and o.attribute.values)
+        for o in operation.operands
+    )
+    words = any(isinstance(o, Value) for o in operation.operands)
+    if closed and words and operation.word in {"=", "<>"} and isinstance(operand, NodeAttribute):
+        return leaf(operand)
+    text = expression_text(operand, leaf, values)
+    return f"({text})" if isinstance(operand, Operation) else text
+
+
+def _membership(operation: Operation, leaf: Callable[[Leaf], str], values: Values) -> str:
+    operand, choices = operation.operands
+    assert isinstance(choices, Choices)  # noqa: S101 - the binder built it so
+    if not choices.items:
+        return "FALSE"
+    if isinstance(operand, NodeAttribute) and all(item.closed for item in choices.items):
+        text = leaf(operand)
+    else:
+        text = expression_text(operand, leaf, values)
+    return f"({text}) IN ({', '.join(_value(item, values) for item in choices.items)})"
+
+
+def leaves(expression: Bound) -> Iterable[Leaf]:
+    """The columns that an expression is made of."""
+    match expression:
+        case Value() | Choices() | LabelTest():
+            return
+        case Operation(operands=operands):
+            for operand in operands:
+                yield from leaves(operand)
+        case Aggregate(operand=operand):
+            if operand is not None:
+                yield from leaves(operand)
+        case _:
+            yield expression
+
+
+def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> list[str]:
+    """Columns of the relations here that bind nodes and edges."""
+    return [quoted(f"{key}.id") for key in sorted(nodes)] + [
+        quoted(f"{key}.type") for key in sorted(edges)
+    ]
+
+
+def lane_ends(src: str, dst: str, edge: Edge) -> tuple[str, str]:
+    """The ends of an ``isIn`` edge as entity and lane: ids of entities are 0 and above, of lanes below."""
+    return (f"greatest({src}, {dst})", f"least({src}, {dst})") if edge.both else (src, dst)
+
+
+def lane_text(leaf: Leaf, alias: str) -> str:
+    """The value of an attribute of an edge, whose row of ``lane_state`` stands under an alias."""
+    assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
+    return attribute_text(leaf.attribute, Aliases(state=alias))
+
+
+def is_position(leaf: Leaf) -> bool:
+    """Whether a value is stored about the trace's origin."""
+    return isinstance(leaf, NodeAttribute) and leaf.attribute.unit in {
+        Unit.east,
+        Unit.north,
+        Unit.up,
+    }
+
+
+def is_constant(leaf: Leaf) -> bool:
+    """Whether a value of an entity never changes."""
+    if not isinstance(leaf, NodeAttribute):
+        return False
+    return Home.entity in leaf.attribute.columns or leaf.attribute.unit is Unit.label
+
+
+def among(column: str, numbers: list[int]) -> str:
+    """Whether a column is one of some numbers of ours."""
+    return f"({column}) IN ({', '.join(map(str, numbers))})" if numbers else "FALSE"
+
+
+def node_text(condition: Bound, node: str, at: Aliases, values: Values) -> str:
+    """A condition on one node, given the column of its id and where its values stand."""
+
+    def leaf(found: Leaf) -> str:
+        if isinstance(found, NodeAttribute) and found.attribute.unit is not Unit.binding:
+            return attribute_text(found.attribute, at)
+        return node
+
+    return expression_text(condition, leaf, values)
+
+
+def bound_text(
+    condition: Bound, nodes: Mapping[str, str], edges: Mapping[str, str], values: Values
+) -> str:
+    """A condition on ids of nodes and relations of edges, given their columns."""
+
+    def leaf(found: Leaf) -> str:
+        match found:
+            case EdgeRelation(edge=edge):
+                return f"CAST({edges[edge]} AS VARCHAR)"
+            case NodeValue(node=node) | NodeAttribute(node=node):
+                return nodes[node]
+            case _:
+                raise TypeError(found)
+
+    return expression_text(condition, leaf, values)
+
+
+def trace_text(condition: Bound, trace: str, values: Values) -> str:
+    """A condition on the trace alone, given the column of its id."""
+    select = Select(['"t"."trace_id"'], ['"trace" AS "t"'])
+    select.join('"map" AS "m"', ['"m"."map_id" = "t"."map_id"'], "LEFT JOIN")
+
+    def leaf(found: Leaf) -> str:
+        assert isinstance(found, TraceAttribute)  # noqa: S101 - the condition was filed so
+        return frame_text(found, "", '"t"', '"m"')
+
+    select.where.append(expression_text(condition, leaf, values))
+    return f"{trace} IN (\n{indented(select.text())}\n  )"

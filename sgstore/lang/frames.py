@@ -1,0 +1,472 @@
+"""Bound patterns → SQL, second phase: conditions and results that need values of single frames.
+
+The frames that the first phase leaves are joined with ``state`` (and the tables of constants) for each node
+whose values are asked for. Numbers of pairs are computed in layers, one statement within the other, so that
+each part has a name and is computed once; a condition stands in the first layer that has all its parts. Of
+``gap`` and ``ttc``, which are dear, a cheap lower bound is compared before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang.bound import (
+    BlockValue,
+    Bound,
+    EdgeAttribute,
+    EdgeRelation,
+    FrameAttribute,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    PairNumber,
+    Scope,
+    TraceAttribute,
+    nodes_of,
+)
+from sgstore.lang.catalog import Home, Type, Unit
+from sgstore.lang.formulas import (
+    Aliases,
+    Leaf,
+    Select,
+    attribute_text,
+    columns_of,
+    expression_text,
+    frame_text,
+    is_position,
+    lane_ends,
+    lane_text,
+    leaves,
+    nested,
+    quoted,
+)
+from sgstore.lang.kinds import Profile, homes_of, kind_conditions
+from sgstore.lang.pairs import needed_for, pair_column, pair_text, stage_of
+from sgstore.lang.phases import Given, Phases, apart
+from sgstore.lang.sql import Masks
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+PATTERN: Final = '":pattern"'
+FRAME: Final = '":frame"'
+TRACE: Final = '":trace"'
+MAP: Final = '":map"'
+_DEAR: Final = {"gap", "ttc"}
+_LESS: Final = {"<", "<=", "="}
+_MORE: Final = {">", ">=", "="}
+
+
+@dataclass(slots=True)
+class Join:
+    """The join of the second phase in the making.
+
+    Attributes
+    ----------
+    select : Select
+    frame : str
+        The column of the frame; empty as long as there is none.
+    nodes, edges : dict of str to str
+        Node → the column of its id, edge → the column of its relation.
+    at : dict of str to Aliases
+        Tables of a node's values that are joined.
+    texts : dict of Leaf to str
+        Values that are there, as they are computed.
+    lanes : set of str
+        Aliases of the rows that are joined for attributes of edges.
+    """
+
+    select: Select = field(default_factory=Select)
+    frame: str = ""
+    nodes: dict[str, str] = field(default_factory=dict[str, str])
+    edges: dict[str, str] = field(default_factory=dict[str, str])
+    at: dict[str, Aliases] = field(default_factory=dict[str, Aliases])
+    texts: dict[Leaf, str] = field(default_factory=dict[Leaf, str])
+    lanes: set[str] = field(default_factory=set[str])
+
+
+class Frames(Masks):
+    """Writes relations of both phases for one query."""
+
+    def frames(
+        self,
+        scope: Scope,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+        columns: Iterable[Leaf] = (),
+    ) -> str:
+        """The relation of the second phase: one row a frame and binding of some nodes and edges.
+
+        Parameters
+        ----------
+        scope : Scope
+        given : Given or None
+            What binds the outer nodes.
+        nodes, edges : frozenset of str
+            What is to be bound; every binding comes once for each frame.
+        columns : iterable of Leaf
+            Values wanted beside them, each a column named by :func:`column_of`.
+        """
+        parts = self.phases(scope)
+        wanted = list(dict.fromkeys(columns))
+        conditions = [*parts.rest, *_bounds(parts.rest)]
+        needed = list(dict.fromkeys([*(leaf for c in conditions for leaf in leaves(c)), *wanted]))
+        join = Join()
+        bound = nodes | {key for leaf in needed for key in nodes_of(leaf)}
+        bound |= self._ends(scope, needed)
+        every = {*scope.nodes, *scope.outer}
+        bound |= {key for pair in apart(scope, every, parts.late) for key in pair}
+        ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation)}
+        given = self._first_phase(join, scope, parts, given, bound, ties, needed)
+        self._second_phase(join, scope, parts, given, needed)
+        layers = _Layers(join, needed, conditions)
+        text = layers.text(self, columns_of(nodes, edges), wanted)
+        hidden = bound | parts.late > nodes or ties > edges
+        return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
+
+    def _ends(self, scope: Scope, needed: list[Leaf]) -> set[str]:
+        """Nodes at the ends of edges whose attributes are needed."""
+        keys = {leaf.edge for leaf in needed if isinstance(leaf, EdgeAttribute)}
+        return {end for e in scope.edges if e.key in keys for end in (e.src, e.dst)}
+
+    def _first_phase(
+        self,
+        join: Join,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        bound: frozenset[str],
+        ties: frozenset[str],
+        needed: list[Leaf],
+    ) -> Given | None:
+        """What the first phase leaves, one row a frame; what it gives to the blocks of the second."""
+        if parts.empty:
+            return None
+        nodes = bound - parts.late
+        text = self.masks(scope, parts, given, nodes, ties)
+        blocks = [leaf for leaf in needed if isinstance(leaf, BlockValue)]
+        if blocks:
+            given = Given(self.share(text, "pattern"), nodes, ties)
+            text = Select(["*"], [quoted(given.name)]).text()
+        join.select.join(nested(self.expanded(text, nodes, ties), PATTERN[1:-1]), [])
+        join.frame = f'{PATTERN}."frame_id"'
+        join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
+        join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
+        return given
+
+    def _second_phase(
+        self, join: Join, scope: Scope, parts: Phases, given: Given | None, needed: list[Leaf]
+    ) -> None:
+        """Join whatever the values come from, and say how each is computed."""
+        for key in sorted(parts.late):
+            self._bind_late(join, scope, key)
+        join.select.where += [
+            f"{join.nodes[a]} <> {join.nodes[b]}"
+            for a, b in apart(scope, set(join.nodes), parts.late)
+        ]
+        if parts.empty:
+            join.select.where += self.within(join.frame, 64)
+            join.select.where += self.of_traces(f"{join.frame} >> 24", scope)
+        self._join_rows(join, scope, parts, needed)
+        for key in sorted({key for leaf in needed for key in _valued(leaf)}):
+            self._join_values(join, scope, key, [leaf for leaf in needed if key in _valued(leaf)])
+        for leaf in needed:
+            self._say(join, scope, given, leaf)
+
+    def _bind_late(self, join: Join, scope: Scope, key: str) -> None:
+        """A node that is bound by its state in the frame."""
+        alias = quoted(key)
+        on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
+        on += kind_conditions(
+            scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', self.catalog.moving
+        )
+        join.select.join(f'"state" AS {alias}', on)
+        join.frame = join.frame or f'{alias}."frame_id"'
+        join.nodes[key] = f'{alias}."node_id"'
+        join.at[key] = Aliases(state=alias)
+
+    def _join_rows(self, join: Join, scope: Scope, parts: Phases, needed: list[Leaf]) -> None:
+        """The rows of the frame, of its trace and of the map, where they are needed."""
+        kinds = {type(leaf) for leaf in needed}
+        on_map = any(
+            Profile.of(scope.kinds(key), self.catalog).mapped
+            for leaf in needed
+            for key in _valued(leaf)
+        )
+        position = any(is_position(leaf) for leaf in needed)
+        pairs_on_map = on_map and PairNumber in kinds
+        trace = TraceAttribute in kinds or position or pairs_on_map
+        since = any(_since_start(leaf) for leaf in needed)
+        if on_map or trace or since or FrameAttribute in kinds:
+            join.select.join(f'"frame" AS {FRAME}', [f'{FRAME}."frame_id" = {join.frame}'])
+        if trace or since:
+            on = [f'{TRACE}."trace_id" = {FRAME}."trace_id"']
+            join.select.join(f'"trace" AS {TRACE}', on)
+        if any(
+            isinstance(leaf, TraceAttribute) and Home.map in leaf.attribute.columns
+            for leaf in needed
+        ):
+            on = [f'{MAP}."map_id" = {TRACE}."map_id"']
+            join.select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
+
+    def _join_values(self, join: Join, scope: Scope, key: str, needed: list[Leaf]) -> None:
+        """The tables that some values of a node come from."""
+        kinds = scope.kinds(key)
+        profile = Profile.of(kinds, self.catalog)
+        homes = _homes(needed, profile)
+        at, node = join.at.get(key, Aliases()), join.nodes[key]
+        state, entity, part = at.state, None, None
+        if Home.state in homes and state is None:
+            state = quoted(key)
+            on = [f'{state}."frame_id" = {join.frame}', f'{state}."node_id" = {node}']
+            on += kind_conditions(
+                kinds, f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
+            )
+            alone = profile.places == 1
+            join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
+        if homes & {Home.entity, Home.scenery}:
+            entity = quoted(f"{key}.entity")
+            on = [f'{entity}."trace_id" = {join.frame} >> 24', f'{entity}."node_id" = {node}']
+            how = "LEFT JOIN" if profile.mapped else "JOIN"
+            join.select.join(f'"entity" AS {entity}', on, how)
+        if Home.map in homes:
+            part = quoted(f"{key}.map")
+            on = [f'{part}."map_id" = {FRAME}."map_id"', f'{part}."node_id" = {node}']
+            how = "JOIN" if profile.places == 1 else "LEFT JOIN"
+            join.select.join(f'"map_node" AS {part}', on, how)
+        join.at[key] = Aliases(state, entity, part, TRACE)
+
+    def _say(self, join: Join, scope: Scope, given: Given | None, leaf: Leaf) -> None:
+        """How a value is computed; a block or the attributes of an edge are joined for it."""
+        match leaf:
+            case NodeValue(node=node):
+                join.texts[leaf] = join.nodes[node]
+            case NodeAttribute(node=node, attribute=attribute):
+                bare = attribute.unit is Unit.binding
+                text = join.nodes[node] if bare else attribute_text(attribute, join.at[node])
+                join.texts[leaf] = text
+            case EdgeRelation(edge=edge):
+                join.texts[leaf] = f"CAST({join.edges[edge]} AS VARCHAR)"
+            case EdgeAttribute(edge=edge):
+                join.texts[leaf] = self._of_lane(join, scope, edge, leaf)
+            case FrameAttribute() | TraceAttribute():
+                join.texts[leaf] = frame_text(leaf, FRAME, TRACE, MAP)
+            case BlockValue():
+                join.texts[leaf] = self._of_block(join, given, leaf)
+            case PairNumber():
+                pass  # computed in layers
+
+    def _of_lane(self, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
+        alias = quoted(f"{key}:in")
+        if alias not in join.lanes:
+            join.lanes.add(alias)
+            edge = next(edge for edge in scope.edges if edge.key == key)
+            entity, lane = lane_ends(join.nodes[edge.src], join.nodes[edge.dst], edge)
+            on = [f'{alias}."frame_id" = {join.frame}', f'{alias}."node_id" = {entity}']
+            on.append(f'{alias}."lane" = {lane}')
+            join.select.join(f'"lane_state" AS {alias}', on, "LEFT JOIN")
+        return lane_text(leaf, alias)
+
+    def _of_block(self, join: Join, given: Given | None, leaf: BlockValue) -> str:
+        """The value of a block for each frame and binding of the nodes outside."""
+        keys = frozenset(leaf.scope.outer)
+        alias = f":block {leaf.number}"
+        rows = self._block_rows(leaf, given, keys)
+        on = [f'{quoted(alias)}."frame_id" = {join.frame}']
+        on += [
+            f"{quoted(alias)}.{column} = {join.nodes[key]}"
+            for key, column in zip(sorted(keys), columns_of(keys), strict=True)
+        ]
+        join.select.join(nested(rows, alias), on, "LEFT JOIN")
+        value = f'{quoted(alias)}."value"'
+        if leaf.word == "EXISTS":
+            return f"coalesce({value}, FALSE)"
+        return f"coalesce({value}, 0)" if leaf.word in {"COUNT", "SUM"} else value
+
+    def _block_rows(self, leaf: BlockValue, given: Given | None, keys: frozenset[str]) -> str:
+        if (
+            leaf.word == "EXISTS"
+        ):  # a column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL
+            rows = self.frames(leaf.scope, given, keys)
+            return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
+        parts = list(leaves(leaf.value)) if leaf.value is not None else []
+        select = Select(['"frame_id"', *columns_of(keys)])
+        select.join(nested(self.counted(leaf, given, parts), ":counted"), [])
+        select.group = list(select.columns)
+        if leaf.value is None:
+            select.columns.append('count(*) AS "value"')
+        else:
+            value = expression_text(leaf.value, lambda part: quoted(column_of(part)), self.values)
+            select.columns.append(f'{leaf.word.lower()}({value}) AS "value"')
+        return select.text()
+
+
+@dataclass(slots=True)
+class _Layers:
+    """The statements around a join that compute numbers of pairs and test conditions."""
+
+    join: Join
+    needed: list[Leaf]
+    conditions: list[Bound]
+
+    def text(self, writer: Frames, keys: list[str], wanted: list[Leaf]) -> str:
+        """The whole: frame, keys and the values that are wanted."""
+        pairs = [leaf for leaf in self.needed if isinstance(leaf, PairNumber)]
+        last = max((stage_of(pair.function) for pair in pairs), default=0)
+        innermost = self.join.select
+        innermost.where += [
+            expression_text(c, self.join.texts.__getitem__, writer.values)
+            for c in self.conditions
+            if _stage(c) == 0
+        ]
+        ids = {quoted(f"{k}.id"): v for k, v in self.join.nodes.items()}
+        ids |= {quoted(f"{k}.type"): v for k, v in self.join.edges.items()}
+        names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
+        texts = {quoted(column_of(leaf)): text for leaf, text in self.join.texts.items()}
+        known = {'"frame_id"': self.join.frame, **texts, **ids}
+        if last == 0:
+            innermost.columns = [_named(known[n], n) for n in dict.fromkeys(names)]
+            return innermost.text()
+        carried = dict.fromkeys([*names, *texts])
+        innermost.columns = [_named(known[n], n) for n in carried if n in known]
+        innermost.columns += [_named(text, n) for n, text in self._raw(pairs).items()]
+        text = innermost.text()
+        for stage in range(1, last + 1):
+            text = self._layer(writer, text, stage, pairs)
+        final = Select(list(dict.fromkeys(names)), [nested(text, f":layer {last}")])
+        final.where = self._tests(writer, last)
+        return final.text()
+
+    def _layer(self, writer: Frames, text: str, stage: int, pairs: list[PairNumber]) -> str:
+        select = Select(["*"], [nested(text, f":layer {stage - 1}")])
+        parts = dict.fromkeys(
+            (name, pair.a, pair.b)
+            for pair in pairs
+            for name in sorted(needed_for(pair.function))
+            if stage_of(name) == stage
+        )
+        select.columns += [_named(pair_text(*part), pair_column(*part)) for part in parts]
+        select.where = self._tests(writer, stage - 1) if stage > 1 else []
+        return select.text()
+
+    def _tests(self, writer: Frames, stage: int) -> list[str]:
+        return [
+            expression_text(c, lambda leaf: quoted(column_of(leaf)), writer.values)
+            for c in self.conditions
+            if _stage(c) == stage
+        ]
+
+    def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
+        """The raw columns that numbers of pairs are made of."""
+        columns: dict[str, str] = {}
+        for pair in pairs:
+            for name in sorted(needed_for(pair.function)):
+                if stage_of(name) == 0:
+                    key = pair.a if name[0] == "a" else pair.b
+                    columns[pair_column(name, pair.a, pair.b)] = _raw_text(
+                        name[1:], self.join.at[key]
+                    )
+        return columns
+
+
+def _raw_text(name: str, at: Aliases) -> str:
+    """A raw column of a node, wherever it lives; positions about the trace's origin."""
+    parts: list[str] = []
+    if at.state:
+        parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")
+    if at.entity and name not in {"vx", "vy"}:
+        parts.append(f"CAST({at.entity}.{quoted(name)} AS DOUBLE)")
+    if at.map and name not in {"vx", "vy"}:
+        value = f"{at.map}.{quoted(name)}"
+        parts.append(f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value)
+    if not parts:
+        return "CAST(NULL AS DOUBLE)"
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def _named(text: str, name: str) -> str:
+    return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
+
+
+def column_of(leaf: Leaf) -> str:
+    """The name of the column of a value."""
+    match leaf:
+        case NodeValue(node=owner):
+            name = "id"
+        case NodeAttribute(node=owner, attribute=attribute):
+            name = attribute.name
+        case EdgeRelation(edge=owner):
+            name = "type"
+        case EdgeAttribute(edge=owner, attribute=attribute):
+            name = attribute.name
+        case FrameAttribute(attribute=attribute):
+            owner, name = "frame", attribute.name
+        case TraceAttribute(attribute=attribute):
+            owner, name = "trace", attribute.name
+        case PairNumber(function=function, a=a, b=b):
+            return f"{function}({a}, {b})"
+        case BlockValue(number=number):
+            return f"block {number}"
+    return f"{owner}.{name}"
+
+
+def _stage(condition: Bound) -> int:
+    """The layer after which a condition can be tested."""
+    found = [leaf for leaf in leaves(condition) if isinstance(leaf, PairNumber)]
+    return max((stage_of(pair.function) for pair in found), default=0)
+
+
+def _bounds(conditions: list[Bound]) -> list[Bound]:
+    """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
+    found: list[Bound] = []
+    for condition in conditions:
+        match condition:
+            case Operation(word, (PairNumber() as pair, limit)) if word in _LESS:
+                found += _bound(pair, limit)
+            case Operation(word, (limit, PairNumber() as pair)) if word in _MORE:
+                found += _bound(pair, limit)
+            case _:
+                pass
+    return found
+
+
+def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
+    if pair.function not in _DEAR or any(_dear(leaf) for leaf in leaves(limit)):
+        return []
+    least = PairNumber("at_least", pair.a, pair.b)
+    if pair.function == "ttc":
+        closing = PairNumber("closing_speed", pair.a, pair.b)
+        limit = Operation("*", (limit, closing), Type.number)
+    return [Operation("<=", (least, limit), Type.boolean)]
+
+
+def _dear(leaf: Leaf) -> bool:
+    return isinstance(leaf, PairNumber) and leaf.function in _DEAR
+
+
+def _valued(leaf: Leaf) -> frozenset[str]:
+    """Nodes whose tables a value needs."""
+    match leaf:
+        case NodeAttribute(node=node, attribute=attribute):
+            return frozenset() if attribute.unit is Unit.binding else frozenset({node})
+        case PairNumber(a=a, b=b):
+            return frozenset({a, b})
+        case _:
+            return frozenset()
+
+
+def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
+    """Where values of a node live, of the places where the node may live."""
+    homes: set[Home] = set()
+    for leaf in needed:
+        if isinstance(leaf, PairNumber):
+            homes |= {Home.state, Home.scenery, Home.map}
+        elif isinstance(leaf, NodeAttribute):
+            homes |= homes_of(leaf.attribute, profile)
+    return {home for home in homes if profile.has(home)}
+
+
+def _since_start(leaf: Leaf) -> bool:
+    return isinstance(leaf, FrameAttribute) and leaf.attribute.unit is Unit.seconds

@@ -1,0 +1,205 @@
+"""Calls in expressions: functions of entities and numbers, predicates, and what is counted of all matches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import QueryError
+from sgstore.lang import bound as b
+from sgstore.lang import syntax as s
+from sgstore.lang.catalog import Type
+from sgstore.lang.conditions import bind, number
+from sgstore.lang.names import Meaning, Names
+from sgstore.lang.standard import predicates
+from sgstore.vocabulary import ENTITY_KINDS, folded
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+PAIR_FUNCTIONS: Final[Mapping[str, str]] = {
+    "dist": "distance between the centres, in space; m",
+    "gap": "shortest distance between the footprints; m",
+    "lon": "how far b's centre lies ahead of a's, in a's axes; m",
+    "lat": "how far b's centre lies to the left of a's, in a's axes; m",
+    "bearing": "direction of b's centre in a's axes, positive to the left; degrees",
+    "rel_heading": "b's heading less a's; degrees",
+    "closing_speed": "how fast the centres approach one another; m/s",
+    "ttc": "time to collision, the gap at the closing speed; s; NULL where they do not approach",
+    "headway": "time until a has come as far as b is now, from bumper to bumper; s; NULL if b is not ahead",
+    "rel_speed": "length of the difference of the velocities; m/s",
+}
+"""Functions of two entities a and b; NULL where a number is missing."""
+
+_PAIR_ALIASES: Final = {"distance": "dist", "thw": "headway"}
+_NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
+_EXTREME: Final = frozenset({"min", "max"})
+_AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
+_OTHERS: Final = frozenset({"coalesce", "known", "type", "lower", "upper"})
+_TEMPORAL: Final = frozenset(
+    {"prev", "delta", "runlength", "sincetrue", "t", "age", "existsnow", "historically"}
+)
+FUNCTIONS: Final = frozenset({*PAIR_FUNCTIONS, *_NUMERIC, *_EXTREME, *_OTHERS, *_AGGREGATES})
+
+MAX_CALLS: Final = 30
+"""Deepest nesting of predicates."""
+
+
+def call(e: s.Call, names: Names) -> b.Bound:
+    """A call of a function or of a predicate.
+
+    Raises
+    ------
+    QueryNameError
+        There is none of that name.
+    QueryError
+        Its arguments do not fit.
+    """
+    name = folded(e.name)
+    if name in names.session.predicates:
+        return _predicate(e, names)
+    if name in _TEMPORAL:
+        names.session.temporal(f"{e.name}()", e.name_span)
+    if names.aggregates and name in _AGGREGATES and len(e.arguments) == 1:
+        return _aggregate(name, e, names)
+    if name in _FUNCTIONS:
+        return _FUNCTIONS[name](e, names)
+    if name in _AGGREGATES:
+        names.session.refuse(f"{e.name}() may stand after RETURN only", e.span)
+    return _standard(name, e, names)
+
+
+def _standard(name: str, e: s.Call, names: Names) -> b.Bound:
+    """A predicate of the standard library, which is read when it is needed."""
+    found = predicates().get(name)
+    if found is None:
+        defined = [*names.session.predicates.values(), *predicates().values()]
+        known = [*FUNCTIONS, *(one.name for one in defined)]
+        names.session.unknown("function", e.name, e.name_span, known)
+    names.session.predicates[name] = found
+    return _predicate(e, names)
+
+
+def _expect(e: s.Call, low: int, high: int, names: Names) -> None:
+    if not low <= len(e.arguments) <= high:
+        wanted = str(low) if low == high else f"{low} or more"
+        names.session.refuse(
+            f"{e.name}() takes {wanted} argument{'s' * (wanted != '1')}, found {len(e.arguments)}",
+            e.span,
+        )
+
+
+def _pair(e: s.Call, names: Names) -> b.PairNumber:
+    _expect(e, 2, 2, names)
+    function = _PAIRS[folded(e.name)]
+    keys = [_entity(function, argument, names) for argument in e.arguments]
+    return b.PairNumber(function, keys[0], keys[1])
+
+
+def _entity(function: str, argument: s.Expression, names: Names) -> str:
+    found = bind(argument, names)
+    if not isinstance(found, b.NodeValue):
+        names.session.refuse(f"{function}() takes two entities", argument.span)
+    kinds = names.scope.kinds(found.node).every
+    if not kinds & frozenset(ENTITY_KINDS):
+        names.session.refuse(
+            f"{function}() takes two entities, and this is a {' or '.join(sorted(kinds))}",
+            argument.span,
+        )
+    return found.node
+
+
+def _numeric(e: s.Call, names: Names) -> b.Operation:
+    _expect(e, 1, 1, names)
+    return b.Operation(folded(e.name), (number(e.arguments[0], names),), Type.number)
+
+
+def _extreme(e: s.Call, names: Names) -> b.Operation:
+    _expect(e, 2, 100, names)
+    return b.Operation(folded(e.name), tuple(number(a, names) for a in e.arguments), Type.number)
+
+
+def _coalesce(e: s.Call, names: Names) -> b.Operation:
+    _expect(e, 1, 100, names)
+    found = tuple(bind(argument, names) for argument in e.arguments)
+    types = {f.type for f in found} - {Type.null}
+    if len(types) > 1 or types & {Type.node, Type.list}:
+        names.session.refuse("coalesce() takes values of one type", e.span)
+    return b.Operation("coalesce", found, types.pop() if types else Type.null)
+
+
+def _known(e: s.Call, names: Names) -> b.Operation:
+    _expect(e, 1, 1, names)
+    return b.Operation("IS NOT NULL", (bind(e.arguments[0], names),), Type.boolean)
+
+
+def _type(e: s.Call, names: Names) -> b.EdgeRelation:
+    _expect(e, 1, 1, names)
+    argument = e.arguments[0]
+    meaning = names.meaning(argument.name) if isinstance(argument, s.Variable) else None
+    if meaning is None or meaning.edge is None:
+        names.session.refuse(
+            "type() takes an edge variable", argument.span, "-[d:near|visible]-> and type(d)"
+        )
+    if all(edge.key != meaning.edge for edge in names.scope.edges):
+        names.session.refuse("an edge is known only in the pattern that binds it", argument.span)
+    return b.EdgeRelation(meaning.edge)
+
+
+def _text_function(e: s.Call, names: Names) -> b.Operation:
+    _expect(e, 1, 1, names)
+    found = bind(e.arguments[0], names)
+    if found.type is not Type.text:
+        names.session.refuse(f"{e.name}() takes a text", e.arguments[0].span)
+    return b.Operation(folded(e.name), (found,), Type.text)
+
+
+def _aggregate(name: str, e: s.Call, names: Names) -> b.Aggregate:
+    inner = Names(names.session, names.scope, names.meanings, names.parent)
+    if name in {"avg", "sum"}:
+        return b.Aggregate(name, number(e.arguments[0], inner), distinct=False, type=Type.number)
+    operand = bind(e.arguments[0], inner)
+    if name == "count":
+        return b.Aggregate(name, operand, e.distinct, Type.number)
+    if operand.type not in {Type.number, Type.text}:
+        names.session.refuse(f"{e.name}() takes numbers or texts", e.arguments[0].span)
+    return b.Aggregate(name, operand, distinct=False, type=operand.type)
+
+
+def _predicate(e: s.Call, names: Names) -> b.Bound:
+    session = names.session
+    definition = session.predicates[folded(e.name)]
+    if definition.body is None:
+        session.temporal("a scenario", e.name_span)
+    if definition.name in session.calls or len(session.calls) > MAX_CALLS:
+        session.refuse(f"{definition.name}() is defined by itself", e.name_span)
+    _expect(e, len(definition.parameters), len(definition.parameters), names)
+    meanings = {
+        formal.name: _meaning(argument, names)
+        for formal, argument in zip(definition.parameters, e.arguments, strict=True)
+    }
+    session.calls.append(definition.name)
+    try:
+        return bind(definition.body, names.body(meanings))
+    except QueryError as error:
+        reason = f"in {definition.name}(): {error.reason}"
+        raise type(error)(reason, text=session.text, span=e.span, hint=error.hint) from None
+    finally:
+        session.calls.pop()
+
+
+def _meaning(argument: s.Expression, names: Names) -> Meaning:
+    found = bind(argument, names)
+    return Meaning(node=found.node) if isinstance(found, b.NodeValue) else Meaning(value=found)
+
+
+_PAIRS: Final = {folded(name): name for name in PAIR_FUNCTIONS} | _PAIR_ALIASES
+_FUNCTIONS: Final[dict[str, Callable[[s.Call, Names], b.Bound]]] = {
+    **dict.fromkeys(_PAIRS, _pair),
+    **dict.fromkeys(_NUMERIC, _numeric),
+    **dict.fromkeys(_EXTREME, _extreme),
+    "coalesce": _coalesce,
+    "known": _known,
+    "type": _type,
+    "lower": _text_function,
+    "upper": _text_function,
+}

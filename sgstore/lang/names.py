@@ -1,0 +1,253 @@
+"""Names while a query is bound: which are visible, what they mean, which nodes a scope speaks of.
+
+Two chains run from the inside out. *Names* are what a text may say: those of a block see those around it,
+those of a predicate's body see its parameters only. *Scopes* are where nodes live; a node that is spoken of
+in a scope further in becomes an outer node of every scope between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from sgstore.errors import QueryError, QueryNameError
+from sgstore.lang.bound import EGO, Bound, Edge, Kinds, Node, Scope
+from sgstore.vocabulary import suggestion
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.errors import Span
+    from sgstore.lang.syntax import Define
+
+MANY: Final = 16
+"""So many names are listed in a hint."""
+
+
+def hint_at(name: str, known: Iterable[str]) -> str | None:
+    """What a name may have meant: that which is most like it, or else all that is known."""
+    names = sorted(known, key=str.lower)
+    like = suggestion(name, names)
+    if like:
+        return f"did you mean '{like}'?"
+    more = f", … ({len(names)} in all)" if len(names) > MANY else ""
+    return f"known: {', '.join(names[:MANY])}{more}" if names else None
+
+
+THE_EGO: Final = "ego"
+"""The name that is always bound: to the ego of the frame."""
+
+RESERVED: Final = frozenset({"frame", "trace"})
+"""Names of what is not a node but has attributes all the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What a name means: a node, an edge, or (for the parameter of a predicate) a value."""
+
+    node: str | None = None
+    edge: str | None = None
+    value: Bound | None = None
+
+
+@dataclass(slots=True)
+class Session:
+    """What is common to the whole of a query while it is bound.
+
+    Attributes
+    ----------
+    text : str
+        The query, for messages.
+    parameters : mapping of str to value
+    predicates : dict of str to Define
+        By folded name.
+    injective : bool
+        Whether different nodes of a pattern are bound to different nodes.
+    used : set of str
+        Parameters that the query speaks of.
+    relations : set of str
+        Relations that it names.
+    keys : set of str
+        Keys taken, without regard to case: the database sees no difference.
+    calls : list of str
+        Predicates whose bodies are being bound.
+    numbers, blocks : int
+        Unnamed nodes and edges, and blocks, so far.
+    """
+
+    text: str
+    parameters: Mapping[str, Any]
+    predicates: dict[str, Define] = field(default_factory=dict[str, "Define"])
+    injective: bool = True
+    used: set[str] = field(default_factory=set[str])
+    relations: set[str] = field(default_factory=set[str])
+    keys: set[str] = field(default_factory=set[str])
+    calls: list[str] = field(default_factory=list[str])
+    numbers: int = 0
+    blocks: int = 0
+
+    def key(self, name: str | None) -> str:
+        """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""
+        self.numbers += name is None
+        wanted = name or f"#{self.numbers}"
+        key, copy = wanted, 2
+        while key.lower() in self.keys:
+            key, copy = f"{wanted}~{copy}", copy + 1
+        self.keys.add(key.lower())
+        return key
+
+    def refuse(self, reason: str, span: Span, hint: str | None = None) -> NoReturn:
+        """Raise a :class:`QueryError` about a part of the text."""
+        raise QueryError(reason, text=self.text, span=span, hint=hint)
+
+    def unknown(self, what: str, name: str, span: Span, known: Iterable[str]) -> NoReturn:
+        """Raise a :class:`QueryNameError` about a name, with what is most like it or else all that is known."""
+        raise QueryNameError(
+            f"unknown {what} '{name}'", text=self.text, span=span, hint=hint_at(name, known)
+        )
+
+    def temporal(self, word: str, span: Span) -> NoReturn:
+        """Raise the one error about the temporal layer."""
+        self.refuse(
+            f"{word} belongs to the temporal layer, which this version does not have",
+            span,
+            "patterns of single frames can be asked; sequences and ALWAYS, EVENTUALLY, … cannot yet",
+        )
+
+
+@dataclass(slots=True)
+class ScopeBuilder:
+    """A scope in the making."""
+
+    session: Session
+    parent: ScopeBuilder | None = None
+    nodes: dict[str, Node] = field(default_factory=dict[str, Node])
+    outer: dict[str, Kinds] = field(default_factory=dict[str, Kinds])
+    edges: list[Edge] = field(default_factory=list[Edge])
+    where: list[Bound] = field(default_factory=list[Bound])
+
+    @property
+    def top(self) -> ScopeBuilder:
+        """The scope of ``MATCH``."""
+        return self.parent.top if self.parent else self
+
+    def kinds(self, key: str) -> Kinds:
+        """What a node may be here."""
+        return self.nodes[key].kinds if key in self.nodes else self.outer[key]
+
+    def mention(self, key: str) -> None:
+        """Take note that a node is spoken of here; it is one of this scope or of one around it."""
+        if key in self.nodes or key in self.outer or self.parent is None:
+            return
+        self.parent.mention(key)
+        self.outer[key] = self.parent.kinds(key)
+
+    def narrow(self, key: str, kinds: Kinds) -> None:
+        """A node is asked to be of some kinds, here."""
+        if key in self.outer:
+            self.outer[key] = self.outer[key] & kinds
+        else:
+            node = self.nodes[key]
+            self.nodes[key] = replace(node, kinds=node.kinds & kinds)
+
+    def add(self, name: str | None, kinds: Kinds, span: Span, *, named: bool) -> str:
+        """A new node; its key."""
+        key = self.session.key(name)
+        self.nodes[key] = Node(key, kinds, "named" if named else "unnamed", span)
+        return key
+
+    def the_ego(self, span: Span) -> str:
+        """The key of the ego: of the node that is labelled so in ``MATCH``, or of one that is added there."""
+        for node in self.nodes.values():
+            if not node.kinds.other:
+                return node.key
+        return self.add(THE_EGO, EGO, span, named=False)
+
+    def finished(self) -> Scope:
+        """The scope, with what must differ."""
+        where = tuple(self.where)
+        return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
+
+    def distinct(self) -> frozenset[tuple[str, str]]:
+        """What must differ, of what was spoken of so far: own nodes from each other and from outer ones."""
+        if not self.session.injective:
+            return frozenset()
+        pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
+        self._refuse_two_egos(pairs)
+        return frozenset(pairs)
+
+    def _refuse_two_egos(self, pairs: set[tuple[str, str]]) -> None:
+        for a, b in sorted(pairs):
+            if not self.kinds(a).other and not self.kinds(b).other:
+                self.session.refuse(
+                    "two nodes are both the ego, and different nodes of a pattern are never the same",
+                    self.nodes[a].span,
+                    "a frame has one ego: use one variable, or USING NODES any",
+                )
+
+
+@dataclass(slots=True)
+class Names:
+    """The names that a part of a text may use, and the scope that it stands in.
+
+    Attributes
+    ----------
+    session : Session
+    scope : ScopeBuilder
+    meanings : dict of str to Meaning
+    parent : Names or None
+        Names around these, visible too.
+    aggregates : bool
+        Whether ``COUNT(*)`` and the like may stand here.
+    """
+
+    session: Session
+    scope: ScopeBuilder
+    meanings: dict[str, Meaning] = field(default_factory=dict[str, Meaning])
+    parent: Names | None = None
+    aggregates: bool = False
+
+    def block(self) -> Names:
+        """Names for a block in this place."""
+        return Names(self.session, ScopeBuilder(self.session, self.scope), parent=self)
+
+    def body(self, meanings: dict[str, Meaning]) -> Names:
+        """Names for the body of a predicate that is called in this place."""
+        return Names(self.session, self.scope, meanings)
+
+    def meaning(self, name: str) -> Meaning | None:
+        """What a name means here; ``None`` if it is not known. ``ego`` is not looked up here."""
+        names: Names | None = self
+        while names is not None:
+            if name in names.meanings:
+                return names.meanings[name]
+            names = names.parent
+        return None
+
+    def node(self, name: str, span: Span) -> str:
+        """The key of the node that a name means; the scope takes note of it.
+
+        Raises
+        ------
+        QueryNameError
+            No such name.
+        QueryError
+            It does not mean a node.
+        """
+        meaning = self.meaning(name)
+        if meaning is None and name == THE_EGO:
+            key = self.scope.top.the_ego(span)
+        elif meaning is None:
+            self.session.unknown("variable", name, span, self.visible())
+        elif meaning.node is None:
+            self.session.refuse(f"'{name}' is not a node", span)
+        else:
+            key = meaning.node
+        self.scope.mention(key)
+        return key
+
+    def visible(self) -> set[str]:
+        """All names that may be used here, but those of frame and trace."""
+        outside = self.parent.visible() if self.parent else {THE_EGO}
+        return outside | set(self.meanings)

@@ -1,0 +1,196 @@
+"""Which condition of a scope is answered in which phase, and which nodes wait for the second one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from sgstore.lang.bound import (
+    BlockValue,
+    Bound,
+    EdgeAttribute,
+    EdgeRelation,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    Query,
+    Scope,
+    TraceAttribute,
+    blocks_of,
+    nodes_of,
+)
+from sgstore.lang.catalog import Unit
+from sgstore.lang.formulas import Leaf, leaves
+from sgstore.lang.kinds import Profile
+from sgstore.lang.rewrite import counted_block
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.lang.catalog import Catalog
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A range of buckets: ``low`` is in it, ``high`` is not."""
+
+    low: int
+    high: int
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A shared relation of the first phase that binds nodes for a block, and which; and edges."""
+
+    name: str
+    nodes: frozenset[str]
+    edges: frozenset[str]
+
+
+@dataclass(slots=True)
+class Phases:
+    """The conditions of a scope by how they are answered.
+
+    Attributes
+    ----------
+    blocks : list
+        ``EXISTS``, ``NOT EXISTS`` and comparisons of ``COUNT`` with a number: by masks.
+    single : dict
+        Node → conditions on its attributes alone: by masks.
+    lane : dict
+        Edge → conditions on its attributes alone: by masks.
+    direct : list
+        On node ids, relations and constants: where the edges are joined.
+    trace : list
+        On the trace alone: on the bucket.
+    rest : list
+        In the second phase.
+    late : set of str
+        Nodes that are bound in the second phase.
+    empty : bool
+        Whether the first phase has nothing to say.
+    """
+
+    blocks: list[Bound] = field(default_factory=list[Bound])
+    single: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    lane: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    direct: list[Bound] = field(default_factory=list[Bound])
+    trace: list[Bound] = field(default_factory=list[Bound])
+    rest: list[Bound] = field(default_factory=list[Bound])
+    late: set[str] = field(default_factory=set[str])
+    empty: bool = False
+
+
+def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
+    """The conditions of a scope, filed."""
+    parts = Phases()
+    for condition in scope.where:
+        _file(condition, parts)
+    parts.late = set(_late(scope, parts, query, catalog))
+    for key in parts.late & set(parts.single):
+        parts.rest += parts.single.pop(key)
+    parts.rest += [c for c in parts.direct if nodes_of(c) & parts.late]
+    parts.direct = [c for c in parts.direct if not nodes_of(c) & parts.late]
+    parts.empty = not (scope.outer or scope.edges or parts.blocks or set(scope.nodes) - parts.late)
+    if parts.empty:
+        parts.rest += parts.trace + parts.direct
+        parts.trace, parts.direct = [], []
+    return parts
+
+
+def _file(condition: Bound, parts: Phases) -> None:
+    if is_masked(condition):
+        parts.blocks.append(condition)
+        return
+    found = set(leaves(condition))
+    if all(_is_direct(leaf) for leaf in found):
+        parts.direct.append(condition)
+    elif all(isinstance(leaf, NodeAttribute) for leaf in found) and len(nodes_of(condition)) == 1:
+        parts.single.setdefault(next(iter(nodes_of(condition))), []).append(condition)
+    elif all(isinstance(leaf, TraceAttribute) for leaf in found):
+        parts.trace.append(condition)
+    elif (edge := _edge_alone(found)) is not None:
+        parts.lane.setdefault(edge, []).append(condition)
+    else:
+        parts.rest.append(condition)
+
+
+def is_masked(condition: Bound) -> bool:
+    """Whether a condition is a block, or the negation of one, or compares a count with a number."""
+    match condition:
+        case BlockValue(word="EXISTS") | Operation("NOT", (BlockValue(word="EXISTS"),)):
+            return True
+        case _:
+            return counted_block(condition) is not None
+
+
+def _is_direct(leaf: Leaf) -> bool:
+    match leaf:
+        case NodeValue() | EdgeRelation():
+            return True
+        case NodeAttribute(attribute=attribute):
+            return attribute.unit is Unit.binding
+        case _:
+            return False
+
+
+def _edge_alone(found: set[Leaf]) -> str | None:
+    edges = {leaf.edge if isinstance(leaf, EdgeAttribute) else None for leaf in found}
+    return edges.pop() if len(edges) == 1 else None
+
+
+def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
+    """Nodes that no edge or block has a say in, but values have; and a node that is all there is.
+
+    To bind them by their presence would mean to group all states into masks, and to expand these again.
+    """
+    bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
+    compared = {key for condition in parts.rest for key in nodes_of(condition)}
+    alone = scope is query.scope and len(scope.nodes) == 1
+    spoken_of = blocked(query)
+    for key in scope.nodes:
+        profile = Profile.of(scope.kinds(key), catalog)
+        if profile.fixed or profile.mapped or key in bound_nodes or key in spoken_of:
+            continue
+        if alone or key in compared:
+            yield key
+
+
+def blocked(query: Query) -> frozenset[str]:
+    """Nodes that blocks speak of from inside, anywhere in a query."""
+    values = [column.value for column in query.result.columns]
+    values += [key.value for key in query.result.order if not isinstance(key.value, str)]
+    sample = query.result.sample
+    if sample and sample.per and not isinstance(sample.per, str):
+        values.append(sample.per)
+    return frozenset(_blocked([*query.scope.where, *values]))
+
+
+def _blocked(expressions: list[Bound]) -> Iterator[str]:
+    for expression in expressions:
+        for block in blocks_of(expression):
+            yield from block.scope.outer
+            yield from _blocked([*block.scope.where, *([block.value] if block.value else [])])
+
+
+def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:
+    """Ids of the traces that a query chooses (``None``: all), and of those that cannot answer it."""
+    chosen = None
+    if query.ego is not None:
+        chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
+    left: set[int] = set()
+    if not query.unknown_is_false:
+        left = {t.trace_id for t in catalog.traces if not query.relations <= t.answers}
+    return (None if chosen is None else chosen - left), left
+
+
+def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
+    """Pairs of nodes that must differ and could be the same, of those bound, one of which is newly bound.
+
+    Of two nodes whose kinds exclude one another nothing need be said.
+    """
+    for a, b in sorted(scope.distinct):
+        if {a, b} <= nodes and {a, b} & new:
+            one, other = scope.kinds(a), scope.kinds(b)
+            if (one & other).every:
+                yield a, b

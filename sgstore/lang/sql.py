@@ -1,0 +1,596 @@
+"""Bound patterns → SQL, first phase: what can be answered on masks, 60 frames at a time.
+
+A row of ``edge`` or ``node`` says with the bits of a mask in which frames of a bucket it holds. So edges join
+on bucket and node ids, and the frames of a match are the bits that all masks have in common. Conditions on the
+attributes of one node become masks too, and so do blocks (``EXISTS``, ``COUNT``), which are answered once for
+all bindings of the nodes outside that they speak of.
+
+What needs values of single frames is left to the second phase (:mod:`sgstore.lang.frames`). Masks are known
+here and in the store, and nowhere else.
+
+A relation of this phase has the columns ``bucket``, ``mask``, ``"x.id"`` for each node x and ``"d.type"`` for
+each edge d; one of the second phase has ``frame_id`` in place of the first two.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from itertools import combinations, count
+from operator import eq, ge, gt, le, lt, ne
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang.bound import (
+    BlockValue,
+    Bound,
+    Edge,
+    Node,
+    NodeAttribute,
+    Operation,
+    Scope,
+    blocks_of,
+)
+from sgstore.lang.catalog import Home
+from sgstore.lang.formulas import (
+    Aliases,
+    Leaf,
+    Select,
+    Values,
+    among,
+    bound_text,
+    columns_of,
+    expression_text,
+    is_constant,
+    is_position,
+    lane_ends,
+    lane_text,
+    leaves,
+    nested,
+    node_text,
+    quoted,
+    trace_text,
+)
+from sgstore.lang.kinds import Profile, alias_of, edge_conditions, homes_of, kind_conditions
+from sgstore.lang.phases import Given, Phases, Window, apart, phases_of, traces_of
+from sgstore.lang.rewrite import (
+    FALSE,
+    chain,
+    complement,
+    counted_block,
+    narrowed,
+    ordered,
+    possible,
+)
+from sgstore.vocabulary import ENTITY_KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.lang.bound import Kinds, Query
+    from sgstore.lang.catalog import Catalog
+
+OUTSIDE: Final = '":outside"'
+BUCKET: Final = '":bucket"'
+_ENTITIES: Final = frozenset(ENTITY_KINDS)
+_MANY: Final = 5
+"""Up to so many masks are compared in pairs, so that each join sheds what it can."""
+
+_COMPARED: Final = {"=": eq, "<>": ne, "<": lt, "<=": le, ">": gt, ">=": ge}
+
+
+@dataclass(slots=True)
+class Base:
+    """The join of the first phase in the making.
+
+    Attributes
+    ----------
+    select : Select
+    nodes : dict of str to str
+        Node → the column that binds it.
+    edges : dict of str to str
+        Edge → the column of its relation.
+    bucket : str
+        The column of the bucket; empty as long as there is none.
+    masks : list of str
+        Columns, or other terms.
+    present : set of str
+        Nodes that a mask of their own edges makes present.
+    repeats : bool
+        Whether a binding may come in several rows whose masks overlap.
+    knows_map : bool
+        Whether the row of the bucket is joined, which knows the map.
+    """
+
+    select: Select = field(default_factory=Select)
+    nodes: dict[str, str] = field(default_factory=dict[str, str])
+    edges: dict[str, str] = field(default_factory=dict[str, str])
+    bucket: str = ""
+    masks: list[str] = field(default_factory=list[str])
+    present: set[str] = field(default_factory=set[str])
+    repeats: bool = False
+    knows_map: bool = False
+
+    def join(
+        self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
+    ) -> None:
+        """Join a table with masks on the bucket and on the nodes that are bound; bind the others."""
+        on = [f'{alias}."bucket" = {self.bucket}'] if self.bucket else []
+        self.bucket = self.bucket or f'{alias}."bucket"'
+        self.masks.append(f'{alias}."mask"')
+        self.present |= set(ends)
+        self.tie(table, ends, [*conditions, *on])
+
+    def tie(self, table: str, ends: Mapping[str, str], conditions: Iterable[str]) -> None:
+        """Join a table on the nodes that are bound; bind the others."""
+        on = list(conditions)
+        for key, column in ends.items():
+            if key in self.nodes:
+                on.append(f"{column} = {self.nodes[key]}")
+            else:
+                self.nodes[key] = column
+        self.select.join(table, on)
+
+    def need_bucket(self) -> None:
+        """Join the row of the bucket, if it is not yet."""
+        if not self.knows_map:
+            self.knows_map = True
+            on = [f'{BUCKET}."bucket" = {self.bucket}'] if self.bucket else []
+            self.select.join(f'"bucket" AS {BUCKET}', on)
+            self.bucket = self.bucket or f'{BUCKET}."bucket"'
+
+
+class Masks(ABC):
+    """Writes relations of the first phase for one query.
+
+    Parameters
+    ----------
+    query : Query
+        Rewritten.
+    catalog : Catalog
+    window : Window or None
+        The buckets to look at; ``None``: all.
+    """
+
+    def __init__(self, query: Query, catalog: Catalog, window: Window | None = None) -> None:
+        self.query = query
+        self.catalog = catalog
+        self.window = window
+        self.values = Values()
+        self.shared: list[tuple[str, str]] = []
+        self._numbers = count(1)
+
+    @abstractmethod
+    def frames(
+        self,
+        scope: Scope,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+        columns: Iterable[Leaf] = (),
+    ) -> str:
+        """The relation of the second phase: one row a frame and binding of some nodes and edges."""
+
+    def phases(self, scope: Scope) -> Phases:
+        """The conditions of a scope by phase."""
+        return phases_of(scope, self.query, self.catalog)
+
+    def share(self, text: str, name: str) -> str:
+        """The name under which a relation stands before the statement, to be used more than once."""
+        full = f"{name} {next(self._numbers)}"
+        self.shared.append((full, text))
+        return full
+
+    def masks(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+    ) -> str:
+        """The relation of the first phase: one row a bucket and binding of some nodes and edges."""
+        if not parts.blocks:
+            return self._base(scope, parts, given, nodes, edges)
+        outside = {key for c in parts.blocks for block in blocks_of(c) for key in block.scope.outer}
+        wide = nodes | frozenset(outside)
+        name = self.share(self._base(scope, parts, given, wide, edges), "pattern")
+        return self._with_blocks(parts.blocks, Given(name, wide, edges), nodes, edges)
+
+    def expanded(self, text: str, nodes: frozenset[str], edges: frozenset[str]) -> str:
+        """A relation of the first phase, one row a frame."""
+        keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+        select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
+        select.join(nested(text, ":pattern"), [])
+        select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
+        return select.text()
+
+    def folded(self, text: str, nodes: frozenset[str]) -> str:
+        """A relation of the second phase as one of the first."""
+        keep = columns_of(nodes)
+        bit = bit_of('"frame_id"')
+        select = Select(['"frame_id" >> 6 AS "bucket"', *keep, f'bit_or({bit}) AS "mask"'])
+        select.join(nested(text, ":frames"), [])
+        select.group = ['"frame_id" >> 6', *keep]
+        return select.text()
+
+    def number_of_frames(self, text: str) -> str:
+        """How many frames a relation of the first phase that binds nothing speaks of, as ``frames``."""
+        total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
+        return Select([total], [nested(text, ":pattern")]).text()
+
+    def existence(self, scope: Scope, given: Given | None) -> str:
+        """In which frames a block has a match: one row a bucket and binding of the nodes outside."""
+        keys = frozenset(scope.outer)
+        parts = self.phases(scope)
+        if parts.rest or parts.late:
+            return self.folded(self.frames(scope, given, keys), keys)
+        text = self.masks(scope, parts, given, keys)
+        if set(scope.nodes) and not parts.blocks:
+            return text  # grouped already, for the nodes inside are dropped
+        select = Select(['"bucket"', *columns_of(keys), 'bit_or("mask") AS "mask"'])
+        select.join(nested(text, ":block"), [])
+        select.group = ['"bucket"', *columns_of(keys)]
+        return select.text()
+
+    def within(self, column: str, per: int = 1) -> list[str]:
+        """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window."""
+        if self.window is None:
+            return []
+        low, high = self.window.low * per, self.window.high * per
+        return [f"{column} >= {low}", f"{column} < {high}"]
+
+    def of_traces(self, trace: str, scope: Scope) -> list[str]:
+        """Conditions on a trace id that keep the traces that are asked, in the outermost scope."""
+        if scope is not self.query.scope:
+            return []
+        chosen, left = traces_of(self.query, self.catalog)
+        if chosen is not None:
+            return [among(trace, sorted(chosen))]
+        return ["NOT " + among(trace, sorted(left))] if left else []
+
+    # The join of edges and nodes
+
+    def _base(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+    ) -> str:
+        base = Base()
+        if given is not None and scope.outer:
+            self._join_given(base, scope, given)
+        for edge in scope.edges:
+            self._join_edge(base, scope, edge)
+        single = dict(parts.single)
+        for key in scope.nodes:
+            if key not in parts.late and key not in base.present:
+                self._join_presence(base, key, scope.kinds(key), single.pop(key, []))
+        for key, conditions in single.items():
+            self._join_conditions(base, key, scope.kinds(key), conditions)
+        for key, conditions in parts.lane.items():
+            self._join_lane(base, next(e for e in scope.edges if e.key == key), conditions)
+        if not base.masks:  # all nodes wait for the second phase
+            base.need_bucket()
+            base.masks.append(f'{BUCKET}."valid"')
+        where, bound = base.select.where, set(base.nodes)
+        where += [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in apart(scope, bound, bound)]
+        where += [bound_text(c, base.nodes, base.edges, self.values) for c in parts.direct]
+        where += self.within(base.bucket)
+        where += self.of_traces(f"{base.bucket} >> 18", scope)
+        where += [trace_text(c, f"{base.bucket} >> 18", self.values) for c in parts.trace]
+        return _masked(base, nodes, edges)
+
+    def _join_given(self, base: Base, scope: Scope, given: Given) -> None:
+        """The bindings of the nodes outside that a block speaks of."""
+        columns = columns_of(frozenset(scope.outer))
+        table = f"{quoted(given.name)} AS {OUTSIDE}"
+        if given.edges or given.nodes != frozenset(scope.outer):
+            reduced = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
+            reduced.join(quoted(given.name), [])
+            reduced.group = ['"bucket"', *columns]
+            table = nested(reduced.text(), ":outside")
+        ends = zip(sorted(scope.outer), columns, strict=True)
+        base.join(table, OUTSIDE, {key: f"{OUTSIDE}.{column}" for key, column in ends})
+
+    def _join_edge(self, base: Base, scope: Scope, edge: Edge) -> None:
+        ends = scope.kinds(edge.src), scope.kinds(edge.dst)
+        moving = any(possible(edge, *ends, self.catalog.edges))
+        lasting = any(possible(edge, *ends, self.catalog.map_edges))
+        alias = quoted(alias_of(edge))
+        ends = {edge.src: f'{alias}."src"', edge.dst: f'{alias}."dst"'}
+        base.edges[edge.key] = f'{alias}."relation"'
+        if edge.src == edge.dst:
+            base.select.where.append(f'{alias}."src" = {alias}."dst"')
+        if edge.high > 1:
+            base.repeats = True
+            base.join(nested(self._paths(scope, edge), alias[1:-1]), alias, ends)
+        elif edge.both or (moving and lasting):
+            base.repeats = True
+            rows = self._rows(scope, edge, moving=moving, lasting=lasting)
+            base.join(nested(rows, alias[1:-1]), alias, ends)
+        elif lasting:
+            base.need_bucket()
+            on = edge_conditions(self.catalog, scope, edge, alias, moving=False)
+            on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
+            base.repeats |= len(edge.relations) > 1
+            base.tie(f'"map_edge" AS {alias}', ends, on)
+        else:
+            base.repeats |= len(edge.relations) > 1
+            base.join(
+                f'"edge" AS {alias}',
+                alias,
+                ends,
+                edge_conditions(self.catalog, scope, edge, alias, moving=True),
+            )
+
+    def _rows(self, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
+        """Rows of an edge that may run either way, or hold in frames as well as on the map."""
+        directions = (False, True) if edge.both else (False,)
+        branches: list[str] = []
+        for swapped in directions:
+            if moving or not lasting:
+                select = Select(_row_columns('"e"', '"e"."mask"', swapped=swapped))
+                select.join('"edge" AS "e"', [])
+                select.where = edge_conditions(
+                    self.catalog, scope, edge, '"e"', moving=True, swapped=swapped
+                )
+                select.where += self.within('"e"."bucket"')
+                branches.append(select.text())
+            if lasting:
+                branches.append(self._lasting_rows(scope, edge, swapped=swapped))
+        return "\nUNION ALL\n".join(branches)
+
+    def _lasting_rows(self, scope: Scope, edge: Edge, *, swapped: bool) -> str:
+        """Rows of a map's edges with the frames in which both ends are present."""
+        mask = '"p"."mask" & "q"."mask"'
+        select = Select(_row_columns('"m"', mask, swapped=swapped))
+        select.columns[0] = '"p"."bucket" AS "bucket"'
+        select.join('"map_edge" AS "m"', [])
+        select.join('"bucket" AS "b"', ['"b"."map_id" = "m"."map_id"'])
+        for alias, end in (("p", "src"), ("q", "dst")):
+            select.join(
+                f'"node" AS "{alias}"',
+                [f'"{alias}"."bucket" = "b"."bucket"', f'"{alias}"."node_id" = "m"."{end}"'],
+            )
+        select.where = edge_conditions(
+            self.catalog, scope, edge, '"m"', moving=False, swapped=swapped
+        )
+        select.where += [f"({mask}) <> 0", *self.within('"b"."bucket"')]
+        return select.text()
+
+    def _paths(self, scope: Scope, edge: Edge) -> str:
+        """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
+        nodes = {
+            key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)
+        }
+        single = replace(edge, low=1, high=1)
+        branches: list[str] = []
+        for length in range(edge.low, edge.high + 1):
+            inner = Scope(nodes, {}, (single,), (), frozenset())
+            inner = chain(inner, single, length, self._numbers, injective=self.query.injective)
+            inner = ordered(narrowed(inner, self.catalog), self.catalog)
+            if inner.where != (FALSE,):
+                rows = self._base(inner, Phases(), None, frozenset(nodes), frozenset())
+                ends = ((edge.src, "src"), (edge.dst, "dst"))
+                columns = [f'{quoted(f"{key}.id")} AS "{end}"' for key, end in ends]
+                select = Select(['"bucket"', *columns, '"mask"'], [nested(rows, ":path")])
+                branches.append(select.text())
+        if not branches:
+            columns = ['"bucket"', '"src"', '"dst"', '"mask"']
+            branches.append(Select(columns, ['"edge"'], ["FALSE"]).text())
+        return "\nUNION ALL\n".join(branches)
+
+    # Presence and conditions
+
+    def _join_presence(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
+        """The frames in which a node is present and meets conditions on its attributes."""
+        alias = quoted(f"{key}:")
+        profile = Profile.of(kinds, self.catalog)
+        if profile.moving or conditions:
+            rows = self._present(kinds, profile, conditions)
+            base.join(nested(rows, f"{key}:"), alias, {key: f'{alias}."node_id"'})
+        else:
+            on = kind_conditions(kinds, f'{alias}."kind"', None, self._standing)
+            base.join(f'"node" AS {alias}', alias, {key: f'{alias}."node_id"'}, on)
+
+    def _join_conditions(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
+        """The frames in which a node that is present meets conditions on its attributes."""
+        profile, alias = Profile.of(kinds, self.catalog), quoted(f"{key}:")
+        constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
+        if profile.mapped and profile.places == 1:
+            base.need_bucket()
+            table, at = "map_node", Aliases(map=alias)
+            on = [f'{alias}."map_id" = {BUCKET}."map_id"']
+        elif constant and not profile.mapped:
+            table, at = "entity", Aliases(entity=alias)
+            on = [f'{alias}."trace_id" = {base.bucket} >> 18']
+        else:
+            self._join_presence(base, key, kinds, conditions)
+            return
+        node = f'{alias}."node_id"'
+        base.tie(f'"{table}" AS {alias}', {key: node}, on)
+        base.select.where += [node_text(c, node, at, self.values) for c in conditions]
+
+    @property
+    def _standing(self) -> frozenset[str]:
+        return self.catalog.fixed | self.catalog.mapped
+
+    def _present(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
+        """Frames in which nodes are present and meet conditions, for each place where they may live."""
+        branches: list[str] = []
+        if (
+            profile.moving
+            and not conditions
+            and not kinds.other
+            and profile.moving >= (self.catalog.moving & _ENTITIES)
+        ):
+            branches.append(self._present_ego())
+        elif profile.moving:
+            branches.append(self._present_moving(kinds, profile, conditions))
+        if profile.fixed:
+            branches.append(self._present_standing(kinds.only(profile.fixed), conditions, "fixed"))
+        if profile.mapped:
+            branches.append(
+                self._present_standing(kinds.only(profile.mapped), conditions, "mapped")
+            )
+        return "\nUNION ALL\n".join(branches)
+
+    def _present_ego(self) -> str:
+        select = Select(['"bucket"', '"ego" AS "node_id"', f'bit_or({bit_of(_BIT)}) AS "mask"'])
+        select.join('"frame"', ['"ego" IS NOT NULL', *self.within('"bucket"')])
+        select.group = ['"bucket"', '"ego"']
+        return select.text()
+
+    def _present_moving(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
+        frame, node = '"s"."frame_id"', '"s"."node_id"'
+        select = Select(
+            [f'{frame} >> 6 AS "bucket"', node, f'bit_or({bit_of(frame)}) AS "mask"'],
+            group=[f"{frame} >> 6", node],
+        )
+        select.join(
+            '"state" AS "s"',
+            kind_conditions(kinds, '"s"."kind"', '"s"."is_ego"', self.catalog.moving),
+        )
+        select.where += self.within(frame, 64)
+        found = [leaf for c in conditions for leaf in leaves(c) if isinstance(leaf, NodeAttribute)]
+        homes = {home for leaf in found for home in homes_of(leaf.attribute, profile)}
+        entity = '"n"' if Home.entity in homes else None
+        if entity:
+            on = [f'"n"."trace_id" = {frame} >> 24', f'"n"."node_id" = {node}']
+            select.join('"entity" AS "n"', on)
+        at = Aliases('"s"', entity, None, self._join_trace(select, f"{frame} >> 24", conditions))
+        select.where += [node_text(c, node, at, self.values) for c in conditions]
+        return select.text()
+
+    def _present_standing(self, kinds: Kinds, conditions: list[Bound], place: str) -> str:
+        bucket, node = '"p"."bucket"', '"p"."node_id"'
+        select = Select([bucket, node, '"p"."mask"'])
+        select.join('"node" AS "p"', kind_conditions(kinds, '"p"."kind"', None, self._standing))
+        select.where += [f"{node} {'>=' if place == 'fixed' else '<'} 0", *self.within(bucket)]
+        at = Aliases()
+        if conditions and place == "fixed":
+            on = [f'"n"."trace_id" = {bucket} >> 18', f'"n"."node_id" = {node}']
+            select.join('"entity" AS "n"', on)
+            trace = self._join_trace(select, f"{bucket} >> 18", conditions)
+            at = Aliases(entity='"n"', trace=trace)
+        elif conditions:
+            select.join('"bucket" AS "b"', [f'"b"."bucket" = {bucket}'])
+            on = ['"n"."map_id" = "b"."map_id"', f'"n"."node_id" = {node}']
+            select.join('"map_node" AS "n"', on)
+            at = Aliases(map='"n"')
+        select.where += [node_text(c, node, at, self.values) for c in conditions]
+        return select.text()
+
+    def _join_trace(self, select: Select, trace: str, conditions: list[Bound]) -> str | None:
+        """The row of the trace, if a condition is on a position, which is stored about the trace's origin."""
+        if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
+            return None
+        select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
+        return '"t"'
+
+    def _join_lane(self, base: Base, edge: Edge, conditions: list[Bound]) -> None:
+        """The frames in which an edge from an entity to a lane meets conditions on its attributes."""
+        frame = '"l"."frame_id"'
+        ends = ['"l"."node_id"', '"l"."lane"']
+        select = Select(
+            [f'{frame} >> 6 AS "bucket"', *ends, f'bit_or({bit_of(frame)}) AS "mask"'],
+            ['"lane_state" AS "l"'],
+            self.within(frame, 64),
+            [f"{frame} >> 6", *ends],
+        )
+        select.where += [
+            expression_text(c, lambda leaf: lane_text(leaf, '"l"'), self.values) for c in conditions
+        ]
+        name = f"{edge.key}:in"
+        entity, lane = lane_ends(base.nodes[edge.src], base.nodes[edge.dst], edge)
+        alias = quoted(name)
+        on = [f'{alias}."node_id" = {entity}', f'{alias}."lane" = {lane}']
+        base.join(nested(select.text(), name), alias, {}, on)
+
+    # Blocks
+
+    def _with_blocks(
+        self, blocks: list[Bound], given: Given, nodes: frozenset[str], edges: frozenset[str]
+    ) -> str:
+        """A relation of the first phase with the frames in which blocks are true."""
+        select = Select()
+        select.join(f'{quoted(given.name)} AS ":pattern"', [])
+        mask = '":pattern"."mask"'
+        for number, condition in enumerate(blocks, start=1):
+            text, keys, wanted = self._block(condition, given)
+            alias = f":block {number}"
+            on = [f'":pattern".{c} = {quoted(alias)}.{c}' for c in ('"bucket"', *columns_of(keys))]
+            select.join(nested(text, alias), on, "JOIN" if wanted else "LEFT JOIN")
+            theirs = f'{quoted(alias)}."mask"'
+            mask += f" & {theirs}" if wanted else f" & ~coalesce({theirs}, 0)"
+        select.where.append(f"({mask}) <> 0")
+        keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+        select.columns = ['":pattern"."bucket"', *keep, f'{mask} AS "mask"']
+        if nodes != given.nodes:
+            select.columns[-1] = f'bit_or({mask}) AS "mask"'
+            select.group = ['":pattern"."bucket"', *keep]
+        return select.text()
+
+    def _block(self, condition: Bound, given: Given) -> tuple[str, frozenset[str], bool]:
+        """Where a block is true (or, if the last is false, where it is not), and the nodes it speaks of."""
+        match condition:
+            case BlockValue(scope=scope):
+                return self.existence(scope, given), frozenset(scope.outer), True
+            case Operation("NOT", (BlockValue(scope=scope),)):
+                return self.existence(scope, given), frozenset(scope.outer), False
+            case _:
+                return self._block_counted(condition, given)
+
+    def _block_counted(self, condition: Bound, given: Given) -> tuple[str, frozenset[str], bool]:
+        counted = counted_block(condition)
+        assert counted is not None, condition  # noqa: S101 - it was filed so
+        block, sign, number = counted
+        wanted = not _COMPARED[sign](0, number)
+        sign = sign if wanted else complement(sign)
+        keys = frozenset(block.scope.outer)
+        select = Select(['"frame_id"', *columns_of(keys)])
+        select.join(nested(self.counted(block, given), ":counted"), [])
+        select.group = ['"frame_id"', *columns_of(keys)]
+        select.having = [f"count(*) {sign} {self.values.add(number)}"]
+        return self.folded(select.text(), keys), keys, wanted
+
+    def counted(self, block: BlockValue, given: Given | None, columns: Iterable[Leaf] = ()) -> str:
+        """The matches of a block, one row each and frame."""
+        nodes = {key for key, node in block.scope.nodes.items() if node.role != "hidden"}
+        edges = frozenset(edge.key for edge in block.scope.edges if edge.named)
+        keys = frozenset(nodes) | frozenset(block.scope.outer)
+        return self.frames(block.scope, given, keys, edges, columns)
+
+
+_BIT: Final = '"bit"'
+
+
+def bit_of(frame: str) -> str:
+    """The mask of a single frame, given its id or its number in the bucket."""
+    number = frame if frame == _BIT else f"{frame} & 63"
+    return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
+
+
+def _masked(base: Base, nodes: frozenset[str], edges: frozenset[str]) -> str:
+    """The join as a relation of some nodes and edges, each binding once."""
+    select, masks = base.select, base.masks
+    mask = " & ".join(masks)
+    keep = [base.nodes[key] for key in sorted(nodes)] + [base.edges[key] for key in sorted(edges)]
+    named = [f"{c} AS {name}" for c, name in zip(keep, columns_of(nodes, edges), strict=True)]
+    if len(masks) <= _MANY:
+        select.where += [f"({a} & {b}) <> 0" for a, b in combinations(masks, 2)]
+    if len(masks) > 2:
+        select.where.append(f"({mask}) <> 0")
+    select.columns = [f'{base.bucket} AS "bucket"', *named, f'{mask} AS "mask"']
+    if base.repeats or set(base.nodes) > nodes:
+        select.columns[-1] = f'bit_or({mask}) AS "mask"'
+        select.group = [base.bucket, *keep]
+    return select.text()
+
+
+def _row_columns(alias: str, mask: str, *, swapped: bool) -> list[str]:
+    src, dst = ("dst", "src") if swapped else ("src", "dst")
+    ends = [f'{alias}."{src}" AS "src"', f'{alias}."{dst}" AS "dst"']
+    return [f'{alias}."bucket"', *ends, f'{alias}."relation"', f'{mask} AS "mask"']

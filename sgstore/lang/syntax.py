@@ -1,0 +1,357 @@
+"""Syntax trees: a query as it was written, every part with its place in the text.
+
+Nothing here is checked against a vocabulary; that is the binder's work. :mod:`sgstore.lang.parser` makes these
+trees from text.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from sgstore.errors import Span
+
+
+# Expressions --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A number, a text, a truth value or NULL as it stands in the query."""
+
+    value: int | float | str | bool | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Duration:
+    """A length of time: ``amount`` of ``ms``, ``s``, ``min`` or ``frames``."""
+
+    amount: float
+    unit: str
+    span: Span
+
+    @property
+    def ns(self) -> int:
+        """The same in nanoseconds; meaningless in frames."""
+        return round(self.amount * {"ms": 1e6, "s": 1e9, "min": 60e9}.get(self.unit, 0))
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """``$name``: a value that comes with the query."""
+
+    name: str
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A name that a pattern binds, or ``ego``, ``frame``, ``trace``."""
+
+    name: str
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class AttributeOf:
+    """``owner.name``."""
+
+    owner: Variable
+    name: str
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """``name(arguments)``; ``COUNT(DISTINCT x)`` is a call too."""
+
+    name: str
+    arguments: tuple[Expression, ...]
+    distinct: bool
+    name_span: Span
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class CountAll:
+    """``COUNT(*)``."""
+
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class ListOf:
+    """``[a, b, …]``."""
+
+    items: tuple[Expression, ...]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Logic:
+    """``NOT a``, ``a AND b AND …``, ``OR``, ``XOR``, ``a IMPLIES b``."""
+
+    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"]
+    operands: tuple[Expression, ...]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """``a = b`` and the like; also ``STARTS WITH``, ``ENDS WITH``, ``CONTAINS``, ``=~``."""
+
+    word: str
+    left: Expression
+    right: Expression
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class NullTest:
+    """``a IS NULL``; negated: ``a IS NOT NULL``."""
+
+    operand: Expression
+    negated: bool
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Membership:
+    """``a IN list``; negated: ``a NOT IN list``."""
+
+    operand: Expression
+    choices: Expression
+    negated: bool
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Arithmetic:
+    """``first sign term sign term …`` with signs of one rank, from left to right."""
+
+    first: Expression
+    rest: tuple[tuple[str, Expression], ...]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Negative:
+    """``-a``."""
+
+    operand: Expression
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class BlockExpression:
+    """``EXISTS {…}``, ``COUNT {…}``, and ``MIN {… | value}`` with ``MAX``, ``AVG``, ``SUM``."""
+
+    word: str
+    block: Block
+    value: Expression | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Temporal:
+    """An operator of the temporal layer with its bound and operands."""
+
+    word: str
+    operands: tuple[Expression, ...]
+    span: Span
+
+
+Expression = (
+    Constant
+    | Duration
+    | Parameter
+    | Variable
+    | AttributeOf
+    | Call
+    | CountAll
+    | ListOf
+    | Logic
+    | Comparison
+    | NullTest
+    | Membership
+    | Arithmetic
+    | Negative
+    | BlockExpression
+    | Temporal
+)
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A label as written; the name ``%`` stands for any."""
+
+    name: str
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class LabelLogic:
+    """``!a``, ``a & b``, ``a | b``."""
+
+    word: Literal["!", "&", "|"]
+    operands: tuple[LabelExpression, ...]
+    span: Span
+
+
+LabelExpression = Label | LabelLogic
+
+
+@dataclass(frozen=True, slots=True)
+class Property:
+    """``name: value`` in braces."""
+
+    name: str
+    value: Expression
+    name_span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class NodePattern:
+    """``(name:label {properties} WHERE condition)``; every part may be absent."""
+
+    name: str | None
+    label: LabelExpression | None
+    properties: tuple[Property, ...]
+    where: Expression | None
+    name_span: Span
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePattern:
+    """``-[name:label*low..high {properties} WHERE condition]->``; ``low`` is ``None`` for a single edge."""
+
+    name: str | None
+    label: LabelExpression | None
+    low: int | None
+    high: int | None
+    properties: tuple[Property, ...]
+    where: Expression | None
+    direction: Literal["right", "left", "any"]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Nodes with edges between them; there is one node more than edges."""
+
+    nodes: tuple[NodePattern, ...]
+    edges: tuple[EdgePattern, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Paths and a condition: what stands in a ``MATCH`` or in braces."""
+
+    paths: tuple[Path, ...]
+    where: Expression | None
+    span: Span
+
+
+# Statements ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """``USING name value``."""
+
+    name: str
+    value: str | Parameter
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One thing to return: a value with its name, ``*``, ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS``, ``CLIPS``.
+
+    ``before`` and ``after`` are the two offsets of ``CLIPS``; ns, negative is earlier.
+    """
+
+    form: Literal["value", "all", "frames", "intervals", "subgraphs", "clips"]
+    value: Expression | None
+    name: str | None
+    before: int
+    after: int
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Sort:
+    """``value ASC`` or ``DESC``."""
+
+    value: Expression
+    descending: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """``SAMPLE number PER value``."""
+
+    number: int
+    per: Expression | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """``RETURN DISTINCT items ORDER BY … SAMPLE … LIMIT …``."""
+
+    distinct: bool
+    items: tuple[Item, ...]
+    order: tuple[Sort, ...]
+    sample: Sample | None
+    limit: int | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """``USING … MATCH … WHERE … RETURN …``.
+
+    ``temporal`` is the first part of it that belongs to the temporal layer: a word and its place.
+    """
+
+    settings: tuple[Setting, ...]
+    block: Block
+    temporal: tuple[str, Span] | None
+    returns: Returns | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Formal:
+    """A parameter of a definition."""
+
+    name: str
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Define:
+    """``DEFINE PREDICATE name(parameters) AS body``; a scenario's body is ``None``, it is temporal."""
+
+    name: str
+    parameters: tuple[Formal, ...]
+    body: Expression | None
+    name_span: Span
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """``CHECK …``, which belongs to the temporal layer."""
+
+    span: Span
+
+
+Statement = Match | Define | Check

@@ -1,0 +1,89 @@
+"""Every query in the documentation is run, and everything that the language knows is documented."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import duckdb
+import pytest
+from oracle_worlds import SCHEMA
+from test_lang_golden import CATALOG
+
+from sgstore.errors import QueryError
+from sgstore.lang import catalog, compile_query
+from sgstore.lang.functions import FUNCTIONS, PAIR_FUNCTIONS
+from sgstore.lang.standard import predicates
+from sgstore.vocabulary import KINDS, RELATIONS
+
+PAGE = (Path(__file__).parents[1] / "docs" / "language.md").read_text(encoding="utf-8")
+QUERIES = re.findall(r"```sgql\n(.*?)```", PAGE, re.DOTALL)
+WORDS = set(re.findall(r"[A-Za-z_][\w]*", PAGE))
+
+
+@pytest.mark.parametrize("text", QUERIES)
+def test_a_query_of_the_page_compiles_and_runs(text: str) -> None:
+    connection = duckdb.connect()
+    connection.execute(SCHEMA)
+
+    statement = compile_query(text, CATALOG).rows()
+
+    assert connection.execute(statement.sql, list(statement.values)).fetchall() == []
+
+
+def test_there_are_queries_on_the_page() -> None:
+    assert len(QUERIES) > 10
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        pytest.param([a.name for a in catalog.NODE_ATTRIBUTES.values()], id="attributes of nodes"),
+        pytest.param([a.name for a in catalog.EDGE_ATTRIBUTES.values()], id="attributes of edges"),
+        pytest.param([a.name for a in catalog.FRAME_ATTRIBUTES.values()], id="of frames"),
+        pytest.param([a.name for a in catalog.TRACE_ATTRIBUTES.values()], id="of traces"),
+        pytest.param([*PAIR_FUNCTIONS], id="functions of pairs"),
+        pytest.param([p.name for p in predicates().values()], id="predicates"),
+        pytest.param([*KINDS], id="kinds"),
+        pytest.param([*RELATIONS], id="relations"),
+    ],
+)
+def test_what_the_language_knows_is_on_the_page(known: list[str]) -> None:
+    assert set(known) - WORDS == set()
+
+
+def test_every_function_is_on_the_page() -> None:
+    assert {f.lower() for f in FUNCTIONS} - {word.lower() for word in WORDS} == set()
+
+
+@pytest.mark.parametrize("name", predicates())
+def test_a_predicate_of_the_library_can_be_asked(name: str) -> None:
+    definition = predicates()[name]
+    arguments = [parameter.name for parameter in definition.parameters]
+    nodes = ", ".join(f"({argument}:Vehicle)" for argument in arguments)
+    connection = duckdb.connect()
+    connection.execute(SCHEMA)
+
+    compiled = compile_query(
+        f"MATCH {nodes} WHERE {definition.name}({', '.join(arguments)})", CATALOG
+    )
+
+    assert connection.execute(compiled.count().sql, list(compiled.count().values)).fetchall() == [
+        (0,)
+    ]
+
+
+def test_an_own_predicate_hides_one_of_the_library() -> None:
+    text = "DEFINE PREDICATE stopped(x) AS x.speed = 77; MATCH (v:Car) WHERE stopped(v)"
+
+    assert 77 in compile_query(text, CATALOG).rows().values
+
+
+def test_a_mistake_in_a_predicate_is_told_at_its_call() -> None:
+    with pytest.raises(
+        QueryError, match=r"in stopped\(\): a lane has no attribute 'speed'"
+    ) as caught:
+        compile_query("MATCH (l:Lane) WHERE stopped(l)", CATALOG)
+
+    assert caught.value.span is not None
+    assert caught.value.text[caught.value.span.start : caught.value.span.end] == "stopped(l)"

@@ -1,0 +1,88 @@
+"""Compiled queries against exhaustive search over networkx graphs, on random worlds and patterns."""
+
+from __future__ import annotations
+
+import pytest
+from oracle import disagreement, try_many
+from oracle_worlds import World, random_world
+
+
+@pytest.mark.parametrize("first", [0, 100, 200])
+def test_random_patterns_find_what_exhaustive_search_finds(first: int) -> None:
+    seen = try_many(first, 100)
+
+    assert seen["tried"] > 80
+    assert seen["matched"] > 20
+
+
+@pytest.fixture(scope="module", params=[1, 2], ids=["moving only", "static too"])
+def world(request: pytest.FixtureRequest) -> World:
+    return random_world(request.param, frames=20, static=request.param == 2)
+
+
+FOUND: dict[str, int] = {}
+QUERIES = [
+    pytest.param("MATCH (e:Ego)-[:isIn]->(l:Lane)<-[:isIn]-(v)", id="two in one lane"),
+    pytest.param("MATCH (a:Vehicle)-[:near]->(b)-[:near]->(c)", id="three that differ"),
+    pytest.param(
+        "USING NODES any MATCH (a:Vehicle)-[:near]->(b)-[:near]->(c)", id="that may coincide"
+    ),
+    pytest.param("MATCH (a)-[:near|visible]-(b:Person)", id="either way"),
+    pytest.param("MATCH (a)-[d]->(b:Lane)", id="any relation"),
+    pytest.param("MATCH (a)-[:isIn*1..3]->(b)", id="one to three edges"),
+    pytest.param("MATCH (a:Lane)-[:travelsTo*3]->(b:Lane)", id="three edges, no node twice"),
+    pytest.param(
+        "USING NODES any MATCH (a:Lane)-[:travelsTo*3]->(b:Lane)", id="three edges of a circle"
+    ),
+    pytest.param(
+        "MATCH (s)-[:controlsTrafficOf]->(l:Lane)<-[:isIn]-(v)", id="signals that move or stand"
+    ),
+    pytest.param("MATCH (a:Car) WHERE NOT EXISTS {(a)-[:near]->()}", id="no such edge"),
+    pytest.param("MATCH (a:Car) WHERE NOT EXISTS {(b:Person)}", id="no such node at all"),
+    pytest.param("MATCH (e:Ego) WHERE COUNT {(e)-[:isIn]->(:Lane)} > 1", id="counted"),
+    pytest.param(
+        "MATCH (a:Lane) WHERE COUNT {(a)<-[:isIn]-(b)} = COUNT {(a)-[:opposes]-(b)}",
+        id="two counts",
+    ),
+    pytest.param(
+        "MATCH (a) WHERE EXISTS {(a)-[:near]->(b) WHERE NOT EXISTS {(b)-[:near]->(c) WHERE c.x > a.x}}",
+        id="a block in a block speaks of the outermost node",
+    ),
+    pytest.param("MATCH (a:Car) WHERE a.speed > 1 OR NOT a.length < 3", id="unknown or not"),
+    pytest.param(
+        "MATCH (a)-[:near]->(b) WHERE a.speed > b.speed XOR a.width = b.width", id="unknown xor"
+    ),
+    pytest.param("MATCH (e:Ego), (v) WHERE dist(e, v) < 6", id="near by distance"),
+    pytest.param(
+        "MATCH (a), (b:Car) WHERE lon(a, b) > 3 AND abs(lat(a, b)) < 4", id="ahead by offsets"
+    ),
+    pytest.param(
+        "MATCH (v)-[r:isIn {primary: TRUE}]->(l) WHERE r.overlap >= 0.5 OR r.offset > 0", id="lanes"
+    ),
+    pytest.param("MATCH (a:Car) WHERE MIN {(a)-[:near]->(b) | b.x} < a.x", id="least of a block"),
+    pytest.param("MATCH (a) WHERE SUM {(a)-[:near]-(b) | b.speed} >= 10", id="sum of a block"),
+    pytest.param("MATCH (v:Vehicle) WHERE v.light_left OR v.light_right", id="lights"),
+    pytest.param("MATCH (t:TrafficLight {light_state: 'RED'})", id="in any case"),
+    pytest.param(
+        "MATCH (n) WHERE n.special IN ['taxi', 'Emergency']", id="words of a vocabulary in a list"
+    ),
+    pytest.param("MATCH (a:Car), (b:Lane) WHERE ego.id <> a.id", id="the ego without a pattern"),
+    pytest.param("MATCH (:Car)-[:near]->(:Person)", id="no names at all"),
+    pytest.param("MATCH (a), (A:Car) WHERE a.x = A.x", id="names that differ in case"),
+    pytest.param(
+        "MATCH (mask:Car)-[:near]->(bucket) WHERE mask.x < bucket.x", id="names of columns"
+    ),
+    pytest.param("USING UNKNOWN false MATCH (a:Lane)-[:travelsTo]->(b)", id="unknown is false"),
+]
+
+
+@pytest.mark.parametrize("text", QUERIES)
+def test_queries_find_what_exhaustive_search_finds(text: str, world: World) -> None:
+    problem, frames = disagreement(text, world)
+
+    assert problem == ""
+    FOUND[text] = FOUND.get(text, 0) + frames
+
+
+def test_most_of_these_queries_have_matches() -> None:
+    assert sum(frames > 0 for frames in FOUND.values()) >= len(FOUND) - 2

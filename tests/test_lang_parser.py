@@ -1,0 +1,197 @@
+"""The grammar, its tables, and what the parser makes of texts."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import pytest
+from lark import Lark, UnexpectedInput
+
+from sgstore.errors import QuerySyntaxError
+from sgstore.lang import syntax as s
+from sgstore.lang import tables
+from sgstore.lang.builders import BUILDERS
+from sgstore.lang.parser import MAX_DEPTH, MAX_LENGTH, parse
+from sgstore.lang.printing import tree_text
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LANG = resources.files("sgstore.lang")
+GRAMMAR = LANG.joinpath(tables.GRAMMAR).read_text(encoding="utf-8")
+
+SENTENCES = [
+    "MATCH (e:Ego)-[:near]->(p:Person)",
+    "USING NODES any, EGO 'x' MATCH (a), (b) WHERE a.speed > 1 OR NOT b.speed <= 2 XOR a = b",
+    "MATCH (a:Car|!Bus&%)<-[r:isIn*1..3]-(b {speed: -3.5e2, special: 'taxi'})-[]-(c)",
+    "MATCH (a)-[:near]->{1,3}(b)-[:near]->{2}(c)",
+    "MATCH (a) WHERE EXISTS {MATCH (a)-[:near]->(b) WHERE b.speed > 3} AND COUNT {(a)} * 2 % 3 = 1",
+    "MATCH (a) WHERE MIN {(a)-[:near]->(b) | b.speed} < $limit RETURN min(a.x, 3), MIN {(b) | b.x}",
+    "MATCH (a) RETURN DISTINCT a.x AS x, COUNT(*) ORDER BY x DESC, a.y ASC SAMPLE 3 PER a.z LIMIT 5",
+    "MATCH (a) WHERE a.name STARTS WITH 'a' AND a.name ENDS WITH \"b\" OR a.name =~ 'c' LIMIT 3",
+    "MATCH (a) WHERE a.x IS NULL => a.y IS NOT NULL IMPLIES a.id NOT IN [1, 2, $x] RETURN CLIPS(-3s, +5s)",
+    "DEFINE PREDICATE f(x) AS x.speed < 1; DEFINE SCENARIO g() AS MATCH (a); MATCH (a) WHERE f(a);",
+    "MATCH (a) WHERE a.x > 1 FOR >= 2s AS slow THEN AFTER 1s WITHIN 2s NOT MATCH (b) UNTIL MATCH (a)",
+    "CHECK c: FORALL (v:Car, w:Bus WHERE v.x > w.x) ALWAYS[0s, INF] (v.x > 1 UNTIL w.x < 2) RESET WHEN TRUE",
+    "MATCH (a) WHERE ALWAYS WITHIN 3s a.x > 1 SINCE [1s, 2s] a.y < 2",
+]
+NO_SENTENCES = [
+    "",
+    "MATCH",
+    "MATCH (a",
+    "MATCH (a)-[:near](b)",
+    "MATCH (a) WHERE",
+    "MATCH (a) WHERE a.x >",
+    "MATCH (a) RETURN",
+    "MATCH (a) LIMIT x",
+    "MATCH (a:Car&)",
+    "MATCH (a) WHERE a.x IS 3",
+    "MATCH (a) WHERE (a.x > 3",
+    "RETURN 3",
+    "MATCH (a) (b)",
+]
+
+
+def test_the_tables_that_are_shipped_are_those_of_the_grammar() -> None:
+    kept = LANG.joinpath(tables.TABLES).read_text(encoding="utf-8")
+
+    made = tables.text_of(tables.made_from(GRAMMAR))
+
+    assert kept == made, "run: python -m sgstore.lang.tables"
+
+
+def test_every_rule_of_the_grammar_has_a_builder_and_every_builder_a_rule() -> None:
+    names = {rule.name for rule in tables.tables().rules if not rule.name.startswith("_")}
+    inlined = {rule.name for rule in tables.tables().rules if rule.inline}
+
+    assert names - inlined <= set(BUILDERS)
+    assert set(BUILDERS) <= names
+
+
+@pytest.mark.parametrize("text", SENTENCES)
+def test_a_sentence_is_parsed_by_ours_and_by_larks_parser(text: str) -> None:
+    lark().parse(text)
+
+    assert parse(text)
+
+
+@pytest.mark.parametrize("text", NO_SENTENCES)
+def test_what_is_no_sentence_is_refused_by_ours_and_by_larks_parser(text: str) -> None:
+    with pytest.raises(UnexpectedInput):
+        lark().parse(text)
+    with pytest.raises(QuerySyntaxError):
+        parse(text)
+
+
+@pytest.mark.data
+def test_every_example_of_the_proposed_language_is_a_sentence(data: Path) -> None:
+    proposal = data.parent / "reference" / "applications.md"
+    if not proposal.is_file():
+        pytest.skip("the proposal is not there")
+    blocks = re.findall(r"```sgql\n(.*?)```", proposal.read_text(encoding="utf-8"), re.DOTALL)
+
+    statements = [statement for block in blocks for statement in parse(block)]
+
+    assert len(statements) > 100
+
+
+def test_keywords_are_words_where_a_keyword_cannot_stand() -> None:
+    (match,) = parse("match (limit:Car) where limit.frames > 3 return limit.match as match")
+
+    assert isinstance(match, s.Match)
+    assert match.block.paths[0].nodes[0].name == "limit"
+    assert match.returns is not None
+    assert match.returns.items[0].name == "match"
+
+
+def test_comments_are_no_edges_and_edges_no_comments() -> None:
+    (match,) = parse("MATCH (a)--(b)-->(c)<--(d) -- a comment (e)\n, (f) /* and\n(g) */ , (h) --")
+
+    assert isinstance(match, s.Match)
+    assert [len(path.nodes) for path in match.block.paths] == [4, 1, 1]
+    assert [e.direction for e in match.block.paths[0].edges] == ["any", "right", "left"]
+
+
+def test_arithmetic_binds_as_in_school() -> None:
+    (match,) = parse("MATCH (a) WHERE 1 + 2 * 3 - -4 = 11 AND TRUE OR NOT FALSE AND TRUE")
+
+    assert isinstance(match, s.Match)
+    where = match.block.where
+    assert isinstance(where, s.Logic)
+    assert where.word == "OR"
+    assert isinstance(where.operands[0], s.Logic)
+    comparison = where.operands[0].operands[0]
+    assert isinstance(comparison, s.Comparison)
+    assert isinstance(comparison.left, s.Arithmetic)
+    assert [sign for sign, _ in comparison.left.rest] == ["+", "-"]
+
+
+def test_texts_keep_what_is_escaped() -> None:
+    (match,) = parse(r"""MATCH (a) WHERE a.name IN ['it\'s', "a\"b", 'c\\d', 'e\nf']""")
+
+    assert isinstance(match, s.Match)
+    assert isinstance(match.block.where, s.Membership)
+    assert isinstance(match.block.where.choices, s.ListOf)
+    values = [
+        item.value for item in match.block.where.choices.items if isinstance(item, s.Constant)
+    ]
+    assert values == ["it's", 'a"b', "c\\d", "e\nf"]
+
+
+def test_spans_cover_the_parts_of_the_text() -> None:
+    text = "MATCH (e:Ego)-[d:near]->(p) WHERE dist(e, p) < 15"
+
+    (match,) = parse(text)
+
+    assert isinstance(match, s.Match)
+    where = match.block.where
+    assert isinstance(where, s.Comparison)
+    assert text[where.span.start : where.span.end] == "dist(e, p) < 15"
+    assert isinstance(where.left, s.Call)
+    assert text[where.left.name_span.start : where.left.name_span.end] == "dist"
+    edge = match.block.paths[0].edges[0]
+    assert text[edge.span.start : edge.span.end] == "-[d:near]->"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param("MATCH (a) WHERE " + "(" * (MAX_DEPTH + 1), id="parentheses"),
+        pytest.param("MATCH (a) WHERE " + "NOT " * (MAX_DEPTH + 1) + "TRUE", id="negations"),
+        pytest.param("MATCH (a) WHERE " + "EXISTS {(a) WHERE " * MAX_DEPTH, id="blocks"),
+        pytest.param("MATCH (a)" + " " * MAX_LENGTH, id="length"),
+    ],
+)
+def test_depth_and_length_are_bounded(text: str) -> None:
+    with pytest.raises(QuerySyntaxError, match=r"nested too deeply|characters, more than"):
+        parse(text)
+
+
+def test_many_terms_in_a_row_are_no_nesting() -> None:
+    text = "MATCH (a) WHERE " + " AND ".join(["1 + 1 + 1 = 3"] * 2000)
+
+    (match,) = parse(text)
+
+    assert isinstance(match, s.Match)
+    assert isinstance(match.block.where, s.Logic)
+    assert len(match.block.where.operands) == 2000
+
+
+def test_a_tree_is_printed_without_places() -> None:
+    printed = tree_text(parse("MATCH (e:Ego) WHERE e.speed > 3")[0])
+
+    assert "NodePattern name='e'" in printed
+    assert "span" not in printed
+
+
+def lark() -> Lark:
+    """Lark's own parser of the same grammar: who else reads it, and blanks and comments, which ours skips."""
+    if not PARSERS:
+        more = "\n%ignore /\\s+/\n%ignore /--[^\\n]*|\\/\\*(.|\\n)*?\\*\\//\n"
+        PARSERS.append(Lark(GRAMMAR + more, parser="lalr", maybe_placeholders=True))
+    return PARSERS[0]
+
+
+PARSERS: list[Lark] = []
