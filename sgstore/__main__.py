@@ -1,0 +1,5 @@
+"""``python -m sgstore``: the command line."""
+
+from sgstore.cli import main
+
+main()

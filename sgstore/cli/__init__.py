@@ -1,0 +1,56 @@
+"""The command line: each verb parses, calls one function of the library, and prints.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 done; 1 error; 2 wrong usage, the language of
+queries and SQL included; 3 done, but something in a recording was lost; 4 nothing matched (with ``--require``).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+
+from sgstore.cli.output import say
+from sgstore.cli.verbs import app
+from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
+
+__all__ = ["app", "main"]
+
+ERROR, USAGE, INTERRUPTED = 1, 2, 130
+
+
+def main() -> None:
+    """Run the command line of this process and end it with the right exit code."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line.
+
+    Returns
+    -------
+    int
+        The exit code, as the module says.
+    """
+    try:
+        return int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+    except typer.Abort:
+        return INTERRUPTED
+    except KeyboardInterrupt:
+        say("interrupted; what was finished is in the store")
+        return INTERRUPTED
+    except SgstoreError as error:
+        say(str(error))
+        return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR
+    except BrokenPipeError:
+        # The reader of our output went away (`| head`): nothing to say, and nothing more to flush.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        # Wrong usage: the class of these errors has moved between versions of typer, its faces have not.
+        show = getattr(error, "show", None)
+        if not callable(show):
+            raise
+        show()
+        return USAGE

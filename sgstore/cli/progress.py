@@ -1,0 +1,43 @@
+"""The bar that long work shows, on a terminal and nowhere else."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator
+
+    from sgstore.ingest import Progress
+
+
+@contextmanager
+def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
+    """A function that shows the progress of an ingest on stderr; ``None`` where that is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[frames]} frames"),
+        TextColumn("{task.fields[speed]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+    task = bar.add_task("", total=None, frames=0, speed="")
+
+    def show(progress: Progress) -> None:
+        if bar.tasks[task].description != progress.path.name:
+            bar.reset(task, description=progress.path.name, total=progress.size)
+        elapsed = bar.tasks[task].elapsed or 0
+        speed = f"{progress.bytes_done / elapsed / 1e6:.0f} MB/s" if elapsed > 0.5 else ""
+        bar.update(task, completed=progress.bytes_done, frames=progress.frames, speed=speed)
+
+    with bar:
+        yield show

@@ -1,0 +1,185 @@
+"""The main job on the recording that comes with the package: ingest, ask, look, export."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from importlib import resources
+from typing import TYPE_CHECKING, Final
+
+from sgstore.draw.stored import draw_stored
+from sgstore.errors import ExportError, MissingExtraError
+from sgstore.exporters.stored import write_stored
+from sgstore.ingest import ingest
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from sgstore.query import Interval
+
+    Say = Callable[[str], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What a test engineer asks, as a sentence and as a pattern.
+
+    Attributes
+    ----------
+    name : str
+        Of the picture that answers it.
+    sentence, pattern : str
+    """
+
+    name: str
+    sentence: str
+    pattern: str
+
+
+QUESTIONS: Final = (
+    Question(
+        "crossing-at-red",
+        "Does anybody cross in front of the ego, in its own lane, while the light is red?",
+        """\
+MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(p:Person),
+      (light:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(lane)
+WHERE abs(bearing(e, p)) < 45""",
+    ),
+    Question(
+        "cut-in",
+        "Does anybody come over from the lane beside, closely before the ego?",
+        """\
+MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(v:Vehicle)-[:isIn]->(beside:Lane),
+      (beside)-[:laneChange]->(lane)
+WHERE abs(bearing(e, v)) < 45 AND gap(e, v) < 12 AND v.speed > 1""",
+    ),
+    Question(
+        "jaywalking",
+        "Does anybody walk on a driving lane, near the ego and on no crosswalk?",
+        """\
+MATCH (e:Ego), (p:Person)-[at:isIn]->(lane:Lane {lane_type: 'driving'})
+WHERE dist(e, p) < 25 AND at.overlap > 0.5 AND NOT EXISTS {(p)-[:isIn]->(:Crosswalk)}""",
+    ),
+)
+"""Each holds somewhere in the sample; ``samples/town/README.md`` says when and who."""
+
+STORE: Final = "demo.sgstore"
+
+
+def run_demo(folder: Path, say: Say) -> None:
+    """Run the demonstration, and tell what happens.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it does not exist; what an earlier run left there is made anew.
+    say : function
+        Takes each line.
+
+    Raises
+    ------
+    ExportError
+        The folder holds something else.
+    SgstoreError
+        Anything that the library refuses to do.
+    """
+    _prepare(folder)
+    with resources.as_file(resources.files("sgstore") / "sample" / "town.mcap") as sample:
+        _ingest(folder / STORE, sample, say)
+        store = Store(folder / STORE)
+        pictures = [_answer(store, question, folder, say) for question in QUESTIONS]
+        clips = _export(store, folder, say)
+    _say_what_next(folder, clips, pictures, say)
+
+
+def _prepare(folder: Path) -> None:
+    store = folder / STORE
+    if folder.exists() and not store.exists() and any(folder.iterdir()):
+        raise ExportError(
+            f"{folder} holds something else; name a folder that is empty or not there"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    store.unlink(missing_ok=True)
+    shutil.rmtree(folder / "clips", ignore_errors=True)
+
+
+def _ingest(store: Path, sample: Path, say: Say) -> None:
+    say("A drive of 75 s through a small town, as a simulator recorded it: ground truth at 10 Hz,")
+    say(f"a camera, a lidar, and the road map, in {sample.stat().st_size / 1e6:.1f} MB of MCAP.")
+    say("")
+    say(f"$ sgstore ingest {store} town.mcap")
+    outcome = ingest(store, [sample])[0]
+    if outcome.error:
+        raise outcome.error
+    kinds = ", ".join(f"{number} {kind}" for kind, number in sorted(outcome.entities.items()))
+    say(f"  {outcome.frames} scene graphs in {outcome.seconds:.1f} s, of {kinds}.")
+
+
+def _answer(store: Store, question: Question, folder: Path, say: Say) -> Path | None:
+    """Ask, print the intervals, and draw the middle of the first one."""
+    say("")
+    say(f"{question.sentence}")
+    say("")
+    for line in question.pattern.splitlines():
+        say(f"    {line}")
+    say("")
+    matches = store.find(question.pattern)
+    found = list(matches.intervals())
+    say(f"  {matches.count()} frames:")
+    for interval in found:
+        who = ", ".join(_bound(interval))
+        say(f"  {interval.start:6.1f} s to {interval.end:4.1f} s   {who}")
+    picture = folder / f"{question.name}.png"
+    middle = (found[0].start_seq + found[0].end_seq) // 2
+    try:
+        draw_stored(store, f"{found[0].trace}#{middle}", picture, matches=matches)
+    except MissingExtraError as error:
+        say(f"  (no picture: {error})")
+        return None
+    say(f"  seen from above, and by the ego's camera: {picture}")
+    return picture
+
+
+def _bound(interval: Interval) -> list[str]:
+    """``p = person 15`` for each variable."""
+    return [
+        f"{name.removesuffix('.name')} = {value}"
+        for name, value in interval.values.items()
+        if name.endswith(".name")
+    ]
+
+
+def _export(store: Store, folder: Path, say: Say) -> Path:
+    question = QUESTIONS[0]
+    to = folder / "clips"
+    clips = list(store.find(question.pattern).clips(before=2.0, after=2.0))
+    written = write_stored(store, clips, to, query=question.pattern)
+    say("")
+    say(
+        "The first answer as a test case of its own: the original messages, 2 s before to 2 s after."
+    )
+    say("")
+    for clip in written:
+        seconds = (clip.end_ns - clip.start_ns) / 1e9
+        messages = sum(channel.messages for channel in clip.messages)
+        say(f"  {clip.file}: {seconds:.1f} s, {messages} messages, camera and lidar among them")
+    return written[0].file
+
+
+def _say_what_next(folder: Path, clip: Path, pictures: list[Path | None], say: Say) -> None:
+    store = folder / STORE
+    say("")
+    say("What to type next:")
+    say("")
+    pattern = '"MATCH (e:Ego)-[:near_coll]->(v:Vehicle) RETURN v.name, INTERVALS"'
+    count = '"FROM edges SELECT relation, dst_kind, count(*) GROUP BY ALL"'
+    say(f"  sgstore find {store} {pattern}")
+    say(f"  sgstore sql {store} {count}")
+    say(f"  sgstore show {store} town@38s -o turning.svg")
+    say(f"  sgstore ingest {store} YOUR.mcap")
+    say("")
+    if any(pictures):
+        say(f"The pictures are in {folder}/.")
+    say(f"{clip} opens in Foxglove or Lichtblick, and in sgstore again.")

@@ -1,0 +1,358 @@
+"""The command line as a person and as a script use it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from sgstore.cli import run
+
+REPOSITORY = Path(__file__).parents[1]
+SAMPLE = REPOSITORY / "sgstore" / "sample" / "town.mcap"
+CROSSING = """
+MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(p:Person),
+      (:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(lane)
+WHERE abs(bearing(e, p)) < 45
+"""
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a demonstration has been run."""
+    folder = tmp_path_factory.mktemp("demo")
+    assert run(["demo", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def store(folder: Path) -> str:
+    return str(folder / "demo.sgstore")
+
+
+@pytest.fixture
+def sgstore(capsys: pytest.CaptureFixture[str]):
+    """Runs a command line; gives exit code, stdout and stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = run([str(a) for a in arguments])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def test_the_demo_leaves_a_store_pictures_and_a_clip(folder: Path) -> None:
+    pictures = sorted(folder.glob("*.png"))
+
+    assert [p.stem for p in pictures] == ["crossing-at-red", "cut-in", "jaywalking"]
+    assert all(p.read_bytes().startswith(PNG) for p in pictures)
+    assert sorted(p.name for p in (folder / "clips").iterdir()) == [
+        "manifest.json",
+        "town_001.mcap",
+    ]
+
+
+def test_the_demo_can_be_run_again_but_not_in_a_folder_of_others(
+    folder: Path, tmp_path: Path, sgstore
+) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+
+    assert sgstore("demo", folder)[0] == 0
+    code, _, err = sgstore("demo", tmp_path)
+
+    assert code == 1
+    assert "holds something else" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_find_prints_what_each_variable_is_bound_to(store: str, sgstore) -> None:
+    code, out, _ = sgstore("find", store, CROSSING)
+    head, _, first, *_ = out.splitlines()
+
+    assert code == 0
+    assert head.split() == ["frame", "t", "e", "lane", "p"]
+    assert first.split()[0] == "town#251"
+
+
+def test_count_is_the_number_of_distinct_frames_and_nothing_else(store: str, sgstore) -> None:
+    rows = json.loads(sgstore("find", store, CROSSING, "--json")[1])
+
+    code, out, err = sgstore("find", store, CROSSING, "--count")
+
+    assert (code, err) == (0, "")
+    assert out == f"{len({row['frame_id'] for row in rows})}\n"
+
+
+def test_ids_are_texts_in_json_because_readers_round_them(store: str, sgstore) -> None:
+    row = json.loads(sgstore("find", store, CROSSING, "--json")[1])[0]
+
+    assert isinstance(row["frame_id"], str)
+    assert int(row["frame_id"]) > 2**53
+    assert isinstance(row["seq"], int)
+
+
+def test_all_formats_hold_the_same_rows(store: str, sgstore, tmp_path: Path) -> None:
+    statement = "SELECT seq, t, trace FROM frames ORDER BY seq LIMIT 300"
+    file = tmp_path / "rows.parquet"
+
+    whole = json.loads(sgstore("sql", store, statement, "--json")[1])
+    lines = [
+        json.loads(line)
+        for line in sgstore("sql", store, statement, "--format", "ndjson")[1].splitlines()
+    ]
+    table = list(csv.DictReader(StringIO(sgstore("sql", store, statement, "--format", "csv")[1])))
+    assert sgstore("sql", store, statement, "--format", "parquet", "-o", file)[0] == 0
+
+    import pyarrow.parquet
+
+    assert len(whole) == 300
+    assert lines == whole
+    assert [{"seq": int(r["seq"]), "t": float(r["t"]), "trace": r["trace"]} for r in table] == whole
+    assert pyarrow.parquet.read_table(file).to_pylist() == whole
+
+
+def test_nothing_found_is_no_error_unless_it_is_required(store: str, sgstore) -> None:
+    nothing = "MATCH (a:Animal)"
+
+    assert sgstore("find", store, nothing)[0] == 0
+    assert sgstore("find", store, nothing, "--count")[1] == "0\n"
+    assert sgstore("find", store, nothing, "--require")[0] == 4
+
+
+def test_a_query_comes_from_a_file_or_stdin_with_parameters(
+    store: str, sgstore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "MATCH (e:Ego), (v:Vehicle) WHERE gap(e, v) < $near"
+    (tmp_path / "near.sgql").write_text(text)
+    monkeypatch.setattr(sys, "stdin", StringIO(text))
+
+    near = sgstore("find", store, "-f", tmp_path / "near.sgql", "--param", "near=3", "--count")
+    nearer = sgstore("find", store, "-f", "-", "--param", "near=1.5", "--count")
+
+    assert near[0] == nearer[0] == 0
+    assert int(nearer[1]) < int(near[1])
+
+
+def test_explain_shows_the_stages_and_searches_nothing(store: str, sgstore) -> None:
+    code, out, _ = sgstore("find", store, CROSSING, "--explain")
+
+    assert code == 0
+    stages = [line for line in out.splitlines() if line.startswith("---- ")]
+    assert stages == ["---- parse", "---- bind", "---- rewrite", "---- emit"]
+
+
+def test_show_marks_what_a_query_matches(store: str, sgstore, tmp_path: Path) -> None:
+    plain, marked = tmp_path / "plain.svg", tmp_path / "marked.svg"
+
+    assert sgstore("show", store, "town@26s", "-o", plain)[0] == 0
+    assert sgstore("show", store, "town#260", CROSSING, "-o", marked)[0] == 0
+
+    assert 'id="halo-' not in plain.read_text()
+    assert 'id="halo-' in marked.read_text()
+
+
+def test_show_says_when_nothing_is_marked(store: str, sgstore, tmp_path: Path) -> None:
+    code, _, err = sgstore("show", store, "town#0", CROSSING, "-o", tmp_path / "f.png")
+
+    assert code == 0
+    assert "does not match in town#0" in err
+
+
+def test_export_takes_frames_as_lines(store: str, sgstore, tmp_path: Path) -> None:
+    (tmp_path / "frames.txt").write_text("town#100\ntown@10.5s\ntown#700\n")
+
+    code, out, _ = sgstore(
+        "export", store, "--frames", tmp_path / "frames.txt", "--to", tmp_path / "c", "--json"
+    )
+
+    assert code == 0
+    assert [row["seconds"] for row in json.loads(out)] == [4.5, 4.0]
+
+
+def test_an_exported_clip_has_the_same_graphs(store: str, folder: Path, sgstore) -> None:
+    clip, again = folder / "clips" / "town_001.mcap", folder / "again.sgstore"
+    assert sgstore("ingest", again, clip)[0] == 0
+    # Node ids count entities as they appear; the simulator's own ids are the same.
+    edges = """
+        WITH named AS (
+          SELECT trace_id, node_id, ident AS who FROM entities UNION ALL
+          SELECT DISTINCT f.trace_id, n.node_id, n.name FROM nodes n JOIN frames f USING (frame_id)
+          WHERE n.node_id < 0)
+        SELECT f.log_time_ns, s.who AS src, e.relation, d.who AS dst
+        FROM edges e JOIN frames f USING (frame_id)
+        JOIN named s ON s.trace_id = f.trace_id AND s.node_id = e.src
+        JOIN named d ON d.trace_id = f.trace_id AND d.node_id = e.dst
+        WHERE f.log_time_ns BETWEEN 23.1e9 AND 33.2e9 ORDER BY ALL"""
+
+    original = sgstore("sql", store, edges, "--format", "csv")[1]
+    exported = sgstore("sql", again, edges, "--format", "csv")[1]
+
+    assert original.count("\n") > 10_000
+    assert exported == original
+
+
+BAD: list[tuple[str, list[str], int, str]] = [
+    ("no such recording", ["ingest", "{new}", "nowhere.mcap"], 1, "nowhere.mcap"),
+    ("no such store", ["find", "nowhere.sgstore", "MATCH (e:Ego)"], 1, "nowhere.sgstore"),
+    ("a store that is none", ["info", "{text}"], 1, "{text}"),
+    ("a recording that is none", ["ingest", "{new}", "{text}"], 1, "MCAP"),
+    ("a map that is none", ["ingest", "{new}", "{sample}", "--map", "{text}"], 1, "{text}"),
+    ("a config that is none", ["ingest", "{new}", "{sample}", "--config", "{text}"], 2, "TOML"),
+    ("an unknown relation", ["find", "{store}", "MATCH (e)-[:nier]->(v)"], 2, "'near'"),
+    ("an unknown label", ["find", "{store}", "MATCH (e:Egg)"], 2, "'Ego'"),
+    ("an unknown attribute", ["find", "{store}", "MATCH (e) WHERE e.sped > 1"], 2, "'speed'"),
+    ("an unfinished pattern", ["find", "{store}", "MATCH (e:Ego"], 2, "expected"),
+    ("no query", ["find", "{store}"], 2, "query"),
+    (
+        "a parameter without a value",
+        ["find", "{store}", "MATCH (e)", "--param", "x"],
+        2,
+        "NAME=VALUE",
+    ),
+    ("wrong SQL", ["sql", "{store}", "SELECT speeed FROM nodes"], 2, "speed"),
+    ("SQL that writes", ["sql", "{store}", "DROP TABLE edge"], 2, "read only"),
+    (
+        "SQL that reads files",
+        ["sql", "{store}", "SELECT * FROM read_text('{text}')"],
+        2,
+        "disabled",
+    ),
+    ("no such trace", ["show", "{store}", "twon#3", "-o", "{out}.png"], 1, "'town'"),
+    ("no such frame", ["show", "{store}", "town#9999", "-o", "{out}.png"], 1, "749"),
+    ("no such picture format", ["show", "{store}", "town#3", "-o", "{out}.bmp"], 1, ".png"),
+    ("a time that is none", ["export", "{store}", "MATCH (e:Ego)", "--before", "soon"], 2, "2s"),
+    ("no such verb", ["fnd", "{store}"], 2, "fnd"),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"), [b[1:] for b in BAD], ids=[b[0] for b in BAD]
+)
+def test_bad_input_gets_one_clear_message_and_changes_nothing(
+    arguments: list[str], code: int, says: str, store: str, sgstore, tmp_path: Path
+) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("These are notes, and nothing else.\n" * 20)
+    words = {
+        "store": store,
+        "text": str(text),
+        "sample": str(SAMPLE),
+        "new": str(tmp_path / "new.sgstore"),
+        "out": str(tmp_path / "out"),
+    }
+    before = Path(store).read_bytes()
+
+    found, out, err = sgstore(*(a.format(**words) for a in arguments))
+
+    assert found == code
+    assert says.format(**words) in err
+    assert not out.strip() or "failed" in out
+    assert "Traceback" not in err
+    assert Path(store).read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["notes.txt"]
+
+
+def test_a_recording_without_ground_truth_says_which_channels_it_has(
+    sgstore, tmp_path: Path
+) -> None:
+    from mcap.writer import Writer
+
+    file = tmp_path / "camera.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedImage", "protobuf", b"")
+        channel = writer.register_channel("/camera", "protobuf", schema)
+        writer.add_message(channel, 0, b"", 0)
+        writer.finish()
+
+    code, _, err = sgstore("ingest", tmp_path / "new.sgstore", file)
+
+    assert code == 1
+    assert "/camera" in err
+    assert not (tmp_path / "new.sgstore").exists()
+
+
+def test_a_recording_that_lost_something_is_kept_and_the_exit_code_says_so(
+    sgstore, tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    content = SAMPLE.read_bytes()
+    cut.write_bytes(content[: len(content) // 2])
+
+    code, out, err = sgstore("ingest", tmp_path / "new.sgstore", cut, "--json")
+    outcome = json.loads(out)[0]
+
+    assert code == 3
+    assert outcome["status"] == "added"
+    assert 300 < outcome["frames"] < 750
+    assert "lost:" in err
+
+
+def test_a_folder_stands_for_the_recordings_in_it_and_twice_is_once(
+    sgstore, tmp_path: Path
+) -> None:
+    (tmp_path / "drives" / "may").mkdir(parents=True)
+    shutil.copy(SAMPLE, tmp_path / "drives" / "may" / "a.mcap")
+
+    first = sgstore("ingest", tmp_path / "new.sgstore", tmp_path / "drives", "--json")
+    second = sgstore("ingest", tmp_path / "new.sgstore", tmp_path / "drives", "--json")
+
+    assert [json.loads(out)[0]["status"] for _, out, _ in (first, second)] == ["added", "present"]
+    assert len(json.loads(sgstore("info", tmp_path / "new.sgstore", "--json")[1])) == 1
+
+
+def test_info_of_a_trace_says_how_it_was_made(store: str, sgstore) -> None:
+    known = json.loads(sgstore("info", store, "--trace", "town", "--json")[1])
+
+    assert known["name"] == "town"
+    assert known["frames"] == 750
+    assert known["settings"]["range"]["radius"] == 50.0
+    assert "controlsTrafficOf" in known["answers"]
+
+
+def test_a_pipe_that_is_closed_early_is_no_error(store: str) -> None:
+    command = (
+        f"{sys.executable} -m sgstore sql {store} 'SELECT * FROM edges' --format csv | head -1"
+    )
+    done = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True, check=False
+    )
+
+    assert done.stdout.startswith("frame_id,src,relation,dst")
+    assert done.stderr == ""
+
+
+def test_the_command_line_starts_without_the_heavy_packages() -> None:
+    heavy = "{'duckdb', 'numpy', 'shapely', 'networkx', 'matplotlib', 'mcap', 'lark'}"
+    program = f"import sys, sgstore.cli; print(sorted(set(sys.modules) & {heavy}))"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("verb", ["ingest", "info", "find", "sql", "show", "export", "demo"])
+def test_every_verb_is_in_the_readme_and_explains_itself(verb: str) -> None:
+    readme = (REPOSITORY / "README.md").read_text()
+    done = subprocess.run(
+        [sys.executable, "-m", "sgstore", verb, "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "TERM": "dumb", "COLUMNS": "100"},
+    )
+
+    assert f"sgstore {verb}" in readme
+    assert "Usage" in done.stdout
