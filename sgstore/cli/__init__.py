@@ -11,13 +11,19 @@ import sys
 
 import typer
 
+from sgstore.cli import exports, pictures, queries, tour, traces
+from sgstore.cli.arguments import ERROR, INTERRUPTED, USAGE, app
 from sgstore.cli.output import say
-from sgstore.cli.verbs import app
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
 __all__ = ["app", "main"]
 
-ERROR, USAGE, INTERRUPTED = 1, 2, 130
+VERBS = (traces, queries, pictures, exports, tour)
+"""The modules of the verbs: importing them makes the verbs known; help lists them in this order."""
+
+app.registered_commands.sort(
+    key=lambda verb: [module.__name__ for module in VERBS].index(verb.callback.__module__)
+)
 
 
 def main() -> None:
