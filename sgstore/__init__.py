@@ -5,8 +5,9 @@ Traces go in, scene graphs are kept, frames are found by what happens in them, t
 ::
 
     import sgstore
+    from sgstore.ingest import ingest
 
-    sgstore.ingest("drives.sgstore", ["monday.mcap"])
+    ingest("drives.sgstore", ["monday.mcap"])
     store = sgstore.open("drives.sgstore")
     for match in store.find("MATCH (e:Ego)-[:near_coll]->(p:Person)"):
         print(match)
@@ -16,9 +17,7 @@ Names are imported when they are first used, so that ``import sgstore`` costs no
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
         StoreError,
         TraceError,
     )
-    from sgstore.ingest import ingest
     from sgstore.query import Matches, Store
     from sgstore.world import Clip
 
@@ -50,7 +48,6 @@ _HOMES: Final = {
     "Store": "query",
     "StoreError": "errors",
     "TraceError": "errors",
-    "ingest": "ingest",
 }
 
 __all__ = [
@@ -65,7 +62,6 @@ __all__ = [
     "Store",
     "StoreError",
     "TraceError",
-    "ingest",
     "open",
 ]
 
@@ -86,28 +82,8 @@ def open(path: str | Path, *, memory: int = 0) -> Store:
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'sgstore' has no attribute {name!r}")
-    module = import_module(f"sgstore.{_HOMES[name]}")
-    return module if name == _HOMES[name] else getattr(module, name)
+    return getattr(import_module(f"sgstore.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
-
-
-class _CallableModule(ModuleType):
-    """``sgstore.ingest``: the module and, when called, its function of that name."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self.ingest(*args, **kwargs)
-
-
-class _Package(ModuleType):
-    """The package. Importing a submodule sets its name here, and ``ingest`` must stay callable then."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name == "ingest" and isinstance(value, ModuleType):
-            value.__class__ = _CallableModule
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

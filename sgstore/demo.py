@@ -1,21 +1,20 @@
-"""The main job on the recording that comes with the package: ingest, ask, look, export."""
+"""The main job on the recording that comes with the project: ingest, ask, look, export."""
 
 from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sgstore.draw.stored import draw_stored
-from sgstore.errors import ExportError, MissingExtraError
+from sgstore.errors import ExportError, MissingExtraError, TraceError
 from sgstore.exporters.stored import write_stored
 from sgstore.ingest import ingest
 from sgstore.query import Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from sgstore.query import Interval
 
@@ -67,14 +66,19 @@ WHERE dist(e, p) < 25 AND at.overlap > 0.5 AND NOT EXISTS {(p)-[:isIn]->(:Crossw
 
 STORE: Final = "demo.sgstore"
 
+RECORDING: Final = Path(__file__).parent / "sample" / "town.mcap"
+"""The recording in a checkout. A wheel is without it: it would be an eighth of all that is installed."""
 
-def run_demo(folder: Path, say: Say) -> None:
+
+def run_demo(folder: Path, say: Say, recording: Path = RECORDING) -> None:
     """Run the demonstration, and tell what happens.
 
     Parameters
     ----------
     folder : Path
         Made if it does not exist; what an earlier run left there is made anew.
+    recording : Path
+        The sample recording.
     say : function
         Takes each line.
 
@@ -85,12 +89,17 @@ def run_demo(folder: Path, say: Say) -> None:
     SgstoreError
         Anything that the library refuses to do.
     """
+    if not recording.is_file():
+        raise TraceError(
+            "the sample recording is no part of the installed package; take sgstore/sample/town.mcap from the "
+            "project's repository: sgstore demo --recording town.mcap",
+            path=recording,
+        )
     _prepare(folder)
-    with resources.as_file(resources.files("sgstore") / "sample" / "town.mcap") as sample:
-        _ingest(folder / STORE, sample, say)
-        store = Store(folder / STORE)
-        pictures = [_answer(store, question, folder, say) for question in QUESTIONS]
-        clips = _export(store, folder, say)
+    _ingest(folder / STORE, recording, say)
+    store = Store(folder / STORE)
+    pictures = [_answer(store, question, folder, say) for question in QUESTIONS]
+    clips = _export(store, folder, say)
     _say_what_next(folder, clips, pictures, say)
 
 

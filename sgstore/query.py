@@ -336,8 +336,22 @@ class Matches:
     def for_people(self) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
         """Columns and rows as a person wants to read them.
 
-        The frame comes as ``trace#seq``, which every command takes; a variable as the name of its node.
+        A frame, and the first one of an interval, comes as ``trace#seq``, which every command takes; a
+        variable as the name of its node.
         """
+        width = len(INTERVAL_COLUMNS)
+        if self.columns[:width] == INTERVAL_COLUMNS:
+            columns = ("from", "start", "end", "frames", *self.columns[width:])
+            return columns, (
+                (
+                    f"{i.trace}#{i.start_seq}",
+                    round(i.start, 3),
+                    round(i.end, 3),
+                    i.frames,
+                    *i.values.values(),
+                )
+                for i in self.intervals()
+            )
         if self.columns[: len(FRAME_COLUMNS)] != FRAME_COLUMNS:
             return self.columns, iter(self)
         width = len(FRAME_COLUMNS)

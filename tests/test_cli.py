@@ -62,6 +62,26 @@ def test_the_demo_leaves_a_store_pictures_and_a_clip(folder: Path) -> None:
     ]
 
 
+def test_the_demo_says_where_its_recording_is_to_be_had(tmp_path: Path, sgstore) -> None:
+    code, _, err = sgstore("demo", tmp_path / "demo", "--recording", tmp_path / "town.mcap")
+
+    assert code == 1
+    assert "sgstore/sample/town.mcap from the project's repository" in err
+    assert not (tmp_path / "demo").exists()
+
+
+def test_an_interval_is_shown_by_its_first_frame(store: str, sgstore) -> None:
+    query = "MATCH (e:Ego)-[:near_coll]->(v:Bus) RETURN v.name, INTERVALS"
+    code, out, _ = sgstore("find", store, query)
+
+    assert code == 0
+    assert out.split() == [
+        *["from", "start", "end", "frames", "v.name"],
+        *["─" * n for n in (8, 5, 4, 6, 6)],
+        *["town#197", "19.7", "20.6", "10", "bus", "3"],
+    ]
+
+
 def test_the_demo_can_be_run_again_but_not_in_a_folder_of_others(
     folder: Path, tmp_path: Path, sgstore
 ) -> None:

@@ -79,13 +79,6 @@ def test_the_public_names_are_few_and_all_there() -> None:
         sgstore.nothing  # noqa: B018
 
 
-def test_ingest_can_be_called_whether_its_module_is_imported_or_not() -> None:
-    from sgstore.ingest import ingest
-
-    assert callable(sgstore.ingest)
-    assert sgstore.ingest.ingest is ingest  # type: ignore[attr-defined]
-
-
 # Finding
 
 

@@ -8,6 +8,7 @@ import networkx as nx
 import pytest
 
 import sgstore
+from sgstore.ingest import ingest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.data
 @pytest.fixture(scope="module")
 def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
     path = tmp_path_factory.mktemp("swarm") / "swarm.sgstore"
-    (outcome,) = sgstore.ingest(path, [data / "traces" / "esmini" / "swarm_Town04.mcap"])
+    (outcome,) = ingest(path, [data / "traces" / "esmini" / "swarm_Town04.mcap"])
     assert outcome.frames == 602
     return sgstore.open(path)
 

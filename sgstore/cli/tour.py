@@ -15,9 +15,13 @@ def demo(
     folder: Annotated[
         Path, typer.Argument(metavar="DIR", help="Where its store, pictures and clips are put.")
     ] = Path("sgstore-demo"),
+    recording: Annotated[
+        Path | None,
+        typer.Option("--recording", help="The sample recording, where the package lacks it."),
+    ] = None,
 ) -> int:
     """Do the main job on a bundled recording: ingest, ask, look, export."""
-    from sgstore.demo import run_demo
+    from sgstore.demo import RECORDING, run_demo
 
-    run_demo(folder, typer.echo)
+    run_demo(folder, typer.echo, recording or RECORDING)
     return 0
