@@ -85,10 +85,13 @@ class Pairs:
         All entities that move, up to this distance between their centres; m. 0: none.
     ego : bool
         The ego with everything in range, whatever the distance.
+    static : bool
+        Entities that never move with one another too, up to the same distance.
     """
 
     within: float = 25.0
     ego: bool = True
+    static: bool = False
 
     def __post_init__(self) -> None:
         _check(
@@ -97,6 +100,24 @@ class Pairs:
             self.within,
             "a length of 0 or more, in metres",
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Lanes:
+    """What is asked of the lanes beyond those that an entity is in.
+
+    Attributes
+    ----------
+    ahead : float
+        How far along the lanes the next one ahead is looked for, and how far upstream of a signal lanes may
+        be affected by it; m. 0: neither, so that nothing is known of them.
+    """
+
+    ahead: float = 100.0
+
+    def __post_init__(self) -> None:
+        known = 0 <= self.ahead < math.inf
+        _check(known, "lanes.ahead", self.ahead, "a length of 0 or more, in metres")
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +150,22 @@ class Config:
 
     Attributes
     ----------
-    range, proximity, direction, pairs, payloads
+    range, proximity, direction, pairs, lanes, payloads
         See there.
     ego : str
         The simulator's id, role or name of the ego; empty: as the trace says.
+    sees : bool
+        Whether it is computed what the ego sees; otherwise nothing is known of it.
     """
 
     range: Range = field(default_factory=Range)
     proximity: Proximity = field(default_factory=Proximity)
     direction: Direction = field(default_factory=Direction)
     pairs: Pairs = field(default_factory=Pairs)
+    lanes: Lanes = field(default_factory=Lanes)
     payloads: Payloads = field(default_factory=Payloads)
     ego: str = ""
+    sees: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as they stand in TOML and JSON."""
