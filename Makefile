@@ -52,4 +52,4 @@ sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo-out
+	rm -rf $(VENV) build dist *.egg-info sgstore-demo
