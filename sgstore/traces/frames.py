@@ -1,9 +1,10 @@
 """From decoded messages to blocks of frames: what every flavour of recording shares.
 
 A flavour decodes a message into :class:`FrameRows` and enters what it meets into a :class:`Roster`.
-:func:`assemble` makes blocks of that, one frame ahead of what it hands out: a velocity that the
-recording lacks is the difference of two positions, and the second of them may belong to the first
-frame of the next block. So a value never depends on where a block begins or ends.
+:func:`assemble` makes blocks of that, ahead of what it hands out: a velocity that the recording lacks is
+the difference of two positions, the second of them may belong to the first frame of the next block, and
+what else is told of that frame may stand behind the message that leads. So a value never depends on where
+a block begins or ends.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from sgstore.vocabulary import KIND_CODE
 from sgstore.world import Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -186,14 +187,18 @@ class Decoder(Protocol[Raw]):
         ...
 
     def complete(self, frames: list[Raw]) -> list[FrameRows]:
-        """The same frames with their numbers."""
+        """The same frames with their numbers.
+
+        Each has been followed by another, or by the end of the recording: what belongs to the same instant
+        may stand behind the message that leads.
+        """
         ...
 
 
 def assemble(
     runs: Iterable[Messages],
     size: int,
-    leading: int,
+    channels: Collection[int],
     decoder: Decoder[Raw],
     refs: Callable[[Messages], MessageRefs],
 ) -> Iterator[FrameBlock]:
@@ -205,8 +210,9 @@ def assemble(
         In file order.
     size : int
         Frames of a block; the last may have fewer.
-    leading : int
-        Channel id whose messages are frames.
+    channels : collection of int
+        Ids of the channels whose messages the decoder asks for: those that are frames, and those that say
+        more about the same instants.
     decoder : Decoder
     refs : callable
         The references of those messages that belong to frames.
@@ -216,32 +222,38 @@ def assemble(
     FrameBlock
         Its messages are those that stand in the file from its first frame up to the next block's.
     """
+    wanted = np.array(sorted(channels), np.int64)
     raw: list[Raw] = []
-    taken: list[MessageRefs] = []
-    done: list[
-        FrameRows
-    ] = []  # the frame before the block, and its first, which was looked ahead to
-    first = 0
+    done: list[FrameRows] = []  # the frame before the block, and those of it that are complete
+    open_refs: list[MessageRefs] = []
+    block_refs: list[MessageRefs] = []
+    first, known = 0, 0
     for run in runs:
         start = 0
-        for row in np.flatnonzero(run.channel == leading):
-            known = decoder.roster.size
-            frame = decoder.decode(run, int(row))
+        for row in np.flatnonzero(np.isin(run.channel, wanted)).tolist():
+            entered = decoder.roster.size
+            frame = decoder.decode(run, row)
             if frame is None:
                 continue
-            raw.append(frame)
-            if len(raw) + (first > 0) > size:
-                taken.append(refs(run.span(start, int(row))))
-                start = int(row)
+            window = size + (first > 0)
+            if len(done) + len(raw) > window:  # the frame behind the block is complete now, too
                 done += decoder.complete(raw)
-                yield _block(first, done, size, taken, decoder.roster.take(known))
-                first, done = first + size, done[-2:]
-                raw, taken = [], []
-        taken.append(refs(run.span(start, len(run))))
+                yield _block(first, done, size, block_refs, decoder.roster.take(known))
+                first, done, raw = first + size, done[-2:], []
+                window = size + 1
+            if len(done) + len(raw) == window:
+                open_refs.append(refs(run.span(start, row)))
+                start, known = row, entered
+                block_refs, open_refs = open_refs, []
+            raw.append(frame)
+        open_refs.append(refs(run.span(start, len(run))))
     done += decoder.complete(raw)
+    if len(done) - (first > 0) > size:
+        yield _block(first, done, size, block_refs, decoder.roster.take(known))
+        first, done = first + size, done[-2:]
     left = len(done) - (first > 0)
     if left:
-        yield _block(first, done, left, taken, decoder.roster.take(decoder.roster.size))
+        yield _block(first, done, left, open_refs, decoder.roster.take(decoder.roster.size))
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:

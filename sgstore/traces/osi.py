@@ -105,7 +105,7 @@ class OsiTrace:
         decoder = FrameDecoder(message, self.info.ego, window, report)
         runs = self._recording.walk(report)
         refs = _Refs(self._index(), window)
-        blocks = assemble(runs, size, self._leading, decoder, refs)
+        blocks = assemble(runs, size, {self._leading}, decoder, refs)
         yield from counted(blocks, report)
         decoder.settle()
         if not report.frames:
