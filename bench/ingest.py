@@ -89,7 +89,7 @@ def in_parts(path: Path, store: StoreFile) -> tuple[dict[str, float], int]:
             at = parts.timed("segment", at)
             for block in trace.blocks(BLOCK_FRAMES):
                 at = parts.timed("read", at)
-                graph = generator.block(block)
+                graph = generator.block(segment.as_kept(block))
                 at = parts.timed("graph", at)
                 segment.append(graph)
                 at = parts.timed("pack and insert", at)

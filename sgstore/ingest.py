@@ -217,7 +217,7 @@ class _Run:
         ) as segment:
             while block := first or next(blocks, None):
                 first = None
-                graph = generator.block(block)
+                graph = generator.block(segment.as_kept(block))
                 segment.append(graph)
                 self._note(trace, graph, outcome)
             report = trace.report

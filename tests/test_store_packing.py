@@ -123,7 +123,7 @@ def test_positions_are_about_the_ego_s_first_one_in_whole_metres() -> None:
     states = block.frames.states
     first = np.flatnonzero(states.node == 0)[0]
 
-    origin = origin_of(block)
+    origin = origin_of(block.frames)
 
     assert origin == Origin(
         *(float(np.round(getattr(states, axis)[first])) for axis in ("x", "y", "z"))
@@ -135,7 +135,7 @@ def test_a_block_without_positions_has_no_origin() -> None:
     block.frames.states.x[:] = np.nan
     block.frames.scenery.y[:] = np.inf
 
-    assert origin_of(block) is None
+    assert origin_of(block.frames) is None
 
 
 def test_relations_fit_their_codes() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from sgstore.graph import GraphBlock
-    from sgstore.world import Bools, Codes, Entities, Floats, Ints, MessageRefs
+    from sgstore.world import Bools, Codes, Entities, Floats, FrameBlock, Ints, MessageRefs, States
 
 Whole = NDArray[np.signedinteger[Any]]
 
@@ -245,17 +245,54 @@ def message_columns(messages: MessageRefs, channel_ids: Ints) -> Columns:
     return columns | {"channel": channel_ids[messages.channel]}
 
 
-def origin_of(graph: GraphBlock) -> Origin | None:
-    """The ego's first position, else anything's, in whole metres; ``None`` while nothing has a position."""
-    frames, states = graph.frames, graph.frames.states
-    ego = states.node == frames.ego[frames.frame_of]
-    for part in (states.take(ego), states, frames.scenery):
-        placed = np.flatnonzero(np.isfinite(part.x) & np.isfinite(part.y)).tolist()
-        if placed:
-            first = int(placed[0])
-            x, y, z = np.round([part.x[first], part.y[first], part.z[first]]).tolist()
-            return Origin(x, y, z if math.isfinite(z) else 0.0)
-    return None
+def origin_of(frames: FrameBlock) -> Origin | None:
+    """A place in the first frame that has any: the ego's, else anything's; in whole metres.
+
+    Where nothing that moves has a place, one of the scenery; ``None`` while nothing has one.
+    """
+    states, scenery = frames.states, frames.scenery
+    placed = np.flatnonzero(np.isfinite(states.x) & np.isfinite(states.y))
+    if len(placed):
+        frame = frames.frame_of[placed]
+        here = placed[frame == frame[0]]
+        ego = here[states.node[here] == frames.ego[frame[0]]]
+        return _origin_at(states, int((ego if len(ego) else here)[0]))
+    standing = np.flatnonzero(np.isfinite(scenery.x) & np.isfinite(scenery.y))
+    return _origin_at(scenery, int(standing[0])) if len(standing) else None
+
+
+def _origin_at(states: States, row: int) -> Origin:
+    x, y, z = np.round([states.x[row], states.y[row], states.z[row]]).tolist()
+    return Origin(x, y, z if math.isfinite(z) else 0.0)
+
+
+def as_kept(frames: FrameBlock, origin: Origin) -> FrameBlock:
+    """The frames with the numbers that a store gives back of them, so that graphs made of either are equal."""
+    return replace(
+        frames,
+        states=_as_kept(frames.states, origin),
+        scenery=_as_kept(frames.scenery, origin),
+    )
+
+
+def _as_kept(states: States, origin: Origin) -> States:
+    """States as float32 about an origin. Doing it twice changes nothing, nor does storing them afterwards.
+
+    A float32 has 24 bits. If the sum of the origin and one has bits below those of a float64, rounding takes
+    some off its end, and the difference to the origin fits into 24 bits all the more.
+    """
+    columns = {name: _widened(getattr(states, name)) for name in _STATE_FLOATS}
+    columns["heading"] = _widened(_turned(states.heading))
+    for name in ("x", "y", "z"):
+        zero = getattr(origin, name)
+        columns[name] = zero + _widened(getattr(states, name) - zero)
+    return replace(states, **columns)
+
+
+def _widened(values: Floats) -> Floats:
+    """The float32 nearest to values, NaN where there is none."""
+    kept = number(values).astype(np.float64)
+    return np.where(np.isfinite(kept), kept, np.nan)
 
 
 def _turned(heading: Floats) -> Floats:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sgstore.store.access import Access
     from sgstore.store.packing import Columns
     from sgstore.store.traces import Identity
-    from sgstore.world import TraceInfo, TraceReport
+    from sgstore.world import FrameBlock, TraceInfo, TraceReport
 
 
 class Segment:
@@ -84,8 +84,22 @@ class Segment:
         """Forget the segment. What was published stays."""
         self._staging.close()
 
+    def as_kept(self, frames: FrameBlock) -> FrameBlock:
+        """The next frames with the numbers that the store will give back of them.
+
+        Positions are kept as float32 about an origin, all else as float32. Graphs that are made of these
+        numbers can be made again from the store, to the last edge; so this comes before the generator.
+        """
+        self._origin = self._origin or packing.origin_of(frames)
+        return packing.as_kept(frames, self._origin or Origin(0.0, 0.0, 0.0))
+
     def append(self, graph: GraphBlock) -> None:
         """Add the next frames of the trace.
+
+        Parameters
+        ----------
+        graph : GraphBlock
+            Made of what :meth:`as_kept` gave.
 
         Raises
         ------
@@ -105,7 +119,7 @@ class Segment:
         self._staging.settle(whole=self._next_seq % BUCKET_FRAMES == 0)
         self._next_seq += len(frames)
         self._kinds.learn(frames.entities)
-        self._origin = self._origin or packing.origin_of(graph)
+        self._origin = self._origin or packing.origin_of(frames)
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
         self._see_messages(graph)
 
