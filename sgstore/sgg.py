@@ -12,7 +12,7 @@ answer at all is said by :attr:`SceneGraphGenerator.answers`.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -20,17 +20,19 @@ import numpy as np
 from sgstore.geometry import gap_to_points
 from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
 from sgstore.relations import RELATIONS
-from sgstore.relations.pairs import related_pairs
+from sgstore.relations.pairs import near_pairs, related_pairs
 from sgstore.relations.scene import Bodies, Scene
 from sgstore.relations.survey import Survey
 from sgstore.vocabulary import RELATIONS as VOCABULARY
 from sgstore.world import States
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from sgstore.config import Config
-    from sgstore.relations.scene import Ground
+    from sgstore.relations.scene import Ground, Standing
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
 
@@ -75,10 +77,8 @@ class SceneGraphGenerator:
             names.update(MAP_RELATIONS, (VOCABULARY[code] for code in codes))
         return tuple(name for name in VOCABULARY if name in names)
 
-    # Positions come from files and may be absurd; what cannot be computed of them is absent.
-    @np.errstate(over="ignore", invalid="ignore")
     def block(self, frames: FrameBlock) -> GraphBlock:
-        """The scene graphs of the next frames.
+        """The scene graphs of the next frames, as their ego has them.
 
         Raises
         ------
@@ -86,18 +86,61 @@ class SceneGraphGenerator:
             A state belongs to a node that no block has introduced, or nodes are not introduced one after
             another: a defect of the reader.
         """
+        return self.blocks(frames, [frames.ego])[0]
+
+    # Positions come from files and may be absurd; what cannot be computed of them is absent.
+    @np.errstate(over="ignore", invalid="ignore")
+    def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
+        """The scene graphs of the next frames as several egos have them; work that they share is done once.
+
+        Parameters
+        ----------
+        frames : FrameBlock
+            Its own ego does not count.
+        egos : sequence of (F,) int64
+            Of each ego its node id in each frame, -1 where it is absent.
+
+        Returns
+        -------
+        list of GraphBlock
+            One for each ego, the same as of a generator of its own.
+
+        Raises
+        ------
+        ValueError
+            As for :meth:`block`.
+        """
         self._learn(frames)
-        ego = _ego_rows(frames)
-        scenery = self._scenery_in_range(frames, ego)
-        frames, ego = _in_range(frames, ego, self._config.range.radius)
-        bodies = self._bodies(frames, *scenery)
+        views = [self._view(replace(frames, ego=ego)) for ego in egos]
+        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(view.keys for view in views)]))
+        world = self._world(frames, keys)
+        return [self._graphs(view, world) for view in views]
+
+    def _view(self, frames: FrameBlock) -> _View:
+        ego, states = _ego_rows(frames), len(frames.states)
+        frame, row = self._scenery_in_range(frames, ego)
+        reduced, kept, here = _in_range(frames, ego, self._config.range.radius)
+        still = states + frame * len(self._scenery) + row
+        return _View(reduced, here, np.concatenate([kept, still]))
+
+    def _world(self, frames: FrameBlock, keys: Ints) -> _World:
+        bodies = self._bodies(frames, keys)
+        return _World(
+            keys=keys,
+            bodies=bodies,
+            near=near_pairs(bodies, self._config.pairs.within),
+            standing=None if self._survey is None else self._survey.standing(bodies),
+        )
+
+    def _graphs(self, view: _View, world: _World) -> GraphBlock:
+        bodies, near, standing = world.of(view.keys)
         ground = None
-        if self._survey is not None:
-            ground = self._survey.ground(bodies, ego, self._config.range.radius)
-        pairs = related_pairs(bodies, ego, self._config.pairs)
+        if self._survey is not None and standing is not None:
+            ground = self._survey.ground(bodies, standing, view.ego, self._config.range.radius)
+        pairs = related_pairs(bodies, view.ego, near, self._config.pairs)
         scene = Scene(self._config, bodies, pairs, ground)
         return GraphBlock(
-            frames=frames,
+            frames=view.frames,
             presence=_presence(bodies, ground),
             edges=_chained([family.edges(scene) for family in self._families]),
             lanes=_lane_states(bodies, ground),
@@ -131,27 +174,70 @@ class SceneGraphGenerator:
         near = _within(scenery, row, x[frame], y[frame], radius)
         return frame[near], row[near]
 
-    def _bodies(self, frames: FrameBlock, frame: Ints, row: Rows) -> Bodies:
+    def _bodies(self, frames: FrameBlock, keys: Ints) -> Bodies:
         """The states of a block and the scenery that stands in it, as rows of one table."""
         states, scenery = frames.states, self._scenery
-        boxes = (
-            np.concatenate([getattr(states, name), getattr(scenery, name)[row]])
+        count = int(np.searchsorted(keys, len(states)))
+        rows = keys[:count]
+        frame, row = np.divmod(keys[count:] - len(states), max(len(scenery), 1))
+        node, x, y, z, heading, length, width, height = (
+            np.concatenate([getattr(states, name)[rows], getattr(scenery, name)[row]])
             for name in ("node", "x", "y", "z", "heading", "length", "width", "height")
         )
-        node, x, y, z, heading, length, width, height = boxes
         return Bodies(
-            frame=np.concatenate([frames.frame_of, frame]),
+            frame=np.concatenate([frames.frame_of[rows], frame]),
             node=node,
             kind=self._kinds[node],
-            moves=np.arange(len(node)) < len(states),
+            moves=np.arange(len(node)) < count,
             x=x,
             y=y,
             z=z,
             heading=heading,
             length=length,
             width=width,
-            bottom=z - np.nan_to_num(height) / 2,
+            height=height,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """What is in the range of one ego.
+
+    Attributes
+    ----------
+    frames : FrameBlock
+        With only the states in range.
+    ego : (F,) intp
+        Rows of the ego among these; -1 where it has no state, or no position.
+    keys : int64
+        What is in range, ascending: rows of the block's states, and beyond them the scenery, frame by frame.
+    """
+
+    frames: FrameBlock
+    ego: Rows
+    keys: Ints
+
+
+@dataclass(frozen=True, slots=True)
+class _World:
+    """What is in the range of any ego, and what of it does not depend on who looks."""
+
+    keys: Ints
+    bodies: Bodies
+    near: tuple[Rows, Rows]
+    standing: Standing | None
+
+    def of(self, keys: Ints) -> tuple[Bodies, tuple[Rows, Rows], Standing | None]:
+        """The part of it that is in the range of one ego."""
+        if len(keys) == len(self.keys):
+            return self.bodies, self.near, self.standing
+        rows = np.searchsorted(self.keys, keys)
+        place = np.full(len(self.keys), -1)
+        place[rows] = np.arange(len(rows))
+        a, b = (place[end] for end in self.near)
+        both = (a >= 0) & (b >= 0)
+        standing = None if self.standing is None else self.standing.take(place)
+        return self.bodies.take(rows), (a[both], b[both]), standing
 
 
 def _ego_rows(frames: FrameBlock) -> Rows:
@@ -178,8 +264,8 @@ def _within(states: States, rows: Rows, x: Floats, y: Floats, radius: float) -> 
     return (gap_to_points(boxes, x, y) <= radius) | np.isnan(x)
 
 
-def _in_range(frames: FrameBlock, ego: Rows, radius: float) -> tuple[FrameBlock, Rows]:
-    """The frames with only the states in range, and the rows of their egos among these."""
+def _in_range(frames: FrameBlock, ego: Rows, radius: float) -> tuple[FrameBlock, Rows, Rows]:
+    """The frames with only the states in range, the rows of these, and those of the egos among them."""
     x, y = _centres(frames, ego)
     frame = frames.frame_of
     kept = np.flatnonzero(_within(frames.states, np.arange(len(frame)), x[frame], y[frame], radius))
@@ -194,7 +280,7 @@ def _in_range(frames: FrameBlock, ego: Rows, radius: float) -> tuple[FrameBlock,
         states=frames.states.take(kept),
         ego=np.where(seen, frames.ego, -1),
     )
-    return reduced, here
+    return reduced, kept, here
 
 
 def _presence(bodies: Bodies, ground: Ground | None) -> Presence:
@@ -212,7 +298,7 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
         none = np.zeros(0, np.int64)
         empty = np.zeros(0)
         return LaneStates(none, none, none, empty, empty, empty, np.zeros(0, np.bool_))
-    hits = ground.hits
+    hits = ground.standing.hits
     return LaneStates(
         frame=bodies.frame[hits.row],
         node=bodies.node[hits.row],

@@ -315,6 +315,58 @@ def test_entities_must_be_introduced_one_after_another() -> None:
         graph_of(replace(block, entities=replace(block.entities, first=3)))
 
 
+# Several egos -----------------------------------------------------------------------------------
+
+
+def contents(graph: GraphBlock) -> list[object]:
+    """All that is in a graph, to be compared."""
+    of, there, lanes = graph.edges, graph.presence, graph.lanes
+    return [
+        graph.frames.offsets.tolist(),
+        graph.frames.ego.tolist(),
+        graph.frames.states.node.tolist(),
+        sorted(zip(there.frame.tolist(), there.node.tolist(), strict=True)),
+        sorted(zip(*(of.frame, of.relation, of.src, of.dst), strict=True)),
+        sorted(
+            zip(*(lanes.frame, lanes.node, lanes.lane, lanes.overlap, lanes.primary), strict=True)
+        ),
+    ]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_several_egos_in_one_pass_are_as_each_of_them_alone(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    recording, together = Recording(), SceneGraphGenerator(STREET, Config())
+    alone = [SceneGraphGenerator(STREET, Config()) for _ in range(3)]
+    names = ["ego", *(f"c{i}" for i in range(9))]
+    wall = thing("wall", 20, kind="barrier", static=True)
+
+    for _ in range(3):
+        scenes = [
+            [thing(name, *rng.uniform(-120, 120, 2)) for name in names if rng.random() < 0.9]
+            for _ in range(4)
+        ]
+        block = recording.block(*([*scene, wall] for scene in scenes))
+        known = [recording.names.index(n) if n in recording.names else -1 for n in names[:3]]
+        egos = [
+            np.where([names[i] in {t.name for t in scene} for scene in scenes], node, -1)
+            for i, node in enumerate(known)
+        ]
+        graphs = together.blocks(block, egos)
+        for ego, generator, graph in zip(egos, alone, graphs, strict=True):
+            assert contents(generator.block(replace(block, ego=ego))) == contents(graph)
+
+
+def test_a_footprint_in_the_range_of_several_egos_is_looked_up_once() -> None:
+    recording, town = Recording(), PaperMap(*STREET.patches)
+    block = recording.block([thing("ego"), thing("a", 20), thing("b", -20)])
+
+    graphs = SceneGraphGenerator(town, Config()).blocks(block, [np.array([n]) for n in range(3)])
+
+    assert [len(graph.frames.states) for graph in graphs] == [3, 3, 3]
+    assert town.asked == 3
+
+
 # What it can answer -----------------------------------------------------------------------------
 
 

@@ -28,11 +28,12 @@ def _edges(scene: Scene) -> Edges:
     ground = scene.ground
     if ground is None:
         raise ValueError("lanes need a map")
-    walkers, crosswalks = ground.crosswalks
-    rows = np.concatenate([ground.hits.row, walkers, ground.off_road])
-    nowhere = np.full(len(ground.off_road), OFF_ROAD)
+    standing = ground.standing
+    walkers, crosswalks = standing.crosswalks
+    rows = np.concatenate([standing.hits.row, walkers, standing.off_road])
+    nowhere = np.full(len(standing.off_road), OFF_ROAD)
     return edges_to_map(
-        scene, "isIn", rows, np.concatenate([ground.hits.lane, crosswalks, nowhere])
+        scene, "isIn", rows, np.concatenate([standing.hits.lane, crosswalks, nowhere])
     )
 
 

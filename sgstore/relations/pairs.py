@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sgstore.world import Ints
 
     Rows = NDArray[np.intp]
+    Halves = tuple[Rows, Rows]
 
 CHUNK: Final = 1 << 16
 """Candidates that are looked at together: bounds the memory of a crowd, and keeps it within a cache."""
@@ -30,12 +31,23 @@ FAR: Final = 1 << 40
 """Strips from the origin beyond which positions share a strip: keys fit into 64 bits whatever a trace holds."""
 
 
+NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+
+
 def if_related(config: Config, names: tuple[str, ...]) -> tuple[str, ...]:
     """Names of relations of pairs: none where the config relates no pairs, so that nothing is known of them."""
     return names if config.pairs.ego or config.pairs.within > 0 else ()
 
 
-def related_pairs(bodies: Bodies, ego: Rows, settings: PairSettings) -> Pairs:
+def near_pairs(bodies: Bodies, within: float) -> Halves:
+    """Each unordered pair of bodies that move, signals excepted, and are at most so far apart; m."""
+    if within <= 0:
+        return NO_PAIRS
+    movers = np.flatnonzero(bodies.moves & ~IS_SIGNAL[bodies.kind])
+    return _joined([NO_PAIRS, *_near_pairs(bodies, movers, within)])
+
+
+def related_pairs(bodies: Bodies, ego: Rows, near: Halves, settings: PairSettings) -> Pairs:
     """All pairs that the settings relate: the ego with every body, and moving bodies near one another.
 
     Parameters
@@ -43,22 +55,24 @@ def related_pairs(bodies: Bodies, ego: Rows, settings: PairSettings) -> Pairs:
     bodies : Bodies
     ego : (F,) intp
         Row of the ego of each frame, -1 where there is none.
+    near : tuple of intp arrays
+        Pairs of bodies that are near one another.
     settings : Pairs
         Signals and scenery are related to the ego only. What has no position is near nothing; the ego is
         related to it all the same, by numbers that are missing.
     """
-    movers = bodies.moves & ~IS_SIGNAL[bodies.kind]
-    halves: list[tuple[Rows, Rows]] = []
-    if settings.ego:
-        mine = ego[bodies.frame]
-        others = np.flatnonzero((mine >= 0) & (mine != np.arange(len(bodies))))
-        halves.append((mine[others], others))
-        movers[ego[ego >= 0]] = False  # the ego's pairs are complete
-    if settings.within > 0:
-        halves.extend(_near_pairs(bodies, np.flatnonzero(movers), settings.within))
-    first = np.concatenate([np.zeros(0, np.intp), *(a for a, _ in halves)])
-    second = np.concatenate([np.zeros(0, np.intp), *(b for _, b in halves)])
+    if not settings.ego:
+        return _with_mirror_images(bodies, *near)
+    mine = ego[bodies.frame]
+    others = np.flatnonzero((mine >= 0) & (mine != np.arange(len(bodies))))
+    a, b = near
+    further = (ego[bodies.frame[a]] != a) & (ego[bodies.frame[b]] != b)
+    first, second = _joined([(mine[others], others), (a[further], b[further])])
     return _with_mirror_images(bodies, first, second)
+
+
+def _joined(halves: list[Halves]) -> Halves:
+    return np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves])
 
 
 def _near_pairs(bodies: Bodies, rows: Rows, within: float) -> Iterator[tuple[Rows, Rows]]:

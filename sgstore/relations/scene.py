@@ -6,7 +6,7 @@ that stands still in sixty frames is sixty bodies, so that nothing but array ari
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -38,10 +38,8 @@ class Bodies:
         Codes of :data:`sgstore.vocabulary.KINDS`.
     moves : bool
         False for scenery.
-    x, y, z, heading, length, width : float64
-        The box; m, m, m, rad, m, m.
-    bottom : float64
-        Height of its lower side; m.
+    x, y, z, heading, length, width, height : float64
+        The box; m, m, m, rad, m, m, m.
     """
 
     frame: Ints
@@ -54,10 +52,19 @@ class Bodies:
     heading: Floats
     length: Floats
     width: Floats
-    bottom: Floats
+    height: Floats
 
     def __len__(self) -> int:
         return len(self.node)
+
+    def take(self, rows: NDArray[np.intp]) -> Bodies:
+        """Some of the rows, in the order given."""
+        return Bodies(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    @property
+    def bottom(self) -> Floats:
+        """(N,): height of the lower side of the box; m. What has no height is all at ``z``."""
+        return self.z - np.nan_to_num(self.height) / 2
 
     @property
     def boxes(self) -> Floats:
@@ -89,26 +96,50 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
-    """The map under and around the bodies of a block.
+class Standing:
+    """What bodies stand on, whoever looks.
 
     Attributes
     ----------
     hits : LaneHits
-        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`. Signals touch none.
+        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Signals touch none.
     crosswalks : tuple of int64 arrays
-        Rows of :class:`Bodies` and node ids of the crosswalks that they touch.
+        Rows of :class:`Bodies`, ascending, and node ids of the crosswalks that they touch.
     off_road : intp array
-        Rows of the bodies that touch no driving lane.
+        Rows of the bodies that touch no driving lane, ascending.
+    """
+
+    hits: LaneHits
+    crosswalks: tuple[Ints, Ints]
+    off_road: NDArray[np.intp]
+
+    def take(self, place: NDArray[np.intp]) -> Standing:
+        """The same of some of the bodies; ``place`` (N,): their new rows, -1 for those left out."""
+        hits, (walkers, crosswalks) = self.hits, self.crosswalks
+        kept, walking = place[hits.row] >= 0, place[walkers] >= 0
+        columns = {column.name: getattr(hits, column.name)[kept] for column in fields(hits)}
+        off_road = place[self.off_road]
+        return Standing(
+            replace(hits, **(columns | {"row": place[columns["row"]]})),
+            (place[walkers[walking]], crosswalks[walking]),
+            off_road[off_road >= 0],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """The map under the bodies of a block, and around its egos.
+
+    Attributes
+    ----------
+    standing : Standing
     present : (F, K) bool
         Which nodes of the map are in which graph; column i is node -1 - i.
     controls : tuple of int64 arrays
         Node ids of signals of the trace, ascending, and of a lane that each applies to.
     """
 
-    hits: LaneHits
-    crosswalks: tuple[Ints, Ints]
-    off_road: NDArray[np.intp]
+    standing: Standing
     present: Bools
     controls: tuple[Ints, Ints]
 

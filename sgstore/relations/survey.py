@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.opendrive.nodes import DRIVING
-from sgstore.relations.scene import IS_SIGNAL, Bodies, Ground, joined, kinds_mask
+from sgstore.relations.scene import IS_SIGNAL, Bodies, Ground, Standing, joined, kinds_mask
 from sgstore.roads import OFF_ROAD, LaneHits
 from sgstore.vocabulary import ENTITY_KINDS, RELATION_CODE, VEHICLES
 
@@ -91,12 +91,25 @@ class Survey:
         at = int(np.argmin(apart))
         return columns[at] if apart[at] <= SAME_PLACE else None
 
-    def ground(self, bodies: Bodies, ego: Rows, radius: float) -> Ground:
+    def standing(self, bodies: Bodies) -> Standing:
+        """What the bodies of a block stand on; asked once for each block."""
+        hits, crosswalks = self._footing.of(bodies)
+        stands: Bools = np.zeros(len(bodies), np.bool_)
+        stands[hits.row[self._driving[-1 - hits.lane]]] = True
+        placed = np.isfinite(bodies.x) & np.isfinite(bodies.y)
+        off_road = np.flatnonzero(
+            ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
+        )
+        return Standing(hits, crosswalks, off_road)
+
+    def ground(self, bodies: Bodies, standing: Standing, ego: Rows, radius: float) -> Ground:
         """The map under bodies, and around the egos.
 
         Parameters
         ----------
         bodies : Bodies
+        standing : Standing
+            What they stand on.
         ego : (F,) intp
             Row of the ego of each frame, -1 where there is none: there the whole map is in range.
         radius : float
@@ -109,20 +122,18 @@ class Survey:
             the road and the junction it belongs to. ``off_road`` is present where a body is in it. A signal or
             object of the map is not present where an entity of the trace that stands for it is.
         """
-        hits, crosswalks = self._footing.of(bodies)
-        stands: Bools = np.zeros(len(bodies), np.bool_)
-        stands[hits.row[self._driving[-1 - hits.lane]]] = True
-        placed = np.isfinite(bodies.x) & np.isfinite(bodies.y)
-        off_road = np.flatnonzero(
-            ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
-        )
         present = self._around(bodies, ego, radius)
         doubled, index = joined(self._twins[0], bodies.node)
         present[bodies.frame[doubled], self._twins[1][index]] = False
-        rows = np.concatenate([hits.row, crosswalks[0], off_road])
-        nodes = np.concatenate([hits.lane, crosswalks[1], np.full(len(off_road), OFF_ROAD)])
+        hits, (walkers, crosswalks), off_road = (
+            standing.hits,
+            standing.crosswalks,
+            standing.off_road,
+        )
+        rows = np.concatenate([hits.row, walkers, off_road])
+        nodes = np.concatenate([hits.lane, crosswalks, np.full(len(off_road), OFF_ROAD)])
         self._add_with_parents(present, bodies.frame[rows], -1 - nodes)
-        return Ground(hits, crosswalks, off_road, present, self._controls)
+        return Ground(standing, present, self._controls)
 
     def _around(self, bodies: Bodies, ego: Rows, radius: float) -> Bools:
         """(F, K): which nodes of the map are in the range of which frame's ego."""
