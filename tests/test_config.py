@@ -70,7 +70,7 @@ def test_a_config_survives_json(config: Config) -> None:
     [
         ("rangs = 3", "unknown setting 'rangs'; did you mean 'range'?"),
         ("[range]\nradios = 3", "unknown setting 'range.radios'; did you mean 'range.radius'?"),
-        ("[range]\nxyz = 3", "unknown setting 'range.xyz'; known: radius"),
+        ("[range]\nxyz = 3", "unknown setting 'range.xyz'; known: by, front,"),
         ("range = 3", "setting 'range' is 3; expected a table [range]"),
         ("[range]\nradius = '50'", "setting 'range.radius' is '50'; expected a number"),
         ("[range]\nradius = true", "setting 'range.radius' is True; expected a number"),

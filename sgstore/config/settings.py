@@ -1,0 +1,425 @@
+"""The settings of a scene graph generator, table by table; what each means is said where it stands.
+
+Every setting carries its comment, which is what ``sgstore config`` and ``docs/parameters.md`` print.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping  # noqa: TC003 (the types of fields are read when configs are)
+from dataclasses import MISSING, asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from sgstore.errors import ConfigError
+from sgstore.vocabulary import (
+    DIRECTIONS,
+    ENTITY_KINDS,
+    PROXIMITY,
+    RELATIONS,
+    TypeMeaning,
+    folded,
+    kinds_labelled,
+    labels,
+    relation_named,
+    suggestion,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+COMMENT: Final = "comment"
+"""Key of a setting's comment among the metadata of its field."""
+
+SHAPES: Final = ("radius", "rectangle", "polygon", "corridor")
+EXTENTS: Final = ("footprint", "centre")
+GRANULARITIES: Final = ("none", "lane", "waypoint")
+MEASURES: Final = ("centres", "origins", "footprints")
+SIDES: Final = ("open", "closed", "none")
+TIES: Final = ("ahead", "both", "carlasgg")
+JOINS: Final = ("nearest", "latest")
+ALL_EGOS: Final = "all"
+
+MAP_ONLY: Final = ("travelsTo", "laneChange", "opposes", "conflictsWith")
+"""Relations that hold among parts of a map alone: they come with the map and cannot be left out."""
+
+MOST_CORNERS: Final = 64
+MOST_LENGTH: Final = 100_000.0
+"""Greatest length that a range may reach; m. No map is larger, and numbers stay exact."""
+
+_WORD: Final = re.compile(r"[a-z0-9][a-z0-9_]{0,39}|")
+
+T = TypeVar("T")
+
+
+def setting(default: T, comment: str) -> T:
+    """A field of a table: its default, and what it means."""
+    plain: Any = default
+    metadata = {COMMENT: comment}
+    if isinstance(default, dict):
+        return field(default_factory=dict, metadata=metadata)  # pyright: ignore[reportReturnType]
+    return field(default=plain, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Which part of the world is in the graph of an ego."""
+
+    radius: float = setting(50.0, "shape 'radius': how far from the ego's centre; m")
+    shape: str = setting(
+        "radius",
+        "'radius': a circle around the ego's centre; 'rectangle' and 'polygon': in the ego's axes; 'corridor': "
+        "along the lanes ahead of the ego (straight ahead where it is in no driving lane)",
+    )
+    front: float = setting(50.0, "shape 'rectangle': how far ahead of the ego's centre; m")
+    rear: float = setting(25.0, "shape 'rectangle': how far behind it; m")
+    side: float = setting(25.0, "shape 'rectangle': how far to each side; m")
+    polygon: tuple[tuple[float, ...], ...] = setting(
+        (), "shape 'polygon': its corners, [ahead, to the left] of the ego's centre; m"
+    )
+    width: float = setting(10.0, "shape 'corridor': from side to side, across the lane's centre; m")
+    length: float = setting(100.0, "shape 'corridor': how far along the lanes, through forks; m")
+    by: str = setting(
+        "footprint",
+        "what of an entity must be in range: 'footprint': any part of it; 'centre': its centre",
+    )
+    static_by: str = setting(
+        "footprint", "likewise for entities that never move; parts of a map count by their shape"
+    )
+    height: tuple[float, ...] = setting(
+        (),
+        "[lowest, highest]: how far below or above the ground under the ego the ground under an entity, and "
+        "the road, may be (storeys); m. Empty: at any height",
+    )
+    grade: float = setting(
+        0.0, "with height: what rises or falls by less than this for each metre away counts too"
+    )
+    height_of_entities: bool = setting(
+        default=True, comment="whether height holds for entities, too, or only for parts of the map"
+    )
+
+    def __post_init__(self) -> None:
+        check(self.shape in SHAPES, "range.shape", self.shape, one_of(SHAPES))
+        for name in ("radius", "width", "length"):
+            value = getattr(self, name)
+            _check_length(value > 0, f"range.{name}", value, "a length above 0, in metres")
+        for name in ("front", "rear", "side"):
+            value = getattr(self, name)
+            _check_length(value >= 0, f"range.{name}", value, "a length of 0 or more, in metres")
+        if self.shape == "rectangle":
+            area = (self.front + self.rear) * self.side
+            check(area > 0, "range", (self.front, self.rear, self.side), "a rectangle with an area")
+        check(self.by in EXTENTS, "range.by", self.by, one_of(EXTENTS))
+        check(self.static_by in EXTENTS, "range.static_by", self.static_by, one_of(EXTENTS))
+        check(0 <= self.grade < math.inf, "range.grade", self.grade, "0 or more")
+        band = not self.height or (len(self.height) == 2 and self.height[0] <= self.height[1])
+        finite = all(map(math.isfinite, self.height))
+        check(band and finite, "range.height", self.height, "nothing, or [lowest, highest]")
+        if self.polygon or self.shape == "polygon":
+            check_polygon("range.polygon", self.polygon)
+
+
+@dataclass(frozen=True, slots=True)
+class Lanes:
+    """Which parts of a road map are in a graph, and what is asked of the lanes."""
+
+    ahead: float = setting(
+        100.0,
+        "how far along the lanes the next one ahead is looked for ('leads'), and how far upstream of a signal "
+        "lanes may be affected by it ('mayAffect'); m. 0: neither, so that nothing is known of them",
+    )
+    granularity: str = setting(
+        "lane",
+        "'none': no lanes, roads, junctions, crosswalks; 'lane': these; 'waypoint': points of lanes, too",
+    )
+    spacing: float = setting(1.0, "granularity 'waypoint': from point to point along a lane; m")
+    types: tuple[str, ...] = setting(
+        (),
+        "types of lanes that are kept, as OpenDRIVE has them ('driving', 'sidewalk', …); empty: all",
+    )
+
+    def __post_init__(self) -> None:
+        known = 0 <= self.ahead <= MOST_LENGTH
+        check(known, "lanes.ahead", self.ahead, "a length of 0 or more, in metres")
+        right = self.granularity in GRANULARITIES
+        check(right, "lanes.granularity", self.granularity, one_of(GRANULARITIES))
+        right = 0.1 <= self.spacing <= MOST_LENGTH
+        check(right, "lanes.spacing", self.spacing, "a length of 0.1 or more, in metres")
+
+
+@dataclass(frozen=True, slots=True)
+class Proximity:
+    """Distance relations: the first whose upper bound is not exceeded holds, so exactly one or none."""
+
+    names: tuple[str, ...] = setting(
+        PROXIMITY, "relations from the nearest to the farthest; empty: none"
+    )
+    upper: tuple[float, ...] = setting(
+        (2.0, 4.0, 7.0, 10.0, 16.0, 25.0),
+        "their upper bounds, included; m. Each begins where that before it ends",
+    )
+    between: str = setting(
+        "centres",
+        "'centres' of the boxes, in space; 'origins': what CARLA takes for the place of an entity "
+        "(a vehicle's is on the ground); 'footprints': the gap between them, in the plane. "
+        "[pairs] has the same distance",
+    )
+
+    def __post_init__(self) -> None:
+        check_steps("proximity", self.names, self.upper, PROXIMITY, len(self.names))
+        check(self.between in MEASURES, "proximity.between", self.between, one_of(MEASURES))
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """Angular relations: the first whose upper bound the absolute bearing does not exceed; else the last."""
+
+    names: tuple[str, ...] = setting(DIRECTIONS, "relations from ahead to behind; empty: none")
+    upper: tuple[float, ...] = setting(
+        (45.0, 90.0, 135.0), "upper bounds of all but the last, included; degrees"
+    )
+    ties: str = setting(
+        "ahead",
+        "what holds exactly on a bound: 'ahead': the relation nearer to dead ahead; 'both' (RoadScene2Vec); "
+        "'carlasgg': its order: 45° and 90° to the left nearer ahead, 135° and 90° to the right nearer behind",
+    )
+    sides: str = setting(
+        "open",
+        "toLeftOf and toRightOf: 'open': what is dead ahead or dead behind is neither; 'closed': it is to the "
+        "left (CARLASGG); 'none': no such relations among entities",
+    )
+
+    def __post_init__(self) -> None:
+        check_steps("direction", self.names, self.upper, DIRECTIONS, max(len(self.names) - 1, 0))
+        within = all(bound < 180 for bound in self.upper)
+        check(within, "direction.upper", self.upper, "bounds below 180, in degrees")
+        check(self.ties in TIES, "direction.ties", self.ties, one_of(TIES))
+        check(self.sides in SIDES, "direction.sides", self.sides, one_of(SIDES))
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Which pairs of entities are related to one another."""
+
+    within: float = setting(
+        25.0, "all entities that move, up to this distance from one another; m. 0: none"
+    )
+    ego: bool = setting(default=True, comment="the ego with everything in range")
+    static: bool = setting(
+        default=False,
+        comment="entities that never move with one another too, up to the same distance",
+    )
+    ego_within: float = setting(
+        0.0, "up to which distance from the ego; m. 0: whatever the distance"
+    )
+    kinds: tuple[tuple[str, ...], ...] = setting(
+        (),
+        "only pairs of these labels, in either order: [['Ego', 'Vehicle'], ['Person', 'Car']]; empty: all",
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("within", "ego_within"):
+            value = getattr(self, name)
+            _check_length(value >= 0, f"pairs.{name}", value, "a length of 0 or more, in metres")
+        for i, pair in enumerate(self.kinds):
+            check(len(pair) == 2, f"pairs.kinds[{i}]", pair, "two labels")
+            check_labels(f"pairs.kinds[{i}]", pair, ego=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Payloads:
+    """How sensor messages are joined to frames."""
+
+    join: str = setting("nearest", "'nearest' in log time, or 'latest' at or before the frame")
+    tolerance: float = setting(
+        0.0,
+        "greatest difference of log times; s. 0: half the median period of the channel, or of the frames if "
+        "that is longer ('nearest'), the whole of it ('latest')",
+    )
+
+    def __post_init__(self) -> None:
+        check(self.join in JOINS, "payloads.join", self.join, one_of(JOINS))
+        waits = 0 <= self.tolerance < math.inf
+        check(waits, "payloads.tolerance", self.tolerance, "0 or more seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All settings of a scene graph generator.
+
+    Two configs that are equal give equal graphs. What each setting means stands at its field, in
+    ``docs/parameters.md``, and in what ``sgstore config`` prints.
+    """
+
+    range: Range = field(default_factory=Range)
+    proximity: Proximity = field(default_factory=Proximity)
+    direction: Direction = field(default_factory=Direction)
+    pairs: Pairs = field(default_factory=Pairs)
+    lanes: Lanes = field(default_factory=Lanes)
+    payloads: Payloads = field(default_factory=Payloads)
+    ego: str = setting("", "the simulator's id, role or name of the ego; empty: as the trace says")
+    sees: bool = setting(
+        default=True,
+        comment="whether it is computed what the ego sees; otherwise nothing is known of it",
+    )
+    egos: tuple[str, ...] = setting(
+        (),
+        "several egos, each with graphs of its own: their ids, roles or names; ['all']: every vehicle",
+    )
+    rate: float = setting(
+        0.0,
+        "frames kept for each second of the trace's clock: the first frame at or after each step of 1/rate. "
+        "0: all frames",
+    )
+    kinds: tuple[str, ...] = setting(
+        (),
+        "labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map ('Lane'); the "
+        "ego always is. Empty: everything",
+    )
+    without: tuple[str, ...] = setting(
+        (),
+        "relations that are not computed, so that nothing is known of them: ['overlaps', 'follows']",
+    )
+    types: Mapping[str, TypeMeaning] = setting(
+        {},
+        "type names of the simulator, without regard to case -> what they mean: kind, special kind and "
+        "subkind of entities and signs, before what sgstore knows of them:\n"
+        '"vehicle.acme.patrol" = { kind = "car", special = "emergency" }',
+    )
+
+    def __post_init__(self) -> None:
+        check(not (self.ego and self.egos), "egos", self.egos, "either ego or egos, not both")
+        check(len(set(self.egos)) == len(self.egos), "egos", self.egos, "each ego once")
+        check(all(self.egos), "egos", self.egos, "ids, roles or names")
+        alone = ALL_EGOS not in self.egos or len(self.egos) == 1
+        check(alone, "egos", self.egos, f"'{ALL_EGOS}' alone, or a list of egos")
+        check(0 <= self.rate <= 1e6, "rate", self.rate, "0 or more frames per second")
+        check_labels("kinds", self.kinds, ego=False)
+        for name in self.without:
+            known = [r for r in RELATIONS if r not in MAP_ONLY]
+            check(name in known, "without", name, _expected(name, known))
+        object.__setattr__(self, "types", _checked_types(self.types))
+
+    def __hash__(self) -> int:
+        return hash(repr(self))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values, as they stand in TOML and JSON."""
+        return asdict(self)
+
+
+def default_of(setting_field: Any) -> Any:
+    """The default of a field of a table."""
+    if setting_field.default is not MISSING:
+        return setting_field.default
+    return setting_field.default_factory()
+
+
+def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: FBT001
+    """Refuse a setting that does not hold.
+
+    Raises
+    ------
+    ConfigError
+        With the setting, its value, and what would be right.
+    """
+    if not holds:
+        raise ConfigError(f"setting '{name}' is {value!r}; expected {right}")
+
+
+def one_of(words: Iterable[str]) -> str:
+    """``'a', 'b' or 'c'``."""
+    *most, last = (f"'{word}'" for word in words)
+    return f"{', '.join(most)} or {last}"
+
+
+def check_steps(
+    name: str, names: tuple[str, ...], upper: tuple[float, ...], known: tuple[str, ...], bounds: int
+) -> None:
+    """Refuse a ladder of relations whose names are unknown or doubled, or whose bounds do not rise."""
+    for relation in names:
+        check(relation in known, f"{name}.names", relation, f"one of {', '.join(known)}")
+    check(len(set(names)) == len(names), f"{name}.names", names, "each name once")
+    check(len(upper) == bounds, f"{name}.upper", upper, f"{bounds} bounds for {len(names)} names")
+    rising = all(a < b < math.inf for a, b in zip((0.0, *upper), upper, strict=False))
+    check(rising, f"{name}.upper", upper, "ascending bounds above 0")
+
+
+def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
+    """Refuse labels that no kind has; ``Ego`` is one where it is allowed."""
+    known = [label for label in labels() if ego or label != "Ego"]
+    for label in given:
+        meant = kinds_labelled(label) is not None or (ego and folded(label) == "ego")
+        check(meant, name, label, _expected(label, known))
+
+
+def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
+    """Refuse what is no simple polygon."""
+    pairs = all(len(corner) == 2 and all(map(math.isfinite, corner)) for corner in corners)
+    right = f"3 to {MOST_CORNERS} corners [ahead, to the left], in metres"
+    check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)
+    near = all(abs(number) <= MOST_LENGTH for corner in corners for number in corner)
+    check(near, name, corners, f"corners up to {MOST_LENGTH:.0f} m away")
+    sides = list(zip(corners, (*corners[1:], corners[0]), strict=True))
+    folded_back = any(
+        _turn(*one, other[1]) == 0 and not _between(*one, other[1], ahead=True)
+        for one, other in zip(sides, (*sides[1:], sides[0]), strict=True)
+    )
+    crossing = any(
+        _meet(sides[i], sides[j])
+        for i in range(len(sides))
+        for j in range(i + 2, len(sides) - (i == 0))
+    )
+    simple = not folded_back and not crossing
+    check(simple, name, corners, "sides that meet at the corners only, one after another")
+
+
+Corner = tuple[float, ...]
+
+
+def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
+    """Whether two sides have a point in common."""
+    ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
+    turns = [_turn(*three) for three in ends]
+    if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
+        return True
+    return any(turn == 0 and _between(*e) for turn, e in zip(turns, ends, strict=True))
+
+
+def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
+    """Whether c, on the line through a and b, lies between them; or ``ahead``: beyond b, seen from a."""
+    if ahead:
+        return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
+    return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))
+
+
+def _turn(a: Corner, b: Corner, c: Corner) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # noqa: FBT001
+    check(holds and value <= MOST_LENGTH, name, value, right)
+
+
+def _expected(name: str, known: Iterable[str]) -> str:
+    known = list(known)
+    like = suggestion(name, known)
+    alias = relation_named(name)
+    like = alias if alias in known else like
+    return f"'{like}', perhaps" if like else f"one of {', '.join(known)}"
+
+
+def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
+    checked: dict[str, TypeMeaning] = {}
+    for name, meaning in sorted(types.items()):
+        where = f'types."{name}"'
+        check(bool(name.strip()), where, name, "the type name of a simulator")
+        known = meaning.kind in ENTITY_KINDS
+        check(known, f"{where}.kind", meaning.kind, _expected(meaning.kind, ENTITY_KINDS))
+        for part in ("special", "subkind"):
+            word = getattr(meaning, part)
+            plain = _WORD.fullmatch(word) is not None
+            check(plain, f"{where}.{part}", word, "a word of a-z, 0-9 and _")
+        check(name.lower() not in checked, where, name, "each type name once")
+        checked[name.lower()] = meaning
+    return checked
