@@ -20,6 +20,7 @@ import numpy as np
 from sgstore.geometry import gap_to_points
 from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
 from sgstore.relations import RELATIONS
+from sgstore.relations.contact import contacts
 from sgstore.relations.pairs import near_pairs, related_pairs
 from sgstore.relations.scene import Bodies, Scene
 from sgstore.relations.survey import Survey
@@ -129,16 +130,18 @@ class SceneGraphGenerator:
             keys=keys,
             bodies=bodies,
             near=near_pairs(bodies, self._config.pairs.within),
+            contacts=contacts(bodies),
             standing=None if self._survey is None else self._survey.standing(bodies),
         )
 
     def _graphs(self, view: _View, world: _World) -> GraphBlock:
-        bodies, near, standing = world.of(view.keys)
+        part = world.of(view.keys)
+        bodies, standing = part.bodies, part.standing
         ground = None
         if self._survey is not None and standing is not None:
             ground = self._survey.ground(bodies, standing, view.ego, self._config.range.radius)
-        pairs = related_pairs(bodies, view.ego, near, self._config.pairs)
-        scene = Scene(self._config, bodies, pairs, ground)
+        pairs = related_pairs(bodies, view.ego, part.near, self._config.pairs)
+        scene = Scene(self._config, bodies, view.ego, pairs, part.contacts, ground)
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground),
@@ -225,19 +228,30 @@ class _World:
     keys: Ints
     bodies: Bodies
     near: tuple[Rows, Rows]
+    contacts: tuple[Rows, Rows]
     standing: Standing | None
 
-    def of(self, keys: Ints) -> tuple[Bodies, tuple[Rows, Rows], Standing | None]:
+    def of(self, keys: Ints) -> _World:
         """The part of it that is in the range of one ego."""
         if len(keys) == len(self.keys):
-            return self.bodies, self.near, self.standing
+            return self
         rows = np.searchsorted(self.keys, keys)
         place = np.full(len(self.keys), -1)
         place[rows] = np.arange(len(rows))
-        a, b = (place[end] for end in self.near)
-        both = (a >= 0) & (b >= 0)
-        standing = None if self.standing is None else self.standing.take(place)
-        return self.bodies.take(rows), (a[both], b[both]), standing
+        return _World(
+            keys=keys,
+            bodies=self.bodies.take(rows),
+            near=_among(place, self.near),
+            contacts=_among(place, self.contacts),
+            standing=None if self.standing is None else self.standing.take(place),
+        )
+
+
+def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
+    """The pairs of which neither is left out, by their new rows."""
+    a, b = place[pairs[0]], place[pairs[1]]
+    both = (a >= 0) & (b >= 0)
+    return a[both], b[both]
 
 
 def _ego_rows(frames: FrameBlock) -> Rows:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from sgstore.relations.bearing import DIRECTION, SIDE
+from sgstore.relations.contact import CONTACT
 from sgstore.relations.control import CONTROL
 from sgstore.relations.lanes import LANES
 from sgstore.relations.proximity import PROXIMITY
@@ -16,5 +17,5 @@ from sgstore.relations.proximity import PROXIMITY
 if TYPE_CHECKING:
     from sgstore.relations.scene import Family
 
-RELATIONS: Final[tuple[Family, ...]] = (LANES, CONTROL, PROXIMITY, DIRECTION, SIDE)
+RELATIONS: Final[tuple[Family, ...]] = (LANES, CONTROL, PROXIMITY, DIRECTION, SIDE, CONTACT)
 """All families, in the order in which their edges are given."""

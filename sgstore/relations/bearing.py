@@ -4,10 +4,10 @@ An edge goes from what is seen to who sees: *b is in direct front of a* is b →
 centre in a's axes. Where a's heading is missing there is no edge.
 
 Bounds and noise. A bound belongs to the sector nearer to dead ahead (45° is still direct front), and dead
-ahead and dead behind are neither left nor right. Headings come through quaternions, degrees and the rotation
-of axes, so what is exactly on a bound in the world arrives some 1e-16 to 1e-12 rad beside it: a bearing
-within :data:`NOISE` of a bound counts as on it. Otherwise what is dead ahead would flicker between left and
-right.
+ahead and dead behind are neither left nor right. Poses come through quaternions, degrees and the rotation of
+axes, and are kept as float32, so what is exactly on a bound in the world arrives up to some 1e-7 rad and a
+tenth of a millimetre beside it. Otherwise what is dead ahead would flicker between left and right: a bearing
+within :data:`NOISE` of a bound counts as on it, and what is less than :data:`BESIDE` off the axis as on it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ if TYPE_CHECKING:
     from sgstore.config import Config
     from sgstore.graph import Edges
 
-NOISE: Final = 1e-9
-"""Differences of bearing that mean nothing: a micrometre at a kilometre; rad."""
+NOISE: Final = 1e-6
+"""Differences of bearing that mean nothing: a millimetre at a kilometre; rad."""
+
+BESIDE: Final = 1e-3
+"""What is not farther off the axis is neither left nor right; m."""
 
 SIDES: Final = ("toLeftOf", "toRightOf")
 
@@ -48,9 +51,10 @@ def _side_names(config: Config) -> tuple[str, ...]:
 
 
 def _side_edges(scene: Scene) -> Edges:
-    pairs = scene.pairs
-    off_axis = np.abs(np.abs(pairs.bearing) - np.pi / 2) < np.pi / 2 - NOISE
-    aside = np.flatnonzero(off_axis)
+    bodies, pairs = scene.bodies, scene.pairs
+    dx, dy = bodies.x[pairs.b] - bodies.x[pairs.a], bodies.y[pairs.b] - bodies.y[pairs.a]
+    off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(pairs.bearing))
+    aside = np.flatnonzero(off_axis > BESIDE)
     left, right = (RELATION_CODE[name] for name in SIDES)
     codes = np.where(pairs.bearing[aside] > 0, left, right).astype(np.int8)
     return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])

@@ -8,6 +8,7 @@ import numpy as np
 
 from sgstore.geometry import bearings
 from sgstore.relations.scene import IS_SIGNAL, Bodies, Pairs, spread
+from sgstore.relations.sweep import parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,13 +17,9 @@ if TYPE_CHECKING:
 
     from sgstore.config import Config
     from sgstore.config import Pairs as PairSettings
-    from sgstore.world import Ints
 
     Rows = NDArray[np.intp]
     Halves = tuple[Rows, Rows]
-
-CHUNK: Final = 1 << 16
-"""Candidates that are looked at together: bounds the memory of a crowd, and keeps it within a cache."""
 
 CELLS: Final = 8
 """Strips of the plane to the distance within which bodies are related: more of them cut a little sharper."""
@@ -89,19 +86,11 @@ def _near_pairs(bodies: Bodies, rows: Rows, within: float) -> Iterator[tuple[Row
     start = np.arange(1, len(rows) + 1)
     # One strip more than the distance is wide: the division above may round up.
     count = np.searchsorted(key, key + CELLS + 1, side="right") - start
-    for part in _parts(count):
+    for part in parts(count):
         owner, index = spread(start[part], count[part])
         first, second = rows[part][owner], rows[index]
         near = _distance(bodies, first, second) <= within
         yield first[near], second[near]
-
-
-def _parts(count: Ints) -> Iterator[slice]:
-    """Consecutive slices of counts that each add up to :data:`CHUNK` or little more."""
-    total = np.cumsum(count)
-    bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
-    for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
-        yield slice(begin, end)
 
 
 def _distance(bodies: Bodies, a: Rows, b: Rows) -> NDArray[np.float64]:

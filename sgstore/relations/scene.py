@@ -152,14 +152,20 @@ class Scene:
     ----------
     config : Config
     bodies : Bodies
+    ego : (F,) intp
+        Row of the ego of each frame, -1 where there is none.
     pairs : Pairs
+    contacts : tuple of intp arrays
+        Rows of bodies that touch one another, each pair once.
     ground : Ground or None
         None without a map.
     """
 
     config: Config
     bodies: Bodies
+    ego: NDArray[np.intp]
     pairs: Pairs
+    contacts: tuple[NDArray[np.intp], NDArray[np.intp]]
     ground: Ground | None
 
 
