@@ -1,11 +1,14 @@
 """Recordings → blocks of frames: one file for each flavour, and the guarded MCAP reader that all of them use.
 
-A flavour is a class like :class:`~sgstore.traces.osi.OsiTrace` that is listed in :data:`READERS`: it
-recognises a recording by the schemas of its channels, and reads it.
+A flavour is a class like :class:`~sgstore.traces.osi.OsiTrace` that is listed in :data:`READERS`, or that an
+installed package names as an entry point of the group ``sgstore.readers``: it recognises a recording by the
+schemas of its channels, and reads it. ``docs/flavours.md`` says how to add one.
 """
 
 from __future__ import annotations
 
+import inspect
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
@@ -14,14 +17,32 @@ from sgstore.traces.fetch import digest_of
 from sgstore.traces.fetch import read_message as _read_message
 from sgstore.traces.mcap_file import McapFile
 from sgstore.traces.osi import OsiTrace
+from sgstore.traces.osi_file import ENDINGS as _OSI_ENDINGS
+from sgstore.traces.osi_file import OsiFile
+from sgstore.traces.osi_stream import read_message as _read_osi_message
+from sgstore.traces.summary import MAGIC
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from sgstore.traces.recording import Recording
     from sgstore.world import FrameBlock, TraceInfo
 
-__all__ = ["READERS", "Trace", "digest_of", "open_trace", "read_message"]
+__all__ = [
+    "ENDINGS",
+    "READERS",
+    "Reader",
+    "Trace",
+    "digest_of",
+    "open_recording",
+    "open_trace",
+    "read_message",
+    "readers",
+]
+
+ENDINGS: Final = (".mcap", *_OSI_ENDINGS)
+"""How the names of recordings end, where a folder is searched for them."""
 
 
 class Trace(Protocol):
@@ -52,15 +73,15 @@ class Trace(Protocol):
 
 
 class Reader(Protocol):
-    """A flavour of recording: the class of its traces."""
+    """A flavour of recording: the class of its traces. One that takes ``mapping`` too is given it."""
 
     name: str
 
-    def __call__(self, recording: McapFile, *, ego: str, digest: str) -> Trace:
+    def __call__(self, recording: Recording, *, ego: str, digest: str) -> Trace:
         """Open a recording of this flavour."""
         ...
 
-    def recognises(self, recording: McapFile) -> bool:
+    def recognises(self, recording: Recording) -> bool:
         """Whether a recording is of this flavour, by the schemas of its channels."""
         ...
 
@@ -69,7 +90,45 @@ READERS: Final[tuple[Reader, ...]] = (OsiTrace,)
 """The flavours of recordings, in the order in which they are asked."""
 
 
-def open_trace(path: str | Path, *, ego: str = "", digest: str = "") -> Trace:
+GROUP: Final = "sgstore.readers"
+"""Group of entry points by which an installed package adds flavours."""
+
+
+def readers() -> Iterator[Reader]:
+    """All flavours, in the order in which they are asked: :data:`READERS`, then those of other packages.
+
+    Raises
+    ------
+    TraceError
+        A package names a flavour that cannot be loaded.
+    """
+    yield from READERS
+    for entry in entry_points(group=GROUP):
+        try:
+            reader: Reader = entry.load()
+        except Exception as error:  # whatever its import does
+            reason = f"the flavour {entry.name!r} ({entry.value}) cannot be loaded: {error!r}"
+            raise TraceError(reason) from error
+        yield reader
+
+
+def open_recording(path: str | Path) -> McapFile | OsiFile:
+    """A file of messages: MCAP by how it begins, a single-channel OSI file by how its name ends.
+
+    Raises
+    ------
+    TraceError
+        There is no such file, or it is neither.
+    """
+    path = Path(path)
+    if path.name.lower().endswith(_OSI_ENDINGS) and not _is_mcap(path):
+        return OsiFile(path)
+    return McapFile(path)
+
+
+def open_trace(
+    path: str | Path, *, ego: str = "", digest: str = "", mapping: str | Path = ""
+) -> Trace:
     """A recording, opened by the first reader that recognises it.
 
     Parameters
@@ -79,22 +138,26 @@ def open_trace(path: str | Path, *, ego: str = "", digest: str = "") -> Trace:
         The simulator's id or name of the ego; empty: as the recording says.
     digest : str
         SHA-256 of the file, if it is known already.
+    mapping : str or Path
+        How messages are to be understood that do not say it themselves (Foxglove): the name of a mapping that
+        is shipped, or the path of a TOML file; empty: the shipped one that fits. Other flavours need none.
 
     Raises
     ------
     TraceError
-        There is no such file, it is no MCAP file, holds no ground truth that a reader knows, holds no frame,
+        There is no such file, it is no recording, holds no ground truth that a reader knows, holds no frame,
         or nothing in it bears the name given for the ego.
     """
     path = Path(path)
-    recording = McapFile(path)
+    recording = open_recording(path)
     try:
         if not recording.channels:
             for _ in recording.walk(TraceReport()):  # no summary: channels come with their messages
                 pass
-        for reader in READERS:
+        for reader in readers():
             if reader.recognises(recording):
-                return reader(recording, ego=ego, digest=digest)
+                more = {"mapping": mapping} if _takes_mapping(reader) else {}
+                return reader(recording, ego=ego, digest=digest, **more)
         raise TraceError(_no_reader(recording), path=path)
     except TraceError as error:
         recording.close()
@@ -106,6 +169,18 @@ def open_trace(path: str | Path, *, ego: str = "", digest: str = "") -> Trace:
         raise
 
 
+def _takes_mapping(reader: Reader) -> bool:
+    return "mapping" in inspect.signature(reader).parameters
+
+
+def _is_mcap(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
 def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
     """The data of one message of a recording, by its place as :class:`~sgstore.world.MessageRefs` has it.
 
@@ -115,10 +190,13 @@ def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: in
         The file cannot be opened, the chunk is damaged, or there is no message of that length there: the
         file was replaced.
     """
-    return _read_message(Path(path), chunk_offset=chunk_offset, offset=offset, length=length)
+    path = Path(path)
+    single = path.name.lower().endswith(_OSI_ENDINGS) and not _is_mcap(path)
+    read = _read_osi_message if single else _read_message
+    return read(path, chunk_offset=chunk_offset, offset=offset, length=length)
 
 
-def _no_reader(recording: McapFile) -> str:
+def _no_reader(recording: Recording) -> str:
     """Why nothing recognises a recording, and what is in it."""
     listed: list[str] = []
     for _, record in sorted(recording.channels.items()):

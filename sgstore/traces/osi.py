@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sgstore.traces.chunks import Messages
-    from sgstore.traces.mcap_file import McapFile
+    from sgstore.traces.recording import Recording
     from sgstore.world import FrameBlock, Ints
 
 
@@ -36,7 +36,7 @@ class OsiTrace:
 
     Parameters
     ----------
-    recording : McapFile
+    recording : Recording
     ego : str
         Id or name (``entity_name`` of a source reference) of the ego; empty: the host vehicle.
     digest : str
@@ -56,7 +56,7 @@ class OsiTrace:
 
     name: ClassVar[str] = "osi"
 
-    def __init__(self, recording: McapFile, *, ego: str = "", digest: str = "") -> None:
+    def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
         self._recording = recording
         # The file is hashed beside the first reading, so that it comes from the disk once.
         with ThreadPoolExecutor(1) as beside:
@@ -75,7 +75,7 @@ class OsiTrace:
         self.info = self._info(found, digest)
 
     @classmethod
-    def recognises(cls, recording: McapFile) -> bool:
+    def recognises(cls, recording: Recording) -> bool:
         """Whether one of the channels carries OSI ground truth."""
         names = {schema_name(recording, channel) for channel in recording.channels}
         return bool(names & {GROUND_TRUTH, SENSOR_VIEW})

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sgstore.traces.chunks import Messages
-    from sgstore.traces.mcap_file import McapFile
+    from sgstore.traces.recording import Recording
 
 STATIC_FIELDS: Final = (
     "stationary_object",
@@ -227,7 +227,7 @@ class Survey:
         return sorted(refs, key=lambda ref: (ref[2] if ref[2] >= 0 else ref[3], ref[3]))
 
 
-def survey(recording: McapFile, ego: str) -> Survey:
+def survey(recording: Recording, ego: str) -> Survey:
     """Read a recording once, from end to end.
 
     Raises
@@ -255,7 +255,7 @@ def survey(recording: McapFile, ego: str) -> Survey:
     return result
 
 
-def schema_name(recording: McapFile, channel: int) -> str:
+def schema_name(recording: Recording, channel: int) -> str:
     """Name of a channel's schema if its messages are protobuf, else the empty string."""
     record = recording.channels[channel]
     schema = recording.schemas.get(record.schema_id)
@@ -264,7 +264,7 @@ def schema_name(recording: McapFile, channel: int) -> str:
 
 
 def _meet(
-    recording: McapFile, channel: int, ego: str, result: Survey, maps: dict[int, type[Any]]
+    recording: Recording, channel: int, ego: str, result: Survey, maps: dict[int, type[Any]]
 ) -> bool:
     """Whether a channel may lead or carries maps; makes ready for it when it is met for the first time."""
     if channel in result.leads or channel in maps:

@@ -1,0 +1,357 @@
+"""Single-channel OSI files (``.osi``, ``.osi.zst``): messages one after another, each behind its length.
+
+Such a file has no channels, no schemas and no log times. It is given one channel; what its messages are
+(ground truth or sensor views) is found out by reading the first ones as either, and a message's log time
+is its own time. A length that cannot be is damage: the walk goes on where the next message begins just as
+the first one does (with the version of OSI), and what lies between is a loss.
+
+Source: open-simulation-interface 3.8.0, trace_file_formats.adoc (single-channel binary trace files).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from sgstore.errors import TraceError
+from sgstore.traces.chunks import MESSAGE_HEAD, Messages
+from sgstore.traces.fetch import open_regular
+from sgstore.traces.mcap_file import MAX_LOSSES, RUN_MESSAGES
+from sgstore.traces.osi_fields import fields_of
+from sgstore.traces.osi_schema import (
+    DECODE_ERRORS,
+    GROUND_TRUTH,
+    SENSOR_VIEW,
+    ground_truth_of,
+    message_class,
+    parse,
+)
+from sgstore.traces.osi_stream import MAX_MESSAGE, PREFIX, pieces
+from sgstore.traces.osi_types import descriptors
+from sgstore.world import Loss, TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+ENDINGS: Final = (".osi", ".osi.zst")
+"""How the names of such files end; nothing in them tells what they are."""
+CHANNEL: Final = 1
+"""Id of the one channel."""
+RUN_BYTES: Final = 4 << 20
+"""Messages that are handed on together have about this size at most; bytes."""
+
+_TRIED: Final = 8
+"""Messages that are read to find out what they are."""
+_VERSION, _TIMESTAMP = 1, 2
+_LATEST: Final = 1 << 62
+
+
+class OsiFile:
+    """A single-channel OSI file that is read once or more often, in the words of an MCAP file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path, size, mtime_ns
+        The file, its size in bytes, its time of change.
+    schemas, channels : dict
+        The one schema and the one channel, whose topic is ``ground_truth`` or ``sensor_view``.
+    counts : None
+        Nobody counted the messages.
+    window : tuple of int
+        All log times there are.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened, or its first messages are neither ground truth nor sensor views.
+    """
+
+    counts = None
+    window = (0, (1 << 63) - 1)
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._mark = b""
+        self._file = open_regular(path)
+        try:
+            status = os.fstat(self._file.fileno())
+            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            name = self._recognise()
+        except BaseException:
+            self._file.close()
+            raise
+        topic = "sensor_view" if name == SENSOR_VIEW else "ground_truth"
+        self.schemas = {1: Schema(id=1, data=descriptors(), encoding="protobuf", name=name)}
+        self.channels = {
+            CHANNEL: Channel(
+                id=CHANNEL, topic=topic, message_encoding="protobuf", metadata={}, schema_id=1
+            )
+        }
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def walk(
+        self, report: TraceReport, wanted: Callable[[int], bool] | None = None
+    ) -> Iterator[Messages]:
+        """All messages in file order; what cannot be read goes to ``report``.
+
+        ``chunk_offset`` of a message is the place of the zstd frame that it begins in.
+
+        Raises
+        ------
+        TraceError
+            The file cannot be read any more.
+        """
+        run = _Run()
+        try:
+            for place, offset, data in self._messages(report):
+                if run.held and run.is_full(place):
+                    yield run.messages()
+                    run = _Run(run.last_ns)
+                if wanted is None or wanted(place):
+                    run.add(place, offset, data)
+        except OSError as error:
+            raise TraceError(f"cannot be read: {error}", path=self.path) from error
+        if run.held:
+            yield run.messages()
+
+    def _recognise(self) -> str:
+        """What the messages are; learns how they begin."""
+        report = TraceReport()
+        first = [data for _, _, data in islice(self._messages(report), _TRIED)]
+        if not first:
+            reason = report.losses[0].reason if report.losses else "the file is empty"
+            raise TraceError(f"no message of ASAM OSI: {reason}", path=self.path)
+        self._mark = _beginning(first[0])
+        named = {name: _likeness(name, first) for name in (GROUND_TRUTH, SENSOR_VIEW)}
+        best = max(named, key=lambda name: named[name])
+        if named[best] <= 0:
+            reason = f"its messages are neither {GROUND_TRUTH} nor {SENSOR_VIEW}"
+            raise TraceError(reason, path=self.path)
+        return best
+
+    def _messages(self, report: TraceReport) -> Iterator[tuple[int, int, bytes]]:
+        """Place of the zstd frame, offset in it, and data of every message."""
+        stream = _Stream(self._mark)
+        content = pieces(self._file)
+        while True:
+            try:
+                place, piece = next(content)
+            except StopIteration:
+                break
+            except TraceError as error:
+                left = self.size - max(error.offset or 0, 0)
+                report.losses.append(Loss(error.reason, bytes=left, offset=error.offset or 0))
+                break
+            stream.append(place, piece)
+            yield from stream.take(report, ends=False)
+        yield from stream.take(report, ends=True)
+
+
+@dataclass(slots=True)
+class _Run:
+    """Messages of one zstd frame, or of a file as it is, that are handed on together."""
+
+    last_ns: int = 0
+    place: int = -1
+    size: int = 0
+    held: dict[int, bytes] = field(default_factory=dict[int, bytes])
+    times: list[int] = field(default_factory=list[int])
+
+    def add(self, place: int, offset: int, data: bytes) -> None:
+        self.place = place
+        self.held[offset] = data
+        self.size += len(data)
+        time_ns = time_of(data)
+        self.last_ns = self.last_ns if time_ns is None else time_ns
+        self.times.append(self.last_ns)
+
+    def is_full(self, place: int) -> bool:
+        """Whether a message of the zstd frame at a place has to go into another run."""
+        return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
+
+    def messages(self) -> Messages:
+        held, count = self.held, len(self.held)
+        times = np.array(self.times, np.int64)
+        return Messages(
+            chunk_offset=self.place,
+            channel=np.full(count, CHANNEL, np.int64),
+            sequence=np.zeros(count, np.int64),
+            log_time_ns=times,
+            publish_time_ns=times.astype(np.uint64),
+            offset=np.array(list(held), np.int64),
+            length=np.array([len(data) for data in held.values()], np.int64),
+            read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
+        )
+
+
+class _Stream:
+    """Cuts a content, which comes piece by piece, into messages. ``mark``: how they begin, if it is known."""
+
+    def __init__(self, mark: bytes) -> None:
+        self._mark = mark
+        self._buffer = bytearray()
+        self._start = 0  # of the buffer, in all that came
+        self._frames: list[tuple[int, int]] = []  # where in all that came a frame begins; its place
+
+    def append(self, place: int, piece: bytes) -> None:
+        """One more piece, of the zstd frame at a place."""
+        if not self._frames or self._frames[-1][1] != place:
+            self._frames.append((self._start + len(self._buffer), place))
+        self._buffer += piece
+
+    def take(self, report: TraceReport, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
+        """The messages that are whole. ``ends``: no more pieces come."""
+        at = 0
+        while (left := len(self._buffer) - at) >= PREFIX.size or (ends and left):
+            length = PREFIX.unpack_from(self._buffer, at)[0] if left >= PREFIX.size else 0
+            stop = at + PREFIX.size + length
+            possible = 0 < length <= MAX_MESSAGE
+            if possible and stop <= len(self._buffer) and not self._overruns(at, stop):
+                yield *self._place(at), bytes(self._buffer[at + PREFIX.size : stop])
+                at = stop
+                continue
+            if possible and not ends and stop > len(self._buffer):
+                break  # the rest of it is still to come
+            resume = self._resume(at + 1)
+            if resume is None and not ends and self._mark:
+                # Nothing in sight: what may yet be the beginning of a message stays, the rest is lost.
+                resume = max(at + 1, len(self._buffer) - PREFIX.size - len(self._mark))
+            elif resume is None:
+                resume = len(self._buffer)
+            _lose(report, self._loss(at, resume, length))
+            at = resume
+        del self._buffer[:at]
+        self._start += at
+        while len(self._frames) > 1 and self._frames[1][0] <= self._start:
+            del self._frames[0]
+
+    def _overruns(self, at: int, stop: int) -> bool:
+        """Whether a message that would end here seems to swallow others: none begins here, but one before."""
+        following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
+        if self._mark.startswith(following):
+            return False
+        within = self._resume(at + 1)
+        return within is not None and within < stop
+
+    def _resume(self, start: int) -> int | None:
+        """Where in the buffer the next message seems to begin."""
+        while self._mark:
+            found = self._buffer.find(self._mark, start + PREFIX.size)
+            if found < 0:
+                return None
+            start = found - PREFIX.size
+            if len(self._mark) <= PREFIX.unpack_from(self._buffer, start)[0] <= MAX_MESSAGE:
+                return start
+            start += 1
+        return None
+
+    def _loss(self, at: int, resume: int, length: int) -> Loss:
+        left = resume - at
+        cut = resume == len(self._buffer) and (0 < length <= MAX_MESSAGE or left < PREFIX.size)
+        reason = (
+            f"the file ends inside a message: {left} of {PREFIX.size + length} bytes"
+            if cut
+            else f"damage: a message of {length} bytes, which cannot be"
+        )
+        return Loss(reason, 1 if cut else -1, left, offset=self._place(at)[1])
+
+    def _place(self, at: int) -> tuple[int, int]:
+        position = self._start + at
+        start, place = next(f for f in reversed(self._frames) if f[0] <= position)
+        return place, position - start
+
+
+def _lose(report: TraceReport, loss: Loss) -> None:
+    """Report a loss, as one with the loss before it where that is of the same kind and adjoins."""
+    last = report.losses[-1] if report.losses else None
+    if last and last.messages == loss.messages == -1 and last.offset + last.bytes == loss.offset:
+        report.losses[-1] = replace(last, bytes=last.bytes + loss.bytes)
+    elif last is None or len(report.losses) < MAX_LOSSES:
+        report.losses.append(loss)
+    else:
+        reason = "further damage of the same kinds"
+        report.losses[-1] = replace(last, reason=reason, messages=-1, bytes=last.bytes + loss.bytes)
+
+
+def _beginning(data: bytes) -> bytes:
+    """How messages of a file begin: with the version of OSI and the tag of what follows; empty if without."""
+    try:
+        number, wire, _start, stop = next(fields_of(data, 0, len(data)))
+    except (ValueError, StopIteration):
+        return b""
+    return data[: stop + 1] if (number, wire) == (_VERSION, 2) and 4 <= stop <= 32 else b""
+
+
+def _likeness(name: str, messages: list[bytes]) -> int:
+    """How much messages look like being of a type: the things with a place or an id in them; -1: not at all.
+
+    A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
+    """
+    message = _class_of(name)
+    total = 0
+    for data in messages:
+        try:
+            total += _things(parse(message, data))
+        except DECODE_ERRORS:
+            total -= 1
+    return total
+
+
+@cache
+def _class_of(name: str) -> type[Any]:
+    return message_class(Schema(id=1, data=descriptors(), encoding="protobuf", name=name))
+
+
+def _things(message: Any) -> int:
+    ground = ground_truth_of(message)
+    placed = [*ground.moving_object, *ground.stationary_object, *ground.traffic_light]
+    return sum(
+        thing.id.HasField("value") and thing.base.HasField("position") for thing in placed
+    ) + sum(lane.id.HasField("value") for lane in ground.lane)
+
+
+def time_of(data: bytes) -> int | None:
+    """The time of an OSI message in ns, or ``None`` where it has none that can be a log time."""
+    seconds, nanos = 0, 0
+    try:
+        for number, wire, start, stop in fields_of(data, 0, len(data)):
+            if number == _TIMESTAMP and wire == 2:
+                for inner, kind, at, end in fields_of(data, start, stop):
+                    value = _number(data[at:end]) if kind == 0 else 0
+                    seconds = value if inner == 1 else seconds
+                    nanos = value if inner == 2 else nanos
+                break
+            if number > _TIMESTAMP:
+                return None
+        else:
+            return None
+    except ValueError:
+        return None
+    time_ns = seconds * 1_000_000_000 + nanos
+    return time_ns if 0 <= time_ns < _LATEST else None
+
+
+def _number(content: bytes) -> int:
+    """A varint, as a number with a sign."""
+    value = sum((byte & 0x7F) << 7 * i for i, byte in enumerate(content))
+    return value - (1 << 64) if value >> 63 & 1 else value
