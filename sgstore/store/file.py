@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import StoreError, TraceError
+from sgstore.errors import TraceError
 from sgstore.store import rows, schema
 from sgstore.store.access import Access, default_memory, spill_folder, translated
 from sgstore.store.folder import Folder
+from sgstore.store.payloads import payload_place
 from sgstore.store.publishing import copy_sorted, remove
 from sgstore.store.rows import Batches, Rows
 from sgstore.store.scenes import Scenes
@@ -27,7 +28,6 @@ from sgstore.store.traces import (
     stored_traces,
     trace_named,
 )
-from sgstore.vocabulary import suggestion
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog
     from sgstore.roads import RoadMap
     from sgstore.store.rows import Parameters
+    from sgstore.traces.carried import Carried
     from sgstore.world import TraceInfo
 
 WAIT_S: Final = 60.0
@@ -293,20 +294,44 @@ class StoreFile:
         """
         from sgstore.traces import read_message
 
+        path, _, place = self._payload_place(ref, channel)
+        return read_message(path, **place)
+
+    def carried(self, ref: int | str, channel: str) -> Carried:
+        """What the message of a channel that belongs to a frame carries: a picture, a video, or the message.
+
+        Parameters
+        ----------
+        ref, channel
+            As :meth:`payload` takes them.
+
+        Returns
+        -------
+        Carried
+            A frame of H.264 or H.265 comes with the key frame that it needs and all between.
+
+        Raises
+        ------
+        StoreError
+            As :meth:`payload`.
+        TraceError
+            As :meth:`payload`; or the recording lacks what a frame of a video needs to be decoded.
+        """
+        from sgstore.traces.carried import read_carried
+
+        path, channel_id, place = self._payload_place(ref, channel)
+        return read_carried(path, channel=channel_id, **place)
+
+    def _payload_place(self, ref: int | str, channel: str) -> tuple[Path, int, dict[str, int]]:
+        """Recording, channel's id and place of the message that belongs to a frame."""
         with self._reading() as connection:
             frame = frame_named(connection, ref)
-            found = connection.execute(
-                "SELECT chunk_offset, message_offset, length FROM payloads"
-                " WHERE frame_id = ? AND channel = ? ORDER BY abs(offset_s) LIMIT 1",
-                [frame.frame_id, channel],
-            ).fetchone()
-            if found is None:
-                raise _no_payload(connection, frame, channel)
+            found = payload_place(connection, frame, channel)
             sql = "SELECT uri, size, mtime_ns, digest FROM trace WHERE trace_id = ?"
             (recording,) = connection.execute(sql, [frame.trace_id]).fetchall()
-        path = self._unchanged(*recording)
-        chunk_offset, offset, length = found
-        return read_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
+        channel_id, chunk_offset, offset, length = found
+        place = {"chunk_offset": chunk_offset, "offset": offset, "length": length}
+        return self._unchanged(*recording), channel_id, place
 
     def _unchanged(self, uri: str, size: int, mtime_ns: int, digest: str) -> Path:
         """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
@@ -397,16 +422,3 @@ class StoreFile:
     def _reading(self) -> Generator[DuckDBPyConnection]:
         with self._access.reading() as connection, translated(self.path):
             yield connection
-
-
-def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -> StoreError:
-    sql = "SELECT topic, role FROM channel WHERE trace_id = ? ORDER BY topic"
-    roles = dict(connection.execute(sql, [frame.trace_id]).fetchall())
-    if channel not in roles:
-        like = suggestion(channel, [topic for topic in roles if topic])
-        hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(map(repr, roles))}"
-        return StoreError(f"no channel {channel!r} in {frame.trace!r}; {hint}")
-    reason = "no message near enough in time"
-    if roles[channel] == "map":
-        reason = "it holds the map, which belongs to all frames"
-    return StoreError(f"no message of {channel!r} belongs to {frame.trace}#{frame.seq}: {reason}")

@@ -1,4 +1,4 @@
-"""Which message of each channel belongs to a frame."""
+"""Which message of each channel belongs to a frame, and where it stands."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.errors import StoreError
+from sgstore.vocabulary import suggestion
+
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.config import Payloads
+    from sgstore.store.traces import FrameRef
     from sgstore.world import Channel, Ints
 
 _SAMPLE: Final = 8192
@@ -117,3 +121,40 @@ def tolerance_ns(periods: Periods, channel: int, settings: Payloads) -> int:
         return round(settings.tolerance * 1e9)
     period = max(periods.of(channel), periods.of(FRAMES))
     return int(period / 2 if settings.join == "nearest" else period)
+
+
+def payload_place(
+    connection: DuckDBPyConnection, frame: FrameRef, channel: str
+) -> tuple[int, int, int, int]:
+    """Channel's id, chunk offset, offset and length of the message of a channel that belongs to a frame.
+
+    Raises
+    ------
+    StoreError
+        There is none; it says why.
+    """
+    found = connection.execute(
+        """
+        SELECT p.channel_id, p.chunk_offset, p."offset", p.length
+        FROM frame f JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
+             JOIN channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id
+        WHERE f.frame_id = ? AND c.topic = ? ORDER BY abs(p.log_time_ns - f.log_time_ns) LIMIT 1
+        """,
+        [frame.frame_id, channel],
+    ).fetchone()
+    if found is None:
+        raise _no_payload(connection, frame, channel)
+    return found
+
+
+def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -> StoreError:
+    sql = "SELECT topic, role FROM channel WHERE trace_id = ? ORDER BY topic"
+    roles = dict(connection.execute(sql, [frame.trace_id]).fetchall())
+    if channel not in roles:
+        like = suggestion(channel, [topic for topic in roles if topic])
+        hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(map(repr, roles))}"
+        return StoreError(f"no channel {channel!r} in {frame.trace!r}; {hint}")
+    reason = "no message near enough in time"
+    if roles[channel] == "map":
+        reason = "it holds the map, which belongs to all frames"
+    return StoreError(f"no message of {channel!r} belongs to {frame.trace}#{frame.seq}: {reason}")
