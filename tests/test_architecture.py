@@ -16,12 +16,12 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"errors", "geometry", "vocabulary"}),
     frozenset({"config", "world"}),
     frozenset({"roads", "graph"}),
-    frozenset({"opendrive"}),
+    frozenset({"opendrive", "online"}),
     frozenset({"traces", "relations", "abstractions", "lang"}),
     frozenset({"sgg", "store", "temporal"}),
     frozenset({"ingest", "query", "graphs"}),
-    frozenset({"monitor", "coverage", "selection", "exporters", "draw", "cluster"}),
-    frozenset({"demo"}),
+    frozenset({"monitor", "coverage", "selection", "exporters", "draw", "cluster", "sandbox"}),
+    frozenset({"demo", "recording"}),
     frozenset({"cli", "web", "pytest_plugin"}),
 )
 OWNERS = {

@@ -376,3 +376,15 @@ def test_every_verb_is_in_the_readme_and_explains_itself(verb: str) -> None:
 
     assert f"sgstore {verb}" in readme
     assert "Usage" in done.stdout
+
+
+def test_a_question_can_be_asked_in_a_bounded_process(store: str, sgstore) -> None:
+    frames = sgstore("sql", store, "SELECT seq FROM frames", "--safe", "--max-rows", 3, "--json")
+    found = sgstore("find", store, "MATCH (e:Ego) WHERE e.speed > 1e6", "--safe", "--require")
+    late = sgstore("sql", store, "SELECT sleep_ms(60000)", "--safe", "--timeout", "300ms")
+
+    assert (frames[0], len(json.loads(frames[1]))) == (0, 3)
+    assert "only the first 3 rows" in frames[2]
+    assert found[0] == 4
+    assert (late[0], late[1]) == (2, "")
+    assert "stopped after 0.3 s" in late[2]

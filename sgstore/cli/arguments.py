@@ -14,6 +14,7 @@ from sgstore.errors import ConfigError
 
 if TYPE_CHECKING:
     from sgstore.query import Matches, Store
+    from sgstore.sandbox import Answer
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -128,7 +129,7 @@ def seconds_of(text: str, option: str) -> float:
     return float(match[1]) * _UNIT[match[2]]
 
 
-def say_left_out(matches: Matches) -> None:
+def say_left_out(matches: Matches | Answer) -> None:
     """Say which traces cannot answer a query."""
     if matches.left_out:
         names = ", ".join(matches.left_out)

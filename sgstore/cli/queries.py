@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from itertools import chain
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,8 +23,24 @@ from sgstore.cli.arguments import (
     parameters_of,
     query_of,
     say_left_out,
+    seconds_of,
 )
 from sgstore.cli.output import Format, say, write_rows
+
+if TYPE_CHECKING:
+    from sgstore.sandbox import Answer, Sandbox
+
+Safe = Annotated[
+    bool,
+    typer.Option(
+        "--safe", help="Ask in a process of its own that is bounded in time, memory and rows."
+    ),
+]
+Timeout = Annotated[
+    str,
+    typer.Option("--timeout", metavar="TIME", help="With --safe: the longest time, such as 5s."),
+]
+MaxRows = Annotated[int, typer.Option("--max-rows", min=0, help="With --safe: the most rows.")]
 
 
 @app.command()
@@ -44,11 +61,21 @@ def find(
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if nothing matches.")
     ] = False,
+    safe: Safe = False,
+    timeout: Timeout = "5s",
+    max_rows: MaxRows = 10_000,
 ) -> int:
     """Find frames by a pattern of their scene graphs.
 
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
     """
+    if safe:
+        if count or explain:
+            raise typer.BadParameter("--safe gives rows: not with --count or --explain")
+        with _sandbox(store, timeout, max_rows) as box:
+            answer = box.find(query_of(query, file), **parameters_of(parameters))
+        number = _write_answer(answer, form_of(form, as_json=as_json), output)
+        return NO_MATCH if require and not number else 0
     opened = open_store(store)
     matches = opened.find(query_of(query, file), **parameters_of(parameters))
     if explain:
@@ -77,14 +104,35 @@ def sql(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
     output: Output = None,
+    safe: Safe = False,
+    timeout: Timeout = "5s",
+    max_rows: MaxRows = 10_000,
 ) -> int:
     """Ask a store in SQL, read only.
 
     Views: frames, nodes, edges, lane_states, pairs, lanes, entities, payloads; DESCRIBE names their columns.
     """
+    if safe:
+        with _sandbox(store, timeout, max_rows) as box:
+            answer = box.sql(query_of(statement, file))
+        _write_answer(answer, form_of(form, as_json=as_json), output)
+        return 0
     from sgstore.store import StoreFile
 
     with StoreFile(store).user_batches(query_of(statement, file)) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
         write_rows(batches.columns, rows, form_of(form, as_json=as_json), output, batches.types)
     return 0
+
+
+def _sandbox(store: Path, timeout: str, max_rows: int) -> Sandbox:
+    from sgstore.sandbox import Sandbox
+
+    return Sandbox(store, timeout_s=seconds_of(timeout, "--timeout"), max_rows=max_rows)
+
+
+def _write_answer(answer: Answer, form: Format, output: Path | None) -> int:
+    say_left_out(answer)
+    if answer.truncated:
+        say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
+    return write_rows(answer.columns, answer.rows, form, output)

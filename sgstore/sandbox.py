@@ -1,0 +1,317 @@
+"""Questions of strangers: SQL and patterns that nobody has looked at, answered in a process of their own.
+
+The process reads the store and nothing else: the database is opened read-only without access to files, its
+settings are locked, and the operating system allows it no file to be written and a bounded address space. A
+question has a deadline, after which the process is killed (a database that is asked to stop may take its time),
+and its answer a bounded number of rows and bytes. The process lives on between questions, because starting
+it takes a third of a second.
+
+Parent and child speak JSON, a line a message.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryError, SgstoreError, Span, SqlError, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+TIMEOUT_S: Final = 5.0
+MEMORY: Final = 512 << 20
+MAX_ROWS: Final = 10_000
+MAX_BYTES: Final = 64 << 20
+"""Longest answer, as it is sent."""
+
+MAX_QUESTION: Final = 1 << 20
+"""Longest question with its values; characters."""
+
+START_S: Final = 30.0
+"""How long the process may take to start."""
+
+_ADDRESS_SPACE: Final = 4 << 30
+"""What Python, its libraries and the database's threads reserve beside the memory for answers; bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a question gives.
+
+    Attributes
+    ----------
+    columns : tuple of str
+    rows : list of tuple
+        Numbers, texts, truth values, ``None``, and lists and dicts of these; anything else as text.
+    truncated : bool
+        Whether there were more rows than allowed.
+    left_out : tuple of str
+        Traces that cannot answer the pattern.
+    """
+
+    columns: tuple[str, ...]
+    rows: list[tuple[Any, ...]]
+    truncated: bool
+    left_out: tuple[str, ...] = ()
+
+
+class Sandbox:
+    """A process that answers questions about a store.
+
+    Questions of several threads are answered one after the other. To be used with ``with``, or closed.
+
+    Parameters
+    ----------
+    store : str or Path
+    timeout_s : float
+        Longest time for a question; s.
+    memory : int
+        Most memory that a question may take; bytes.
+    max_rows : int
+        Longest answer; rows.
+
+    Raises
+    ------
+    StoreError
+        There is no such file, it is no store, or one of another version.
+    """
+
+    def __init__(
+        self,
+        store: str | Path,
+        *,
+        timeout_s: float = TIMEOUT_S,
+        memory: int = MEMORY,
+        max_rows: int = MAX_ROWS,
+    ) -> None:
+        self._store = Path(store)
+        self._timeout_s = timeout_s
+        self._memory = memory
+        self._max_rows = max_rows
+        self._turn = threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        with self._turn:
+            self._ready()
+
+    def __enter__(self) -> Sandbox:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process."""
+        with self._turn:
+            self._kill()
+
+    def sql(self, text: str) -> Answer:
+        """The rows of one statement that only reads.
+
+        Raises
+        ------
+        SqlError
+            It is none, the database refuses it, or it takes too much time or memory.
+        """
+        return self._ask({"sql": text}, SqlError)
+
+    def find(self, text: str, /, **parameters: object) -> Answer:
+        """The rows of a pattern.
+
+        Raises
+        ------
+        QueryError
+            The text is no query.
+        SqlError
+            It takes too much time or memory.
+        """
+        return self._ask({"find": text, "parameters": parameters}, QueryError)
+
+    def _ask(self, question: Mapping[str, object], error: type[SgstoreError]) -> Answer:
+        line = json.dumps(question)
+        if len(line) > MAX_QUESTION:
+            raise error(f"the question has {len(line)} characters; {MAX_QUESTION} are allowed")
+        with self._turn:
+            reply = self._exchange(self._ready(), line, self._timeout_s)
+        return _answer(reply)
+
+    def _ready(self) -> subprocess.Popen[bytes]:
+        """The process, started if there is none."""
+        if self._child is None or self._child.poll() is not None:
+            self._kill()
+            self._child = subprocess.Popen(
+                [sys.executable, "-m", "sgstore.sandbox"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
+            settings = {
+                "store": str(self._store.absolute()),
+                "memory": self._memory,
+                "rows": self._max_rows,
+            }
+            reply = self._exchange(self._child, json.dumps(settings), START_S)
+            if "error" in reply:
+                self._kill()
+            _answer(reply)
+        return self._child
+
+    def _exchange(self, child: subprocess.Popen[bytes], line: str, timeout_s: float) -> Any:
+        """Send a line and wait for one; the process does not outlive the deadline."""
+        late = threading.Event()
+
+        def stop() -> None:
+            late.set()
+            child.kill()
+
+        watch = threading.Timer(timeout_s, stop)
+        watch.start()
+        try:
+            reply = _sent_and_read(child, line.encode())
+        except BaseException:
+            self._kill()
+            raise
+        finally:
+            watch.cancel()
+        if reply.endswith(b"\n"):
+            return json.loads(reply)
+        self._kill()
+        if late.is_set():
+            raise SqlError(f"stopped after {timeout_s:g} s")
+        if len(reply) > MAX_BYTES:
+            raise SqlError(f"stopped: the answer is longer than {MAX_BYTES} bytes")
+        raise SqlError("stopped: it took more memory than is allowed")
+
+    def _kill(self) -> None:
+        if self._child is None:
+            return
+        with self._child as child:  # which waits for its end and closes the pipes
+            child.kill()
+        self._child = None
+
+
+def _sent_and_read(child: subprocess.Popen[bytes], line: bytes) -> bytes:
+    """The line that a process answers with; one without an end if it died or says too much."""
+    if child.stdin is None or child.stdout is None:
+        raise ValueError("a process without pipes")
+    with suppress(BrokenPipeError):
+        child.stdin.write(line + b"\n")
+        child.stdin.flush()
+    return child.stdout.readline(MAX_BYTES + 1)
+
+
+_ERRORS: Final = {"sql": SqlError, "store": StoreError}
+
+
+def _answer(reply: Any) -> Answer:
+    if "query" in reply:
+        span = Span(*reply["span"]) if reply["span"] else None
+        raise QueryError(reply["reason"], text=reply["query"], span=span, hint=reply["hint"])
+    if "error" in reply:
+        raise _ERRORS[reply["kind"]](reply["error"])
+    rows = [tuple(row) for row in reply["rows"]]
+    return Answer(tuple(reply["columns"]), rows, reply["truncated"], tuple(reply["left_out"]))
+
+
+# The process ------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Answer the questions that come on stdin, until it ends."""
+    lines, replies = sys.stdin.buffer, sys.stdout.buffer
+    settings = json.loads(lines.readline())
+    tempfile.gettempdir()  # it finds out by writing, which is about to be forbidden
+    _limit(settings["memory"])
+    from sgstore.query import Store
+
+    path = Path(settings["store"])
+    try:
+        os.chdir(path.parent)  # so that the database knows no more of where it is than its name
+        store = Store(path.name, memory=settings["memory"])
+    except OSError as error:
+        _send(replies, _refusal(StoreError(f"{path}: {error.strerror}")))
+        return
+    except SgstoreError as error:
+        _send(replies, _refusal(error))
+        return
+    _send(replies, {"columns": [], "rows": [], "truncated": False, "left_out": []})
+    for line in lines:
+        question = json.loads(line)
+        try:
+            _send(replies, _found(store, question, settings["rows"]))
+        except SgstoreError as error:
+            _send(replies, _refusal(error))
+
+
+def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
+    if "sql" in question:
+        rows = store.sql(question["sql"], max_rows=most)
+        values, columns, truncated, left_out = rows.values, rows.columns, rows.truncated, ()
+    else:
+        matches = store.find(question["find"], **question["parameters"])
+        values = list(_first(matches, most + 1))
+        truncated = len(values) > most
+        values, columns, left_out = values[:most], matches.columns, matches.left_out
+    plain = [[_plain(value) for value in row] for row in values]
+    return {"columns": columns, "rows": plain, "truncated": truncated, "left_out": left_out}
+
+
+def _first(rows: Iterable[Any], most: int) -> Iterator[Any]:
+    for number, row in enumerate(rows):
+        if number == most:
+            return
+        yield row
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON can hold it."""
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, (bytes, bytearray)):
+        return value.hex()
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def _refusal(error: SgstoreError) -> dict[str, Any]:
+    if isinstance(error, QueryError):
+        span = (error.span.start, error.span.end) if error.span else None
+        return {"query": error.text, "reason": error.reason, "span": span, "hint": error.hint}
+    kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "sql")
+    return {"kind": kind, "error": str(error)}
+
+
+def _send(to: IO[bytes], reply: object) -> None:
+    to.write(json.dumps(reply).encode() + b"\n")
+    to.flush()
+
+
+def _limit(memory: int) -> None:
+    """What the operating system allows this process, where it can be told."""
+    try:
+        import resource
+    except ImportError:  # not on Windows: there the database's own limits and the deadline hold
+        return
+    for limit, most in (
+        (resource.RLIMIT_AS, _ADDRESS_SPACE + 2 * memory),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        _, hard = resource.getrlimit(limit)
+        bound = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(limit, (bound, bound))
+
+
+if __name__ == "__main__":
+    with suppress(KeyboardInterrupt, BrokenPipeError):
+        main()
+    os._exit(0)

@@ -1,0 +1,187 @@
+"""SQL and patterns of strangers: bounded in what they see, in time, in memory and in rows."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
+from sgstore.ingest import ingest
+from sgstore.query import Store
+from sgstore.sandbox import Sandbox
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+RUNAWAY = (
+    "SELECT count(*) FROM range(1000000000) a, range(1000000000) b WHERE a.range % 7 = b.range % 5"
+)
+NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from sgstore.demo import RECORDING
+
+    path = tmp_path_factory.mktemp("sandbox") / "town.sgstore"
+    assert ingest(path, [RECORDING])[0].error is None
+    return path
+
+
+@pytest.fixture(scope="module")
+def box(path: Path) -> Iterator[Sandbox]:
+    with Sandbox(path, timeout_s=20) as box:
+        yield box
+
+
+def test_sql_gives_what_it_gives_outside(box: Sandbox, path: Path) -> None:
+    sql = "SELECT kind, count(*), max(speed) FROM nodes GROUP BY kind ORDER BY kind"
+
+    assert box.sql(sql).rows == Store(path).sql(sql).values
+
+
+def test_a_pattern_gives_what_it_gives_outside(box: Sandbox, path: Path) -> None:
+    query = f"{NEAR} WHERE v.speed > $least"
+    inside, outside = box.find(query, least=0.5), Store(path).find(query, least=0.5)
+
+    assert inside.columns == outside.columns
+    assert inside.rows == list(outside)
+    assert len(inside.rows) > 10
+    assert not inside.truncated
+
+
+def test_values_that_json_has_not_come_as_texts(box: Sandbox) -> None:
+    sql = "SELECT DATE '2026-01-02', 1.5::DECIMAL(3,1), 'ab'::BLOB, [1, NULL], {'a': 2}, 9007199254740993"
+
+    assert box.sql(sql).rows == [
+        ("2026-01-02", "1.5", "6162", [1, None], {"a": 2}, 9007199254740993)
+    ]
+
+
+def test_an_answer_has_a_bounded_number_of_rows(path: Path) -> None:
+    with Sandbox(path, max_rows=7) as box:
+        some, few = box.find("MATCH (e:Ego)"), box.sql("SELECT seq FROM frames LIMIT 7")
+
+    assert (len(some.rows), some.truncated) == (7, True)
+    assert (len(few.rows), few.truncated) == (7, False)
+
+
+def test_a_mistake_in_a_pattern_is_shown_with_carets(box: Sandbox, path: Path) -> None:
+    query = "MATCH (e:Ego)-[:near_kol]->(v)"
+    with pytest.raises(QueryError) as inside:
+        box.find(query)
+    with pytest.raises(QueryError) as outside:
+        Store(path).find(query)
+
+    assert str(inside.value) == str(outside.value)
+    assert "near_coll" in str(inside.value)
+    assert inside.value.span == outside.value.span
+
+
+@pytest.mark.parametrize(
+    ("sql", "reason"),
+    [
+        ("COPY frames TO '{out}'", "COPY is not allowed"),
+        ("COPY (SELECT 1) TO '{out}' (FORMAT parquet)", "COPY is not allowed"),
+        ("EXPORT DATABASE '{out}'", "EXPORT is not allowed"),
+        ("ATTACH '{out}' AS x", "ATTACH is not allowed"),
+        ("INSTALL httpfs", "is not allowed"),
+        ("LOAD '{secret}'", "is not allowed"),
+        ("SET memory_limit = '100GB'", "SET is not allowed"),
+        ("SET enable_external_access = true", "SET is not allowed"),
+        ("SET VARIABLE x = 1", "SET is not allowed"),
+        ("PRAGMA database_list", "is not allowed"),
+        ("PRAGMA memory_limit='100GB'", "is not allowed"),
+        ("CALL pragma_version()", "CALL is not allowed"),
+        ("CREATE TABLE x AS SELECT 1", "CREATE is not allowed"),
+        ("CREATE MACRO f() AS 1", "CREATE is not allowed"),
+        ("DROP VIEW frames", "DROP is not allowed"),
+        ("INSERT INTO trace SELECT * FROM trace", "INSERT is not allowed"),
+        ("UPDATE trace SET name = 'x'", "UPDATE is not allowed"),
+        ("SELECT 1; SELECT 2", "expected one statement"),
+        ("BEGIN", "TRANSACTION is not allowed"),
+        ("SELECT * FROM read_text('{secret}')", "disabled by configuration"),
+        ("SELECT * FROM read_csv('{secret}')", "disabled by configuration"),
+        ("SELECT * FROM read_blob('/proc/self/environ')", "disabled by configuration"),
+        ("SELECT * FROM '{secret}'", "disabled by configuration|does not exist"),
+        ("SELECT * FROM glob('/*')", "disabled by configuration"),
+        ("SELECT * FROM parquet_scan('http://127.0.0.1/x')", "disabled by configuration|httpfs"),
+        ("SELECT getenv('HOME')", "does not exist"),
+        ("SELECT getvariable('x') FROM query('COPY frames TO ''{out}''')", "SELECT|COPY"),
+        ("EXPLAIN ANALYZE COPY frames TO '{out}'", "disabled by configuration|read-only"),
+    ],
+)
+def test_nothing_but_the_store_is_reached(box: Sandbox, path: Path, tmp_path, sql, reason) -> None:
+    secret, out = tmp_path / "secret.csv", tmp_path / "out"
+    secret.write_text("a,b\n1,2\n")
+    before = path.read_bytes()
+
+    with pytest.raises(SqlError, match=reason):
+        box.sql(sql.replace("{secret}", str(secret)).replace("{out}", str(out)))
+
+    assert not out.exists()
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT len(list(range)) FROM range(100000000)",
+        "SELECT string_agg(repeat('x', 1000000), '') FROM range(100000)",
+        "SELECT * FROM range(50000000) ORDER BY hash(range) OFFSET 49999999",
+    ],
+)
+def test_memory_is_bounded_and_nothing_is_spilled(path: Path, sql: str) -> None:
+    with Sandbox(path, timeout_s=5, memory=128 << 20) as box:
+        with pytest.raises(SqlError):
+            box.sql(sql)
+
+        assert box.sql("SELECT 1").rows == [(1,)]
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        RUNAWAY,
+        "SELECT " + "(" * 100_000,
+        "SELECT sleep_ms(60000)",
+        "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r",
+    ],
+)
+def test_a_runaway_statement_does_not_outlive_its_deadline(path: Path, sql: str) -> None:
+    with Sandbox(path, timeout_s=0.5) as box:
+        start = time.perf_counter()
+        with pytest.raises(SgstoreError):
+            box.sql(sql)
+        spent = time.perf_counter() - start
+
+        assert spent < 2
+        assert box.sql("SELECT 1").rows == [(1,)]
+
+
+def test_a_runaway_pattern_does_not_outlive_its_deadline(path: Path) -> None:
+    with Sandbox(path, timeout_s=0.3) as box:
+        with pytest.raises(SqlError, match=r"stopped after 0\.3 s"):
+            box.find("MATCH (a), (b), (c), (d), (e), (f) RETURN COUNT(*)")
+
+        assert len(box.find(f"{NEAR} RETURN FRAMES").rows) > 0
+
+
+def test_an_answer_that_is_too_long_is_stopped(path: Path) -> None:
+    with Sandbox(path) as box:
+        with pytest.raises(SqlError, match="longer than 67108864 bytes"):
+            box.sql("SELECT repeat('x', 1000000) FROM range(100)")
+
+        assert box.sql("SELECT 1").rows == [(1,)]
+
+
+def test_what_is_no_store_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+
+    with pytest.raises(StoreError, match="no such store"):
+        Sandbox(tmp_path / "none.sgstore")
+    with pytest.raises(StoreError, match="not a store"):
+        Sandbox(tmp_path / "notes.txt")
