@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
 from sgstore.errors import TraceError
+from sgstore.traces.carla import CarlaTrace
 from sgstore.traces.fetch import digest_of
 from sgstore.traces.fetch import read_message as _read_message
 from sgstore.traces.mcap_file import McapFile
@@ -86,7 +87,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: Final[tuple[Reader, ...]] = (OsiTrace,)
+READERS: Final[tuple[Reader, ...]] = (OsiTrace, CarlaTrace)
 """The flavours of recordings, in the order in which they are asked."""
 
 

@@ -1,0 +1,149 @@
+"""Recordings of CARLA's ROS bridge: ``ros2 bag record -s mcap`` of ``derived_object_msgs`` and ``carla_msgs``.
+
+They are recognised by the schema of a channel and by nothing else. A frame is one list of objects, in file
+order; its time is the simulation's. How messages become frames stands in :mod:`sgstore.traces.carla_frames`.
+The road map is the OpenDRIVE text of ``CarlaWorldInfo``, or of a string message that holds one.
+
+The bridge tells where vehicles and walkers are, and nothing else that has a body: signs and props stand in the
+list of actors without a place, and are left out; signs come from the road map.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, ClassVar, Self
+
+from sgstore.errors import MapError, TraceError
+from sgstore.opendrive import read_map
+from sgstore.traces.carla_channels import LASTING, OBJECTS, content_of
+from sgstore.traces.carla_frames import FrameDecoder
+from sgstore.traces.carla_lights import signals_of
+from sgstore.traces.carla_survey import Survey
+from sgstore.traces.fetch import digest_of
+from sgstore.traces.frames import assemble, counted
+from sgstore.traces.references import FrameRefs, channels_of, refs_of
+from sgstore.world import TraceInfo, TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.traces.mcap_file import McapFile
+    from sgstore.world import FrameBlock
+
+
+class CarlaTrace:
+    """A recording of CARLA's ROS bridge.
+
+    Parameters
+    ----------
+    recording : McapFile
+    ego : str
+        Id or role name of the ego; empty: the vehicle whose role is ``hero`` or ``ego_vehicle``, or that has
+        channels of its own.
+    digest : str
+        SHA-256 of the file, if it is known; else the file is hashed.
+
+    Attributes
+    ----------
+    info : TraceInfo
+    report : TraceReport
+        Filled while blocks are read.
+
+    Raises
+    ------
+    TraceError
+        The definition of the objects is malformed, no frame can be read, or nothing bears the name given for
+        the ego.
+    """
+
+    name: ClassVar[str] = "carla"
+
+    def __init__(self, recording: McapFile, *, ego: str = "", digest: str = "") -> None:
+        self._recording = recording
+        # The file is hashed beside the first reading, so that it comes from the disk once.
+        with ThreadPoolExecutor(1) as beside:
+            hashing = None if digest else beside.submit(digest_of, recording.path)
+            found = Survey(recording, ego)
+            digest = hashing.result() if hashing else digest
+        leading = found.leading
+        if leading is None:
+            lost = found.lost.losses()
+            reason = lost[0].reason if lost else "no list of objects can be read"
+            raise TraceError(reason, path=recording.path)
+        self._survey = found
+        self._leading = leading
+        self._ego, self._notes = found.egos.settle(found.driven.values())
+        self._signals = self._find_signals()
+        self.report = TraceReport()
+        channels = channels_of(recording, self._role)
+        self.info = TraceInfo(
+            path=recording.path,
+            size=recording.size,
+            mtime_ns=recording.mtime_ns,
+            digest=digest,
+            flavour=self.name,
+            channels=channels,
+            ego="" if self._ego is None else str(self._ego),
+            map_text=found.map_text,
+            map_name=found.map_name,
+            context=refs_of(found.context(leading), channels),
+        )
+
+    @classmethod
+    def recognises(cls, recording: McapFile) -> bool:
+        """Whether one of the channels carries lists of objects."""
+        return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._recording.close()
+
+    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
+        """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
+
+        Raises
+        ------
+        TraceError
+            The file cannot be read any more.
+        """
+        report = self.report = TraceReport()
+        report.warnings += [*self._survey.notes, *self._notes]
+        report.losses += self._survey.lost.losses()
+        window = self._recording.window
+        decoder = FrameDecoder(
+            self._survey,
+            self._leading,
+            ego=self._ego,
+            signals=self._signals,
+            window=window,
+            report=report,
+        )
+        runs = self._recording.walk(report)
+        refs = FrameRefs(self.info.channels, window)
+        yield from counted(assemble(runs, size, decoder.channels, decoder, refs), report)
+        decoder.settle()
+        if not report.frames:
+            reason = report.losses[0].reason if report.losses else "it has no messages"
+            topic = self._survey.topic(self._leading)
+            raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
+
+    def _find_signals(self) -> dict[int, str]:
+        """Which signals of the recording's own map its traffic lights are."""
+        if not (self._survey.lights and self._survey.map_text):
+            return {}
+        try:
+            road_map = read_map(self._survey.map_text, self._survey.map_name)
+        except MapError:  # whoever reads the map for its lanes says so
+            return {}
+        return signals_of(self._survey.lights, road_map)
+
+    def _role(self, channel: int) -> str:
+        if channel == self._leading:
+            return "ground_truth"
+        return "lasting" if self._survey.contents.get(channel) in LASTING else "payload"
