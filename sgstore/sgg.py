@@ -1,10 +1,12 @@
 """The scene graph generator: frames of a trace and a road map in, scene graphs out, a block at a time.
 
-What is in a graph. The range of an ego is a circle about its centre, whatever the direction and the storey; an
-entity is in it when its footprint comes within the radius. What has no extent counts as a point, and what has
-no position is in no range. *Frames without an ego*, or with one whose position is missing, have no range: their
-graphs hold all entities and the whole map, and no relations of an ego. Parts of the map are present as
-:meth:`sgstore.relations.survey.Survey.ground` says; the static edges among them are the map's own.
+What is in a graph. The range of an ego is a disc about its centre, or another area, as
+:mod:`sgstore.relations.extent` says; an entity is in it when its footprint meets it. What has no extent counts
+as a point, and what has no position is in no range; the ego always is. *Frames without an ego*, or with one
+whose position is missing, have no range: their graphs hold all entities and the whole map, and no relations of
+an ego. Parts of the map are present as :meth:`sgstore.relations.survey.Survey.ground` says; the static edges
+among them are the map's own. What the client does not want (:mod:`sgstore.relations.keeping`) is as if it were
+not there.
 
 A relation that cannot be computed, because a heading or a position is missing, is absent; what a trace cannot
 answer at all is said by :attr:`SceneGraphGenerator.answers`.
@@ -17,10 +19,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.geometry import gap_to_points
 from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
 from sgstore.relations import RELATIONS
 from sgstore.relations.contact import contacts
+from sgstore.relations.extent import Extent, Places
+from sgstore.relations.keeping import Keeping
 from sgstore.relations.pairs import near_pairs, related_pairs
 from sgstore.relations.scene import Bodies, Scene
 from sgstore.relations.survey import Survey
@@ -33,9 +36,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Config
+    from sgstore.relations.extent import Areas
     from sgstore.relations.scene import Ground, Standing
     from sgstore.roads import RoadMap
-    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
+    from sgstore.world import Codes, Floats, FrameBlock, Ints
 
     Rows = NDArray[np.intp]
 
@@ -67,6 +71,8 @@ class SceneGraphGenerator:
         self._config = config
         self._survey = None if road_map is None else Survey(road_map)
         self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
+        self._extent = Extent(config.range, road_map)
+        self._keeping = Keeping(config, road_map)
         self._kinds: Codes = np.zeros(0, np.int8)
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self.answers = self._answers(road_map)
@@ -76,6 +82,7 @@ class SceneGraphGenerator:
         if road_map is not None:
             codes = np.unique(road_map.edges.relation).tolist()
             names.update(MAP_RELATIONS, (VOCABULARY[code] for code in codes))
+        names = self._keeping.names(names)
         return tuple(name for name in VOCABULARY if name in names)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
@@ -111,6 +118,7 @@ class SceneGraphGenerator:
         ValueError
             As for :meth:`block`.
         """
+        frames = replace(frames, entities=self._keeping.renamed(frames.entities))
         self._learn(frames)
         views = [self._view(replace(frames, ego=ego)) for ego in egos]
         keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(view.keys for view in views)]))
@@ -119,10 +127,11 @@ class SceneGraphGenerator:
 
     def _view(self, frames: FrameBlock) -> _View:
         ego, states = _ego_rows(frames), len(frames.states)
-        frame, row = self._scenery_in_range(frames, ego)
-        reduced, kept, here = _in_range(frames, ego, self._config.range.radius)
+        areas = self._extent.areas(_places(frames, ego))
+        frame, row = self._scenery_in_range(areas)
+        reduced, kept, here = self._in_range(frames, ego, areas)
         still = states + frame * len(self._scenery) + row
-        return _View(reduced, here, np.concatenate([kept, still]))
+        return _View(reduced, here, areas, np.concatenate([kept, still]))
 
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
@@ -139,14 +148,14 @@ class SceneGraphGenerator:
         bodies, standing = part.bodies, part.standing
         ground = None
         if self._survey is not None and standing is not None:
-            ground = self._survey.ground(bodies, standing, view.ego, self._config.range.radius)
+            ground = self._survey.ground(bodies, standing, view.areas, self._keeping.parts)
         pairs = related_pairs(bodies, view.ego, part.near, self._config.pairs)
         scene = Scene(self._config, bodies, view.ego, pairs, part.contacts, ground)
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground),
-            edges=_chained([family.edges(scene) for family in self._families]),
-            lanes=_lane_states(bodies, ground),
+            edges=self._keeping.edges(_chained([f.edges(scene) for f in self._families])),
+            lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
         )
 
     def _learn(self, frames: FrameBlock) -> None:
@@ -164,18 +173,36 @@ class SceneGraphGenerator:
             if len(strange):
                 raise ValueError(f"a state of node {strange[0]}, which no block has introduced")
 
-    def _scenery_in_range(self, frames: FrameBlock, ego: Rows) -> tuple[Ints, Rows]:
+    def _scenery_in_range(self, areas: Areas) -> tuple[Ints, Rows]:
         """Frames and rows of the scenery: all of it where there is no ego."""
-        scenery, radius = self._scenery, self._config.range.radius
+        scenery = self._scenery
         if not len(scenery):
             return np.zeros(0, np.int64), np.zeros(0, np.intp)
-        reach = radius + np.nan_to_num(np.hypot(scenery.length, scenery.width)) / 2
-        x, y = _centres(frames, ego)
-        # A generous cut by circles first; where there is no ego, the comparison with NaN keeps all.
-        far = np.subtract.outer(x, scenery.x) ** 2 + np.subtract.outer(y, scenery.y) ** 2
-        frame, row = np.nonzero(~(far > (reach * (1 + 1e-9)) ** 2))
-        near = _within(scenery, row, x[frame], y[frame], radius)
-        return frame[near], row[near]
+        frame, row = areas.near(scenery.x, scenery.y, np.hypot(scenery.length, scenery.width) / 2)
+        held = areas.hold(frame, _boxes(scenery)[row], _bottom(scenery)[row], static=True)
+        held &= self._keeping.entities(self._kinds[scenery.node])[row]
+        return frame[held], row[held]
+
+    def _in_range(
+        self, frames: FrameBlock, ego: Rows, areas: Areas
+    ) -> tuple[FrameBlock, Rows, Rows]:
+        """The frames with only the states in range, the rows of these, and those of the egos among them."""
+        frame, states = frames.frame_of, frames.states
+        held = areas.hold(frame, _boxes(states), _bottom(states))
+        held &= self._keeping.entities(self._kinds[states.node])
+        named = states.node == np.repeat(frames.ego, np.diff(frames.offsets))
+        kept = np.flatnonzero(held | named)
+        here = np.where(ego < 0, -1, np.searchsorted(kept, ego))
+        # An ego that is named but has no state is no node of its graph.
+        seen = np.zeros(len(frames), np.bool_)
+        seen[frame[named]] = True
+        reduced = replace(
+            frames,
+            offsets=np.searchsorted(kept, frames.offsets),
+            states=states.take(kept),
+            ego=np.where(seen, frames.ego, -1),
+        )
+        return reduced, kept, here
 
     def _bodies(self, frames: FrameBlock, keys: Ints) -> Bodies:
         """The states of a block and the scenery that stands in it, as rows of one table."""
@@ -212,12 +239,15 @@ class _View:
         With only the states in range.
     ego : (F,) intp
         Rows of the ego among these; -1 where it has no state, or no position.
+    areas : Areas
+        What its range covers.
     keys : int64
         What is in range, ascending: rows of the block's states, and beyond them the scenery, frame by frame.
     """
 
     frames: FrameBlock
     ego: Rows
+    areas: Areas
     keys: Ints
 
 
@@ -264,37 +294,21 @@ def _ego_rows(frames: FrameBlock) -> Rows:
     return ego
 
 
-def _centres(frames: FrameBlock, ego: Rows) -> tuple[Floats, Floats]:
-    """Centres of the ranges of the frames; NaN where there is no ego."""
-    x, y = np.append(frames.states.x, np.nan), np.append(frames.states.y, np.nan)
-    return x[ego], y[ego]
+def _places(frames: FrameBlock, ego: Rows) -> Places:
+    """Where the egos of the frames are; NaN where there is none."""
+    of = frames.states
+    columns = (of.x, of.y, of.heading, _bottom(of))
+    return Places(*(np.append(column, np.nan)[ego] for column in columns))
 
 
-def _within(states: States, rows: Rows, x: Floats, y: Floats, radius: float) -> Bools:
-    """Whether footprints (rows of states) come within a radius of their points; true where the point is NaN."""
-    boxes = np.stack([states.heading, states.length, states.width], axis=1)[rows]
-    boxes[np.isnan(boxes).any(axis=1)] = 0
-    boxes = np.column_stack([states.x[rows], states.y[rows], boxes])
-    return (gap_to_points(boxes, x, y) <= radius) | np.isnan(x)
+def _boxes(states: States) -> Floats:
+    columns = (states.x, states.y, states.heading, states.length, states.width)
+    return np.stack(columns, axis=1)
 
 
-def _in_range(frames: FrameBlock, ego: Rows, radius: float) -> tuple[FrameBlock, Rows, Rows]:
-    """The frames with only the states in range, the rows of these, and those of the egos among them."""
-    x, y = _centres(frames, ego)
-    frame = frames.frame_of
-    kept = np.flatnonzero(_within(frames.states, np.arange(len(frame)), x[frame], y[frame], radius))
-    here = np.where(ego < 0, -1, np.searchsorted(kept, ego))
-    # An ego that is named but has no state is no node of its graph.
-    seen = np.zeros(len(frames), np.bool_)
-    named = frames.states.node == np.repeat(frames.ego, np.diff(frames.offsets))
-    seen[frame[named]] = True
-    reduced = replace(
-        frames,
-        offsets=np.searchsorted(kept, frames.offsets),
-        states=frames.states.take(kept),
-        ego=np.where(seen, frames.ego, -1),
-    )
-    return reduced, kept, here
+def _bottom(states: States) -> Floats:
+    """Heights of the lower sides of boxes; what has no height is all at ``z``."""
+    return states.z - np.nan_to_num(states.height) / 2
 
 
 def _presence(bodies: Bodies, ground: Ground | None) -> Presence:

@@ -19,6 +19,7 @@ from sgstore.vocabulary import ENTITY_KINDS, RELATION_CODE, VEHICLES
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from sgstore.relations.extent import Areas
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Entities, Floats, Ints, States
 
@@ -102,7 +103,7 @@ class Survey:
         )
         return Standing(hits, crosswalks, off_road)
 
-    def ground(self, bodies: Bodies, standing: Standing, ego: Rows, radius: float) -> Ground:
+    def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Ground:
         """The map under bodies, and around the egos.
 
         Parameters
@@ -110,10 +111,10 @@ class Survey:
         bodies : Bodies
         standing : Standing
             What they stand on.
-        ego : (F,) intp
-            Row of the ego of each frame, -1 where there is none: there the whole map is in range.
-        radius : float
-            How far the range of an ego reaches from its centre; m.
+        areas : Areas
+            What is in range of the ego; where there is none the whole map is.
+        kept : (K,) bool
+            Which nodes of the map the client wants.
 
         Returns
         -------
@@ -122,7 +123,8 @@ class Survey:
             the road and the junction it belongs to. ``off_road`` is present where a body is in it. A signal or
             object of the map is not present where an entity of the trace that stands for it is.
         """
-        present = self._around(bodies, ego, radius)
+        present = areas.parts(self._map)
+        present[:, -1 - OFF_ROAD] = False
         doubled, index = joined(self._twins[0], bodies.node)
         present[bodies.frame[doubled], self._twins[1][index]] = False
         hits, (walkers, crosswalks), off_road = (
@@ -133,17 +135,8 @@ class Survey:
         rows = np.concatenate([hits.row, walkers, off_road])
         nodes = np.concatenate([hits.lane, crosswalks, np.full(len(off_road), OFF_ROAD)])
         self._add_with_parents(present, bodies.frame[rows], -1 - nodes)
+        present &= kept
         return Ground(standing, present, self._controls)
-
-    def _around(self, bodies: Bodies, ego: Rows, radius: float) -> Bools:
-        """(F, K): which nodes of the map are in the range of which frame's ego."""
-        present = np.ones((len(ego), len(self._parent)), np.bool_)
-        seen = np.flatnonzero(ego >= 0)
-        present[seen] = False
-        points, nodes = self._map.near(bodies.x[ego[seen]], bodies.y[ego[seen]], radius)
-        present[seen[points], -1 - nodes] = True
-        present[:, -1 - OFF_ROAD] = False
-        return present
 
     def _add_with_parents(self, present: Bools, frame: Ints, column: Ints) -> None:
         for _ in range(DEPTH):

@@ -364,6 +364,27 @@ class RoadMap:
             present[at, parent[which]] = True
         return present
 
+    def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
+        """Rows of lines or polygons and node ids of the parts of the map within ``distance`` of them.
+
+        Parameters
+        ----------
+        corners : (N, V, 2) float64
+            Ends of lines (V = 2), or corners of simple polygons, all around; m.
+        distance : float
+            m.
+
+        Notes
+        -----
+        Roads, junctions and ``off_road`` have no shape of their own and are near nothing.
+        """
+        make = shapely.linestrings if corners.shape[1] == 2 else shapely.polygons
+        shapes: Any = make(corners)
+        columns, tree = self._extents
+        row, place = tree.query(shapes, predicate="dwithin", distance=distance)
+        order = np.lexsort((columns[place], row))
+        return row[order], -1 - columns[place][order]
+
     def lanes_of_signal(self, signal: str) -> Ints:
         """Node ids of the driving lanes that an OpenDRIVE signal applies to; empty for an unknown id."""
         return self._controlled.get(signal, np.zeros(0, np.int64))

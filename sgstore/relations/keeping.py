@@ -1,0 +1,120 @@
+"""What a client wants in its graphs, and what it says that things are: kinds, parts of the map, relations."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.graph import Edges, LaneStates
+from sgstore.relations.scene import kinds_mask
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    KIND_CODE,
+    KINDS,
+    MAP_KINDS,
+    RELATION_CODE,
+    RELATIONS,
+    kinds_labelled,
+)
+
+if TYPE_CHECKING:
+    from sgstore.config import Config
+    from sgstore.roads import RoadMap
+    from sgstore.world import Bools, Codes, Entities, Ints
+
+ROAD_RELATIONS: Final = (
+    *("isIn", "travelsTo", "laneChange", "opposes", "conflictsWith"),
+    *("controlsTrafficOf", "mayAffect"),
+)
+"""Relations that have a part of a map at one end."""
+
+
+class Keeping:
+    """What is kept under a config.
+
+    Parameters
+    ----------
+    config : Config
+    road_map : RoadMap or None
+
+    Attributes
+    ----------
+    parts : (K,) bool
+        Which nodes of the map are kept, its column i node -1 - i. A road is where one of its lanes is, and a
+        junction where one of its roads is.
+    """
+
+    def __init__(self, config: Config, road_map: RoadMap | None) -> None:
+        kept = {kind for label in config.kinds for kind in kinds_labelled(label) or ()}
+        kept = kept if config.kinds else set(KINDS)
+        if config.lanes.granularity == "none":
+            kept -= set(MAP_KINDS)
+        self._kinds = kinds_mask(tuple(sorted(kept)))
+        self._every_kind = set(ENTITY_KINDS) <= kept
+        self._types = config.types
+        self._without = frozenset(config.without)
+        self._no_roads = config.lanes.granularity == "none"
+        dropped = [RELATION_CODE[name] for name in config.without]
+        self._relations: Bools = np.ones(len(RELATIONS), np.bool_)
+        self._relations[dropped] = False
+        self.parts: Bools = np.ones(0, np.bool_)
+        if road_map is not None:
+            self.parts = self._kept_parts(road_map, config.lanes.types)
+
+    def _kept_parts(self, road_map: RoadMap, lane_types: tuple[str, ...]) -> Bools:
+        nodes, edges = road_map.nodes, road_map.edges
+        kept = self._kinds[nodes.kind]
+        if not lane_types:
+            return kept
+        wanted = {name.lower() for name in lane_types}
+        of_type = np.array([name.lower() in wanted for name in nodes.lane_type], np.bool_)
+        lane, road, junction = (nodes.kind == KIND_CODE[k] for k in ("lane", "road", "junction"))
+        used = of_type & lane
+        inside = edges.relation == RELATION_CODE["isIn"]
+        child, parent = -1 - edges.src[inside], -1 - edges.dst[inside]
+        for _ in range(2):  # the roads of the lanes, then the junctions of the roads
+            used[parent[used[child]]] = True
+        return kept & (used | ~(lane | road | junction))
+
+    def names(self, relations: set[str]) -> set[str]:
+        """Those of the relations that graphs can hold."""
+        left_out = self._without | (set(ROAD_RELATIONS) if self._no_roads else set())
+        return relations - left_out
+
+    def renamed(self, entities: Entities) -> Entities:
+        """Entities, of the kinds that the client says their types are."""
+        if not self._types or not len(entities):
+            return entities
+        meanings = [self._types.get(name.lower()) for name in entities.type_name]
+        kind = entities.kind.copy()
+        special, subkind = list(entities.special), list(entities.subkind)
+        for row, meaning in enumerate(meanings):
+            if meaning is not None:
+                kind[row] = KIND_CODE[meaning.kind]
+                special[row], subkind[row] = meaning.special, meaning.subkind
+        return replace(entities, kind=kind, special=tuple(special), subkind=tuple(subkind))
+
+    def entities(self, kind: Codes) -> Bools:
+        """Whether entities of these kinds are kept."""
+        return self._kinds[kind]
+
+    def edges(self, edges: Edges) -> Edges:
+        """The edges that are kept: of kept relations, to and from parts of the map that are kept."""
+        kept = self._relations[edges.relation]
+        if not self.parts.all():
+            kept &= self._stays(edges.src) & self._stays(edges.dst)
+        return (
+            edges if kept.all() else Edges(*(getattr(edges, f.name)[kept] for f in fields(Edges)))
+        )
+
+    def lane_states(self, lanes: LaneStates) -> LaneStates:
+        """Those in lanes that are kept."""
+        kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
+        if kept.all():
+            return lanes
+        return LaneStates(*(getattr(lanes, f.name)[kept] for f in fields(LaneStates)))
+
+    def _stays(self, node: Ints) -> Bools:
+        return np.append(self.parts, True)[np.where(node < 0, -1 - node, -1)]
