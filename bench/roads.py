@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 
 from bench.measure import Measure
-from sgstore.opendrive import read_map
+from sgstore.opendrive import parse_map
 from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
@@ -257,12 +257,12 @@ def run(quick: bool = False) -> list[Measure]:
     table: list[Measure] = []
     for name, streets, records in (("town", 4, 20), ("city", 17, 26)):
         text = city(streets, records)
-        road_map = read_map(text, name)
+        road_map = parse_map(text, name)
         links = int((road_map.edges.relation == RELATION_CODE["travelsTo"]).sum())
         size = len(text) / 1e6
         note = f"{size:.1f} MB, {len(road_map.ribbons):,} lanes, {links:,} links"
         table.append(
-            Measure(f"{name}, read", timed(partial(read_map, text, name), times), "s", note)
+            Measure(f"{name}, read", timed(partial(parse_map, text, name), times), "s", note)
         )
         table += look_ups(name, road_map, FOOTPRINTS // (10 if quick else 1), times)
         table += beside_carla(name, text, road_map, times)

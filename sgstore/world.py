@@ -266,7 +266,8 @@ class TraceInfo:
     ego : str
         The simulator's id of the ego; empty if there is none.
     map_text, map_name : str
-        OpenDRIVE text that the trace carries and what the trace calls it; empty if it carries none.
+        Text of the road map that the trace carries, OpenDRIVE or plain lanes, and what the trace calls it;
+        empty if it carries none.
     context : MessageRefs
         Messages that later ones depend on: maps, latched messages, those that carry static data. A clip
         must bring the ones before its start.

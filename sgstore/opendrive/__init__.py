@@ -1,4 +1,4 @@
-"""OpenDRIVE text → RoadMap.
+"""Text of a road map → RoadMap: OpenDRIVE, and the plain lanes of recordings that carry none.
 
 ``document`` reads the text into tables · ``planview`` evaluates reference lines · ``lanes`` stacks lanes on
 them · ``links`` finds where traffic flows on · ``nodes`` and its kin make nodes and relations of it all.
@@ -7,11 +7,16 @@ without it, so that no later step has to know. Only a map without any usable roa
 
 OpenDRIVE 1.4 to 1.8 (ASAM) are read alike. Superelevation, crossfall and the height of kerbs are not: a lane
 lies at the elevation of its reference line, which is what storeys are told apart by.
+
+A map that was read is kept by its content, so that the traces of a store, or pictures one after another, read it
+once a process, with the indices that it made. It is not kept on disk: a town is read in a tenth of a second, about
+what starting Python takes, and a file that is trusted less than it would be read for has to be checked as well.
 """
 
 from __future__ import annotations
 
 import hashlib
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +30,6 @@ from sgstore.opendrive.marks import read_lane_changes
 from sgstore.opendrive.nodes import (
     FIRST_LANE,
     containment,
-    edges_of,
     flow_edges,
     lane_nodes,
     neighbours,
@@ -36,20 +40,28 @@ from sgstore.opendrive.objects import read_objects
 from sgstore.opendrive.planview import read_plan_view
 from sgstore.opendrive.signals import read_controllers, read_signals
 from sgstore.roads import MapNodes, RoadMap
+from sgstore.roads.lanes import edges_of
+from sgstore.roads.lanetext import is_lane_text, read_lane_text
 
-__all__ = ["read_map"]
+__all__ = ["parse_map", "read_map"]
 
 _ROUNDS: Final = 8
 """Readings of a text: each leaves out the roads that the one before found defects in."""
 
 
+_KEPT: Final = 4
+"""Maps that are kept: one of 30 MB of text and 12,000 lanes takes 95 MB, a town a tenth of it."""
+
+
+@lru_cache(maxsize=_KEPT)
 def read_map(text: str, name: str) -> RoadMap:
-    """The road map that an OpenDRIVE text describes.
+    """The road map that a text describes; the same one again if it was asked for lately.
 
     Parameters
     ----------
     text : str
-        The text of an ``.xodr`` file. Untrusted: time and memory are bounded by its length.
+        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads.lanetext`). Untrusted: time and memory
+        are bounded by its length.
     name : str
         What people call it; empty: the name in its header, or the first digits of its digest.
 
@@ -63,6 +75,13 @@ def read_map(text: str, name: str) -> RoadMap:
     MapError
         The text is no XML or no OpenDRIVE, exceeds a bound, or has no road that can be used.
     """
+    return parse_map(text, name)
+
+
+def parse_map(text: str, name: str) -> RoadMap:
+    """The same, read anew."""
+    if is_lane_text(text):
+        return read_lane_text(text, name or _short_digest(text))
     skip: dict[int, MapError] = {}
     for _ in range(_ROUNDS):
         document = read_document(text, frozenset(skip))
@@ -111,7 +130,7 @@ def _build(document: Document, text: str, name: str, warnings: list[str]) -> Roa
     shapes[len(nodes) - len(beside) :] = beside
     document.settle()
     return RoadMap(
-        name=name or _header_name(document) or hashlib.sha256(text.encode()).hexdigest()[:12],
+        name=name or _header_name(document) or _short_digest(text),
         text=text,
         nodes=nodes,
         edges=edges_of(edges),
@@ -126,3 +145,7 @@ def _build(document: Document, text: str, name: str, warnings: list[str]) -> Roa
 
 def _header_name(document: Document) -> str:
     return next(iter(document["header"].texts("name")), "").strip()
+
+
+def _short_digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:12]

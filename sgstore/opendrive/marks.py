@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.opendrive.nodes import DRIVING, wide_pairs
+from sgstore.opendrive.nodes import wide_pairs
 from sgstore.roads import LaneChanges
+from sgstore.roads.lanetypes import DRIVING
 
 if TYPE_CHECKING:
     from sgstore.opendrive.document import Document

@@ -7,28 +7,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.opendrive.grouped import last_before
-from sgstore.roads import STOREY, MapEdges, MapNodes
+from sgstore.roads import STOREY, MapNodes
 from sgstore.roads.conflicts import conflicts
+from sgstore.roads.lanetypes import DRIVING, TRAFFIC, turn_words
 from sgstore.roads.ribbons import mean_widths, turned
-from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
     from sgstore.opendrive.document import Document
     from sgstore.opendrive.lanes import Lanes
     from sgstore.opendrive.links import Flow
     from sgstore.roads import Ribbons
+    from sgstore.roads.lanes import Edge
     from sgstore.world import Bools, Floats, Ints
-
-DRIVING: Final = frozenset(
-    {"driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"}
-    | {"bus", "taxi", "HOV", "mwyEntry", "mwyExit"}
-)
-"""Types of lanes that are made for motor traffic. (ASAM OpenDRIVE 1.4 to 1.8, lane types.)"""
-TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
-"""Types of lanes that have a direction of travel which matters to their neighbours."""
-
-STRAIGHT: Final = np.radians(30.0)
-"""A lane through a junction that turns by less goes straight on; rad."""
 
 NARROW: Final = 1e-2
 """A lane that is nowhere wider has no neighbours: those on both sides of it are neighbours; m."""
@@ -36,20 +26,8 @@ NARROW: Final = 1e-2
 SPEED_UNITS: Final = {"": 1.0, "m/s": 1.0, "mph": 0.44704, "km/h": 1 / 3.6, "kmh": 1 / 3.6}
 """Units of speed → m/s. (ASAM OpenDRIVE 1.8, ``e_unitSpeed``.)"""
 
-Edge = tuple[str, "Ints", "Ints"]
-"""A relation, and the rows of its sources and destinations among the nodes."""
-
 FIRST_LANE: Final = 1
 """Row of the first lane: ``off_road`` comes before it."""
-
-
-def edges_of(parts: list[Edge]) -> MapEdges:
-    """Edges among rows of nodes as edges among node ids, each once, ordered."""
-    code = np.concatenate([np.full(len(src), RELATION_CODE[name]) for name, src, _ in parts])
-    src = np.concatenate([s for _, s, _ in parts])
-    dst = np.concatenate([d for _, _, d in parts])
-    table = np.unique(np.column_stack((code, src, dst)), axis=0).reshape(-1, 3)
-    return MapEdges(table[:, 0].astype(np.int8), -1 - table[:, 1], -1 - table[:, 2])
 
 
 def lane_nodes(document: Document, lanes: Lanes, ribbons: Ribbons) -> MapNodes:
@@ -91,16 +69,14 @@ def junction_of(document: Document, road: int) -> str:
 
 def _turns(document: Document, lanes: Lanes, ribbons: Ribbons) -> tuple[str, ...]:
     """How lanes turn on their way through a junction; a road that turns in several sections turns once."""
-    sign = np.where(lanes.forward, 1, -1)
+    sign = np.where(lanes.forward, 1.0, -1.0)
     _, one = np.unique(lanes.section, return_index=True)
-    of_road = np.bincount(
-        lanes.road[one], (turned(ribbons) * sign)[one], minlength=len(document["road"])
-    )
+    of_road = np.zeros(len(document["road"]))
+    np.add.at(of_road, lanes.road[one], (turned(ribbons) * sign)[one])
     turn = of_road[lanes.road] * sign
-    word = np.where(turn > STRAIGHT, "left", np.where(turn < -STRAIGHT, "right", "straight"))
     return tuple(
-        w if junction_of(document, road) else ""
-        for w, road in zip(word.tolist(), lanes.road.tolist(), strict=True)
+        word if junction_of(document, road) else ""
+        for word, road in zip(turn_words(turn), lanes.road.tolist(), strict=True)
     )
 
 

@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.opendrive.nodes import DRIVING, FIRST_LANE, Edge, speed
+from sgstore.opendrive.nodes import FIRST_LANE, speed
 from sgstore.opendrive.places import node_columns, standing
 from sgstore.roads import MapNodes
+from sgstore.roads.lanetypes import DRIVING
 
 if TYPE_CHECKING:
     from sgstore.opendrive.document import Document
     from sgstore.opendrive.links import Network
     from sgstore.opendrive.planview import PlanView
+    from sgstore.roads.lanes import Edge
 
 KIND_OF_TYPE: Final = {
     "206": "stop_sign",

@@ -1,0 +1,572 @@
+"""Lanes told as lines and links → plain lanes.
+
+Simulators that carry no OpenDRIVE tell lanes as lines: each in a direction of its own, which need not be that
+of its traffic, with the ids of the lanes that it touches. Here they get cross sections, run with their
+traffic, and are related to one another. What cannot be used is left out and named.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import shapely
+
+from sgstore.errors import MapError
+from sgstore.roads.lanes import PlainLane
+from sgstore.roads.lanetypes import DRIVING, TRAFFIC
+from sgstore.roads.sections import (
+    APART,
+    WIDE,
+    Sections,
+    along_line,
+    cross_sections,
+    half_width,
+    run_of,
+    thinned,
+    way_between,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from sgstore.world import Floats
+
+START: Final = "start"
+END: Final = "end"
+
+MAX_POINTS: Final = 2_000_000
+"""Greatest number of points of all lines together."""
+MAX_LANES: Final = 30_000
+MAX_WAYS: Final = 20_000
+"""Greatest number of ways through areas."""
+MAX_RELATED: Final = 500_000
+"""Greatest number of times that lanes name others as touching them or lying beside them."""
+GAP: Final = 5.0
+"""Ends of lanes that are farther apart do not touch, whatever is told of them; m."""
+SEAM: Final = 1.0
+"""Gaps up to this length between a lane and the next one are closed; m."""
+LISTED: Final = 8
+"""Lanes that a warning names."""
+_MOST_ACROSS: Final = 16
+"""Lanes without traffic that may lie between two lanes that are neighbours across them."""
+_ABOUT: Final = 1.0
+"""Centre lines of a junction's lanes that come this close to one another belong together; m."""
+
+
+class Joint(NamedTuple):
+    """A lane that touches an end of another, and with which end: ``start``, ``end``, or empty: not told."""
+
+    lane: str
+    contact: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """A line beside a lane.
+
+    Attributes
+    ----------
+    line : (k, 3) float64
+    to_left, to_right : bool or None
+        Whether traffic may cross it from its right to its left, and back, as the lane's line runs; ``None``:
+        that is not known.
+    """
+
+    line: Floats
+    to_left: bool | None = None
+    to_right: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LaneLine:
+    """A lane. Left, right, start and end are those of its line, whichever way its traffic runs.
+
+    Attributes
+    ----------
+    ident : str
+        What others call it.
+    type : str
+        As OpenDRIVE has it.
+    centre : (n, 3) float64
+        Its centre line; m.
+    forward, both : bool
+        Whether traffic runs along the line; whether it runs both ways.
+    lefts, rights : tuple of Border
+        In any order.
+    sections : Sections, optional
+        Cross sections along the line, where they are told; else the lines say where they lie.
+    before, after : tuple of Joint
+        What touches its start and its end.
+    left_beside, right_beside : tuple of str
+    name, road, section, number
+        As :class:`~sgstore.roads.MapNodes` has them; without a road it is one of the lanes side by side.
+    junction : str or None
+        ``None``: it lies in a junction that has no name.
+    """
+
+    ident: str
+    type: str
+    centre: Floats
+    forward: bool = True
+    both: bool = False
+    lefts: tuple[Border, ...] = ()
+    rights: tuple[Border, ...] = ()
+    sections: Sections | None = None
+    before: tuple[Joint, ...] = ()
+    after: tuple[Joint, ...] = ()
+    left_beside: tuple[str, ...] = ()
+    right_beside: tuple[str, ...] = ()
+    name: str = ""
+    road: str = ""
+    section: int = 0
+    number: int = 0
+    junction: str | None = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A junction that is told as an area, with the ways through it: from which lane to which."""
+
+    ident: str
+    ways: tuple[tuple[str, str], ...]
+
+
+@dataclass(slots=True)
+class _Network:
+    """Lanes by number, and what touches what."""
+
+    lines: list[LaneLine]
+    sections: list[Sections]
+    index: dict[str, int]
+    warnings: list[str] = field(default_factory=list[str])
+    _turned: dict[tuple[int, int], bool] = field(default_factory=dict[tuple[int, int], bool])
+
+    def direction(self, lane: int) -> int:
+        return 1 if self.lines[lane].forward else -1
+
+    def end_of(self, lane: int, contact: str) -> Floats:
+        """Where the line of a lane starts or ends."""
+        middle = self.sections[lane].middle
+        return middle[0 if contact == START else -1]
+
+    def gap(self, lane: int, end: str, other: int, contact: str) -> float:
+        """How far an end of a lane is from an end of another; m."""
+        return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
+
+    def runs_against(self, lane: int, other: int) -> bool:
+        """Whether the lines of two lanes side by side run against one another."""
+        key = (lane, other) if lane < other else (other, lane)
+        if key not in self._turned:
+            self._turned[key] = _turned_round(*(self.sections[row].middle for row in key))
+        return self._turned[key]
+
+    def exits(self, lane: int, contact: str) -> bool:
+        """Whether traffic leaves a lane at this end of its line."""
+        line = self.lines[lane]
+        return line.both or line.forward == (contact == END)
+
+    def enters(self, lane: int, contact: str) -> bool:
+        """Whether traffic comes into a lane at this end of its line."""
+        line = self.lines[lane]
+        return line.both or line.forward == (contact == START)
+
+
+def plain_lanes(
+    lines: Sequence[LaneLine], areas: Sequence[Area] = ()
+) -> tuple[list[PlainLane], list[str]]:
+    """Plain lanes, and warnings of what was left out or had to be guessed.
+
+    Raises
+    ------
+    MapError
+        There are too many lanes, neighbours, or ways.
+
+    Notes
+    -----
+    Each way through an area is a lane: the cubic from the end of one lane to the start of the other.
+    """
+    _check_numbers(lines, areas)
+    network = _shaped(lines)
+    _add_ways(network, areas)
+    joints = _joints(network)
+    beside = _beside(network)
+    roads, junctions = _roads(network, beside), _junctions(network)
+    onto = _onto(network, joints)
+    names = _names(network)
+    _close_seams(network, joints)
+    lanes: list[PlainLane] = []
+    for row, line in enumerate(network.lines):
+        sections = network.sections[row]
+        sections = sections if line.forward else sections.turned_round()
+        left, right = beside[row] if line.forward else beside[row][::-1]
+        against = set(_against(network, row, left | right))
+        lanes.append(
+            PlainLane(
+                name=names[row],
+                type=line.type,
+                road=roads[row],
+                junction=junctions[row],
+                section=line.section,
+                number=line.number,
+                left=sections.left,
+                right=sections.right,
+                z=sections.z,
+                onto=tuple(sorted(onto[row])),
+                left_beside=tuple(sorted(left)),
+                right_beside=tuple(sorted(right)),
+                against=tuple(sorted(against)),
+                changes=tuple(_changes(network, row, beside[row], against)),
+            )
+        )
+    return lanes, network.warnings
+
+
+def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
+    related = sum(
+        len(line.before) + len(line.after) + len(line.left_beside) + len(line.right_beside)
+        for line in lines
+    )
+    ways = sum(len(area.ways) for area in areas)
+    for number, limit, what in (
+        (len(lines), MAX_LANES, "lanes"),
+        (related, MAX_RELATED, "neighbours of lanes"),
+        (ways, MAX_WAYS, "ways through intersections"),
+    ):
+        if number > limit:
+            raise MapError(f"{number:,} {what}; a map may have {limit:,}", element="lane")
+
+
+# Surfaces ------------------------------------------------------------------------------------------
+
+
+def _shaped(lines: Sequence[LaneLine]) -> _Network:
+    """The lanes that have a surface, and it."""
+    network = _Network([], [], {})
+    usable: list[LaneLine] = []
+    short: list[str] = []
+    twice: list[str] = []
+    for line in lines:
+        centre = thinned(line.centre)
+        if line.ident in network.index:
+            twice.append(line.ident)
+        elif line.sections is None and (len(centre) < 2 or run_of(centre)[-1] < 1e-3):
+            short.append(line.ident)
+        else:
+            network.index[line.ident] = len(usable)
+            usable.append(replace(line, centre=centre))
+    _tell(network, twice, "there are two of this id; the first one counts")
+    _tell(network, short, "no centre line and no ways through: left out")
+    guessed: list[str] = []
+    for line in usable:
+        sections, told = (line.sections, True) if line.sections else _cut(line, usable, network)
+        network.lines.append(line)
+        network.sections.append(sections)
+        guessed += [line.ident] * (not told)
+    width = f"no boundary beside them: as wide as lanes beside them are apart, else {WIDE} m"
+    _tell(network, guessed, width)
+    return network
+
+
+def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[Sections, bool]:
+    lefts, rights = (
+        [thin for border in side if len(thin := thinned(border.line)) > 1]
+        for side in (line.lefts, line.rights)
+    )
+    half = WIDE / 2
+    if not lefts and not rights:
+        beside = (network.index.get(i) for i in (*line.left_beside, *line.right_beside))
+        others = [lines[row].centre for row in beside if row is not None]
+        half = half_width(line.centre, [other for other in others if len(other) > 1])
+    return cross_sections(line.centre, lefts, rights, half)
+
+
+def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
+    """A warning that names lanes; the first few of many."""
+    if lanes:
+        more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
+        many = "lanes" if len(lanes) > 1 else "lane"
+        network.warnings.append(f"{many} {', '.join(lanes[:LISTED])}{more}: {what}")
+
+
+def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
+    """Lanes for the ways through areas."""
+    missing: list[str] = []
+    for area in areas:
+        number = 0
+        for start, end in dict.fromkeys(area.ways):
+            lanes = network.index.get(start), network.index.get(end)
+            if lanes[0] is None or lanes[1] is None:
+                missing.append(area.ident)
+                continue
+            number += 1
+            _add_way(network, area.ident, number, (lanes[0], lanes[1]))
+    _tell(network, list(dict.fromkeys(missing)), "a way through it leads to a missing lane")
+
+
+def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) -> None:
+    start, end = (network.lines[lane] for lane in lanes)
+    leaves, enters = END if start.forward else START, START if end.forward else END
+    sections = way_between(_gate(network, lanes[0], leaves), _gate(network, lanes[1], enters))
+    ident = f"{area}:{start.ident}-{end.ident}"
+    network.index[ident] = len(network.lines)
+    network.sections.append(sections)
+    network.lines.append(
+        LaneLine(
+            ident,
+            start.type,
+            np.column_stack((sections.middle, sections.z)),
+            before=(Joint(start.ident, leaves),),
+            after=(Joint(end.ident, enters),),
+            name=f"{area}/0/{number}",
+            road=area,
+            number=number,
+            junction=area,
+        )
+    )
+
+
+def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
+    """An end of a lane: place, heading of its traffic, width and height."""
+    sections = network.sections[lane]
+    at, other = (0, 1) if contact == START else (-1, -2)
+    middle = sections.middle
+    way = (middle[other] - middle[at]) * (1 if contact == START else -1)
+    way *= network.direction(lane)
+    width = float(np.hypot(*(sections.left[at] - sections.right[at])))
+    return middle[at], float(np.arctan2(way[1], way[0])), width, float(sections.z[at])
+
+
+# Where traffic flows on ----------------------------------------------------------------------------
+
+
+_Joined = tuple[int, str, int, str]
+"""Ends of lanes that touch: lane, which end, other lane, which end of it."""
+
+
+def _joints(network: _Network) -> set[_Joined]:
+    joints: set[_Joined] = set()
+    far: list[str] = []
+    for row, line in enumerate(network.lines):
+        for own, touched in ((START, line.before), (END, line.after)):
+            for joint in touched:
+                other = network.index.get(joint.lane)
+                if other is None:
+                    continue
+                contact = joint.contact or _contact(network, row, own, other)
+                if network.gap(row, own, other, contact) > GAP:
+                    far.append(f"{line.ident} to {joint.lane}")
+                else:
+                    joints |= {(row, own, other, contact), (other, contact, row, own)}
+    _tell(network, far, f"told to touch, but their ends are more than {GAP} m apart: they do not")
+    return joints
+
+
+def _contact(network: _Network, lane: int, end: str, other: int) -> str:
+    """Which end of the other lane touches an end of a lane: as it says itself, else the nearer one."""
+    line, ident = network.lines[other], network.lines[lane].ident
+    says = {
+        contact
+        for contact, touched in ((START, line.before), (END, line.after))
+        if any(joint.lane == ident for joint in touched)
+    }
+    if len(says) == 1:
+        return says.pop()
+    return min((START, END), key=lambda contact: network.gap(lane, end, other, contact))
+
+
+def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
+    onto: list[set[int]] = [set() for _ in network.lines]
+    for row, end, other, contact in joints:
+        if network.exits(row, end) and network.enters(other, contact):
+            onto[row].add(other)
+    return onto
+
+
+def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
+    """Draw lanes out to the next one where a small gap is left, as in lines of points half a metre apart."""
+    nearest: dict[int, tuple[float, str, int, str]] = {}
+    for row, end, other, contact in sorted(joints):
+        gap = network.gap(row, end, other, contact)
+        if network.exits(row, end) and network.enters(other, contact) and APART < gap <= SEAM:
+            nearest[row] = min(nearest.get(row, (np.inf, "", 0, "")), (gap, end, other, contact))
+    sections = list(network.sections)
+    for row, (_, end, other, contact) in nearest.items():
+        own, onward = sections[row], network.sections[other]
+        own = own if end == END else own.turned_round()
+        onward = onward if contact == START else onward.turned_round()
+        own = own.up_to(onward.left[0], onward.right[0], float(onward.z[0]))
+        network.sections[row] = own if end == END else own.turned_round()
+
+
+# Side by side --------------------------------------------------------------------------------------
+
+_Sides = tuple[set[int], set[int]]
+"""Lanes to the left and to the right of a line."""
+
+
+def _beside(network: _Network) -> list[_Sides]:
+    """What lies beside each line: as it says itself, or as the other says of it."""
+    beside: list[_Sides] = [(set(), set()) for _ in network.lines]
+    for row, line in enumerate(network.lines):
+        for side, idents in enumerate((line.left_beside, line.right_beside)):
+            for ident in idents:
+                other = network.index.get(ident)
+                if other is None or other == row:
+                    continue
+                beside[row][side].add(other)
+                back = side if network.runs_against(row, other) else 1 - side
+                beside[other][back].add(row)
+    across = [
+        tuple(_across(network, beside, row, side) for side in (0, 1))
+        for row in range(len(network.lines))
+    ]
+    for sides, more in zip(beside, across, strict=True):
+        for side in (0, 1):
+            sides[side].update(more[side])
+    return beside
+
+
+def _turned_round(one: Floats, other: Floats) -> bool:
+    """Whether two lines side by side run against one another."""
+    way, back = one[-1] - one[0], other[-1] - other[0]
+    same = float(way @ back)
+    if abs(same) < 0.5 * float(np.hypot(*way) * np.hypot(*back)):
+        # Both bend: what counts is where they lie next to one another.
+        near = along_line(one, other[[0, -1]])
+        return bool(near[1] < near[0])
+    return same < 0
+
+
+def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
+    """Lanes of traffic that only lanes without traffic part from a lane of traffic."""
+    if network.lines[row].type not in TRAFFIC:
+        return set()
+    found: set[int] = set()
+    seen, front = {row}, [(row, side)]
+    for _ in range(_MOST_ACROSS):
+        onward: list[tuple[int, int]] = []
+        for lane, towards in front:
+            for other in sorted(beside[lane][towards] - seen):
+                seen.add(other)
+                if network.lines[other].type in TRAFFIC:
+                    found.add(other)
+                else:
+                    turned = network.runs_against(lane, other)
+                    onward.append((other, 1 - towards if turned else towards))
+        front = onward
+    return found
+
+
+def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int]:
+    """Lanes of traffic beside a lane of traffic whose traffic comes the other way."""
+    if network.lines[row].type not in TRAFFIC:
+        return
+    for other in others:
+        if network.lines[other].type in TRAFFIC:
+            turned = network.runs_against(row, other)
+            same = (network.lines[row].forward == network.lines[other].forward) != turned
+            if not same or network.lines[row].both or network.lines[other].both:
+                yield other
+
+
+def _changes(
+    network: _Network, row: int, beside: _Sides, against: set[int]
+) -> Iterator[tuple[int, float, float]]:
+    """Where traffic may change from a lane to those beside it, along its own direction of travel."""
+    line, middle = network.lines[row], network.sections[row].middle
+    if line.type not in DRIVING:
+        return
+    length = float(run_of(middle)[-1])
+    for side, others in enumerate(beside):
+        reached = [
+            other
+            for other in sorted(others)
+            if network.lines[other].type in DRIVING
+            and (other not in against or line.both or network.lines[other].both)
+        ]
+        stretches = _open_stretches(network, row, side) if reached else []
+        for other in reached if stretches else []:
+            reach = along_line(middle, network.sections[other].middle)
+            for start, end in stretches:
+                low, high = max(start, float(reach.min())), min(end, float(reach.max()))
+                if high > low:
+                    yield (
+                        (other, low, high) if line.forward else (other, length - high, length - low)
+                    )
+
+
+def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
+    """Where along its line the borders on one side of a lane may be crossed; the nearest border counts."""
+    line, middle = network.lines[row], network.sections[row].middle
+    borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
+    spans: list[tuple[float, float, float, bool]] = []
+    for border in borders:
+        along = along_line(middle, border.line[:, :2])
+        start, end = float(along.min()), float(along.max())
+        half = (start + end) / 2
+        inner = np.column_stack([np.interp([half], run_of(middle), c) for c in middle.T])
+        nearest = border.line[np.argmin(np.hypot(*(border.line[:, :2] - inner).T)), :2]
+        allowed = bool(border.to_left if side == 0 else border.to_right)
+        spans.append((start, end, float(np.hypot(*(nearest - inner[0]))), allowed))
+    cuts = sorted({place for span in spans for place in span[:2]})
+    found: list[tuple[float, float]] = []
+    for start, end in pairwise(cuts):
+        over = [span for span in spans if span[0] <= start and span[1] >= end]
+        if over and min(over, key=lambda span: span[2])[3]:
+            follows = bool(found) and found[-1][1] == start
+            found.append((found.pop()[0] if follows else start, end))
+    return found
+
+
+# Roads and junctions -------------------------------------------------------------------------------
+
+
+def _names(network: _Network) -> list[str]:
+    """Names of lanes, each once: what two lanes would be called alike has its id added."""
+    wanted = [line.name or line.ident for line in network.lines]
+    count: dict[str, int] = defaultdict(int)
+    for name in wanted:
+        count[name] += 1
+    return [
+        name if count[name] == 1 else f"{name}#{line.ident}"
+        for name, line in zip(wanted, network.lines, strict=True)
+    ]
+
+
+def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
+    """Roads of lanes; those that have none belong with the lanes beside them."""
+    road = [line.road for line in network.lines]
+    for row, line in enumerate(network.lines):
+        if road[row]:
+            continue
+        road[row] = line.ident
+        front = [row] if line.junction == "" else []
+        while front:
+            for other in set().union(*beside[front.pop()]):
+                if not road[other] and network.lines[other].junction == "":
+                    road[other] = line.ident
+                    front.append(other)
+    return road
+
+
+def _junctions(network: _Network) -> list[str]:
+    """Junctions of lanes; those without a name are lanes that cross or touch, named after the first."""
+    junction = [line.junction or "" for line in network.lines]
+    rows = [row for row, line in enumerate(network.lines) if line.junction is None]
+    if not rows:
+        return junction
+    centres: Any = [shapely.LineString(network.sections[row].middle) for row in rows]
+    union: Any = shapely.union_all(shapely.buffer(centres, _ABOUT / 2, quad_segs=1))
+    parts: Any = shapely.get_parts(union)
+    tree = shapely.STRtree(parts)
+    starts: Any = [shapely.Point(network.sections[row].middle[0]) for row in rows]
+    inside = dict(zip(*tree.query(starts, predicate="intersects").tolist(), strict=True))
+    name: dict[int, str] = {}
+    for number, row in enumerate(rows):
+        part = inside[number]
+        junction[row] = name.setdefault(part, network.lines[row].ident)
+    return junction

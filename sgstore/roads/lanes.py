@@ -1,0 +1,260 @@
+"""Plain lanes → RoadMap: what a map needs to say at least, whatever it was read from.
+
+A plain lane is its cross sections in the direction of travel and the lanes that it is related to. All else
+that a :class:`~sgstore.roads.RoadMap` holds follows: roads, junctions, turns, conflicts, lengths and widths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.roads import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap
+from sgstore.roads.conflicts import conflicts
+from sgstore.roads.lanetypes import DRIVING, turn_words
+from sgstore.roads.ribbons import Ribbons, mean_widths, turned, wrapped
+from sgstore.vocabulary import RELATION_CODE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from sgstore.world import Bools, Floats, Ints
+
+_FIRST_LANE: Final = 1
+"""Row of the first lane among the nodes: ``off_road`` comes before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlainLane:
+    """A lane. Other lanes are named by their number in the list that this one stands in.
+
+    Attributes
+    ----------
+    name, type, road, junction : str
+        As :class:`~sgstore.roads.MapNodes` has them.
+    section, number : int
+        Section and lane number in the road; 0 where there is none.
+    left, right : (n, 2) float64
+        Ends of the cross sections, in the direction of travel; m. Two at least.
+    z : (n,) float64
+        Heights of the cross sections; m.
+    onto : tuple of int
+        Lanes that traffic flows on to.
+    left_beside, right_beside : tuple of int
+        Lanes that lie beside it, as its own traffic sees them.
+    against : tuple of int
+        Those of them whose traffic comes the other way.
+    changes : tuple of (int, float, float)
+        Lanes that traffic may change to, from where to where along this one; m.
+    speed_limit : float
+        m/s; NaN where there is none.
+    """
+
+    name: str
+    type: str
+    road: str
+    junction: str
+    section: int
+    number: int
+    left: Floats
+    right: Floats
+    z: Floats
+    onto: tuple[int, ...] = ()
+    left_beside: tuple[int, ...] = ()
+    right_beside: tuple[int, ...] = ()
+    against: tuple[int, ...] = ()
+    changes: tuple[tuple[int, float, float], ...] = ()
+    speed_limit: float = np.nan
+
+
+def road_map_of(
+    lanes: Sequence[PlainLane], *, name: str, text: str, warnings: Iterable[str] = ()
+) -> RoadMap:
+    """The road map that plain lanes make; ``text`` is what they were read from.
+
+    Raises
+    ------
+    MapError
+        A junction has more lanes than can be looked at in pairs.
+    """
+    ribbons = ribbons_of(lanes)
+    surfaces = _lane_nodes(lanes, ribbons)
+    roads, junctions = _roads(lanes, ribbons), _junctions(lanes)
+    nodes = MapNodes.joined([MapNodes.of("off_road", ["off_road"]), surfaces, roads, junctions])
+    return RoadMap(
+        name=name,
+        text=text,
+        nodes=nodes,
+        edges=_edges(lanes, ribbons, roads, junctions),
+        ribbons=ribbons,
+        shapes=np.full(len(nodes), None, object),
+        lane_changes=_lane_changes(lanes),
+        warnings=warnings,
+    )
+
+
+def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
+    """The surface of plain lanes."""
+    counts = np.array([len(lane.z) for lane in lanes], np.int64)
+    offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+    left = np.concatenate([np.zeros((0, 2)), *(lane.left for lane in lanes)])
+    right = np.concatenate([np.zeros((0, 2)), *(lane.right for lane in lanes)])
+    x, y = ((left + right) / 2).T
+    first = np.zeros(len(x), np.bool_)
+    first[offsets[:-1]] = True
+    step = np.hypot(np.diff(x, prepend=0.0), np.diff(y, prepend=0.0))
+    step[first] = 0.0
+    run = np.cumsum(step)
+    along = run - np.repeat(run[offsets[:-1]], counts)
+    return Ribbons(
+        offsets=offsets,
+        left_x=left[:, 0],
+        left_y=left[:, 1],
+        right_x=right[:, 0],
+        right_y=right[:, 1],
+        z=np.concatenate([np.zeros(0), *(lane.z for lane in lanes)]),
+        heading=headings(x, y, first),
+        s=along,
+        along=along,
+    )
+
+
+def headings(x: Floats, y: Floats, first: Bools) -> Floats:
+    """Headings of polylines at their points: (N,), not wrapped; ``first`` marks where each line begins.
+
+    Within a line it is the mean of the two pieces' directions, weighted by their lengths, so that the cubic
+    through points and headings strays from neither far; at an end it is what the nearest piece would
+    have if it were part of a circle.
+    """
+    if not len(x):
+        return np.zeros(0)
+    inner = ~first[1:]
+    length = np.where(inner, np.hypot(np.diff(x), np.diff(y)), 0.0)
+    direction = np.arctan2(np.diff(y), np.diff(x))
+    before, after = np.append(0.0, length), np.append(length, 0.0)
+    into, out = np.append(0.0, direction), np.append(direction, 0.0)
+    turn = wrapped(out - into)
+    total = before + after
+    both = (before > 0) & (after > 0)
+    share = after / np.where(total > 0, total, 1.0)
+    heading = np.where(both, into + turn * share, np.where(after > 0, out, into))
+    # A line's ends: as far beyond the piece's direction as its other end is before it.
+    starts, ends = np.flatnonzero(~both & (after > 0)), np.flatnonzero(~both & (before > 0))
+    for rows, others, pieces in ((starts, starts + 1, out), (ends, ends - 1, into)):
+        bend = wrapped(heading[others] - pieces[rows])
+        curved = both[others] & (np.abs(bend) < np.pi / 4)
+        heading[rows] = pieces[rows] - np.where(curved, bend, 0.0)
+    return heading
+
+
+def _lane_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+    every, length = np.arange(len(ribbons)), ribbons.lengths
+    middle = ribbons.at(every, length / 2)
+    turns = turn_words(turned(ribbons))
+    return MapNodes.of(
+        "lane",
+        [lane.name for lane in lanes],
+        x=middle.x,
+        y=middle.y,
+        z=middle.z,
+        heading=middle.heading,
+        lane_type=tuple(lane.type for lane in lanes),
+        road=tuple(lane.road for lane in lanes),
+        junction=tuple(lane.junction for lane in lanes),
+        turn=tuple(word if lane.junction else "" for word, lane in zip(turns, lanes, strict=True)),
+        section=np.array([lane.section for lane in lanes], np.int64),
+        lane=np.array([lane.number for lane in lanes], np.int64),
+        length=length,
+        width=mean_widths(ribbons),
+        speed_limit=np.array([lane.speed_limit for lane in lanes], np.float64),
+    )
+
+
+def _roads(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+    """Roads in the order of their first lanes; a road is as long as the longest lanes of its sections."""
+    junction: dict[str, str] = {}
+    longest: dict[str, dict[int, float]] = {}
+    for lane, length in zip(lanes, ribbons.lengths.tolist(), strict=True):
+        junction.setdefault(lane.road, lane.junction)
+        sections = longest.setdefault(lane.road, {})
+        sections[lane.section] = max(sections.get(lane.section, 0.0), length)
+    names = tuple(junction)
+    return MapNodes.of(
+        "road",
+        names,
+        length=np.array([sum(longest[name].values()) for name in names], np.float64),
+        road=names,
+        junction=tuple(junction.values()),
+    )
+
+
+def _junctions(lanes: Sequence[PlainLane]) -> MapNodes:
+    names = tuple(dict.fromkeys(lane.junction for lane in lanes if lane.junction))
+    return MapNodes.of("junction", names, junction=names)
+
+
+def _edges(
+    lanes: Sequence[PlainLane], ribbons: Ribbons, roads: MapNodes, junctions: MapNodes
+) -> MapEdges:
+    first_road = _FIRST_LANE + len(lanes)
+    first_junction = first_road + len(roads)
+    road = {name: first_road + row for row, name in enumerate(roads.name)}
+    junction = {name: first_junction + row for row, name in enumerate(junctions.name)}
+    within = [(_FIRST_LANE + row, road[lane.road]) for row, lane in enumerate(lanes)]
+    within += [(road[r], junction[j]) for r, j in zip(roads.name, roads.junction, strict=True) if j]
+    flow = _spread([lane.onto for lane in lanes])
+    crossing = [row for row, lane in enumerate(lanes) if lane.junction and lane.type in DRIVING]
+    one, other = conflicts(
+        ribbons,
+        np.array(crossing, np.int64),
+        [lane.junction for lane in lanes],
+        (flow[:, 0], flow[:, 1]),
+        STOREY,
+    )
+    against = _spread([lane.against for lane in lanes])
+    change = np.array(
+        [(row, to) for row, lane in enumerate(lanes) for to, _, _ in lane.changes], np.int64
+    ).reshape(-1, 2)
+    among_lanes = {
+        "travelsTo": flow,
+        "laneChange": change,
+        "toLeftOf": _spread([lane.left_beside for lane in lanes])[:, ::-1],
+        "toRightOf": _spread([lane.right_beside for lane in lanes])[:, ::-1],
+        "opposes": np.concatenate((against, against[:, ::-1])),
+        "conflictsWith": np.column_stack((np.append(one, other), np.append(other, one))),
+    }
+    parts = {"isIn": np.array(within, np.int64).reshape(-1, 2)}
+    parts |= {relation: _FIRST_LANE + pairs for relation, pairs in among_lanes.items()}
+    return edges_of([(relation, pairs[:, 0], pairs[:, 1]) for relation, pairs in parts.items()])
+
+
+Edge = tuple[str, "Ints", "Ints"]
+"""A relation, and the rows of its sources and destinations among the nodes."""
+
+
+def edges_of(parts: Sequence[Edge]) -> MapEdges:
+    """Edges among rows of nodes as edges among node ids, each once, ordered."""
+    code = np.concatenate([np.full(len(src), RELATION_CODE[name]) for name, src, _ in parts])
+    src = np.concatenate([s for _, s, _ in parts])
+    dst = np.concatenate([d for _, _, d in parts])
+    table = np.unique(np.column_stack((code, src, dst)), axis=0).reshape(-1, 3)
+    return MapEdges(table[:, 0].astype(np.int8), -1 - table[:, 1], -1 - table[:, 2])
+
+
+def _spread(groups: Sequence[tuple[int, ...]]) -> Ints:
+    """(n, 2): each row's number with each of its group."""
+    row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    return np.column_stack((row, np.array([*chain(*groups)], np.int64)))
+
+
+def _lane_changes(lanes: Sequence[PlainLane]) -> LaneChanges:
+    rows = [(row, *change) for row, lane in enumerate(lanes) for change in lane.changes]
+    if not rows:
+        return LaneChanges.none()
+    lane, to, start, end = zip(*sorted(rows), strict=True)
+    return LaneChanges(
+        np.array(lane, np.int64), np.array(to, np.int64), np.array(start), np.array(end)
+    )

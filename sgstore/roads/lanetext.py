@@ -1,0 +1,214 @@
+"""Plain lanes as text, and back: what a store keeps of a map that is no OpenDRIVE.
+
+The text is JSON, one lane a line, so that people can read it and tools can compare it::
+
+    {"format": "sgstore lanes", "version": 1, "warnings": [], "lanes": [
+    {"name": "1/0/-1", "type": "driving", …, "left": [x, y, x, y, …], "right": […], "z": […], "onto": [1]},
+    …
+    ]}
+
+Lengths are rounded to a tenth of a millimetre when the text is written, and the map is always made from the
+text: what is read back is what was there before. Texts come from files, so nothing in them is trusted.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import MapError
+from sgstore.roads.lanes import PlainLane, road_map_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from sgstore.roads import RoadMap
+    from sgstore.world import Floats
+
+FORMAT: Final = "sgstore lanes"
+VERSION: Final = 1
+
+MAX_CHARACTERS: Final = 128 << 20
+MAX_LANES: Final = 100_000
+MAX_SECTIONS: Final = 4_000_000
+"""Greatest number of cross sections of all lanes."""
+MAX_COORDINATE: Final = 1e8
+"""Greatest distance from the origin; m."""
+MAX_NAME: Final = 200
+MAX_RELATED: Final = 1_000
+"""Greatest number of lanes that a lane can be related to in one way."""
+DIGITS: Final = 4
+"""Digits that are kept of a length in metres."""
+
+_NAMES: Final = ("name", "type", "road", "junction")
+_RELATED: Final = ("onto", "left_beside", "right_beside", "against")
+
+
+def is_lane_text(text: str) -> bool:
+    """Whether a text can be one of these, and no OpenDRIVE: it begins as a JSON object does."""
+    return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
+
+
+def lane_text(lanes: Sequence[PlainLane], warnings: Iterable[str] = ()) -> str:
+    """The text of plain lanes; ``warnings`` are kept in it."""
+    head = {"format": FORMAT, "version": VERSION, "warnings": list(warnings)}
+    rows = ",\n".join(_dumps(_fields(lane)) for lane in lanes)
+    return f'{_dumps(head)[:-1]}, "lanes": [\n{rows}\n]}}\n'
+
+
+def read_lane_text(text: str, name: str) -> RoadMap:
+    """The road map that a text of plain lanes describes.
+
+    Raises
+    ------
+    MapError
+        It is no such text, is of another version, or something in it is not what it must be.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise MapError(f"{len(text):,} characters; a text of lanes may have {MAX_CHARACTERS:,}")
+    try:
+        document = json.loads(text.lstrip("\ufeff"), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise MapError(f"neither OpenDRIVE nor a text of lanes: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise MapError(f"neither OpenDRIVE nor a text of lanes: no format {FORMAT!r}")
+    if document.get("version") != VERSION:
+        raise MapError(
+            f"a text of lanes of version {document.get('version')!r}; expected {VERSION}"
+        )
+    rows, warnings = document.get("lanes"), document.get("warnings", [])
+    if not isinstance(rows, list) or not rows or len(rows) > MAX_LANES:
+        raise MapError(f"expected a list of 1 to {MAX_LANES:,} lanes", element="lanes")
+    if not isinstance(warnings, list) or not all(isinstance(w, str) for w in warnings):
+        raise MapError("expected a list of texts", element="warnings")
+    lanes = [_lane(row, number, len(rows)) for number, row in enumerate(rows)]
+    if sum(len(lane.z) for lane in lanes) > MAX_SECTIONS:
+        raise MapError(f"more than {MAX_SECTIONS:,} cross sections", element="lanes")
+    return road_map_of(lanes, name=name, text=text, warnings=warnings)
+
+
+def _dumps(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is no number")
+
+
+def _fields(lane: PlainLane) -> dict[str, Any]:
+    """A lane as JSON has it; what is missing or empty is left out."""
+    fields: dict[str, Any] = {key: getattr(lane, key) for key in _NAMES}
+    fields |= {"section": lane.section, "number": lane.number}
+    fields |= {
+        key: np.round(getattr(lane, key), DIGITS).ravel().tolist() for key in ("left", "right", "z")
+    }
+    fields |= {key: list(getattr(lane, key)) for key in _RELATED}
+    fields["changes"] = [
+        [to, round(start, DIGITS), round(end, DIGITS)] for to, start, end in lane.changes
+    ]
+    if math.isfinite(lane.speed_limit):
+        fields["speed_limit"] = lane.speed_limit
+    return {key: value for key, value in fields.items() if value not in ("", [])}
+
+
+def _lane(row: Any, number: int, lanes: int) -> PlainLane:
+    if not isinstance(row, dict):
+        raise MapError(f"lane {number} is no object", element="lanes")
+    fields: dict[str, Any] = row
+    return _Row(fields, number, lanes).lane()
+
+
+class _Row:
+    """A lane of a text; whatever is asked of it is what it must be, or a :class:`MapError` says what is not."""
+
+    def __init__(self, fields: dict[str, Any], number: int, lanes: int) -> None:
+        self._fields = fields
+        self._number = number
+        self._lanes = lanes
+
+    def lane(self) -> PlainLane:
+        left, right = (self._floats(key).reshape(-1, 2) for key in ("left", "right"))
+        z = self._floats("z")
+        if not len(left) == len(right) == len(z) >= 2:
+            raise self._wrong("z", "as many cross sections on both sides, two at least")
+        return PlainLane(
+            name=self._text("name"),
+            type=self._text("type"),
+            road=self._text("road"),
+            junction=self._text("junction"),
+            section=self._whole("section"),
+            number=self._whole("number"),
+            left=left,
+            right=right,
+            z=z,
+            onto=self._related("onto"),
+            left_beside=self._related("left_beside"),
+            right_beside=self._related("right_beside"),
+            against=self._related("against"),
+            changes=self._changes(),
+            speed_limit=self._speed(),
+        )
+
+    def _wrong(self, key: str, expected: str) -> MapError:
+        return MapError(f"lane {self._number}: expected {expected}", element=f"lanes/{key}")
+
+    def _text(self, key: str) -> str:
+        value = self._fields.get(key, "")
+        if not isinstance(value, str) or len(value) > MAX_NAME:
+            raise self._wrong(key, f"a text of at most {MAX_NAME} characters")
+        return value
+
+    def _whole(self, key: str) -> int:
+        value = self._fields.get(key, 0)
+        if type(value) is not int or abs(value) > 1 << 31:
+            raise self._wrong(key, "a whole number")
+        return value
+
+    def _floats(self, key: str) -> Floats:
+        values = self._fields.get(key)
+        expected = "numbers, an even number of them" if key != "z" else "numbers"
+        if not isinstance(values, list) or (key != "z" and len(values) % 2):
+            raise self._wrong(key, expected)
+        if not set(map(type, values)) <= {int, float}:
+            raise self._wrong(key, expected)
+        try:
+            array = np.array(values, np.float64)
+        except OverflowError as error:
+            raise self._wrong(key, expected) from error
+        if not (np.abs(array) < MAX_COORDINATE).all():
+            raise self._wrong(key, f"no place farther than {MAX_COORDINATE:.0e} m from the origin")
+        return array
+
+    def _related(self, key: str) -> tuple[int, ...]:
+        values = self._fields.get(key, [])
+        if not isinstance(values, list) or len(values) > MAX_RELATED:
+            raise self._wrong(key, f"at most {MAX_RELATED} numbers of lanes")
+        if not all(type(v) is int and 0 <= v < self._lanes for v in values):
+            raise self._wrong(key, f"numbers of lanes, 0 to {self._lanes - 1}")
+        return tuple(values)
+
+    def _changes(self) -> tuple[tuple[int, float, float], ...]:
+        values = self._fields.get("changes", [])
+        expected = f"at most {MAX_RELATED} stretches [lane, start, end]"
+        if not isinstance(values, list) or len(values) > MAX_RELATED:
+            raise self._wrong("changes", expected)
+        changes: list[tuple[int, float, float]] = []
+        for value in values:
+            if not isinstance(value, list) or list(map(type, value))[:1] != [int]:
+                raise self._wrong("changes", expected)
+            if len(value) != 3 or not {*map(type, value)} <= {int, float}:
+                raise self._wrong("changes", expected)
+            to, start, end = value
+            if not (0 <= to < self._lanes and 0 <= start <= end < MAX_COORDINATE):
+                raise self._wrong("changes", expected)
+            changes.append((to, float(start), float(end)))
+        return tuple(changes)
+
+    def _speed(self) -> float:
+        value = self._fields.get("speed_limit", math.nan)
+        if type(value) not in {int, float} or value <= 0 or value > 1000:
+            raise self._wrong("speed_limit", "a speed in m/s")
+        return float(value)
