@@ -138,7 +138,7 @@ class SceneGraphGenerator:
         return _World(
             keys=keys,
             bodies=bodies,
-            near=near_pairs(bodies, self._config.pairs.within),
+            near=near_pairs(bodies, self._config),
             contacts=contacts(bodies),
             standing=None if self._survey is None else self._survey.standing(bodies),
         )
@@ -149,7 +149,7 @@ class SceneGraphGenerator:
         ground = None
         if self._survey is not None and standing is not None:
             ground = self._survey.ground(bodies, standing, view.areas, self._keeping.parts)
-        pairs = related_pairs(bodies, view.ego, part.near, self._config.pairs)
+        pairs = related_pairs(bodies, view.ego, part.near, self._config)
         scene = Scene(self._config, bodies, view.ego, pairs, part.contacts, ground)
         return GraphBlock(
             frames=view.frames,

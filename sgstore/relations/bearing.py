@@ -4,10 +4,11 @@ An edge goes from what is seen to who sees: *b is in direct front of a* is b →
 centre in a's axes. Where a's heading is missing there is no edge.
 
 Bounds and noise. A bound belongs to the sector nearer to dead ahead (45° is still direct front), and dead
-ahead and dead behind are neither left nor right. Poses come through quaternions, degrees and the rotation of
-axes, and are kept as float32, so what is exactly on a bound in the world arrives up to some 1e-7 rad and a
-tenth of a millimetre beside it. Otherwise what is dead ahead would flicker between left and right: a bearing
-within :data:`NOISE` of a bound counts as on it, and what is less than :data:`BESIDE` off the axis as on it.
+ahead and dead behind are neither left nor right, unless the settings say otherwise. Poses come through
+quaternions, degrees and the rotation of axes, and are kept as float32, so what is exactly on a bound in the
+world arrives up to some 1e-7 rad and a tenth of a millimetre beside it. Otherwise what is dead ahead would
+flicker between left and right: a bearing within :data:`NOISE` of a bound counts as on it, and what is less than
+:data:`BESIDE` off the axis as on it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from sgstore.vocabulary import RELATION_CODE
 if TYPE_CHECKING:
     from sgstore.config import Config
     from sgstore.graph import Edges
+    from sgstore.world import Bools, Floats
 
 NOISE: Final = 1e-6
 """Differences of bearing that mean nothing: a millimetre at a kilometre; rad."""
@@ -41,22 +43,45 @@ def _direction_edges(scene: Scene) -> Edges:
     settings, pairs = scene.config.direction, scene.pairs
     seen = np.flatnonzero(~np.isnan(pairs.bearing) & bool(settings.names))
     bounds = np.radians(settings.upper) + NOISE
-    sector = np.searchsorted(bounds, np.abs(pairs.bearing[seen]))
+    bearing = pairs.bearing[seen]
+    sector = np.searchsorted(bounds, np.abs(bearing))
+    tie = np.abs(bearing) >= np.append(bounds, np.inf)[sector] - 2 * NOISE
+    if settings.ties == "carlasgg":
+        sector += tie & _behind(bearing)
+    elif settings.ties == "both":
+        seen = np.concatenate([seen, seen[tie]])
+        sector = np.concatenate([sector, sector[tie] + 1])
     codes = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
     return edges_between(scene, codes[sector], pairs.b[seen], pairs.a[seen])
 
 
+def _behind(bearing: Floats) -> Bools:
+    """Whether CARLASGG takes what is at a bound for the sector behind it: from abeam to the right backwards.
+
+    It looks through its sectors in the order direct front, side front, direct rear, side rear, all of which
+    hold both their bounds. Abeam to the left is 180° in its count; abeam to the right is 360°, not 0°.
+    """
+    aside = np.abs(bearing) - np.pi / 2
+    return (aside > NOISE) | ((aside >= -NOISE) & (bearing < 0))
+
+
 def _side_names(config: Config) -> tuple[str, ...]:
-    return if_related(config, SIDES)
+    return if_related(config, SIDES if config.direction.sides != "none" else ())
 
 
 def _side_edges(scene: Scene) -> Edges:
+    if scene.config.direction.sides == "none":
+        none = np.zeros(0, np.intp)
+        return edges_between(scene, SIDES[0], none, none)
     bodies, pairs = scene.bodies, scene.pairs
     dx, dy = bodies.x[pairs.b] - bodies.x[pairs.a], bodies.y[pairs.b] - bodies.y[pairs.a]
     off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(pairs.bearing))
-    aside = np.flatnonzero(off_axis > BESIDE)
+    apart = off_axis > BESIDE
+    closed = scene.config.direction.sides == "closed"
+    aside = np.flatnonzero(~np.isnan(pairs.bearing) & (apart | closed))
     left, right = (RELATION_CODE[name] for name in SIDES)
-    codes = np.where(pairs.bearing[aside] > 0, left, right).astype(np.int8)
+    to_left = (pairs.bearing > 0) | ~apart
+    codes = np.where(to_left[aside], left, right).astype(np.int8)
     return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])
 
 
