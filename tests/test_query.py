@@ -468,3 +468,12 @@ def test_bindings_of_a_frame_are_those_of_its_rows(store: Store) -> None:
     wanted = [{"t": row[5], "v": row[7]} for row in rows if row[0] == frame.frame_id]
     assert matches.bindings(frame) == wanted
     assert wanted
+
+
+def test_arrays_hold_enumerations_as_texts(store: Store, world: World) -> None:
+    arrays = store.find("MATCH (e:Ego)-[r]->(x) RETURN x.kind AS kind, type(r), x.speed").numpy()
+
+    assert set(arrays["kind"]) == {
+        row[0] for row in store.find("MATCH (e:Ego)-->(x) RETURN x.kind")
+    }
+    assert {type(kind) for kind in arrays["kind"]} == {str}

@@ -89,7 +89,13 @@ def run(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None 
 def arrays(
     connection: DuckDBPyConnection, sql: str, parameters: Parameters | None
 ) -> dict[str, NDArray[np.generic]]:
-    """All columns of a statement of ours; masked arrays where something is NULL."""
+    """All columns of a statement of ours; masked arrays where something is NULL, enumerations as texts."""
+    described = connection.execute(f"DESCRIBE {sql}", parameters or None).fetchall()
+    # As enumerations they would come as categories of pandas.
+    listed = [str(row[0]).replace('"', '""') for row in described if "ENUM" in str(row[1])]
+    if listed:
+        texts = ", ".join(f'"{name}"::VARCHAR AS "{name}"' for name in listed)
+        sql = f"SELECT * REPLACE ({texts}) FROM ({sql})"
     return connection.execute(sql, parameters or None).fetchnumpy()
 
 
