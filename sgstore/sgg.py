@@ -15,11 +15,13 @@ answer at all is said by :attr:`SceneGraphGenerator.answers`.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
+from sgstore.online import Online
 from sgstore.relations import RELATIONS
 from sgstore.relations.contact import contacts
 from sgstore.relations.extent import Extent, Places
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Config
+    from sgstore.graph import SceneGraph
+    from sgstore.online import Frame
     from sgstore.relations.extent import Areas
     from sgstore.relations.scene import Ground, Standing
     from sgstore.roads import RoadMap
@@ -69,6 +73,8 @@ class SceneGraphGenerator:
 
     def __init__(self, road_map: RoadMap | None, config: Config) -> None:
         self._config = config
+        self._road_map = road_map
+        self._online: Online | None = None
         self._survey = None if road_map is None else Survey(road_map)
         self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
         self._extent = Extent(config.range, road_map)
@@ -157,6 +163,35 @@ class SceneGraphGenerator:
             edges=self._keeping.edges(_chained([f.edges(scene) for f in self._families])),
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
         )
+
+    def step(self, frame: Frame) -> SceneGraph:
+        """The scene graph of the next frame, for a client that owns the loop; the same as of a recording.
+
+        Parameters
+        ----------
+        frame : Frame
+            See :class:`sgstore.online.Frame`. Its ego, else that of the config, is the ego.
+
+        Returns
+        -------
+        SceneGraph
+            As a store gives it, and ``ident``, the client's own id, for each entity. ``trace`` is ``online``,
+            ``frame_id`` is ``seq``: the number of the step.
+
+        Raises
+        ------
+        ValueError
+            Two entities of the frame share an id, or one has become of another kind; the frame is as if it
+            had not been given.
+
+        Notes
+        -----
+        Memory does not grow with time: see :mod:`sgstore.online`. Steps and blocks do not know of one another.
+        """
+        if self._online is None:
+            fresh = partial(SceneGraphGenerator, self._road_map, self._config)
+            self._online = Online(fresh, self._road_map, self._config.ego)
+        return self._online.step(frame)
 
     def _learn(self, frames: FrameBlock) -> None:
         entities, nodes = frames.entities, frames.states.node

@@ -1,0 +1,180 @@
+"""Frame after frame to scene graph after scene graph, in bounded memory.
+
+Node ids are given in the order of appearance and never to two entities. The tables of a generator grow with
+every entity that it meets, so it is made anew when most of those it knows are gone; what it keeps between
+blocks saves work and changes no graph, so nobody can tell. What has been absent while :data:`REMEMBERED`
+others came is forgotten, and would come back as somebody new.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from sgstore.online.frame import NUMBERS, WHOLE
+from sgstore.online.records import Known, Records
+from sgstore.vocabulary import KINDS
+from sgstore.world import Entities, FrameBlock, MessageRefs, States
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sgstore.graph import GraphBlock, SceneGraph
+    from sgstore.online.frame import Entity, Frame
+    from sgstore.roads import RoadMap
+    from sgstore.world import Ints
+
+REMEMBERED: Final = 20_000
+"""Entities that are absent and still known by their ids; some 5 MB."""
+
+SPARE: Final = 2048
+"""Entities that may be gone before a generator is made anew."""
+
+
+class Generator(Protocol):
+    """What makes graphs of blocks: :class:`sgstore.sgg.SceneGraphGenerator`."""
+
+    def block(self, frames: FrameBlock) -> GraphBlock:
+        """The graphs of the next frames."""
+        ...
+
+
+class Online:
+    """Frame after frame to scene graph after scene graph.
+
+    Parameters
+    ----------
+    make : callable
+        Makes a generator that has seen nothing yet.
+    road_map : RoadMap or None
+        The map that its graphs lie on.
+    ego : str
+        The ego of frames that name none.
+    """
+
+    def __init__(
+        self, make: Callable[[], Generator], road_map: RoadMap | None, ego: str = ""
+    ) -> None:
+        self._make = make
+        self._generator = make()
+        self._ego = ego
+        self._records = Records(road_map)
+        self._seq = 0
+        self._next = 0
+        self._moving: OrderedDict[str, Known] = OrderedDict()  # whom the last frame had, at the end
+        self._standing: dict[str, tuple[Entity, Known]] = {}
+        # The generator's own node ids, which begin anew with it, and what they are outside.
+        self._inner: dict[str, int] = {}
+        self._introduced = 0
+        self._outer: Ints = np.zeros(64, np.int64)
+
+    def step(self, frame: Frame) -> SceneGraph:
+        """The scene graph of the next frame; see :meth:`sgstore.sgg.SceneGraphGenerator.step`."""
+        moving, new = self._met(frame)
+        if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
+            self._generator, self._inner, self._introduced = self._make(), {}, 0
+            new = [entity for entity, _ in self._standing.values()]
+        block = self._block(frame, moving, new)
+        for row, entity in enumerate(new):
+            self._records.stand(self._standing[entity.ident][1], block.scenery, row)
+        graph = self._generator.block(block)
+        self._seq += 1
+        while len(self._moving) > len(moving) + REMEMBERED:
+            ident, _ = self._moving.popitem(last=False)
+            self._inner.pop(ident, None)
+        known = (self._moving[e.ident] for e in moving)
+        return self._records.graph(graph, self._outer, {k.node: k for k in known})
+
+    def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
+        """What moves in a frame, and what stands in it that was not known.
+
+        Everything is checked before anything is remembered: a frame that is refused has not been.
+        """
+        moving: dict[str, Entity] = {}
+        new: dict[str, Entity] = {}
+        for entity in frame.entities:
+            ident = entity.ident
+            stands = ident in self._standing or ident in new
+            known = self._moving.get(ident)
+            if ident in moving or (stands and not entity.static):
+                raise ValueError(f"two entities have the id {ident!r}")
+            if entity.static and known is not None:
+                raise ValueError(f"entity {ident!r} moved before and is static now")
+            if known is not None and known.kind != KINDS[entity.kind]:
+                now = KINDS[entity.kind]
+                raise ValueError(f"entity {ident!r} was of kind {known.kind!r} and is {now!r} now")
+            if not entity.static:
+                moving[ident] = entity
+            elif not stands:
+                new[ident] = entity
+        for entity in frame.entities:
+            self._remember(entity, new)
+        return list(moving.values()), list(new.values())
+
+    def _remember(self, entity: Entity, new: dict[str, Entity]) -> None:
+        ident = entity.ident
+        if ident in self._moving:
+            self._moving.move_to_end(ident)
+        elif ident not in self._standing:
+            known = Known(self._next, ident, KINDS[entity.kind], entity.special, entity.subkind)
+            self._next += 1
+            if ident in new:
+                self._standing[ident] = entity, known
+            else:
+                self._moving[ident] = known
+
+    def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
+        """A frame as a block, in the generator's own node ids."""
+        first = self._introduced
+        new = [*standing, *(e for e in moving if e.ident not in self._inner)]
+        self._introduced += len(new)
+        while self._introduced > len(self._outer):
+            self._outer = np.concatenate([self._outer, self._outer])
+        for inner, entity in enumerate(new, start=first):
+            self._inner[entity.ident] = inner
+            self._outer[inner] = self._node(entity)
+        ego = frame.ego or self._ego
+        here = any(e.ident == ego for e in moving)
+        time, none = np.array([frame.time_ns]), np.zeros(0, np.int64)
+        return FrameBlock(
+            seq=np.array([self._seq]),
+            time_ns=time,
+            log_time_ns=time,
+            offsets=np.array([0, len(moving)]),
+            states=self._states(moving),
+            ego=np.array([self._inner[ego] if here else -1]),
+            entities=_entities(first, new),
+            scenery=self._states(standing),
+            messages=MessageRefs(none, none, none, none, none),
+        )
+
+    def _node(self, entity: Entity) -> int:
+        known = self._standing[entity.ident][1] if entity.static else self._moving[entity.ident]
+        return known.node
+
+    def _states(self, of: list[Entity]) -> States:
+        numbers = np.array([e.numbers for e in of], np.float64).reshape(-1, len(NUMBERS))
+        whole = np.array([e.whole for e in of], np.int64).reshape(-1, len(WHOLE))
+        lights, light_state, derived = whole.T
+        return States.of(
+            node=np.array([self._inner[e.ident] for e in of], np.int64),
+            lights=lights,
+            light_state=light_state.astype(np.int8),
+            derived=derived,
+            **{name: numbers[:, i] for i, name in enumerate(NUMBERS)},
+        )
+
+
+def _entities(first: int, new: list[Entity]) -> Entities:
+    return Entities(
+        first=first,
+        ident=tuple(e.ident for e in new),
+        kind=np.array([e.kind for e in new], np.int8),
+        special=tuple(e.special for e in new),
+        subkind=tuple(e.subkind for e in new),
+        type_name=tuple(e.type_name for e in new),
+        static=np.array([e.static for e in new], np.bool_),
+        map_ref=tuple(e.map_ref for e in new),
+    )
