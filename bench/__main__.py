@@ -12,6 +12,7 @@ TITLES = {
     "sgg": "The scene graph generator",
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
+    "patterns": "Patterns over a million frames",
 }
 
 names = [name for name in sys.argv[1:] if not name.startswith("-")] or list(TITLES)
