@@ -11,7 +11,7 @@ import shapely
 from opendrive_maps import a_map, a_road, arc, cubic, element, lane, line, section
 
 from sgstore.opendrive import read_map
-from sgstore.opendrive.objects import kind_of_object
+from sgstore.opendrive.objects import PAINT, PARKING, kind_of_object
 from sgstore.opendrive.signals import kind_of_signal
 from sgstore.vocabulary import KINDS
 
@@ -299,8 +299,25 @@ def test_what_is_repeated_without_end_is_left_out_and_said() -> None:
         ("rail-pole", "x", "pole"),
         ("railing", "x", "barrier"),
         ("guide-post", "x", "pole"),
-        ("parkingSpace", "", "prop"),
-        ("-1", "StopLine", "prop"),
+        ("parkingSpace", "", PARKING),
+        ("parkingSpace", "beside the tree", PARKING),
+        ("-1", "ParkingSpace_12", PARKING),
+        ("-1", "StopLine", PAINT),
+        ("-1", "Stencil_ArrowType4R", PAINT),
+        ("-1", "SolidSingleWhite", PAINT),
+        ("roadMark", "stop line of Main Street", PAINT),
+        ("none", "Main Street", "prop"),
+        ("none", "Postal box", "prop"),
+        ("none", "Trailer park", "prop"),
+        ("none", "Greenhouse", "prop"),
+        ("none", "Main Street trees", "vegetation"),
+        ("none", "TREE_07", "vegetation"),
+        ("none", "Row of bushes", "vegetation"),
+        ("none", "garden fences", "barrier"),
+        ("none", "treehouse", "prop"),
+        ("-1", "StopSign", "prop"),
+        ("obstacle", "tree", "prop"),
+        ("Tree", "", "vegetation"),
         ("car", "", "car"),
         ("none", "Mystery", "prop"),
     ],
@@ -344,13 +361,76 @@ def test_nodes_come_in_their_order_and_their_ids_run_down_from_minus_one() -> No
     ]  # fmt: skip
 
 
+def test_a_parking_space_is_a_lane_lengthwise() -> None:
+    space = thing("p", type="parkingSpace", length=5, width=2.5, t=8, hdg=pi / 2)
+    road_map = read_map(a_map(road_with(objects=space)), "map")
+    nodes, row = road_map.nodes, row_of(road_map, "p")
+
+    assert KINDS[nodes.kind[row]] == "lane"
+    assert (nodes.lane_type[row], nodes.road[row]) == ("parking", "1")
+    assert (nodes.length[row], nodes.width[row]) == (pytest.approx(5), pytest.approx(2.5))
+    assert (nodes.x[row], nodes.y[row]) == (pytest.approx(10), pytest.approx(8))
+    assert nodes.heading[row] == pytest.approx(pi / 2)
+    assert road_map.outlines()[row].area == pytest.approx(12.5)
+    parked = np.array([(10.1, 8.2, pi / 2, 4.0, 1.8)])
+    hits = road_map.lanes_of(parked, np.zeros(1))
+    share = dict(zip((-1 - hits.lane).tolist(), hits.overlap.tolist(), strict=True))
+    assert share[row] == pytest.approx(1.0)
+    assert (-1 - row) in road_map.near(np.array([10.0]), np.array([8.0]), 1.0)[1]
+    assert "1" in {
+        nodes.name[-1 - n] for n in road_map.near(np.array([10.0]), np.array([11.0]), 1.0)[1]
+    }
+
+
+def test_parking_spaces_are_as_many_as_are_repeated_and_each_has_its_own_outline() -> None:
+    corner = ((3.5, 0.0), (-1.8, 5.3), (-3.5, 3.5), (0.0, 0.0))
+    outline = element("outlines", element("outline", corners("cornerLocal", *corner)))
+    slanted = thing("s", outline, repeat(distance=4, tStart=5, tEnd=5), type="parkingSpace")
+
+    road_map = read_map(a_map(road_with(objects=slanted)), "map")
+
+    nodes = road_map.nodes
+    rows = [row for row in range(len(nodes)) if nodes.lane_type[row] == "parking"]
+    assert [nodes.name[row] for row in rows] == [f"s#{i}" for i in range(6)]
+    shape = shapely.Polygon(corner)
+    for i, row in enumerate(rows):
+        there = shapely.transform(shape, lambda p, i=i: np.add(p, (4.0 * i, 5.0)))
+        assert road_map.outlines()[row].symmetric_difference(there).area < 1e-9
+    assert nodes.length[rows[0]] > nodes.width[rows[0]] > 2
+
+
+def test_a_parking_space_of_odd_shape_is_the_rectangle_around_it_and_one_without_area_is_said() -> (
+    None
+):
+    corner = ((0.0, 0.0), (6.0, 0.0), (6.0, 2.0), (3.0, 2.5), (0.0, 2.0))
+    odd = thing("odd", element("outline", corners("cornerLocal", *corner)), type="parkingSpace")
+    flat = thing("flat", type="parkingSpace")
+
+    road_map = read_map(a_map(road_with(objects=odd + flat)), "map")
+
+    assert road_map.outlines()[row_of(road_map, "odd")].area == pytest.approx(15.0)
+    assert "flat" not in road_map.nodes.name
+    assert [w for w in road_map.warnings if "'flat'" in w and "no extent" in w]
+
+
+def test_what_is_painted_on_the_road_makes_no_node() -> None:
+    line = element("outline", corners("cornerLocal", *SQUARE))
+    objects = thing("line", line, type="roadMark", name="stop line of Main Street") + thing("tree")
+
+    road_map = read_map(a_map(road_with(objects=objects)), "map")
+
+    assert "line" not in road_map.nodes.name
+    assert "tree" in road_map.nodes.name
+    assert road_map.warnings == ()
+
+
 @pytest.mark.data
 def test_real_maps_have_what_their_files_count(data: Path) -> None:
     counts = {
         "Town01": {"traffic_light": 36, "speed_limit": 22, "junction": 12},
         "Town07": {"traffic_light": 17, "stop_sign": 19, "yield_sign": 20, "crosswalk": 7},
         "fabriksgatan_traffic_lights": {"traffic_light": 3, "pole": 2},
-        "parking_demo": {"crosswalk": 3, "vegetation": 12},
+        "parking_demo": {"crosswalk": 3, "vegetation": 12, "prop": 0},
     }
     for name, expected in counts.items():
         text = (data / f"maps/{name}.xodr").read_text(encoding="utf-8")

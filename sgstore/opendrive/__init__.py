@@ -8,9 +8,9 @@ without it, so that no later step has to know. Only a map without any usable roa
 OpenDRIVE 1.4 to 1.8 (ASAM) are read alike. Superelevation, crossfall and the height of kerbs are not: a lane
 lies at the elevation of its reference line, which is what storeys are told apart by.
 
-A map that was read is kept by its content, so that the traces of a store, or pictures one after another, read it
-once a process, with the indices that it made. It is not kept on disk: a town is read in a tenth of a second, about
-what starting Python takes, and a file that is trusted less than it would be read for has to be checked as well.
+A map that was read is kept by its content, so that the traces of a store, or pictures one after another, read
+it once a process, with the indices that it made. It is not kept on disk: a town is read in a tenth of a second,
+less than starting takes, and what is read from a file has to be checked again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from sgstore.opendrive.objects import read_objects
 from sgstore.opendrive.planview import read_plan_view
 from sgstore.opendrive.signals import read_controllers, read_signals
 from sgstore.roads import MapNodes, RoadMap
-from sgstore.roads.lanes import edges_of
+from sgstore.roads.lanes import edges_of, plain_nodes, ribbons_of
 from sgstore.roads.lanetext import is_lane_text, read_lane_text
 
 __all__ = ["parse_map", "read_map"]
@@ -60,8 +60,8 @@ def read_map(text: str, name: str) -> RoadMap:
     Parameters
     ----------
     text : str
-        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads.lanetext`). Untrusted: time and memory
-        are bounded by its length.
+        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads.lanetext`). Untrusted: time and
+        memory are bounded by its length.
     name : str
         What people call it; empty: the name in its header, or the first digits of its digest.
 
@@ -107,26 +107,28 @@ def _build(document: Document, text: str, name: str, warnings: list[str]) -> Roa
     network = Network.of(document, lanes)
     surfaces = lane_nodes(document, lanes, ribbons)
     signals = read_signals(document, plan, network)
-    crosswalks, scenery = read_objects(document, plan, network.warnings)
+    furniture = read_objects(document, plan, network.warnings)
+    spaces = ribbons_of(furniture.parking)
     before = [
         MapNodes.of("off_road", ["off_road"]),
         surfaces,
+        plain_nodes(furniture.parking, spaces),
         *road_nodes(document),
-        crosswalks.nodes,
+        furniture.crosswalks.nodes,
     ]
-    nodes = MapNodes.joined([*before, signals.nodes, scenery.nodes])
+    nodes = MapNodes.joined([*before, signals.nodes, furniture.scenery.nodes])
     first_signal = sum(map(len, before))
     lane_changes = read_lane_changes(document, lanes, ribbons)
     edges = [
         *neighbours(lanes, ribbons),
         *flow_edges(lanes, surfaces, ribbons, flows(document, network)),
-        *containment(document, lanes),
+        *containment(document, np.append(lanes.road, furniture.parking_road)),
         ("laneChange", FIRST_LANE + lane_changes.lane, FIRST_LANE + lane_changes.to),
         signals.edges(first_signal),
     ]
     shapes = np.full(len(nodes), None, object)
     poles: Any = shapely.points(signals.nodes.x, signals.nodes.y)
-    beside = [*crosswalks.shapes, *poles, *scenery.shapes]
+    beside = [*furniture.crosswalks.shapes, *poles, *furniture.scenery.shapes]
     shapes[len(nodes) - len(beside) :] = beside
     document.settle()
     return RoadMap(
@@ -134,7 +136,7 @@ def _build(document: Document, text: str, name: str, warnings: list[str]) -> Roa
         text=text,
         nodes=nodes,
         edges=edges_of(edges),
-        ribbons=ribbons,
+        ribbons=ribbons.followed_by(spaces),
         shapes=shapes,
         lane_changes=lane_changes,
         road_types=road_types(document),

@@ -191,9 +191,12 @@ def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
     return {road: tuple(sorted(types)) for road, types in found.items()}
 
 
-def containment(document: Document, lanes: Lanes) -> list[Edge]:
-    """``isIn``: lanes in their roads, roads in their junctions. They stand in the order of their nodes."""
-    first_road = FIRST_LANE + len(lanes)
+def containment(document: Document, road: Ints) -> list[Edge]:
+    """``isIn``: lanes in their roads, roads in their junctions. They stand in the order of their nodes.
+
+    ``road``: rows of the roads of all lanes.
+    """
+    first_road = FIRST_LANE + len(road)
     first_junction = first_road + len(document["road"])
     junctions: dict[str, int] = {}
     for row, name in enumerate(document["junction"].texts("id")):
@@ -204,8 +207,8 @@ def containment(document: Document, lanes: Lanes) -> list[Edge]:
         if (name := junction_of(document, row)) in junctions
     ]
     roads, within = np.array(pairs, np.int64).reshape(-1, 2).T
-    every = np.arange(len(lanes))
+    every = np.arange(len(road))
     return [
-        ("isIn", FIRST_LANE + every, first_road + lanes.road),
+        ("isIn", FIRST_LANE + every, first_road + road),
         ("isIn", first_road + roads, first_junction + within),
     ]

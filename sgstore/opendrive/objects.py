@@ -1,13 +1,15 @@
-"""Objects beside and on roads: crosswalks, and scenery with its outlines.
+"""Objects beside and on roads: crosswalks, parking spaces, and scenery with its outlines.
 
 An object has outlines, in its own axes (``cornerLocal``) or along the road (``cornerRoad``); or a length and
 a width; or a radius; or nothing, and is a point. A ``repeat`` makes many of one: copies at distances, or one
 strip along the road where the distance is 0. (ASAM OpenDRIVE 1.8, 13.) All corners of all objects are placed
-at once.
+at once. A parking space is a lane of type ``parking`` with two cross sections. What is painted on the road
+(stop lines, arrows, hatchings) is neither a thing nor a place to be in, and makes no node.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -17,6 +19,7 @@ import shapely
 from sgstore.opendrive.places import node_columns, places, standing
 from sgstore.opendrive.signals import is_signal_object
 from sgstore.roads import MapNodes
+from sgstore.roads.lanes import PlainLane
 from sgstore.vocabulary import KIND_CODE
 
 if TYPE_CHECKING:
@@ -26,35 +29,41 @@ if TYPE_CHECKING:
     from sgstore.opendrive.planview import PlanView
     from sgstore.world import Floats, Ints
 
+PARKING: Final = "parking"
+"""What a parking space is: no kind of entity, but a lane of this type."""
+PAINT: Final = "paint"
+"""What is only paint: no kind either."""
+
 KIND_OF_TYPE: Final = {
     **dict.fromkeys(
-        ("barrier", "railing", "soundBarrier", "wall", "fence", "guardRail"), "barrier"
+        ("barrier", "railing", "soundbarrier", "wall", "fence", "guardrail"), "barrier"
     ),
     **dict.fromkeys(("building", "house", "tunnel", "bridge"), "building"),
-    **dict.fromkeys(("pole", "streetLamp", "lamp", "post"), "pole"),
+    **dict.fromkeys(("pole", "streetlamp", "lamp", "post"), "pole"),
     **dict.fromkeys(("tree", "vegetation", "bush", "forest"), "vegetation"),
-    **{kind: kind for kind in ("car", "van", "bus", "trailer", "train")},
+    **dict.fromkeys(("obstacle", "trafficisland", "gantry", "wind"), "prop"),
+    **dict.fromkeys(("roadmark", "roadsurface", "patch"), PAINT),
+    **{kind: kind for kind in ("car", "van", "bus", "trailer", "train", "crosswalk")},
     "bike": "bicycle",
     "motorbike": "motorcycle",
     "tram": "train",
     "pedestrian": "person",
+    "parkingspace": PARKING,
 }
-"""Types of objects → kinds. (ASAM OpenDRIVE 1.8, ``e_objectType``, and words that older maps use.)"""
+"""Types of objects, in lower case → kinds. (ASAM OpenDRIVE 1.8, ``e_objectType``; words of older maps.)"""
 
-_WORDS: Final = (
-    ("crosswalk", "crosswalk"),
-    ("rail-pole", "pole"),
-    ("guide-post", "pole"),
-    ("signpost", "pole"),
-    ("rail", "barrier"),
-    ("pole", "pole"),
-    ("post", "pole"),
-    ("fence", "barrier"),
-    ("barrier", "barrier"),
-    ("building", "building"),
-    ("tree", "vegetation"),
+_PHRASES: Final = (
+    (("crosswalk", "zebra"), "crosswalk"),
+    (("stencil", "chevron region", "stop line", "road mark", "road marking"), PAINT),
+    (("solid single", "solid double", "broken single", "broken double"), PAINT),
+    (("pole", "post", "signpost", "lamppost", "streetlamp", "streetlight", "mast"), "pole"),
+    (("barrier", "guardrail", "rail", "railing", "fence", "wall"), "barrier"),
+    (("building", "house"), "building"),
+    (("tree", "bush", "hedge", "shrub", "vegetation"), "vegetation"),
+    (("parking space", "parking lot"), PARKING),
 )
-"""What a name or an unknown type must contain to be of a kind, the first that fits: maps that know no types."""
+"""Words, one after another, in a name or unknown type → kinds, the first that fits: for maps without types."""
+_WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 MOST_POINTS: Final = 1_000_000
 """Corners that the objects of a map may have together, copies included; what has more is left out and said."""
@@ -65,14 +74,24 @@ _CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
 
 
 def kind_of_object(type_name: str, name: str) -> str:
-    """The kind of an object; ``prop`` for whatever is none of the others."""
-    if type_name in KIND_OF_TYPE:
-        return KIND_OF_TYPE[type_name]
-    for text in (type_name.lower(), name.lower()):
-        for word, kind in _WORDS:
-            if word in text:
+    """The kind of an object by its type, else by whole words of its type and name.
+
+    :data:`PARKING` and :data:`PAINT` for what is no entity; ``prop`` for whatever is none of the others.
+    """
+    declared = KIND_OF_TYPE.get(type_name.strip().lower())
+    if declared is not None:
+        return declared
+    for text in (type_name, name):
+        words = " ".join(_singular(word) for word in _WORD.findall(text))
+        for phrases, kind in _PHRASES:
+            if any(f" {phrase} " in f" {words} " for phrase in phrases):
                 return kind
     return "prop"
+
+
+def _singular(word: str) -> str:
+    word = word.lower()
+    return word.removesuffix("es") if word.endswith(("shes", "xes")) else word.removesuffix("s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,22 +142,34 @@ class _Items:
         return len(self.row) - 1
 
 
-def read_objects(
-    document: Document, plan: PlanView, warnings: list[str]
-) -> tuple[Objects, Objects]:
-    """Crosswalks, and all other objects; one whose place is broken is left out with a warning."""
+@dataclass(frozen=True, slots=True)
+class Furniture:
+    """What objects are: crosswalks, all other entities, and parking spaces with the rows of their roads."""
+
+    crosswalks: Objects
+    scenery: Objects
+    parking: list[PlainLane]
+    parking_road: Ints
+
+
+def read_objects(document: Document, plan: PlanView, warnings: list[str]) -> Furniture:
+    """What the objects of a map are; one whose place is broken is left out with a warning."""
     kind = "road/object"
     table = document[kind]
     names, types = table.texts("name"), table.texts("type")
-    named = np.array([is_signal_object(name) for name in names], bool)
-    rows = standing(document, kind, np.flatnonzero(~named), warnings).tolist()
+    kinds = list(map(kind_of_object, types, names))
+    wanted = np.array(
+        [not is_signal_object(n) and k != PAINT for n, k in zip(names, kinds, strict=True)], bool
+    )
+    rows = standing(document, kind, np.flatnonzero(wanted), warnings).tolist()
     items = _items(_Outlines(document), _repeats(document), rows, warnings)
     row = np.array(items.row, np.int64)
     s, t, up = np.array(items.place, np.float64).reshape(-1, 3).T
     columns = node_columns(document, plan, kind, row, at=(s, t, up))
     length, width = np.array(items.size, np.float64).reshape(-1, 2).T
+    parks = np.array([kinds[r] == PARKING for r in items.row], bool)
     nodes = MapNodes.of(
-        [kind_of_object(types[r], names[r]) for r in items.row],
+        ["prop" if kinds[r] == PARKING else kinds[r] for r in items.row],
         items.name,
         length=np.where(length > 0, length, np.nan),
         width=np.where(width > 0, width, np.nan),
@@ -147,7 +178,50 @@ def read_objects(
     shapes = _shapes(items, _placed(document, plan, items, columns))
     objects = Objects(nodes, shapes)
     crosswalk = nodes.kind == KIND_CODE["crosswalk"]
-    return objects.take(np.flatnonzero(crosswalk)), objects.take(np.flatnonzero(~crosswalk))
+    spaces = {
+        row: space for row in np.flatnonzero(parks).tolist() if (space := _space(objects, row))
+    }
+    flat = [nodes.name[row] for row in np.flatnonzero(parks).tolist() if row not in spaces]
+    warnings.extend(f"parking space {name!r} has no extent and is left out" for name in flat)
+    return Furniture(
+        objects.take(np.flatnonzero(crosswalk)),
+        objects.take(np.flatnonzero(~crosswalk & ~parks)),
+        list(spaces.values()),
+        table.road[row[list(spaces)]],
+    )
+
+
+def _space(objects: Objects, row: int) -> PlainLane | None:
+    """A parking space as a lane: lengthwise, as the object faces; ``None`` if it has no area."""
+    nodes, shape = objects.nodes, objects.shapes[row]
+    if shape.area <= 0:
+        return None
+    corners = _quadrangle(shape)
+    sides = np.hypot(*np.diff(corners, axis=0, append=corners[:1]).T)
+    if sides[0] + sides[2] < sides[1] + sides[3]:
+        corners = np.roll(corners, -1, axis=0)
+    facing = np.array((np.cos(nodes.heading[row]), np.sin(nodes.heading[row])))
+    if (corners[1] - corners[0] + corners[2] - corners[3]) @ facing < 0:
+        corners = np.roll(corners, 2, axis=0)
+    return PlainLane(
+        name=nodes.name[row],
+        type=PARKING,
+        road=nodes.road[row],
+        junction=nodes.junction[row],
+        section=0,
+        number=0,
+        left=corners[[3, 2]],
+        right=corners[[0, 1]],
+        z=np.full(2, nodes.z[row]),
+    )
+
+
+def _quadrangle(shape: Any) -> Floats:
+    """(4, 2): the corners of a shape that has four, counter-clockwise, else of the rectangle around it."""
+    if shape.geom_type != "Polygon" or len(shape.exterior.coords) != 5 or not shape.is_valid:
+        shape = shapely.minimum_rotated_rectangle(shape)
+    corners = np.asarray(shape.exterior.coords, np.float64)[:-1]
+    return corners if shape.exterior.is_ccw else corners[::-1]
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ def road_map_of(
         A junction has more lanes than can be looked at in pairs.
     """
     ribbons = ribbons_of(lanes)
-    surfaces = _lane_nodes(lanes, ribbons)
+    surfaces = plain_nodes(lanes, ribbons)
     roads, junctions = _roads(lanes, ribbons), _junctions(lanes)
     nodes = MapNodes.joined([MapNodes.of("off_road", ["off_road"]), surfaces, roads, junctions])
     return RoadMap(
@@ -150,7 +150,8 @@ def headings(x: Floats, y: Floats, first: Bools) -> Floats:
     return heading
 
 
-def _lane_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+    """The nodes of plain lanes with these surfaces."""
     every, length = np.arange(len(ribbons)), ribbons.lengths
     middle = ribbons.at(every, length / 2)
     turns = turn_words(turned(ribbons))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,6 +48,16 @@ class Ribbons:
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
+
+    def followed_by(self, more: Ribbons) -> Ribbons:
+        """The ribbons of these lanes, then of more."""
+        offsets = np.concatenate((self.offsets, self.offsets[-1] + more.offsets[1:]))
+        columns = {
+            column.name: np.concatenate((getattr(self, column.name), getattr(more, column.name)))
+            for column in fields(self)
+            if column.name != "offsets"
+        }
+        return Ribbons(offsets=offsets, **columns)
 
     @property
     def lengths(self) -> Floats:
