@@ -47,6 +47,8 @@ CREATE TABLE trace (
   digest     VARCHAR,     -- SHA-256 of the whole file
   flavour    VARCHAR,     -- the reader: 'osi'
   ego        VARCHAR,     -- the simulator's id of the ego, NULL without one
+  since      DOUBLE,      -- seconds of the recording from which on its frames were read, NULL: from the first
+  until      DOUBLE,      -- and up to which, included, NULL: to the last
   map_id     INTEGER,     -- NULL without a map
   config_id  INTEGER,
   frames     INTEGER,
@@ -117,6 +119,11 @@ CREATE TABLE map_node (
 
 CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
   map_id INTEGER, relation relation, src_kind kind, dst_kind kind, src INTEGER, dst INTEGER);
+
+-- For sgstore verify ------------------------------------------------------------------------------------------------
+
+CREATE TABLE manifest (                                        -- what was published: rows of a trace, or of a map
+  trace_id BIGINT, map_id INTEGER, "table" VARCHAR, rows BIGINT, checksum BIGINT);     -- store/checksums.py says how
 
 -- For the compiler ------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from sgstore.store import rows, schema
 from sgstore.store.access import Access, default_memory, spill_folder, translated
 from sgstore.store.folder import Folder
 from sgstore.store.payloads import payload_place
-from sgstore.store.publishing import copy_sorted, remove
+from sgstore.store.publishing import copy_sorted, publish_in, remove
 from sgstore.store.rows import Batches, Rows
 from sgstore.store.scenes import Scenes
 from sgstore.store.segment import Segment
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog
     from sgstore.roads import RoadMap
     from sgstore.store.rows import Parameters
+    from sgstore.store.sealed import Sealed
     from sgstore.traces.carried import Carried
     from sgstore.world import TraceInfo
 
@@ -349,16 +350,29 @@ class StoreFile:
             self._seen.add(mark)
         return path
 
-    def stored(self, info: TraceInfo, config: Config, road_map: RoadMap | None) -> str | None:
+    def stored(
+        self,
+        info: TraceInfo,
+        config: Config,
+        road_map: RoadMap | None,
+        part: tuple[float | None, float | None] = (None, None),
+    ) -> str | None:
         """The name under which the store has a recording already; ``None`` if it has it not.
+
+        Parameters
+        ----------
+        info, config, road_map
+            As :meth:`segment` takes them.
+        part : tuple
+            The part of it that is read: since and until; s.
 
         Raises
         ------
         StoreError
-            It has it with another config or map, or another trace has its id.
+            It has another part of it, or with another config or map; or another trace has its id.
         """
         with self._reading() as connection:
-            return already_stored(connection, Identity.of(info, config, road_map))
+            return already_stored(connection, Identity.of(info, config, road_map, part))
 
     def segment(
         self,
@@ -381,20 +395,43 @@ class StoreFile:
             Relations that they can hold.
         """
         identity = Identity.of(info, config, road_map)
-        return Segment(self._access, info, identity, road_map, answers)
+        return Segment(self.path, info, identity, road_map, answers, access=self._access)
 
-    def remove(self, trace: int | str) -> StoredTrace:
-        """Delete a trace, in one transaction, with the settings and the map that no other trace has.
+    def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
+        """Bring a trace into the store, in one transaction.
+
+        Parameters
+        ----------
+        sealed : Sealed
+        replace : bool
+            Whether it takes the place of the trace with its id, under the same name.
+
+        Returns
+        -------
+        str
+            The name of the trace in the store.
 
         Raises
         ------
         StoreError
-            There is no such trace, or others keep the store for too long.
+            The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
         """
-        gone = self.trace(trace)
+        return publish_in(self._access, sealed, replace=replace)
+
+    def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
+        """Delete traces, in one transaction, with the settings and the maps that no other trace has.
+
+        Raises
+        ------
+        StoreError
+            One of them is not there, or others keep the store for too long.
+        """
+        with self._reading():
+            gone = {trace.trace_id: trace for trace in map(self.trace, traces)}
         with scratch(spill_folder()) as connection, self._access.writing(connection):
-            remove(connection, gone.trace_id)
-        return gone
+            for trace_id in gone:
+                remove(connection, trace_id)
+        return tuple(gone.values())
 
     def compact(self) -> None:
         """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.

@@ -1,102 +1,136 @@
-"""From a segment into the store: what one transaction does."""
+"""From a sealed segment into the store, and out of it: what one transaction does."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from glob import escape
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import StoreError
+from sgstore.store.access import spill_folder
 from sgstore.store.packing import plain
+from sgstore.store.staging import quoted, scratch
 from sgstore.store.traces import already_stored, free_name
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from duckdb import DuckDBPyConnection
 
-    from sgstore.roads import RoadMap
-    from sgstore.store.staging import Staging
+    from sgstore.store.access import Access
+    from sgstore.store.checksums import Checksum
+    from sgstore.store.sealed import Sealed
     from sgstore.store.traces import Identity
     from sgstore.world import TraceInfo
 
-_PLAIN: Final = """
-INSERT INTO store.channel BY NAME SELECT * REPLACE ($trace_id AS trace_id) FROM channel;
-INSERT INTO store.context BY NAME SELECT * REPLACE ($trace_id AS trace_id) FROM context ORDER BY log_time_ns;
-INSERT INTO store.entity BY NAME SELECT * REPLACE ($trace_id AS trace_id) FROM entity ORDER BY node_id;
-INSERT INTO store.frame BY NAME
-SELECT * REPLACE ($trace_id AS trace_id, $map_id AS map_id) FROM frame ORDER BY frame_id;
-INSERT INTO store.bucket
-SELECT bucket, $trace_id, $map_id, bit_or(1::BIGINT << bit) FROM frame GROUP BY bucket ORDER BY bucket;
-INSERT INTO store.payload SELECT * FROM payload ORDER BY channel_id, bucket, bit;
-"""
+MAP_TABLES: Final = ("map", "map_node", "map_edge")
+"""Tables of a road map; they come into a store once, whatever the number of traces on it."""
 
 _TRACE: Final = """
-INSERT INTO store.trace BY NAME
+INSERT INTO bucket BY NAME
+SELECT bucket, $trace_id AS trace_id, bit_or(1::BIGINT << bit) AS valid FROM frame GROUP BY bucket;
+INSERT INTO trace BY NAME
 WITH steps AS (SELECT time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
-SELECT $trace_id AS trace_id, $name AS name, $uri AS uri, $size AS size, $mtime_ns AS mtime_ns,
-       $digest AS digest, $flavour AS flavour, nullif($ego, '') AS ego, $map_id AS map_id,
-       $config_id AS config_id, count(*) AS frames,
+SELECT $trace_id AS trace_id, $uri AS uri, $size AS size, $mtime_ns AS mtime_ns,
+       $digest AS digest, $flavour AS flavour, nullif($ego, '') AS ego, $since AS since, $until AS until,
+       count(*) AS frames,
        arg_min(time_ns, frame_id) AS start_ns, arg_max(time_ns, frame_id) AS end_ns,
        coalesce((SELECT quantile_disc(step, 0.5) FROM steps), 0) AS period_ns,
        $origin_x AS origin_x, $origin_y AS origin_y, $origin_z AS origin_z, $answers AS answers,
-       $report AS report, $ingested_at AS ingested_at, $version AS version
-FROM frame
+       $report AS report, $version AS version
+FROM frame;
 """
 
 
-def publish(
-    staging: Staging,
-    info: TraceInfo,
-    identity: Identity,
-    values: dict[str, Any],
-    road_map: RoadMap | None,
-) -> str:
-    """Copy the tables of a trace into the store that is attached to their connection.
+def fill_trace(
+    connection: DuckDBPyConnection, info: TraceInfo, identity: Identity, values: dict[str, Any]
+) -> None:
+    """Complete the tables of a trace: its own row, and its buckets.
 
     Parameters
     ----------
     values : dict
         Columns of table ``trace`` that the segment knows.
-
-    Returns
-    -------
-    str
-        The name of the trace.
-
-    Raises
-    ------
-    StoreError
-        The trace is in the store already.
     """
-    connection = staging.connection
-    name = already_stored(connection, identity, catalog="store.")
-    if name is not None:
-        raise StoreError(f"{info.path}: came into the store meanwhile, as {name!r}")
-    names = connection.execute("SELECT name FROM store.trace").fetchall()
-    name = free_name(plain(info.path.stem), {taken for (taken,) in names})
-    keys = {
+    about = values | {
         "trace_id": identity.trace_id,
-        "map_id": _map_id(connection, road_map),
-    }
-    for statement in _PLAIN.split(";\n")[:-1]:
-        used = {key: value for key, value in keys.items() if f"${key}" in statement}
-        connection.execute(statement, used)
-    for table in ("state", "lane_state", "node", "edge"):
-        for part in staging.parts(table):
-            connection.execute(f"INSERT INTO store.{table} BY NAME {part}")
-    about = {
-        "name": name,
         "uri": plain(str(info.path.resolve())),
         "size": info.size,
         "mtime_ns": info.mtime_ns,
         "digest": info.digest,
         "flavour": info.flavour,
         "ego": identity.ego,
-        "config_id": _config_id(connection, identity),
-        "ingested_at": datetime.now(UTC).replace(tzinfo=None),
+        "since": identity.since,
+        "until": identity.until,
         "version": version("sgstore"),
     }
-    connection.execute(_TRACE, keys | about | values)
+    for statement in _TRACE.split(";\n")[:-1]:
+        used = {key: value for key, value in about.items() if f"${key}" in statement}
+        connection.execute(statement, used)
+
+
+def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
+    """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
+    with scratch(spill_folder()) as connection, access.writing(connection):
+        return _publish(connection, sealed, replace=replace)
+
+
+def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -> str:
+    """Copy the files of a trace into the attached store; the name of the trace there."""
+    identity = sealed.identity
+    taken = dict(connection.execute("SELECT trace_id, name FROM store.trace").fetchall())
+    if replace and identity.trace_id in taken:
+        name = taken[identity.trace_id]
+        _delete(connection, identity.trace_id)
+    else:
+        found = already_stored(connection, identity, catalog="store.")
+        if found is not None:
+            raise StoreError(f"{sealed.path}: came into the store meanwhile, as {found!r}")
+        name = free_name(plain(sealed.path.stem), set(taken.values()))
+    given = {"name": name, "ingested_at": datetime.now(UTC).replace(tzinfo=None)}
+    given["map_id"] = _map_id(connection, sealed)
+    given["config_id"] = _config_id(connection, identity)
+    for table in sealed.files:
+        if table not in MAP_TABLES:
+            _insert(connection, sealed, table, given)
+    _note(connection, sealed.checksums, trace_id=identity.trace_id)
+    connection.execute(_ORPHANS)  # of a trace that was replaced
     return name
+
+
+def _insert(
+    connection: DuckDBPyConnection, sealed: Sealed, table: str, given: dict[str, Any]
+) -> None:
+    """Insert the files of a table, with the values that only the store can give."""
+    of_store = (
+        "SELECT column_name FROM duckdb_columns() WHERE database_name = 'store' AND table_name = ?"
+    )
+    columns = {name for (name,) in connection.execute(of_store, [table]).fetchall()}
+    values = {name: value for name, value in given.items() if name in columns}
+    replaced = ", ".join(f"${name} AS {name}" for name in values)
+    select = f"SELECT * REPLACE ({replaced})" if replaced else "SELECT *"
+    for name in sealed.files[table]:
+        # Reading takes a pattern, and a folder may be called anything.
+        file = quoted(escape(str(sealed.folder / name)))
+        connection.execute(
+            f"INSERT INTO store.{table} BY NAME {select} FROM read_parquet('{file}')", values
+        )
+
+
+def _note(
+    connection: DuckDBPyConnection,
+    checksums: dict[str, Checksum],
+    *,
+    trace_id: int | None = None,
+    map_id: int | None = None,
+) -> None:
+    """Take down the checksums of what was inserted."""
+    for table, checksum in checksums.items():
+        connection.execute(
+            "INSERT INTO store.manifest VALUES (?, ?, ?, ?, ?)",
+            [trace_id, map_id, table, checksum.rows, checksum.value],
+        )
 
 
 def _config_id(connection: DuckDBPyConnection, identity: Identity) -> int:
@@ -113,51 +147,67 @@ def _config_id(connection: DuckDBPyConnection, identity: Identity) -> int:
     return new
 
 
-def _map_id(connection: DuckDBPyConnection, road_map: RoadMap | None) -> int | None:
+def _map_id(connection: DuckDBPyConnection, sealed: Sealed) -> int | None:
     """The number of the map in the store, where it is now with its nodes and edges if it was not before."""
-    if road_map is None:
+    digest = sealed.identity.map_digest
+    if not digest:
         return None
     rows = connection.execute("SELECT map_id, digest, name FROM store.map").fetchall()
-    for number, digest, _ in rows:
-        if digest == road_map.digest:
+    for number, known, _ in rows:
+        if known == digest:
             return number
     new = max((number for number, _, _ in rows), default=0) + 1
-    name = free_name(plain(road_map.name) or "map", {name for _, _, name in rows})
-    connection.execute(
-        "INSERT INTO store.map VALUES (?, ?, ?, ?)",
-        [new, road_map.digest, name, plain(road_map.text)],
-    )
-    for table, order in (("map_node", "node_id DESC"), ("map_edge", "ALL")):
-        connection.execute(
-            f"INSERT INTO store.{table} BY NAME SELECT * REPLACE (? AS map_id) FROM {table} ORDER BY {order}",
-            [new],
-        )
+    wanted = plain(sealed.identity.map_name) or "map"
+    given = {"map_id": new, "name": free_name(wanted, {name for _, _, name in rows})}
+    for table in MAP_TABLES:
+        if table in sealed.files:
+            _insert(connection, sealed, table, given if table == "map" else {"map_id": new})
+    _note(connection, sealed.map_checksums, map_id=new)
     return new
 
 
-_REMOVED: Final = {
-    "trace_id = $trace_id": ("trace", "channel", "context", "entity", "bucket", "frame", "payload"),
-    "bucket >= $trace_id << 18 AND bucket < ($trace_id + 1) << 18": ("node", "edge"),
-    "frame_id >= $trace_id << 24 AND frame_id < ($trace_id + 1) << 24": ("state", "lane_state"),
+_OWNED: Final = {
+    "trace_id": "trace_id = $trace_id",
+    "bucket": "bucket >= $trace_id << 18 AND bucket < ($trace_id + 1) << 18",
+    "frame_id": "frame_id >= $trace_id << 24 AND frame_id < ($trace_id + 1) << 24",
 }
-"""Conditions on the rows of a trace; ranges where the column that they are about is all that a scan needs."""
+"""Column → condition on the rows of a trace; of a table that has several, the first counts."""
 
 _ORPHANS: Final = """
 DELETE FROM store.config WHERE config_id NOT IN (SELECT config_id FROM store.trace);
 DELETE FROM store.map WHERE map_id NOT IN (SELECT map_id FROM store.trace WHERE map_id IS NOT NULL);
 DELETE FROM store.map_node WHERE map_id NOT IN (SELECT map_id FROM store.map);
 DELETE FROM store.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.manifest WHERE map_id NOT IN (SELECT map_id FROM store.map);
 """
+
+
+def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
+    """The tables of a store that hold rows of traces, each with the condition on the rows of ``$trace_id``."""
+    rows = connection.execute(
+        """
+        SELECT table_name, list(column_name) FROM duckdb_columns()
+        WHERE database_name = ? AND NOT internal
+          AND table_name IN (SELECT table_name FROM duckdb_tables() WHERE database_name = ?)
+        GROUP BY table_name ORDER BY table_name
+        """,
+        [database, database],
+    ).fetchall()
+    for table, columns in rows:
+        found = next((column for column in _OWNED if column in columns), None)
+        if found is not None:
+            yield table, _OWNED[found]
 
 
 def remove(connection: DuckDBPyConnection, trace_id: int) -> None:
     """Delete a trace from the attached store, with the settings and the map that no other trace has."""
-    for condition, tables in _REMOVED.items():
-        for table in tables:
-            connection.execute(
-                f"DELETE FROM store.{table} WHERE {condition}", {"trace_id": trace_id}
-            )
+    _delete(connection, trace_id)
     connection.execute(_ORPHANS)
+
+
+def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
+    for table, condition in list(owned(connection, "store")):
+        connection.execute(f"DELETE FROM store.{table} WHERE {condition}", {"trace_id": trace_id})
 
 
 _SORTED: Final = {

@@ -15,11 +15,16 @@ from sgstore.errors import StoreError
 from sgstore.store import packing, payloads
 from sgstore.store.access import translated
 from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
-from sgstore.store.publishing import publish
+from sgstore.store.publishing import MAP_TABLES, fill_trace, publish_in
+from sgstore.store.reports import report_of
+from sgstore.store.sealed import Sealed
 from sgstore.store.staging import Staging
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
     from sgstore.store.access import Access
@@ -29,17 +34,22 @@ if TYPE_CHECKING:
 
 
 class Segment:
-    """The graphs of one trace, until they are published. Made by :meth:`StoreFile.segment`.
+    """The graphs of one trace, until they are published. Made by :meth:`StoreFile.segment` or :func:`segment`.
 
     Parameters
     ----------
-    access : Access
+    store : Path
+        The store that it is meant for. It need not be there yet.
     info : TraceInfo
     identity : Identity
         What the trace is in the store, and the settings it was read with.
     road_map : RoadMap or None
     answers : tuple of str
         Relations that the generator can answer.
+    folder : Path, optional
+        Where it is built; it belongs to the caller. By default a folder beside the store, which goes with it.
+    access : Access, optional
+        To the store, for :meth:`publish`.
 
     Notes
     -----
@@ -48,12 +58,16 @@ class Segment:
 
     def __init__(
         self,
-        access: Access,
+        store: Path,
         info: TraceInfo,
         identity: Identity,
         road_map: RoadMap | None,
         answers: tuple[str, ...],
+        *,
+        folder: Path | None = None,
+        access: Access | None = None,
     ) -> None:
+        self._store = store
         self._access = access
         self._info = info
         self._identity = identity
@@ -67,7 +81,7 @@ class Segment:
         self._origin: Origin | None = None
         self._periods = payloads.Periods()
         self._next_seq = 0
-        self._staging = Staging(access.path)
+        self._staging = Staging(store, folder)
         try:
             self._insert_about()
         except BaseException:
@@ -138,50 +152,81 @@ class Segment:
         ValueError
             There are no frames.
         """
+        sealed = self.seal(report)
+        if self._access is None:
+            raise ValueError("a segment without a store is sealed, and published by one")
+        return publish_in(self._access, sealed)
+
+    def seal(self, report: TraceReport, more: Mapping[str, Any] | None = None) -> Sealed:
+        """Complete the files of the trace, so that any process can publish them; nothing can be added then.
+
+        Parameters
+        ----------
+        report : TraceReport
+        more : mapping, optional
+            What else the report in the store is to say, as plain values.
+
+        Raises
+        ------
+        StoreError
+            The disk is full.
+        ValueError
+            There are no frames.
+        """
         if not self._next_seq:
             raise ValueError("a trace without frames")
-        staging = self._staging
-        with translated(self._access.path):
+        staging, identity = self._staging, self._identity
+        with translated(self._store):
             payloads.join(
                 staging.connection,
                 staging.all_messages(),
                 self._info.channels,
                 self._periods,
-                self._identity.payloads,
+                identity.payloads,
             )
-            with self._access.writing(staging.connection):
-                values = self._trace_values(report)
-                return publish(staging, self._info, self._identity, values, self._road_map)
+            fill_trace(staging.connection, self._info, identity, self._trace_values(report, more))
+            files, checksums = staging.seal()
+        of_map = {name: checksums.pop(name) for name in MAP_TABLES if name in checksums}
+        sealed = Sealed(staging.folder, self._info.path, identity, files, checksums, of_map)
+        sealed.write()
+        return sealed
 
-    def _trace_values(self, report: TraceReport) -> dict[str, Any]:
+    def _trace_values(self, report: TraceReport, more: Mapping[str, Any] | None) -> dict[str, Any]:
         origin = self._origin or Origin(0.0, 0.0, 0.0)
+        found = report_of(self._staging.connection)
         return {
             "origin_x": origin.x,
             "origin_y": origin.y,
             "origin_z": origin.z,
             "answers": list(self._answers),
-            "report": packing.as_json(asdict(report)),
+            "report": packing.as_json(asdict(report) | found | dict(more or {})),
         }
 
     def _insert_about(self) -> None:
         """What is known before the first frame."""
         insert = self._staging.insert
-        insert("channel", _channel_columns(self._info))
+        insert("channel", self._owned(_channel_columns(self._info)))
         context = packing.message_columns(self._info.context, self._channel_ids)
         context["channel_id"] = context.pop("channel")
-        insert("context", context)
+        insert("context", self._owned(context))
         if self._road_map is not None:
+            insert("map", _map_columns(self._road_map))
             insert("map_node", _map_node_columns(self._road_map))
             insert("map_edge", _map_edge_columns(self._road_map))
 
     def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
         kinds, insert = self._kinds, self._staging.insert
-        insert("frame", packing.frame_columns(graph, trace_id))
-        insert("entity", packing.entity_columns(graph, origin))
+        insert("frame", self._owned(packing.frame_columns(graph, trace_id)))
+        insert("entity", self._owned(packing.entity_columns(graph, origin)))
         insert("state", packing.state_columns(graph, trace_id, kinds, origin))
         insert("node", packing.node_columns(graph, trace_id, kinds))
         insert("edge", packing.edge_columns(graph, trace_id, kinds))
         insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
+
+    def _owned(self, columns: Columns) -> Columns:
+        """The columns, and whose they are."""
+        count = len(next(iter(columns.values())))
+        return columns | {"trace_id": np.full(count, self._identity.trace_id)}
 
     def _see_messages(self, graph: GraphBlock) -> None:
         messages = packing.message_columns(graph.frames.messages, self._channel_ids)
@@ -196,6 +241,11 @@ def _channel_columns(info: TraceInfo) -> Columns:
     names = ("topic", "schema", "schema_encoding", "message_encoding", "role")
     columns: Columns = {name: texts(getattr(c, name) for c in info.channels) for name in names}
     return columns | {"channel_id": np.array([c.id for c in info.channels], np.int64)}
+
+
+def _map_columns(road_map: RoadMap) -> Columns:
+    names = ("digest", "name", "text")
+    return {name: texts([getattr(road_map, name)]) for name in names}
 
 
 def _map_node_columns(road_map: RoadMap) -> Columns:

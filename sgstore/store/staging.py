@@ -1,7 +1,8 @@
 """Where the tables of a trace wait to be published: a little in memory, the rest in files beside the store.
 
 The tables that grow with a trace are cut into parts of some ten thousand rows, each sorted as the store is
-and written as a Parquet file into a folder beside the store, so that memory does not grow.
+and written as a Parquet file into a folder beside the store, so that memory does not grow. In the end all of
+them are in files, with a checksum of the rows of each table.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 
 from sgstore.store.access import memory_setting, translated
+from sgstore.store.checksums import Checksum, expressions
 from sgstore.store.folder import Folder
 from sgstore.store.packing import MISSING
 from sgstore.store.schema import tables_sql
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -72,6 +73,13 @@ FROM edge GROUP BY ALL ORDER BY ALL""",
 """The same where blocks split buckets: the pieces of a mask become one row again."""
 
 
+_ORDERS: Final = {"payload": "channel_id, bucket, bit", "map_node": "node_id DESC"}
+"""How the others are sorted, where not by all their columns."""
+
+_NOT_SEALED: Final = {"bits", "store_info"}
+"""Tables that belong to no trace."""
+
+
 class Staging:
     """The tables of one trace. ``connection`` has them in memory, under the names that they have in a store.
 
@@ -79,29 +87,39 @@ class Staging:
     ----------
     store : Path
         The store that they are meant for.
+    folder : Path, optional
+        Where the files are written; it belongs to the caller, who removes it. By default a folder beside the
+        store, which is removed with this.
     """
 
-    def __init__(self, store: Path) -> None:
+    def __init__(self, store: Path, folder: Path | None = None) -> None:
         self._store = store
         self._rows = 0
         self._bytes = 0
         self._memory = MEMORY
         self._parts = 0
+        self._files: dict[str, list[str]] = {}
         self.merge = False
-        self._folder = Folder(store)
+        self._own = Folder(store) if folder is None else None
+        self.folder = self._own.path if self._own else folder or store
         try:
             with translated(store):
-                self.connection = scratch(self._folder.path / "spill")
+                self.connection = scratch(self.folder / "spill")
                 self.connection.execute(tables_sql())
+                self._tables = self._names() - _NOT_SEALED
                 self.connection.execute(MESSAGES)
         except BaseException:
-            self._folder.remove()
+            self._remove()
             raise
 
     def close(self) -> None:
-        """Forget the tables."""
+        """Forget the tables in memory, and the files if the folder is its own."""
         self.connection.close()
-        self._folder.remove()
+        self._remove()
+
+    def _remove(self) -> None:
+        if self._own is not None:
+            self._own.remove()
 
     def insert(self, table: str, columns: Columns) -> None:
         """Append columns to a table; DuckDB finds them by the name of the variable."""
@@ -139,36 +157,68 @@ class Staging:
     def _write_part(self) -> None:
         with translated(self._store):
             for table in _GROWING:
-                file = _quoted(self._file(table, self._parts))
-                self.connection.execute(
-                    f"COPY ({self._sorted(table)}) TO '{file}' (FORMAT parquet)"
-                )
+                self._write(table, self._sorted(table), f"{table}-{self._parts:06}")
                 self.connection.execute(f"CREATE OR REPLACE TABLE {table} AS FROM {table} LIMIT 0")
         self._parts += 1
         self._rows = self._bytes = 0
 
-    def parts(self, table: str) -> Iterator[str]:
-        """Statements that give all rows of a growing table, part by part."""
-        for part in range(self._parts):
-            # Reading takes a pattern, and a folder may be called anything.
-            yield f"SELECT * FROM read_parquet('{_quoted(escape(self._file(table, part)))}')"
-        yield self._sorted(table)
+    def _write(self, table: str, select: str, name: str) -> None:
+        file = self.folder / f"{name}.parquet"
+        self.connection.execute(f"COPY ({select}) TO '{quoted(str(file))}' (FORMAT parquet)")
+        self._files.setdefault(table, []).append(file.name)
 
     def all_messages(self) -> str:
         """A statement that gives all messages, in no order."""
         if not self._parts:
             return "SELECT * FROM message"
-        files = f"{_quoted(escape(str(self._folder.path)))}/message-*.parquet"
+        files = f"{quoted(escape(str(self.folder)))}/message-*.parquet"
         return f"SELECT * FROM read_parquet('{files}') UNION ALL SELECT * FROM message"
+
+    def seal(self) -> tuple[dict[str, list[str]], dict[str, Checksum]]:
+        """Write everything into files.
+
+        Returns
+        -------
+        files : dict
+            Table → names of its files in the folder, in order; no table without rows.
+        checksums : dict
+            Table → checksum of its rows.
+        """
+        with translated(self._store):
+            for table in sorted(filter(self._has_rows, self._tables)):
+                if table in _GROWING:
+                    self._write(table, self._sorted(table), f"{table}-{self._parts:06}")
+                else:
+                    order = _ORDERS.get(table, "ALL")
+                    self._write(table, f"SELECT * FROM {table} ORDER BY {order}", table)
+            files = {
+                table: self._files[table] for table in sorted(self._files.keys() & self._tables)
+            }
+            return files, {table: self._checksum(table, names) for table, names in files.items()}
+
+    def _names(self) -> set[str]:
+        sql = "SELECT table_name FROM duckdb_tables() WHERE NOT internal"
+        return {name for (name,) in self.connection.execute(sql).fetchall()}
+
+    def _has_rows(self, table: str) -> bool:
+        return self.connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone() is not None
+
+    def _checksum(self, table: str, names: list[str]) -> Checksum:
+        """The checksum of the rows in files; a part is small enough to be in memory."""
+        checksum = Checksum()
+        select = expressions(self.connection, table)
+        for name in names:
+            file = quoted(escape(str(self.folder / name)))
+            rows = self.connection.execute(f"SELECT {select} FROM read_parquet('{file}')")
+            checksum.add(rows.fetchnumpy())
+        return checksum
 
     def _sorted(self, table: str) -> str:
         return _MERGED[table] if self.merge and table in _MERGED else _GROWING[table]
 
-    def _file(self, table: str, part: int) -> str:
-        return str(self._folder.path / f"{table}-{part:06}.parquet")
 
-
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """A text as it stands between the quotation marks of SQL."""
     return text.replace("'", "''")
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.config import Payloads
 from sgstore.errors import StoreError
 from sgstore.store.packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store.rows import run
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.config import Config, Payloads
+    from sgstore.config import Config
     from sgstore.roads import RoadMap
     from sgstore.world import TraceInfo
 
@@ -38,11 +39,13 @@ class Identity:
     digest, ego : str
         SHA-256 of the recording, and the simulator's id of the ego.
     settings : str
-        The config as JSON.
+        The config as JSON, without its egos: the trace has one.
     settings_digest : str
     payloads : Payloads
-    map_digest : str
+    map_digest, map_name : str
         Empty without a map.
+    since, until : float or None
+        The part of the recording that is read; seconds since its first frame.
     """
 
     trace_id: int
@@ -52,11 +55,20 @@ class Identity:
     settings_digest: str
     payloads: Payloads
     map_digest: str
+    map_name: str
+    since: float | None = None
+    until: float | None = None
 
     @classmethod
-    def of(cls, info: TraceInfo, config: Config, road_map: RoadMap | None) -> Identity:
-        """The identity of a recording that is read with a config and a map."""
-        settings = as_json(config.as_dict())
+    def of(
+        cls,
+        info: TraceInfo,
+        config: Config,
+        road_map: RoadMap | None,
+        part: tuple[float | None, float | None] = (None, None),
+    ) -> Identity:
+        """The identity of a recording, or of a part of it, that is read with a config and a map."""
+        settings = as_json(replace(config, ego="", egos=()).as_dict())
         return cls(
             trace_id=trace_id_of(info.digest, info.ego),
             digest=info.digest,
@@ -65,7 +77,16 @@ class Identity:
             settings_digest=hashlib.sha256(settings.encode()).hexdigest(),
             payloads=config.payloads,
             map_digest=road_map.digest if road_map else "",
+            map_name=plain(road_map.name) if road_map else "",
+            since=part[0],
+            until=part[1],
         )
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Identity:
+        """The identity that plain values describe."""
+        payloads: Any = Payloads(**values["payloads"])
+        return cls(**(values | {"payloads": payloads}))
 
 
 def trace_id_of(digest: str, ego: str) -> int:
@@ -89,6 +110,8 @@ class StoredTrace:
         Of the recording then.
     digest, flavour, ego : str
         As in :class:`sgstore.world.TraceInfo`.
+    since, until : float or None
+        The part of the recording that was read, if not all of it; seconds since its first frame.
     map : str
         Name of its road map; empty without one.
     frames : int
@@ -99,7 +122,8 @@ class StoredTrace:
     answers : tuple of str
         Relations that it can answer.
     report : dict
-        What reading it brought to light, as :class:`sgstore.world.TraceReport`.
+        What reading it brought to light: :class:`sgstore.world.TraceReport`, and what
+        :func:`sgstore.store.reports.report_of` says.
     settings : dict
         The config it was ingested with.
     ingested_at : datetime
@@ -116,6 +140,8 @@ class StoredTrace:
     digest: str
     flavour: str
     ego: str
+    since: float | None
+    until: float | None
     map: str
     frames: int
     start_ns: int
@@ -159,8 +185,8 @@ class FrameRef:
 
 _TRACES: Final = """
 SELECT t.trace_id, t.name, t.uri AS path, t.size, t.mtime_ns, t.digest, t.flavour,
-       coalesce(t.ego, '') AS ego, coalesce(m.name, '') AS map, t.frames, t.start_ns, t.end_ns, t.period_ns,
-       t.answers, t.report, c.settings, t.ingested_at, t.version
+       coalesce(t.ego, '') AS ego, t.since, t.until, coalesce(m.name, '') AS map,
+       t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, c.settings, t.ingested_at, t.version
 FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
 ORDER BY t.ingested_at, t.name
 """
@@ -189,7 +215,7 @@ def already_stored(
     """
     found = connection.execute(
         f"""
-        SELECT t.name, t.digest, coalesce(t.ego, ''), c.digest, coalesce(m.digest, '')
+        SELECT t.name, t.digest, coalesce(t.ego, ''), c.digest, coalesce(m.digest, ''), t.since, t.until
         FROM {catalog}trace t JOIN {catalog}config c ON c.config_id = t.config_id
              LEFT JOIN {catalog}map m ON m.map_id = t.map_id
         WHERE t.trace_id = ?
@@ -198,17 +224,22 @@ def already_stored(
     ).fetchone()
     if found is None:
         return None
-    name, digest, ego, settings, map_digest = found
+    name, digest, ego, settings, map_digest, *part = found
     if (digest, ego) != (identity.digest, identity.ego):
         raise StoreError(
             f"its id {identity.trace_id} is taken by another trace, {name!r}, by chance; put one of them into a"
             " store of its own"
         )
-    if (settings, map_digest) != (identity.settings_digest, identity.map_digest):
-        what = "another road map" if settings == identity.settings_digest else "other settings"
-        raise StoreError(
-            f"already in the store as {name!r}, read with {what}; remove it first to read it anew"
-        )
+    same = {
+        "with other settings": settings == identity.settings_digest,
+        "with another road map": map_digest == identity.map_digest,
+        "in another part": part == [identity.since, identity.until],
+    }
+    for how, holds in same.items():
+        if not holds:
+            raise StoreError(
+                f"already in the store as {name!r}, read {how}; to read it anew, remove it first or say --force"
+            )
     return name
 
 
