@@ -76,12 +76,12 @@ def _side_edges(scene: Scene) -> Edges:
     bodies, pairs = scene.bodies, scene.pairs
     dx, dy = bodies.x[pairs.b] - bodies.x[pairs.a], bodies.y[pairs.b] - bodies.y[pairs.a]
     off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(pairs.bearing))
-    apart = off_axis > BESIDE
-    closed = scene.config.direction.sides == "closed"
-    aside = np.flatnonzero(~np.isnan(pairs.bearing) & (apart | closed))
+    if scene.config.direction.sides == "closed":  # to the last bit, as CARLASGG has it
+        aside = np.flatnonzero(~np.isnan(pairs.bearing))
+    else:
+        aside = np.flatnonzero(off_axis > BESIDE)
     left, right = (RELATION_CODE[name] for name in SIDES)
-    to_left = (pairs.bearing > 0) | ~apart
-    codes = np.where(to_left[aside], left, right).astype(np.int8)
+    codes = np.where(pairs.bearing[aside] >= 0, left, right).astype(np.int8)
     return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])
 
 
