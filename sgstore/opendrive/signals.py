@@ -3,8 +3,9 @@
 A signal stands in one place and applies to lanes of the roads that name it: by its own validity, and by each
 ``signalReference`` with its own. Without a validity it applies to whatever travels in the direction of its
 orientation. (ASAM OpenDRIVE 1.8, 14.) The maps of CARLA keep speed limits and painted stop signs as
-*objects* named ``Speed_30`` and ``Stencil_STOP``, which LibCarla reads as signals of type 274 and 206; their
-orientation is the sign of the lanes that they apply to.
+*objects* named ``Speed_30`` and ``Stencil_STOP``, which LibCarla reads as signals of type 274 and 206 (and
+loses the painted ones on the way to its landmarks); their orientation is the sign of the lanes that they
+apply to.
 """
 
 from __future__ import annotations
