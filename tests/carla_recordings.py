@@ -20,9 +20,14 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 from mcap_ros2._dynamic import serialize_dynamic
 
+from sgstore.traces import open_trace
+from sgstore.vocabulary import KINDS
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
+
+    from sgstore.world import FrameBlock, TraceInfo, TraceReport
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
@@ -356,6 +361,7 @@ def control(steer: float, throttle: float, brake: float) -> dict[str, Any]:
     }
 
 
+HERO = {1: ("vehicle.tesla.model3", "hero")}
 ACTORS = {
     7: ("vehicle.tesla.model3", "hero"),
     3: ("vehicle.mitsubishi.fusorosa", "autopilot"),
@@ -390,3 +396,36 @@ def drive(
             if camera and i % 2 == 0:
                 bridge.camera(t)
     return path
+
+
+def read(path: Path, size: int = 60, **how: Any) -> tuple[TraceInfo, list[FrameBlock], TraceReport]:
+    """What a recording gives, without hashing it."""
+    with open_trace(path, digest="0" * 64, **how) as trace:
+        return trace.info, list(trace.blocks(size)), trace.report
+
+
+def idents(blocks: list[FrameBlock]) -> list[str]:
+    return [ident for block in blocks for ident in block.entities.ident]
+
+
+def states(blocks: list[FrameBlock]) -> list[dict[str, Any]]:
+    """States by frame, each a mapping from the entity's id to its columns."""
+    names = idents(blocks)
+    frames = []
+    for block in blocks:
+        for start, stop in zip(block.offsets, block.offsets[1:], strict=False):
+            found = {}
+            for row in range(start, stop):
+                state = {n: getattr(block.states, n)[row] for n in block.states.__slots__}
+                found[names[state["node"]]] = state
+            frames.append(found)
+    return frames
+
+
+def kinds(blocks: list[FrameBlock]) -> dict[str, str]:
+    codes = [code for block in blocks for code in block.entities.kind]
+    return {ident: KINDS[code] for ident, code in zip(idents(blocks), codes, strict=True)}
+
+
+def reasons(report: Any) -> str:
+    return "; ".join(loss.reason for loss in report.losses)

@@ -27,7 +27,7 @@ from sgstore.world import TraceInfo, TraceReport
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.traces.mcap_file import McapFile
+    from sgstore.traces.recording import Recording
     from sgstore.world import FrameBlock
 
 
@@ -36,7 +36,7 @@ class CarlaTrace:
 
     Parameters
     ----------
-    recording : McapFile
+    recording : Recording
     ego : str
         Id or role name of the ego; empty: the vehicle whose role is ``hero`` or ``ego_vehicle``, or that has
         channels of its own.
@@ -58,7 +58,7 @@ class CarlaTrace:
 
     name: ClassVar[str] = "carla"
 
-    def __init__(self, recording: McapFile, *, ego: str = "", digest: str = "") -> None:
+    def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
         self._recording = recording
         # The file is hashed beside the first reading, so that it comes from the disk once.
         with ThreadPoolExecutor(1) as beside:
@@ -90,7 +90,7 @@ class CarlaTrace:
         )
 
     @classmethod
-    def recognises(cls, recording: McapFile) -> bool:
+    def recognises(cls, recording: Recording) -> bool:
         """Whether one of the channels carries lists of objects."""
         return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
 

@@ -15,7 +15,7 @@ from sgstore.traces.ros2msg import parse_definition, short_name
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
-    from sgstore.traces.mcap_file import McapFile
+    from sgstore.traces.recording import Recording
     from sgstore.traces.ros2msg import Struct
 
 OBJECTS: Final = "objects"
@@ -55,7 +55,7 @@ OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISIO
 """What the bridge publishes under the role name of a vehicle."""
 
 
-def content_of(recording: McapFile, channel: int) -> str:
+def content_of(recording: Recording, channel: int) -> str:
     """What the messages of a channel are; empty where the reader knows nothing of them.
 
     Lights of vehicles are no part of the bridge: they are read from JSON messages ``{"t": s, "lights": {id:
@@ -70,7 +70,7 @@ def content_of(recording: McapFile, channel: int) -> str:
     return CONTENTS.get(short_name(schema.name), "") if _is_ros(record, schema) else ""
 
 
-def structure(recording: McapFile, channel: int) -> Struct | None:
+def structure(recording: Recording, channel: int) -> Struct | None:
     """The structure of a channel's messages, as the recording itself defines it; ``None``: no ROS messages.
 
     Raises

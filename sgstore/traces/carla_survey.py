@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sgstore.traces.chunks import Messages
-    from sgstore.traces.mcap_file import McapFile
+    from sgstore.traces.recording import Recording
     from sgstore.traces.ros2msg import Struct
     from sgstore.world import Floats
 
@@ -99,7 +99,7 @@ class Survey:
 
     Parameters
     ----------
-    recording : McapFile
+    recording : Recording
     ego : str
         Id or role name that the user gave for the ego; empty: as the recording says.
 
@@ -127,7 +127,7 @@ class Survey:
         The file cannot be read, or the definition of the objects is malformed.
     """
 
-    def __init__(self, recording: McapFile, ego: str) -> None:
+    def __init__(self, recording: Recording, ego: str) -> None:
         self.contents: dict[int, str] = {}
         self.structures: dict[int, Struct] = {}
         self.leads: dict[int, Lead] = {}

@@ -207,12 +207,12 @@ class _Layout:
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
         """How many of the elements from a place on have this layout, one after another."""
         for offset, expected in self.prefixes:
+            if most < 1:
+                break
             lengths = np.ndarray((most,), order + "u4", values, place + offset, (self.size,))
             other = lengths != expected
             if other.any():
                 most = int(np.argmax(other))
-                if not most:
-                    break
         return most
 
     def copy(self, values: memoryview, place: int, to: Floats) -> None:

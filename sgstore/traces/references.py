@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from sgstore.traces.chunks import Messages
-    from sgstore.traces.mcap_file import McapFile
+    from sgstore.traces.recording import Recording
 
 Ref = tuple[int, int, int, int, int]
 """Channel id, log time, chunk offset, offset, length."""
@@ -38,7 +38,7 @@ def refs_of(refs: Iterable[Ref], channels: tuple[Channel, ...]) -> MessageRefs:
     return MessageRefs(channel, columns[1], columns[2], columns[3], columns[4])
 
 
-def channels_of(recording: McapFile, role: Callable[[int], str]) -> tuple[Channel, ...]:
+def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Channel, ...]:
     """The channels of a recording in order of their ids; ``role``: that of a channel, by its id."""
     counts = recording.counts or {}
     channels: list[Channel] = []

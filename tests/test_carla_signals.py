@@ -1,0 +1,350 @@
+"""What CARLA's bridge tells beside objects: controls, lights, the road map; and what a clip brings of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from carla_recordings import (
+    HERO,
+    Bridge,
+    drive,
+    kinds,
+    light,
+    read,
+    reasons,
+    states,
+    vehicle,
+)
+from opendrive_maps import a_map, a_road, element, lane, line, link, section
+
+from sgstore.exporters import Source
+from sgstore.exporters.mcap import write_clips
+from sgstore.opendrive import read_map
+from sgstore.traces import open_trace
+from sgstore.traces.carla_lights import Light, signals_of
+from sgstore.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
+from sgstore.world import Clip
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from sgstore.roads import RoadMap
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "drive.mcap"
+
+
+# Controls and lights of vehicles ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["before", "behind"])
+def test_controls_belong_to_the_frame_of_their_instant(path: Path, first: bool) -> None:
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        for i in range(7):
+            t = i * 0.1
+            if first:
+                bridge.status(t, steer=0.25, throttle=i / 8, brake=0.5)
+            bridge.objects(t, [vehicle(1), vehicle(2)])
+            if not first:
+                bridge.status(t, steer=0.25, throttle=i / 8, brake=0.5)
+
+    for size in (1, 3, 60):
+        frames = states(read(path, size)[1])
+
+        assert [frame["1"]["throttle"] for frame in frames] == [i / 8 for i in range(7)]
+        assert {frame["1"]["steer"] for frame in frames} == {-0.25}, "to the right is negative"
+        assert {frame["1"]["brake"] for frame in frames} == {0.5}
+        assert np.isnan([frame["2"]["throttle"] for frame in frames]).all()
+
+
+def test_controls_hold_for_half_a_second(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        bridge.status(0.0, throttle=0.5)
+        for i in range(10):
+            bridge.objects(i * 0.1, [vehicle(1)])
+
+    throttles = [frame["1"]["throttle"] for frame in states(read(path)[1])]
+
+    np.testing.assert_equal(throttles, [0.5] * 6 + [math.nan] * 4)
+
+
+def test_commands_stand_in_for_controls_that_were_not_recorded(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        bridge.command(0.0, steer=-0.5, throttle=0.75, brake=0)
+        bridge.objects(0.0, [vehicle(1)])
+
+    (frame,) = states(read(path)[1])
+
+    assert (frame["1"]["steer"], frame["1"]["throttle"]) == (0.5, 0.75)
+
+
+def test_controls_of_another_vehicle_are_not_the_ego_s(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.actors(HERO | {2: ("vehicle.audi.tt", "hero2")})
+        bridge.objects(0.0, [vehicle(1), vehicle(2)])
+        bridge.status(0.0, throttle=0.25)
+        bridge.status(0.0, throttle=0.75, role="hero2")
+
+    assert states(read(path)[1])[0]["1"]["throttle"] == 0.25
+    assert states(read(path, ego="hero2")[1])[0]["2"]["throttle"] == 0.75
+
+
+def test_lights_of_vehicles_have_our_order(path: Path) -> None:
+    order = ("position", "low_beam", "high_beam", "brake", "right", "left", "reverse", "fog")
+    order += ("interior", "special1", "special2")
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        for bit in range(11):
+            bridge.objects(bit * 0.1, [vehicle(1), vehicle(2)])
+            bridge.vehicle_lights(bit * 0.1, {1: 1 << bit})
+
+    frames = states(read(path)[1])
+
+    assert [frame["1"]["lights"] for frame in frames] == [
+        1 << VEHICLE_LIGHTS.index(f"light_{name}") for name in order
+    ]
+    assert {frame["2"]["lights"] for frame in frames} == {-1}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"[]",
+        b"{}",
+        b'{"t": "x", "lights": {}}',
+        b'{"t": 1e999, "lights": {}}',
+        b"[" * 100_000,
+        b'{"t": 0, "lights": {"a": 1}}',
+        b'{"t": 0, "lights": {"1": "a"}}',
+        b'{"t": 0, "lights": 5}',
+        b" " * (2 << 20),
+    ],
+    ids=range(10),
+)
+def test_lights_that_cannot_be_read_are_a_loss(path: Path, text: bytes) -> None:
+    with Bridge(path) as bridge:
+        bridge.objects(0.0, [vehicle(1)])
+        bridge.vehicle_lights(0.0, {1: 1})
+        bridge.writer.add_message(bridge.channels["/carla/vehicle_lights"], 7, text, 7)
+
+    _, blocks, report = read(path)
+
+    assert "a message of '/carla/vehicle_lights' cannot be read" in reasons(report)
+    assert states(blocks)[0]["1"]["lights"] == 1 << VEHICLE_LIGHTS.index("light_position")
+
+
+# Traffic lights and the map -----------------------------------------------------------------------
+
+
+def test_a_light_is_unknown_until_it_is_told_and_then_holds(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.light_places([light(80, 25, -4, 1.5), light(81, 5, 4)])
+        for i in range(9):
+            bridge.objects(i * 0.1, [vehicle(1)])
+            if i == 2:
+                bridge.light_states({80: 0, 81: 2}, 0.25)
+            if i == 5:
+                bridge.light_states({80: 3}, 0.55)  # the other stays as it is
+            if i == 7:
+                bridge.light_states({80: 4, 81: 77}, 0.75)
+
+    for size in (1, 4, 60):
+        frames = states(read(path, size)[1])
+        shown = [[LIGHT_STATES[frame[i]["light_state"]] for i in ("80", "81")] for frame in frames]
+
+        assert shown == (
+            [["unknown"] * 2] * 3
+            + [["red", "green"]] * 3
+            + [["off", "green"]] * 2
+            + [["unknown", "unknown"]]
+        )
+        assert [frames[0]["80"][c] for c in ("x", "y", "heading")] == pytest.approx([25, -4, 1.5])
+
+
+def test_places_of_lights_that_are_told_late_hold_from_the_start(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.objects(0.0, [vehicle(1)])
+        bridge.light_states({80: 0}, 0.05)
+        bridge.objects(0.1, [vehicle(1)])
+        bridge.light_places([light(80, 25, -4)], time=0.2)
+
+    _, blocks, report = read(path)
+
+    assert [LIGHT_STATES[frame["80"]["light_state"]] for frame in states(blocks)] == [
+        "unknown",
+        "red",
+    ]
+    assert report.losses == []
+
+
+def test_lights_without_a_place_are_listed_and_named(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.light_places([light(80, 25, -4), light(82, math.nan, 0)])
+        bridge.light_states({80: 0, 81: 1, 82: 2}, 0.0)
+        bridge.objects(0.1, [vehicle(1)])
+
+    _, blocks, report = read(path)
+
+    assert sorted(states(blocks)[0]) == ["1", "80"]
+    assert [i for i, k in kinds(blocks).items() if k == "traffic_light"] == ["80", "81", "82"]
+    assert any(warning.startswith("of 2 traffic lights") for warning in report.warnings)
+
+
+@pytest.mark.parametrize("by", ["world", "text"])
+def test_the_map_comes_from_the_world_or_from_a_text_that_is_one(path: Path, by: str) -> None:
+    with Bridge(path) as bridge:
+        bridge.write("/chatter", "std_msgs/String", {"data": "hello"}, 0.0)
+        if by == "world":
+            bridge.world("<OpenDRIVE/>", "Game\\Carla/Maps/Town05_Opt")
+        else:
+            bridge.write("/carla/map", "std_msgs/String", {"data": "<?xml?><OpenDRIVE/>"}, 0.0)
+        bridge.objects(0.1, [vehicle(1)])
+
+    info, _, _ = read(path)
+
+    assert "<OpenDRIVE/>" in info.map_text
+    assert info.map_name == ("Town05_Opt" if by == "world" else "")
+
+
+def test_of_two_maps_the_first_counts_and_that_is_said(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.world("<OpenDRIVE/>")
+        bridge.objects(0.1, [vehicle(1)])
+        bridge.world("<OpenDRIVE></OpenDRIVE>")
+
+    info, _, report = read(path)
+
+    assert info.map_text == "<OpenDRIVE/>"
+    assert any("more than one road map" in warning for warning in report.warnings)
+
+
+def crossing() -> RoadMap:
+    """Two roads, one after the other along x; a light for each direction stands at their meeting."""
+    lanes = section(lane(-1, before=-1, after=-1), lane(0), lane(1, before=1, after=1))
+
+    def lamp(name: str, s: float, t: float, way: str) -> str:
+        place = {"id": name, "s": s, "t": t, "orientation": way, "zOffset": 3}
+        return element("signal", dynamic="yes", type="1000001", country="OpenDRIVE", **place)
+
+    return read_map(
+        a_map(
+            a_road(
+                "1",
+                line(100),
+                sections=lanes,
+                links=link("successor", "road", "2", "start"),
+                signals=lamp("back", 99, 6, "-"),
+            ),
+            a_road(
+                "2",
+                line(100, x=100),
+                sections=lanes,
+                links=link("predecessor", "road", "1", "end"),
+                signals=lamp("forth", 1, -6, "+"),
+            ),
+        ),
+        "crossing",
+    )
+
+
+def test_a_light_is_the_signal_that_stands_where_it_stands_and_faces_its_way() -> None:
+    road_map = crossing()
+    nodes = road_map.nodes
+    column = nodes.name.index("forth")
+    heading = float(nodes.heading[column])
+    at = Light(101.3, -6.4, 3.0, heading)
+
+    assert (nodes.x[column], nodes.y[column]) == (101, -6)
+    assert signals_of({1: at}, road_map) == {1: "forth"}
+    assert signals_of({1: replace(at, heading=heading + 6.5)}, road_map) == {1: "forth"}
+    assert signals_of({1: replace(at, heading=heading + 3)}, road_map) == {}
+    assert signals_of({1: replace(at, x=103)}, road_map) == {}
+
+
+@pytest.mark.parametrize(
+    ("box", "signal"),
+    [
+        ((97.0, -1.75, 0.0, 0.0, 3.0, 3.0), "forth"),  # on the lane that leads to the signal's
+        ((104.0, -1.75, 0.0, 0.0, 3.0, 3.0), "forth"),  # on the signal's own
+        ((97.0, -1.75, 0.0, math.pi / 2, 3.0, 3.0), "forth"),
+        ((98.0, 1.75, 0.0, math.pi, 3.0, 3.0), "back"),
+        ((97.0, -8.0, 0.0, 0.0, 3.0, 3.0), None),  # beside the road
+        ((97.0, -3.6, 0.0, 0.0, 3.0, 2.0), None),  # on the lane's border only
+        ((math.nan,) * 6, None),
+    ],
+)
+def test_a_light_that_stands_elsewhere_is_the_signal_of_the_lanes_in_its_box(
+    box: tuple[float, ...], signal: str | None
+) -> None:
+    assert signals_of({1: Light(120, 20, 5, 0, box)}, crossing()).get(1) == signal
+
+
+def test_the_box_of_a_light_lies_in_the_light_s_own_axes(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.world(crossing().text)
+        bridge.light_places([light(80, 120, 10, math.pi / 2, centre=(-11.75, 23, -3))])
+        bridge.objects(0.0, [vehicle(1)])
+
+    entities = read(path)[1][0].entities
+
+    assert dict(zip(entities.ident, entities.map_ref, strict=True)) == {"80": "forth", "1": ""}
+
+
+# What a clip needs --------------------------------------------------------------------------------
+
+
+def test_context_is_what_lasts_each_time_it_says_something_new(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.world("<OpenDRIVE/>")
+        bridge.light_places([light(80, 25, -4)])
+        for i in range(10):
+            bridge.actors(HERO | ({2: ("vehicle.audi.tt", "")} if i > 4 else {}), time=i * 0.1)
+            bridge.light_states({80: 0 if i < 7 else 2}, i * 0.1)
+            bridge.objects(i * 0.1, [vehicle(1)])
+
+    info, blocks, _ = read(path)
+    told = [
+        (info.channels[channel].topic, round(time / 1e8))
+        for channel, time in zip(info.context.channel, info.context.log_time_ns, strict=True)
+    ]
+
+    assert told == [
+        ("/carla/world_info", 0),
+        ("/carla/traffic_lights/info", 0),
+        ("/carla/actor_list", 0),
+        ("/carla/traffic_lights/status", 0),
+        ("/carla/actor_list", 5),
+        ("/carla/traffic_lights/status", 7),
+    ]
+    roles = {channel.topic: channel.role for channel in info.channels}
+    assert roles["/carla/objects"] == "ground_truth"
+    assert {role for topic, role in roles.items() if topic != "/carla/objects"} == {"lasting"}
+    assert {info.channels[c].topic for c in blocks[0].messages.channel} == {"/carla/objects"}
+
+
+def test_a_clip_keeps_what_lasts_and_only_its_own_frames(tmp_path: Path, path: Path) -> None:
+    with open_trace(drive(path)) as trace:
+        info, whole = trace.info, list(trace.blocks())
+    start, end = (int(whole[0].log_time_ns[i]) for i in (8, 12))
+    source = Source(path, info.digest, info.context)
+    (clip,) = write_clips([Clip("drive", start, end)], {"drive": source}, tmp_path / "clips")
+
+    ours, blocks, report = read(clip.file)
+
+    assert report.losses == []
+    assert (ours.ego, ours.map_text) == (info.ego, info.map_text)
+    assert kinds(blocks) == kinds(whole)
+    assert blocks[0].log_time_ns.tolist() == whole[0].log_time_ns[8:13].tolist()
+    assert [f["80"]["light_state"] for f in states(blocks)] == [
+        f["80"]["light_state"] for f in states(whole)[8:13]
+    ]
