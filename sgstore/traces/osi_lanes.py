@@ -37,12 +37,13 @@ from sgstore.traces.osi_schema import (
     SENSOR_VIEW,
     enum_name,
     ground_truth_of,
+    has_field,
     identifiers,
     message_class,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from mcap.records import Schema
 
@@ -101,6 +102,8 @@ _GROUND_TRUTH: Final[dict[str, Any]] = {
     },
 }
 _SENSOR_VIEW: Final = {"global_ground_truth": _GROUND_TRUTH}
+_MAY_LACK: Final = {"subtype", "source_reference", "physical_lane_reference"}
+"""Fields that older versions of OSI do not have, and that a lane is usable without."""
 
 _TYPES: Final = {
     "NORMAL": "driving",
@@ -132,6 +135,13 @@ _FAR: Final = 1e8
 """Greatest distance of a place from the origin; m."""
 
 
+def _paths(fields: dict[str, Any]) -> Iterator[str]:
+    """Paths to all fields that a lane must have, with dots between the names."""
+    for name, inner in fields.items():
+        if name not in _MAY_LACK:
+            yield from (f"{name}.{path}" for path in _paths(inner)) if inner else (name,)
+
+
 class OsiLanes:
     """The lanes that messages tell, taken up one message after another.
 
@@ -149,6 +159,15 @@ class OsiLanes:
     def __init__(self, schema: Schema) -> None:
         fields = _SENSOR_VIEW if schema.name == SENSOR_VIEW else _GROUND_TRUTH
         self._class = message_class(schema, fields)
+        prefix = "global_ground_truth." if schema.name == SENSOR_VIEW else ""
+        self._lacks = {
+            name: [
+                path
+                for path in _paths(_GROUND_TRUTH[name])
+                if not has_field(self._class, f"{prefix}{name}.{path}")
+            ]
+            for name in FIELDS
+        }
         self._told: dict[str, dict[int, Any]] = {name: {} for name in FIELDS}
         self._map = ""
         self._points = 0
@@ -163,8 +182,17 @@ class OsiLanes:
             return
         self._map = self._map or str(getattr(truth, "map_reference", ""))
         for name in FIELDS:
-            for thing in getattr(truth, name, ()):
+            things = getattr(truth, name, ())
+            if self._lacks[name]:
+                self._say_lack(name, len(things))
+                continue
+            for thing in things:
                 self._told[name].setdefault(int(thing.id.value), thing)
+
+    def _say_lack(self, name: str, number: int) -> None:
+        warning = f"the schema of {name} lacks the field {self._lacks[name][0]}: none of it is used"
+        if number and warning not in self.warnings:
+            self.warnings.append(warning)
 
     def text(self) -> tuple[str, str]:
         """The text of the road map, and what the recording calls the map; empty if it tells no lanes.
@@ -182,11 +210,7 @@ class OsiLanes:
         areas: list[Area] = []
         for ident, lane in logical.items():
             lines += self._guarded(_logical_line, ident, lane, borders)
-        covered = {
-            int(part.physical_lane_id.value)
-            for lane in logical.values()
-            for part in lane.physical_lane_reference
-        }
+        covered = {ident for lane in logical.values() for ident in _physical(lane)}
         for ident, lane in lanes.items():
             if ident in covered:
                 continue
@@ -327,7 +351,7 @@ def _physical_line(lane: Any, borders: _Borders) -> LaneLine:
     told = about.HasField("centerline_is_driving_direction")
     return LaneLine(
         ident=str(lane.id.value),
-        type=_type_of(kind, enum_name(about, "subtype").partition("_")[2]),
+        type=_type_of(kind, _word(about, "subtype")),
         centre=borders.place(about.centerline),
         forward=bool(about.centerline_is_driving_direction) or not told,
         lefts=borders.physical(about.left_lane_boundary_id),
@@ -339,6 +363,12 @@ def _physical_line(lane: Any, borders: _Borders) -> LaneLine:
         junction=None if kind == "TYPE_INTERSECTION" else "",
         **_source(lane),
     )
+
+
+def _word(message: Any, field: str) -> str:
+    """What stands behind ``TYPE_`` or ``SUBTYPE_`` in the name of a value; empty if there is no such field."""
+    known = field in message.DESCRIPTOR.fields_by_name
+    return enum_name(message, field).partition("_")[2] if known else ""
 
 
 def _type_of(kind: str, word: str) -> str:
@@ -363,9 +393,8 @@ def _logical_line(lane: Any, borders: _Borders) -> LaneLine:
         np.column_stack([np.interp(cuts, s, column) for column in line.T])
         for line, s in ((left, left_s), (right, right_s))
     )
-    kind = enum_name(lane, "type")
     ways = enum_name(lane, "move_direction")
-    physical = {_number(part.physical_lane_id) for part in lane.physical_lane_reference}
+    physical = _physical(lane)
     crossing = [
         ident
         for ident in sorted(physical)
@@ -374,7 +403,7 @@ def _logical_line(lane: Any, borders: _Borders) -> LaneLine:
     ]
     return LaneLine(
         ident=str(lane.id.value),
-        type=_TYPES.get(kind.partition("_")[2], "none"),
+        type=_TYPES.get(_word(lane, "type"), "none"),
         centre=(one + other) / 2,
         forward=ways != "MOVE_DIRECTION_DECREASING_S",
         both=ways == "MOVE_DIRECTION_BOTH_ALLOWED",
@@ -388,6 +417,11 @@ def _logical_line(lane: Any, borders: _Borders) -> LaneLine:
         junction=str(crossing[0]) if crossing else "",
         **_source(lane),
     )
+
+
+def _physical(lane: Any) -> set[int]:
+    """Ids of the physical lanes that a logical lane is made of."""
+    return {_number(part.physical_lane_id) for part in getattr(lane, "physical_lane_reference", ())}
 
 
 def _connections(connections: Iterable[Any]) -> tuple[Joint, ...]:
