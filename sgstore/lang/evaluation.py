@@ -1,0 +1,357 @@
+"""Bound expressions as Python functions: the value of an expression for one binding of one graph in memory.
+
+The same meaning as :mod:`sgstore.lang.sql` gives them in a store: ``None`` is NULL, and logic has three values.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.geometry import pair_numbers
+from sgstore.lang import bound as b
+from sgstore.lang.catalog import NODE_ATTRIBUTES, Unit
+from sgstore.vocabulary import MAP_KINDS
+
+if TYPE_CHECKING:
+    from sgstore.graph import SceneGraph
+
+Attributes = Mapping[str, Any]
+
+
+@dataclass
+class FrameView:
+    """A scene graph as a search wants it, with what is known of its frame and trace.
+
+    Parameters
+    ----------
+    graph : SceneGraph
+    frame, trace : mapping
+        Attributes of ``frame`` and ``trace`` by their names in the language, as far as they are known.
+    """
+
+    graph: SceneGraph
+    frame: Attributes = field(default_factory=dict[str, Any])
+    trace: Attributes = field(default_factory=dict[str, Any])
+
+    @cached_property
+    def nodes(self) -> Mapping[int, Attributes]:
+        """Attributes of the nodes by id."""
+        return self.graph.nodes
+
+    @cached_property
+    def by_kind(self) -> Mapping[str, list[int]]:
+        """Nodes of each kind, the ego among them."""
+        found: defaultdict[str, list[int]] = defaultdict(list)
+        for node, attributes in self.nodes.items():
+            found[attributes["kind"]].append(node)
+        return found
+
+    @cached_property
+    def links(self) -> Mapping[tuple[int, int], dict[str, Attributes]]:
+        """Relation and attributes of the edges of each pair of nodes."""
+        found: defaultdict[tuple[int, int], dict[str, Attributes]] = defaultdict(dict)
+        for src, relation, dst, attributes in self.graph.edges:
+            found[src, dst][relation] = attributes
+        return found
+
+    @cached_property
+    def ahead(self) -> Mapping[tuple[str, int], list[int]]:
+        """Where the edges of a relation lead from a node."""
+        return self._neighbours(0, 2)
+
+    @cached_property
+    def back(self) -> Mapping[tuple[str, int], list[int]]:
+        """Where the edges of a relation that end in a node come from."""
+        return self._neighbours(2, 0)
+
+    def _neighbours(self, at: int, other: int) -> Mapping[tuple[str, int], list[int]]:
+        found: defaultdict[tuple[str, int], list[int]] = defaultdict(list)
+        for edge in self.graph.edges:
+            found[edge[1], edge[at]].append(edge[other])  # type: ignore[index, arg-type]
+        return found
+
+    def is_one(self, node: int, kinds: b.Kinds) -> bool:
+        """Whether a node is of these kinds."""
+        kind = self.nodes[node]["kind"]
+        return kind in (kinds.ego if node == self.graph.ego else kinds.other)
+
+    def pair(self, name: str, one: int, other: int) -> float | None:
+        """A number of a pair of entities; ``None`` where something that it needs is missing."""
+        key = (one, other)
+        if key not in self._pairs:
+            boxes = [self._box(one), self._box(other)]
+            if None in boxes:
+                self._pairs[key] = {}
+            else:
+                with np.errstate(invalid="ignore"):
+                    numbers = pair_numbers(np.array(boxes[:1]), np.array(boxes[1:]))
+                self._pairs[key] = {
+                    name: float(scale * getattr(numbers, column)[0])
+                    for name, (column, scale) in _PAIR_COLUMNS.items()
+                }
+        value = self._pairs[key].get(name)
+        return None if value is None or math.isnan(value) else value
+
+    @cached_property
+    def _pairs(self) -> dict[tuple[int, int], dict[str, float]]:
+        return {}
+
+    def _box(self, node: int) -> list[float] | None:
+        attributes = self.nodes[node]
+        if attributes["kind"] in MAP_KINDS:
+            return None
+        known = [attributes.get(name, math.nan) for name in _BOX]
+        known[3] = math.radians(known[3])
+        return known
+
+
+_BOX: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
+_DEGREES: Final = 180 / math.pi
+_PAIR_COLUMNS: Final = {
+    "dist": ("distance", 1.0),
+    "gap": ("gap", 1.0),
+    "lon": ("lon", 1.0),
+    "lat": ("lat", 1.0),
+    "bearing": ("bearing", _DEGREES),
+    "rel_heading": ("rel_heading", _DEGREES),
+    "closing_speed": ("closing_speed", 1.0),
+    "ttc": ("ttc", 1.0),
+    "headway": ("headway", 1.0),
+    "rel_speed": ("rel_speed", 1.0),
+}
+
+
+@dataclass(slots=True)
+class Binding:
+    """What the variables are bound to while a graph is searched.
+
+    Attributes
+    ----------
+    view : FrameView
+    nodes : dict of str to int
+        Node ids by key; only those of the keys that the search has come to mean something.
+    edges : dict of str to (relation, attributes)
+    """
+
+    view: FrameView
+    nodes: dict[str, int] = field(default_factory=dict[str, int])
+    edges: dict[str, tuple[str, Attributes]] = field(
+        default_factory=dict[str, "tuple[str, Attributes]"]
+    )
+
+
+Evaluate = Callable[[Binding], Any]
+Blocks = Callable[[b.BlockValue], Evaluate]
+
+
+def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, PLR0911, PLR0912 - a case each
+    """The function that gives the value of an expression.
+
+    Parameters
+    ----------
+    expression : Bound
+    blocks : function
+        Gives the function of a block; it belongs to who can search.
+    """
+    match expression:
+        case b.Value(value=value):
+            return lambda _: value
+        case b.NodeValue(node=node):
+            return lambda at: at.nodes[node]
+        case b.NodeAttribute(node=node, attribute=attribute):
+            if attribute.unit is Unit.binding:
+                return lambda at: at.nodes[node]
+            if attribute is NODE_ATTRIBUTES["type"]:
+                return lambda at: _type_of(at.view.nodes[at.nodes[node]])
+            name = attribute.name
+            return lambda at: at.view.nodes[at.nodes[node]].get(name)
+        case b.LabelTest(node=node, kinds=kinds):
+            return lambda at: at.view.is_one(at.nodes[node], kinds)
+        case b.EdgeRelation(edge=edge):
+            return lambda at: at.edges[edge][0]
+        case b.EdgeAttribute(edge=edge, attribute=attribute):
+            name = attribute.name
+            return lambda at: at.edges[edge][1].get(name)
+        case b.FrameAttribute(attribute=attribute):
+            name = attribute.name
+            return lambda at: at.view.frame.get(name)
+        case b.TraceAttribute(attribute=attribute):
+            name = attribute.name
+            return lambda at: at.view.trace.get(name)
+        case b.PairNumber(function=function, a=one, b=other):
+            return lambda at: at.view.pair(function, at.nodes[one], at.nodes[other])
+        case b.BlockValue():
+            return blocks(expression)
+        case b.Operation():
+            return _operation(expression, blocks)
+        case b.Choices() | b.Aggregate():
+            raise TypeError(f"{expression} has no value of its own")
+
+
+def _type_of(attributes: Attributes) -> Any:
+    return attributes.get("lane_type" if attributes["kind"] == "lane" else "type_name")
+
+
+def _operation(operation: b.Operation, blocks: Blocks) -> Evaluate:
+    word = operation.word
+    if word == "IN":
+        return _membership(operation, blocks)
+    parts = [evaluator(operand, blocks) for operand in operation.operands]
+    if word in _LOGIC:
+        combine = _LOGIC[word]
+        return lambda at: combine(part(at) for part in parts)
+    if word == "coalesce":
+        return lambda at: next((v for v in (part(at) for part in parts) if v is not None), None)
+    if word in {"IS NULL", "IS NOT NULL"}:
+        wanted, part = word == "IS NULL", parts[0]
+        return lambda at: (part(at) is None) == wanted
+    if word == "=~":
+        return _regex(operation, parts[0])
+    return _strict(_FUNCTIONS[word], parts)
+
+
+def _strict(function: Callable[..., Any], parts: list[Evaluate]) -> Evaluate:
+    """A function that is unknown where one of its arguments is."""
+    if len(parts) == 2:
+        left, right = parts
+
+        def of_two(at: Binding) -> Any:
+            one = left(at)
+            if one is None:
+                return None
+            other = right(at)
+            return None if other is None else function(one, other)
+
+        return of_two
+
+    def of_many(at: Binding) -> Any:
+        values = [part(at) for part in parts]
+        return None if None in values else function(*values)
+
+    return of_many
+
+
+def _membership(operation: b.Operation, blocks: Blocks) -> Evaluate:
+    operand, choices = operation.operands
+    if not isinstance(choices, b.Choices):
+        raise TypeError(f"{choices} is no list")
+    items = frozenset(item.value for item in choices.items)
+    value = evaluator(operand, blocks)
+
+    def member(at: Binding) -> bool | None:
+        if not items:
+            return False
+        found = value(at)
+        return None if found is None else found in items
+
+    return member
+
+
+def _regex(operation: b.Operation, text: Evaluate) -> Evaluate:
+    pattern = operation.operands[1]
+    if not isinstance(pattern, b.Value):
+        raise TypeError(f"{pattern} is no constant")
+    wanted = re.compile(str(pattern.value))
+
+    def whole(value: str) -> bool:
+        return wanted.fullmatch(value) is not None
+
+    return _strict(whole, [text])
+
+
+def _and(values: Any) -> bool | None:
+    result: bool | None = True
+    for value in values:
+        if value is False:
+            return False
+        if value is None:
+            result = None
+    return result
+
+
+def _or(values: Any) -> bool | None:
+    result: bool | None = False
+    for value in values:
+        if value is True:
+            return True
+        if value is None:
+            result = None
+    return result
+
+
+def _not(values: Any) -> bool | None:
+    (value,) = values
+    return None if value is None else not value
+
+
+def _xor(values: Any) -> bool | None:
+    known = list(values)
+    return None if None in known else sum(known) % 2 == 1
+
+
+def _implies(values: Any) -> bool | None:
+    condition, consequence = values
+    return _or((_not((condition,)), consequence))
+
+
+_LOGIC: Final[dict[str, Callable[[Any], bool | None]]] = {
+    "AND": _and,
+    "OR": _or,
+    "NOT": _not,
+    "XOR": _xor,
+    "IMPLIES": _implies,
+}
+
+
+def _divided(a: float, by: float) -> float | None:
+    return a / by if by else None
+
+
+def _remainder(a: float, by: float) -> float | None:
+    return math.fmod(a, by) if by else None
+
+
+def _root(a: float) -> float | None:
+    return math.sqrt(a) if a >= 0 else None
+
+
+def _rounded(a: float) -> float:
+    """Halves go away from zero, as in SQL."""
+    return math.copysign(math.floor(abs(a) + 0.5), a)
+
+
+_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
+    "=": operator.eq,
+    "<>": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": _divided,
+    "%": _remainder,
+    "negative": operator.neg,
+    "abs": abs,
+    "sqrt": _root,
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "round": _rounded,
+    "min": min,
+    "max": max,
+    "lower": str.lower,
+    "upper": str.upper,
+    "STARTS WITH": str.startswith,
+    "ENDS WITH": str.endswith,
+    "CONTAINS": operator.contains,
+}

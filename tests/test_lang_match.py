@@ -1,0 +1,119 @@
+"""Patterns over one graph in memory, against exhaustive search and against SQL."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from oracle import answer
+from oracle_patterns import Writer
+from oracle_worlds import World, random_world
+from test_lang_oracle import QUERIES
+
+from sgstore.demo import QUESTIONS, RECORDING
+from sgstore.errors import QueryError
+from sgstore.graph import SceneGraph
+from sgstore.ingest import ingest
+from sgstore.lang import compile_query
+from sgstore.lang.evaluation import FrameView
+from sgstore.lang.match import Matcher
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from oracle_worlds import Frame
+
+
+def view_of(frame: Frame) -> FrameView:
+    graph = frame.graph
+    edges = [
+        (src, relation, dst, {k: v for k, v in data.items() if k != "relation"})
+        for src, dst, relation, data in graph.edges(keys=True, data=True)
+    ]
+    start = frame.trace.frames[0].time_ns
+    nodes = dict(graph.nodes(data=True))
+    key = (frame.frame_id, frame.trace.name, frame.seq, frame.time_ns, frame.ego)
+    scene = SceneGraph(*key, nodes, edges)
+    about = {"id": frame.frame_id, "seq": frame.seq, "t": (frame.time_ns - start) / 1e9}
+    return FrameView(scene, about, {"name": frame.trace.name, "id": frame.trace.trace_id})
+
+
+def found(text: str, world: World) -> Counter[tuple[Any, ...]]:
+    """Rows of a query, as ``oracle.answer`` gives them."""
+    query = compile_query(text, world.catalog)
+    matcher = Matcher(query.bound)
+    rows: Counter[tuple[Any, ...]] = Counter()
+    for frame in world.frames:
+        if frame.trace.name in query.left_out:
+            continue
+        for match in matcher.matches(view_of(frame)):
+            named = {k: v for k, v in {**match.nodes, **match.edges}.items() if k != "ego"}
+            rows[frame.frame_id, *(value for _, value in sorted(named.items()))] += 1
+    return rows
+
+
+@pytest.mark.parametrize("first", [0, 100])
+def test_random_patterns_find_in_memory_what_exhaustive_search_finds(first: int) -> None:
+    tried = matched = 0
+    for number in range(first, first + 50):
+        if number % 25 == 0:
+            world = random_world(number, static=number % 2 == 0)
+        text = Writer(number).query()
+        try:
+            rows = found(text, world)
+        except QueryError:
+            continue
+        wanted, _ = answer(text, world)
+        tried += 1
+        matched += bool(wanted)
+        assert rows == wanted, f"pattern {number}: {text}"
+
+    assert tried > 40
+    assert matched > 10
+
+
+@pytest.mark.parametrize("text", QUERIES)
+def test_queries_find_in_memory_what_exhaustive_search_finds(text: str) -> None:
+    world = random_world(2, frames=5, static=True)
+
+    assert found(text, world) == answer(text, world)[0]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    path: Path = tmp_path_factory.mktemp("match") / "town.sgstore"
+    assert ingest(path, [RECORDING])[0].error is None
+    return Store(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(question.pattern for question in QUESTIONS),
+        "MATCH (e:Ego), (v:Vehicle) WHERE lead(e, v) AND headway(e, v) < 1.5",
+        "MATCH (e:Ego), (v:Vehicle) WHERE ttc(e, v) < 3 AND NOT same_lane(e, v)",
+        "MATCH (p:Person)-[r:isIn]->(c:Crosswalk)",
+        "MATCH (e:Ego) WHERE in_junction(e) OR red_for(e)",
+        "MATCH (a:Car)-[d:near|very_near]->(b:Person) WHERE abs(rel_heading(a, b)) > 60",
+    ],
+)
+def test_a_graph_of_the_store_gives_in_memory_what_sql_gives(town: Store, text: str) -> None:
+    matches = town.find(text)
+    bound = compile_query(text, town.catalog()).bound
+    matcher = Matcher(bound)
+    frames = {frame.frame_id: frame for frame in town.find("MATCH (e:Ego)").frames()}
+
+    for frame_id in list(frames)[::60]:
+        scene = town.file.graph(frame_id)
+        frame = frames[frame_id]
+        here = [match.nodes for match in matcher.matches(FrameView(scene, {"t": frame.t}))]
+        there = [{name: row[name] for name in row} for row in matches.bindings(frame)]
+        assert _sorted(here) == _sorted(there), frame
+
+
+def _sorted(rows: list[Any]) -> list[list[tuple[str, int]]]:
+    return sorted(
+        sorted(dict(row).items()) for row in {tuple(sorted(r.items())): r for r in rows}.values()
+    )
