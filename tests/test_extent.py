@@ -1,0 +1,548 @@
+"""What is in range: every shape against shapely, frame by frame, and the rules that hold for all of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import shapely
+from builders import Thing, edges, frames, graph_of, present, thing
+from conftest import REPOSITORY
+from opendrive_maps import a_map, a_road, cubic, lane, line, section
+
+from sgstore.config import Config, Lanes, Pairs, Range, configured
+from sgstore.opendrive import read_map
+from sgstore.opendrive.nodes import DRIVING
+from sgstore.relations.extent import STEP, Extent, Places
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.vocabulary import KIND_CODE, KINDS, RELATION_CODE, TypeMeaning
+
+if TYPE_CHECKING:
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+
+ARROW = ((40.0, 0.0), (-10.0, 18.0), (0.0, 0.0), (-10.0, -18.0))
+SHAPES = {
+    "radius": Range(35.0),
+    "rectangle": Range(shape="rectangle", front=50, rear=2, side=25),
+    "polygon": Range(shape="polygon", polygon=ARROW),
+    "corridor": Range(shape="corridor", width=9, length=70),
+}
+shapes = pytest.mark.parametrize("of", SHAPES.values(), ids=SHAPES)
+
+
+@cache
+def town() -> RoadMap:
+    path = REPOSITORY / "samples/town/town.xodr"
+    return read_map(path.read_text(encoding="utf-8"), "town")
+
+
+@cache
+def outlines() -> Any:
+    return town().outlines()
+
+
+def places(seed: int, count: int = 40) -> Places:
+    """Egos on lanes, roughly in their direction or against it, some off the roads, some without a number."""
+    rng = np.random.default_rng(seed)
+    points = town().waypoints(1.0)
+    at = rng.integers(len(points), size=count)
+    x, y = points.x[at] + rng.normal(0, 1, count), points.y[at] + rng.normal(0, 1, count)
+    heading = points.heading[at] + rng.normal(0, 0.3, count) + np.pi * (rng.random(count) < 0.2)
+    x[::9] += 30
+    x[3], y[4], heading[5] = np.nan, np.nan, np.nan
+    return Places(x, y, heading, points.z[at])
+
+
+def boxes_around(egos: Places, seed: int, each: int = 30) -> tuple[Any, Any]:
+    """Frames and footprints of things around egos; some of them points, some without a position."""
+    rng = np.random.default_rng(seed)
+    frame = np.repeat(np.arange(len(egos)), each)
+    count = len(frame)
+    box = np.column_stack(
+        [
+            egos.x[frame] + rng.uniform(-70, 70, count),
+            egos.y[frame] + rng.uniform(-70, 70, count),
+            rng.uniform(-9, 9, count),
+            rng.choice([0.5, 4.5, 12.0, 60.0], count),
+            rng.choice([0.5, 2.0], count),
+        ]
+    )
+    box[::7, 3:] = np.nan
+    box[::11, 2] = np.nan
+    box[::13, 0] = np.nan
+    return frame, box
+
+
+def turned(shape: Any, x: float, y: float, heading: float) -> Any:
+    shape = shapely.affinity.rotate(shape, heading, (0, 0), use_radians=True)
+    return shapely.affinity.translate(shape, x, y)
+
+
+def footprint(box: Any, by: str = "footprint") -> Any:
+    x, y, heading, length, width = box
+    if by == "centre" or np.isnan(box).any():
+        return shapely.Point(x, y)
+    return turned(shapely.box(-length / 2, -width / 2, length / 2, width / 2), x, y, heading)
+
+
+def area(of: Range, egos: Places, i: int) -> Any:
+    """The area of a frame as a shapely shape; None where there is no range."""
+    x, y, heading = (float(column[i]) for column in (egos.x, egos.y, egos.heading))
+    if math.isnan(x + y) or (math.isnan(heading) and of.shape != "radius"):
+        return None
+    if of.shape == "radius":
+        return shapely.Point(x, y)
+    if of.shape == "rectangle":
+        return turned(shapely.box(-of.rear, -of.side, of.front, of.side), x, y, heading)
+    if of.shape == "polygon":
+        return turned(shapely.Polygon(of.polygon), x, y, heading)
+    return shapely.MultiLineString(corridor(of.length, x, y, heading))
+
+
+def reach(of: Range) -> float:
+    return {"radius": of.radius, "corridor": of.width / 2}.get(of.shape, 0.0)
+
+
+def corridor(length: float, x: float, y: float, heading: float) -> list[Any]:
+    """Lines of a corridor: down every branch of the lanes, one after another."""
+    road_map, point = town(), shapely.Point(x, y)
+    ribbons, found = town().ribbons, []
+    flow = road_map.edges.relation == RELATION_CODE["travelsTo"]
+    onward: dict[int, list[int]] = {}
+    for src, dst in zip(road_map.edges.src[flow], road_map.edges.dst[flow], strict=True):
+        onward.setdefault(-2 - int(src), []).append(-2 - int(dst))
+
+    def follow(number: int, start: float, left: float) -> None:
+        found.append(cut(number, start, start + left))
+        rest = left - (float(ribbons.lengths[number]) - start)
+        for other in onward.get(number, []) if rest > 0 else []:
+            follow(other, 0.0, rest)
+
+    for number in range(len(ribbons)):
+        if road_map.nodes.lane_type[1 + number] not in DRIVING:
+            continue
+        if not shapely.dwithin(outlines()[1 + number], point, 1e-3):
+            continue
+        start, direction = beside(number, point)
+        if math.cos(direction - heading) > 0:
+            follow(number, start, length)
+    ahead = (x + length * math.cos(heading), y + length * math.sin(heading))
+    return [one for one in found if one.length > 0] or [shapely.LineString([(x, y), ahead])]
+
+
+def centre_line(number: int) -> tuple[Any, Any]:
+    of = town().ribbons
+    rows = slice(of.offsets[number], of.offsets[number + 1])
+    x, y = (of.left_x + of.right_x)[rows] / 2, (of.left_y + of.right_y)[rows] / 2
+    return np.column_stack([x, y]), of.along[rows]
+
+
+def beside(number: int, point: Any) -> tuple[float, float]:
+    """How far along a lane a point is, and the direction there."""
+    line, along = centre_line(number)
+    steps = np.append(0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    place = shapely.line_locate_point(shapely.LineString(line), point)
+    i = int(np.clip(np.searchsorted(steps, place) - 1, 0, len(line) - 2))
+    run = line[i + 1] - line[i]
+    return float(np.interp(place, steps, along)), math.atan2(run[1], run[0])
+
+
+def cut(number: int, begin: float, end: float) -> Any:
+    line, along = centre_line(number)
+    end = min(end, float(along[-1]))
+    inner = (along > begin) & (along < end)
+    ends = [[np.interp(at, along, line[:, k]) for k in (0, 1)] for at in (begin, end)]
+    return shapely.LineString([ends[0], *line[inner], ends[1]])
+
+
+# Shapes -----------------------------------------------------------------------------------------
+
+
+@shapes
+@pytest.mark.parametrize("by", ["footprint", "centre"])
+@pytest.mark.parametrize("seed", range(3))
+def test_entities_in_range_are_those_that_shapely_finds(of: Range, by: str, seed: int) -> None:
+    egos = places(seed)
+    frame, boxes = boxes_around(egos, seed)
+    areas = Extent(replace(of, by=by), town()).areas(egos)
+    expected = []
+    for i, box in zip(frame.tolist(), boxes, strict=True):
+        around = area(of, egos, i)
+        there = not np.isnan(box[:2]).any()
+        meets = there and shapely.dwithin(around, footprint(box, by), reach(of) + 1e-9)
+        expected.append(around is None or bool(meets))
+
+    held = areas.hold(frame, boxes, np.zeros(len(frame)))
+
+    assert held.tolist() == expected
+    assert 0.05 < np.mean(held) < 0.95
+
+
+@shapes
+@pytest.mark.parametrize("seed", range(2))
+def test_parts_of_a_map_in_range_are_those_that_shapely_finds(of: Range, seed: int) -> None:
+    egos, nodes = places(seed), town().nodes
+    inside = town().edges.relation == RELATION_CODE["isIn"]
+    within = list(zip(town().edges.src[inside], town().edges.dst[inside], strict=True))
+
+    parts = Extent(of, town()).areas(egos).parts(town())
+
+    for i in range(len(egos)):
+        around = area(of, egos, i)
+        if around is None:
+            assert parts[i].all()
+            continue
+        shaped = ~shapely.is_missing(outlines())
+        near = {
+            -1 - k for k in np.flatnonzero(shaped & shapely.dwithin(outlines(), around, reach(of)))
+        }
+        for kind in ("lane", "road"):
+            near |= {d for s, d in within if s in near and KINDS[nodes.kind[-1 - s]] == kind}
+        assert {-1 - k for k in np.flatnonzero(parts[i])} == near
+
+
+@shapes
+def test_the_circle_around_an_area_holds_whatever_is_in_it(of: Range) -> None:
+    egos = places(7)
+    frame, boxes = boxes_around(egos, 7)
+    areas = Extent(of, town()).areas(egos)
+    x, y, extent = boxes[:, 0], boxes[:, 1], np.hypot(boxes[:, 3], boxes[:, 4]) / 2
+
+    held = areas.hold(frame, boxes, np.zeros(len(frame)))
+    near = set(zip(*(column.tolist() for column in areas.near(x, y, extent)), strict=True))
+
+    assert {(f, row) for row, f in enumerate(frame.tolist()) if held[row]} <= near
+
+
+@shapes
+def test_a_block_of_one_frame_has_the_same_range(of: Range) -> None:
+    egos = places(1, 12)
+    frame, boxes = boxes_around(egos, 1)
+    whole = Extent(of, town()).areas(egos)
+    held = whole.hold(frame, boxes, np.zeros(len(frame)))
+    for i in range(len(egos)):
+        one = Places(*(column[i : i + 1] for column in (egos.x, egos.y, egos.heading, egos.ground)))
+        areas = Extent(of, town()).areas(one)
+        mine = frame == i
+        alone = areas.hold(np.zeros(mine.sum(), int), boxes[mine], np.zeros(mine.sum()))
+
+        assert alone.tolist() == held[mine].tolist()
+        assert (areas.parts(town())[0] == whole.parts(town())[i]).all()
+
+
+def test_a_corridor_without_a_map_runs_straight_ahead() -> None:
+    config = configured(range={"shape": "corridor", "width": 4, "length": 30})
+    things = [thing("ego"), thing("ahead", 31), thing("behind", -6), thing("aside", 10, 3.1)]
+
+    assert entities(graph_of(frames(things), None, config)) == ["ego", "ahead"]
+
+
+# Entities of either sort, and the ego ---------------------------------------------------------------
+
+
+def entities(graph: GraphBlock, frame: int = 0) -> list[str]:
+    of = graph.frames
+    moving = of.states.node[of.offsets[frame] : of.offsets[frame + 1]].tolist()
+    still = sorted(node for node in present(graph, frame) if node >= 0)
+    return [of.entities.ident[node] for node in [*moving, *still]]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "inside"),
+    [
+        (52.0, 0.0, True),
+        (52.001, 0.0, False),
+        (-4.0, 0.0, True),
+        (-4.001, 0.0, False),
+        (0.0, 26.0, True),
+        (0.0, -26.001, False),
+        (52.0, 26.0, True),
+    ],
+)
+def test_what_touches_the_edge_of_a_rectangle_is_in(x: float, y: float, inside: bool) -> None:
+    config = Config(range=SHAPES["rectangle"])
+
+    graph = graph_of(frames([thing("ego"), thing("c", x, y)]), None, config)
+
+    assert ("c" in entities(graph)) == inside
+
+
+def test_a_rectangle_turns_with_the_ego() -> None:
+    config = Config(range=SHAPES["rectangle"])
+    north = [thing("ego", heading=math.pi / 2), thing("ahead", 0, 50), thing("behind", 0, -8)]
+
+    assert entities(graph_of(frames(north), None, config)) == ["ego", "ahead"]
+
+
+def test_what_moves_and_what_stands_are_told_in_range_as_the_settings_say() -> None:
+    of = replace(SHAPES["rectangle"], by="centre", static_by="footprint")
+    things = [thing("ego"), thing("moving", 51), thing("still", 51, 5, static=True)]
+
+    assert entities(graph_of(frames(things), None, Config(range=of))) == ["ego", "still"]
+    other = replace(of, by="footprint", static_by="centre")
+    assert entities(graph_of(frames(things), None, Config(range=other))) == ["ego", "moving"]
+
+
+def test_the_ego_is_in_its_graph_wherever_its_range_lies() -> None:
+    of = Range(shape="polygon", polygon=((20.0, -5.0), (40.0, -5.0), (40.0, 5.0), (20.0, 5.0)))
+    things = [thing("ego"), thing("near", 6), thing("there", 30)]
+
+    assert entities(graph_of(frames(things), None, Config(range=of))) == ["ego", "there"]
+
+
+# Storeys ----------------------------------------------------------------------------------------
+
+BRIDGE = a_map(
+    a_road("low", line(200, x=-100, y=0, hdg=0)),
+    a_road("high", line(200, x=0, y=-100, hdg=math.pi / 2), elevation=cubic("elevation", 6, s=0)),
+    a_road("ramp", line(200, x=-100, y=10, hdg=0), elevation=cubic("elevation", 0, 0.05, s=0)),
+)
+
+
+def roads(graph: GraphBlock, road_map: RoadMap) -> set[str]:
+    parts = [-1 - node for node in present(graph) if node < 0]
+    return {road_map.nodes.name[k] for k in parts if road_map.nodes.kind[k] == KIND_CODE["road"]}
+
+
+@pytest.mark.parametrize(
+    ("of", "names", "passed"),
+    [
+        (Range(), ["ego", "above", "below", "unknown"], {"low", "high", "ramp"}),
+        (Range(height=(-2.0, 2.0)), ["ego", "unknown"], {"low", "ramp"}),
+        (Range(height=(-2.0, 9.0)), ["ego", "above", "unknown"], {"low", "high", "ramp"}),
+        (
+            Range(height=(-2.0, 2.0), grade=0.5),
+            ["ego", "below", "unknown"],
+            {"low", "high", "ramp"},
+        ),
+        (
+            Range(height=(-2.0, 2.0), height_of_entities=False),
+            ["ego", "above", "below", "unknown"],
+            {"low", "ramp"},
+        ),
+    ],
+    ids=["any height", "one storey", "upwards", "by grade", "the map alone"],
+)
+def test_other_storeys_are_out_of_range(of: Range, names: list[str], passed: set[str]) -> None:
+    road_map = read_map(BRIDGE, "bridge")
+    things = [
+        thing("ego", -90, -1.75),
+        thing("above", -88, 3, z=6.75),
+        thing("below", -60, 0, z=-5.25),
+        thing("unknown", -80, 3, z=math.nan),
+    ]
+    of = replace(of, radius=100.0)
+
+    graph = graph_of(frames(things), road_map, Config(range=of))
+
+    assert entities(graph) == names
+    assert roads(graph, road_map) == passed
+
+
+def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is() -> None:
+    road_map, egos = read_map(BRIDGE, "bridge"), Places(*np.array([[0.0], [9.0], [0.0], [5.0]]))
+    points, of = road_map.waypoints(STEP), Range(30.0, height=(-1.0, 1.0))
+    expected = []
+    for i in range(3):
+        mine = points.lane == i
+        away = np.hypot(points.x[mine], points.y[mine] - 9)
+        level = np.abs(points.z[mine] - 5) <= 1
+        expected.append(bool((level & ((away <= 30) | (away == away.min()))).any()))
+
+    parts = Extent(of, road_map).areas(egos).parts(road_map)
+
+    assert parts[0, 1:4].tolist() == expected == [False, True, True]
+
+
+# What is kept ------------------------------------------------------------------------------------
+
+STREET = a_map(
+    a_road(
+        "street",
+        line(200, x=-100, y=0, hdg=0),
+        sections=section(lane(0), lane(-1), lane(-2, kind="sidewalk")),
+    ),
+    a_road(
+        "path", line(200, x=-100, y=9, hdg=0), sections=section(lane(0), lane(-1, kind="biking"))
+    ),
+)
+
+
+def kinds_of(config: Config) -> tuple[set[str], set[str]]:
+    """Names of the nodes in a graph with everything, and the relations that it has."""
+    road_map = read_map(STREET, "street")
+    things = [
+        thing("ego", 0, -1.75),
+        thing("car", 9, -1.75),
+        thing("walker", 5, -5, kind="person", length=0.5, width=0.5),
+        thing("house", 0, 30, kind="building", static=True),
+    ]
+    graph = graph_of(frames(things), road_map, config)
+    parts = {road_map.nodes.name[-1 - node] for node in present(graph) if node < 0}
+    names = {relation for _, relation, _ in edges(graph, 0, road_map)}
+    for lane_of in graph.lanes.lane.tolist():
+        assert road_map.nodes.name[-1 - lane_of] in parts
+    return {*entities(graph), *parts}, names
+
+
+def test_everything_is_kept_unless_the_client_says_what() -> None:
+    nodes, _ = kinds_of(Config())
+
+    lanes = {"street/0/-1", "street/0/-2", "path/0/-1"}
+    assert nodes == {"ego", "car", "walker", "house", "off_road", "street", "path"} | lanes
+
+
+def test_only_the_kinds_that_are_wanted_are_nodes_but_the_ego_always_is() -> None:
+    nodes, names = kinds_of(Config(kinds=("Person", "Lane")))
+
+    assert nodes == {"ego", "walker", "street/0/-1", "street/0/-2", "path/0/-1"}
+    assert "isIn" in names
+
+
+def test_lanes_of_other_types_go_with_their_roads() -> None:
+    nodes, _ = kinds_of(Config(lanes=Lanes(types=("Driving",))))
+
+    assert nodes == {"ego", "car", "walker", "house", "off_road", "street", "street/0/-1"}
+
+
+def test_without_road_granularity_nothing_of_the_roads_is_known() -> None:
+    config = Config(lanes=Lanes(granularity="none"))
+
+    nodes, names = kinds_of(config)
+    answers = SceneGraphGenerator(read_map(STREET, "street"), config).answers
+
+    assert nodes == {"ego", "car", "walker", "house"}
+    assert "isIn" not in names | set(answers)
+    assert {"near", "toLeftOf"} <= set(answers)
+
+
+def test_relations_that_are_not_wanted_are_neither_computed_nor_answered() -> None:
+    config = Config(without=("isIn", "very_near"))
+
+    nodes, names = kinds_of(config)
+    answers = SceneGraphGenerator(read_map(STREET, "street"), config).answers
+
+    assert "street/0/-1" in nodes
+    assert not {"isIn", "very_near"} & (names | set(answers))
+    assert "inDFrontOf" in names
+
+
+def test_types_are_what_the_client_says_they_are() -> None:
+    block = frames([thing("ego"), thing("odd", 9, kind="unknown"), thing("other", 5)])
+    told = replace(block.entities, type_name=("a.car", "Acme.Cart", ""))
+    config = Config(types={"acme.CART": TypeMeaning("bicycle", "service", "cart")})
+
+    of = graph_of(replace(block, entities=told), None, config).frames.entities
+
+    assert [KINDS[kind] for kind in of.kind] == ["car", "bicycle", "car"]
+    assert (of.special, of.subkind) == (("", "service", ""), ("", "cart", ""))
+
+
+# Pairs ------------------------------------------------------------------------------------------
+
+
+def near_ones(things: list[Thing], **settings: Any) -> set[tuple[str, str]]:
+    config = configured(proximity={"names": ["visible"], "upper": [25]}, **settings)
+    graph = graph_of(frames(things), None, config)
+    return {(s, d) for s, r, d in edges(graph) if r == "visible" and s < d}
+
+
+CROWD = [
+    thing("ego"),
+    thing("a", 10),
+    thing("b", 20, kind="person"),
+    thing("c", -20, kind="truck", length=12.0),
+]
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, {("a", "ego"), ("b", "ego"), ("c", "ego"), ("a", "b")}),
+        ({"pairs": Pairs(0)}, {("a", "ego"), ("b", "ego"), ("c", "ego")}),
+        ({"pairs": Pairs(0, ego_within=15)}, {("a", "ego")}),
+        ({"pairs": {"kinds": [["Ego", "Person"]]}}, {("b", "ego")}),
+        ({"pairs": {"kinds": [["person", "CAR"]]}}, {("a", "b"), ("b", "ego")}),
+        ({"pairs": {"kinds": [["Vehicle", "Vehicle"]]}}, {("a", "ego"), ("c", "ego")}),
+        ({"pairs": Pairs(ego=False, within=12)}, {("a", "b"), ("a", "ego")}),
+    ],
+    ids=["all", "ego", "ego within", "ego and people", "either order", "super-kinds", "no ego"],
+)
+def test_pairs_are_those_that_are_listed(
+    settings: dict[str, Any], expected: set[tuple[str, str]]
+) -> None:
+    assert near_ones(CROWD, **settings) == expected
+
+
+def test_distances_are_between_what_the_settings_say() -> None:
+    def bucket(between: str, *things: Thing) -> set[str]:
+        config = configured(proximity={"between": between}, direction={"sides": "none"})
+        of = edges(graph_of(frames([thing("ego"), *things]), None, config))
+        return {r for s, r, d in of if d == "ego" and r in config.proximity.names}
+
+    lorry = thing("lorry", 10.5, 0, kind="truck", length=12.0, z=2.0, height=4.0)
+    assert bucket("centres", lorry) == {"near"}
+    assert bucket("footprints", lorry) == {"near_coll"}  # 10.5 - 6 - 2
+    tall = thing("tall", 2.0, 0, kind="truck", z=3.75, height=7.5)
+    assert bucket("centres", tall) == {"near_coll"}  # up by 3
+    assert bucket("origins", tall) == {"safety_hazard"}  # both on the ground
+    walker = thing("walker", 2.0, 0, kind="person", z=0.93, height=1.86)
+    assert bucket("origins", walker) == {"near_coll"}  # its origin is in its middle
+
+
+# Ties -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("degrees", "ahead", "both", "carlasgg"),
+    [
+        (0, "DF", "DF", "DF"),
+        (45, "DF", "DF SF", "DF"),
+        (-45, "DF", "DF SF", "DF"),
+        (90, "SF", "SF SR", "SF"),
+        (-90, "SF", "SF SR", "SR"),
+        (135, "SR", "SR DR", "DR"),
+        (-135, "SR", "SR DR", "DR"),
+        (180, "DR", "DR", "DR"),
+        (60, "SF", "SF", "SF"),
+        (-120, "SR", "SR", "SR"),
+    ],
+)
+def test_ties_of_directions_belong_where_the_settings_say(
+    degrees: float, ahead: str, both: str, carlasgg: str
+) -> None:
+    short = {"inDFrontOf": "DF", "inSFrontOf": "SF", "atSRearOf": "SR", "atDRearOf": "DR"}
+    at = math.radians(degrees)
+    things = [thing("ego"), thing("c", 10 * math.cos(at), 10 * math.sin(at))]
+    found = {}
+    for ties in ("ahead", "both", "carlasgg"):
+        of = edges(graph_of(frames(things), None, configured(direction={"ties": ties})))
+        found[ties] = {short[r] for s, r, d in of if (s, d) == ("c", "ego") and r in short}
+
+    assert found == {"ahead": {ahead}, "both": set(both.split()), "carlasgg": {carlasgg}}
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "sides"),
+    [(9, 0, {"open": "", "closed": "toLeftOf"}), (-9, 0, {"open": "", "closed": "toLeftOf"})]
+    + [
+        (9, y, dict.fromkeys(("open", "closed"), s))
+        for y, s in ((1, "toLeftOf"), (-1, "toRightOf"))
+    ],
+)
+def test_what_is_dead_ahead_is_left_only_where_sides_are_closed(
+    x: float, y: float, sides: dict[str, str]
+) -> None:
+    for name, expected in {**sides, "none": ""}.items():
+        config = configured(direction={"sides": name})
+        of = edges(graph_of(frames([thing("ego"), thing("c", x, y)]), None, config))
+
+        found = {r for s, r, d in of if (s, d) == ("c", "ego")} & {"toLeftOf", "toRightOf"}
+        assert found == ({expected} if expected else set())
+        answers = SceneGraphGenerator(None, config).answers
+        assert ("toLeftOf" in answers) == (name != "none")
