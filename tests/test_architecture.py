@@ -37,6 +37,7 @@ OWNERS = {
     "lark": {"lang"},
     "matplotlib": {"draw"},
     "PIL": {"draw"},
+    "carla": {"traces"},
 }
 MASKS_ARE_KNOWN_TO = {"store", "lang/sql"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")
