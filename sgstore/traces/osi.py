@@ -13,22 +13,20 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, ClassVar, Self
 
-import numpy as np
-
 from sgstore.errors import TraceError
 from sgstore.traces.fetch import digest_of
 from sgstore.traces.frames import assemble, counted
 from sgstore.traces.osi_frames import FrameDecoder
 from sgstore.traces.osi_schema import GROUND_TRUTH, ROAD_MAP, SENSOR_VIEW
-from sgstore.traces.osi_survey import Survey, refs_of, schema_name, survey
-from sgstore.world import Channel, MessageRefs, TraceInfo, TraceReport
+from sgstore.traces.osi_survey import Survey, schema_name, survey
+from sgstore.traces.references import FrameRefs, channels_of, refs_of
+from sgstore.world import TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.traces.chunks import Messages
     from sgstore.traces.recording import Recording
-    from sgstore.world import FrameBlock, Ints
+    from sgstore.world import FrameBlock
 
 
 class OsiTrace:
@@ -38,7 +36,8 @@ class OsiTrace:
     ----------
     recording : Recording
     ego : str
-        Id or name (``entity_name`` of a source reference) of the ego; empty: the host vehicle.
+        Id or name (``entity_name`` of a source reference) of the ego; empty: the host vehicle, else what is
+        called as egos are.
     digest : str
         SHA-256 of the file, if it is known; else the file is hashed.
 
@@ -61,7 +60,7 @@ class OsiTrace:
         # The file is hashed beside the first reading, so that it comes from the disk once.
         with ThreadPoolExecutor(1) as beside:
             hashing = None if digest else beside.submit(digest_of, recording.path)
-            found = survey(recording, ego)
+            found = survey(recording)
             digest = hashing.result() if hashing else digest
         leading = found.leading()
         if leading is None:
@@ -71,6 +70,7 @@ class OsiTrace:
             raise TraceError(reason, path=recording.path)
         self._survey = found
         self._leading = leading
+        self._ego = found.cast.ego(ego, found.notes)
         self.report = TraceReport()
         self.info = self._info(found, digest)
 
@@ -100,12 +100,10 @@ class OsiTrace:
         """
         report = self.report = TraceReport()
         report.warnings += self._survey.notes
-        window = self._recording.window
-        message = self._survey.leads[self._leading].message
-        decoder = FrameDecoder(message, self.info.ego, window, report)
+        decoder = FrameDecoder(self._survey, self._leading, self._ego, report)
         runs = self._recording.walk(report)
-        refs = _Refs(self._index(), window)
-        blocks = assemble(runs, size, {self._leading}, decoder, refs)
+        refs = FrameRefs(self.info.channels, self._recording.window)
+        blocks = assemble(runs, size, decoder.channels, decoder, refs)
         yield from counted(blocks, report)
         decoder.settle()
         if not report.frames:
@@ -115,60 +113,21 @@ class OsiTrace:
 
     def _info(self, found: Survey, digest: str) -> TraceInfo:
         recording = self._recording
-        counts = recording.counts or {}
-        channels: list[Channel] = []
-        for number, record in sorted(recording.channels.items()):
-            schema = recording.schemas.get(record.schema_id)
-            channels.append(
-                Channel(
-                    id=number,
-                    topic=record.topic,
-                    schema=schema.name if schema else "",
-                    schema_encoding=schema.encoding if schema else "",
-                    message_encoding=record.message_encoding,
-                    messages=counts.get(number, 0 if counts else -1),
-                    role=self._role(number),
-                )
-            )
-        index = {channel.id: i for i, channel in enumerate(channels)}
+        channels = channels_of(recording, self._role)
         return TraceInfo(
             path=recording.path,
             size=recording.size,
             mtime_ns=recording.mtime_ns,
             digest=digest,
             flavour=self.name,
-            channels=tuple(channels),
-            ego=found.leads[self._leading].ego.settle(),
+            channels=channels,
+            ego="" if self._ego is None else found.cast.idents()[self._ego],
             map_text=found.map_text,
             map_name=found.map_name,
-            context=refs_of(found.context(self._leading), index),
+            context=refs_of(found.context(self._leading), channels),
         )
 
     def _role(self, channel: int) -> str:
         if channel == self._leading:
             return "ground_truth"
         return "map" if schema_name(self._recording, channel) == ROAD_MAP else "payload"
-
-    def _index(self) -> Ints:
-        """Channel id → index into the channels of the trace; -1 for those that no frame refers to."""
-        index = np.full(1 << 16, -1, np.int64)
-        for i, channel in enumerate(self.info.channels):
-            index[channel.id] = -1 if channel.role == "map" else i
-        return index
-
-
-class _Refs:
-    """References of the messages that belong to frames: not of maps, nor from outside a clip."""
-
-    def __init__(self, index: Ints, window: tuple[int, int]) -> None:
-        self._index = index
-        self._window = window
-
-    def __call__(self, run: Messages) -> MessageRefs:
-        start, end = self._window
-        channel = self._index[run.channel]
-        kept = (channel >= 0) & (run.log_time_ns >= start) & (run.log_time_ns <= end)
-        chunk = np.full(int(kept.sum()), run.chunk_offset, np.int64)
-        return MessageRefs(
-            channel[kept], run.log_time_ns[kept], chunk, run.offset[kept], run.length[kept]
-        )

@@ -22,6 +22,9 @@ MAX_OBJECTS: Final = 100_000
 SMALL: Final = 64 << 10
 """A message up to this size cannot hold so many that it mattered; bytes."""
 
+OPAQUE: Final = "opaque"
+"""Mark of a field of messages that is read as bytes, one for each message."""
+
 _VECTOR: Final = dict.fromkeys(("x", "y", "z"))
 _ANGLES: Final = dict.fromkeys(("roll", "pitch", "yaw"))
 _EXTENTS: Final = dict.fromkeys(("length", "width", "height"))
@@ -43,21 +46,24 @@ _LIGHT_STATE: Final = dict.fromkeys(
 )
 _TIME: Final = {"seconds": None, "nanos": None}
 
+MOVING_OBJECT_FIELDS: Final[dict[str, Any]] = {
+    **_ID,
+    "base": {
+        **_STATIC_BASE,
+        "velocity": _VECTOR,
+        "acceleration": _VECTOR,
+        "orientation_rate": _ANGLES,
+    },
+    "type": None,
+    "vehicle_classification": {"type": None, "light_state": _LIGHT_STATE, "role": None},
+    **_REFERENCES,
+}
+"""Fields of ``osi3.MovingObject`` that are read."""
+
 GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
     "timestamp": _TIME,
     "host_vehicle_id": {"value": None},
-    "moving_object": {
-        **_ID,
-        "base": {
-            **_STATIC_BASE,
-            "velocity": _VECTOR,
-            "acceleration": _VECTOR,
-            "orientation_rate": _ANGLES,
-        },
-        "type": None,
-        "vehicle_classification": {"type": None, "light_state": _LIGHT_STATE, "role": None},
-        **_REFERENCES,
-    },
+    "moving_object": OPAQUE,
     "stationary_object": {
         **_ID,
         "base": _STATIC_BASE,
@@ -66,7 +72,10 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
     },
     "traffic_sign": {
         **_ID,
-        "main_sign": {"base": _STATIC_BASE, "classification": {"type": None}},
+        "main_sign": {
+            "base": _STATIC_BASE,
+            "classification": {"type": None, "value": {"value": None, "value_unit": None}},
+        },
         **_REFERENCES,
     },
     "traffic_light": {
@@ -82,33 +91,34 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
     "logical_lane_boundary": _ID,
     "logical_lane": _ID,
 }
-"""Fields of ``osi3.GroundTruth`` that are read, and theirs; ``None``: as it is."""
+"""Fields of ``osi3.GroundTruth`` that are read, and theirs; ``None``: as it is; :data:`OPAQUE`: as bytes."""
+
+HOST_DATA_FIELDS: Final[dict[str, Any]] = {
+    "host_vehicle_id": {"value": None},
+    "vehicle_powertrain": {"pedal_position_acceleration": None},
+    "vehicle_brake_system": {"pedal_position_brake": None},
+}
 
 SENSOR_VIEW_FIELDS: Final[dict[str, Any]] = {
     "timestamp": _TIME,
     "host_vehicle_id": {"value": None},
-    "host_vehicle_data": {
-        "vehicle_powertrain": {"pedal_position_acceleration": None},
-        "vehicle_brake_system": {"pedal_position_brake": None},
-    },
+    "host_vehicle_data": HOST_DATA_FIELDS,
     "global_ground_truth": GROUND_TRUTH_FIELDS,
 }
 
 
 def prune(
-    files: list[descriptor_pb2.FileDescriptorProto], root: str, fields: dict[str, Any]
+    files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, dict[str, Any]]
 ) -> None:
-    """Take the fields that are not read out of the descriptors of a message type.
+    """Take the fields that are not read out of the descriptors of message types.
 
     Parameters
     ----------
     files : list of FileDescriptorProto
         Changed.
-    root : str
-        Full name of the type.
-    fields : dict
-        Names of the fields to be read → those of their messages. Of a type that is met in several places
-        all are kept that one of them reads.
+    roots : dict
+        Full names of types → the fields to be read → those of their messages. Of a type that is met in
+        several places all are kept that one of them reads.
     """
     types = {
         name: message
@@ -116,13 +126,18 @@ def prune(
         for name, message in _named(file.message_type, f"{file.package}." if file.package else "")
     }
     kept: dict[str, set[str]] = {}
-    waiting = [(root, fields)]
+    waiting = list(roots.items())
     while waiting:
         name, wanted = waiting.pop()
         kept.setdefault(name, set()).update(wanted)
         for field in types[name].field if name in types else ():
             inner = wanted.get(field.name)
-            if inner is not None and field.type_name:
+            if not field.type_name or field.type != field.TYPE_MESSAGE or inner is None:
+                continue
+            if inner == OPAQUE:
+                field.type = field.TYPE_BYTES
+                field.ClearField("type_name")
+            else:
                 waiting.append((field.type_name.removeprefix("."), inner))
     for name, names in kept.items():
         message = types.get(name)

@@ -30,6 +30,7 @@ from sgstore.traces.osi_schema import (
     SENSOR_VIEW,
     ground_truth_of,
     message_class,
+    object_class,
     parse,
 )
 from sgstore.traces.osi_stream import MAX_MESSAGE, PREFIX, pieces
@@ -307,24 +308,26 @@ def _likeness(name: str, messages: list[bytes]) -> int:
 
     A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
     """
-    message = _class_of(name)
+    message, objects = _classes_of(name)
     total = 0
     for data in messages:
         try:
-            total += _things(parse(message, data))
+            total += _things(ground_truth_of(parse(message, data)), objects)
         except DECODE_ERRORS:
             total -= 1
     return total
 
 
 @cache
-def _class_of(name: str) -> type[Any]:
-    return message_class(Schema(id=1, data=descriptors(), encoding="protobuf", name=name))
+def _classes_of(name: str) -> tuple[type[Any], type[Any]]:
+    schema = Schema(id=1, data=descriptors(), encoding="protobuf", name=name)
+    message = message_class(schema)
+    return message, object_class(message)
 
 
-def _things(message: Any) -> int:
-    ground = ground_truth_of(message)
-    placed = [*ground.moving_object, *ground.stationary_object, *ground.traffic_light]
+def _things(ground: Any, objects: type[Any]) -> int:
+    moving = [objects.FromString(content) for content in ground.moving_object]
+    placed = [*moving, *ground.stationary_object, *ground.traffic_light]
     return sum(
         thing.id.HasField("value") and thing.base.HasField("position") for thing in placed
     ) + sum(lane.id.HasField("value") for lane in ground.lane)

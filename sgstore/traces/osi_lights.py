@@ -104,24 +104,19 @@ class TrafficLights:
 
     Parameters
     ----------
-    message : type
-        Class of the messages of the leading channel.
-    truth : str
-        Path to the ground truth in them: empty, or ``global_ground_truth.``.
     roster : Roster
         Takes up each head as an entity of kind ``traffic_light``; its ident is the id of its first bulb.
     """
 
-    def __init__(self, message: type[Any], truth: str, roster: Roster) -> None:
+    def __init__(self, roster: Roster) -> None:
         self._roster = roster
         self._heads: list[_Head] = []
         self._head_of: dict[int, _Head] = {}
         self._words: set[bytes] = set()
         self._by_ref: dict[str, _Head] = {}
         self._by_cell: dict[tuple[int, int], list[_Head]] = {}
-        path = f"{truth}traffic_light.classification"
-        self._has_any = has_field(message, path)
-        self._has_service = has_field(message, f"{path}.is_out_of_service")
+        self._tells: dict[type[Any], tuple[bool, bool]] = {}
+        self._has_service = False
         self._fill()
 
     @property
@@ -131,7 +126,12 @@ class TrafficLights:
 
     def update(self, ground: Any) -> None:
         """Take up what a ground truth says of bulbs; of the others the last word stands."""
-        bulbs = ground.traffic_light if self._has_any else ()
+        kind = type(ground)
+        if kind not in self._tells:
+            path = "traffic_light.classification"
+            self._tells[kind] = has_field(kind, path), has_field(kind, f"{path}.is_out_of_service")
+        has_any, self._has_service = self._tells[kind]
+        bulbs = ground.traffic_light if has_any else ()
         words = [bulb.SerializeToString() for bulb in bulbs]
         news = set(words) - self._words
         if not news:

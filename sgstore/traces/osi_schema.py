@@ -19,7 +19,9 @@ from sgstore.errors import TraceError
 from sgstore.traces.frames import FAR, NAN
 from sgstore.traces.osi_fields import (
     GROUND_TRUTH_FIELDS,
+    HOST_DATA_FIELDS,
     MAX_OBJECTS,
+    MOVING_OBJECT_FIELDS,
     SENSOR_VIEW_FIELDS,
     check_size,
     prune,
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 GROUND_TRUTH: Final = "osi3.GroundTruth"
 SENSOR_VIEW: Final = "osi3.SensorView"
+HOST_DATA: Final = "osi3.HostVehicleData"
+MOVING_OBJECT: Final = "osi3.MovingObject"
 ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
 
 MAX_DESCRIPTORS: Final = 4 << 20
@@ -49,20 +53,24 @@ DECODE_ERRORS: Final = (
 """What reading a message raises if it, or the descriptors it came with, are not what they seem."""
 
 _NO_VECTOR: Final = (NAN, NAN, NAN)
-_GROUND_TRUTH_NEEDS: Final = (
-    "timestamp.seconds",
-    "moving_object.id.value",
-    "moving_object.type",
-    "moving_object.vehicle_classification.type",
-    *(f"moving_object.base.dimension.{name}" for name in ("length", "width", "height")),
-    *(f"moving_object.base.orientation.{name}" for name in ("roll", "pitch", "yaw")),
+_GROUND_TRUTH_NEEDS: Final = ("timestamp.seconds", "moving_object")
+_MOVING_OBJECT_NEEDS: Final = (
+    "id.value",
+    "type",
+    "vehicle_classification.type",
+    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
+    *(f"base.orientation.{name}" for name in ("roll", "pitch", "yaw")),
     *(
-        f"moving_object.base.{vector}.{name}"
+        f"base.{vector}.{name}"
         for vector in ("position", "velocity", "acceleration")
         for name in ("x", "y", "z")
     ),
 )
-_FIELDS: Final = {GROUND_TRUTH: GROUND_TRUTH_FIELDS, SENSOR_VIEW: SENSOR_VIEW_FIELDS}
+_FIELDS: Final = {
+    GROUND_TRUTH: GROUND_TRUTH_FIELDS,
+    SENSOR_VIEW: SENSOR_VIEW_FIELDS,
+    HOST_DATA: HOST_DATA_FIELDS,
+}
 _NEEDS: Final = {
     GROUND_TRUTH: _GROUND_TRUTH_NEEDS,
     SENSOR_VIEW: tuple(f"global_ground_truth.{path}" for path in _GROUND_TRUTH_NEEDS),
@@ -70,8 +78,15 @@ _NEEDS: Final = {
 }
 
 
-def message_class(schema: Schema) -> type[Any]:
+def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[Any]:
     """The class of the messages of a schema.
+
+    Parameters
+    ----------
+    schema : Schema
+    fields : dict, optional
+        Which fields to read instead of those of frames, as :func:`~sgstore.traces.osi_fields.prune` has them;
+        any of them may be missing.
 
     Raises
     ------
@@ -84,12 +99,13 @@ def message_class(schema: Schema) -> type[Any]:
         raise TraceError(f"{reason}; at most {MAX_DESCRIPTORS} are read")
     try:
         files = list(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file)
-        if schema.name in _FIELDS:
-            prune(files, schema.name, _FIELDS[schema.name])
+        wanted = _FIELDS.get(schema.name) if fields is None else fields
+        if wanted is not None:
+            prune(files, {MOVING_OBJECT: MOVING_OBJECT_FIELDS, schema.name: wanted})
         pool = descriptor_pool.DescriptorPool()
         _add(pool, {file.name: file for file in files})
         found = pool.FindMessageTypeByName(schema.name)
-        _require(found, _NEEDS.get(schema.name, ()))
+        _require(found, _NEEDS.get(schema.name, ()) if fields is None else ())
         return message_factory.GetMessageClass(found)
     except DECODE_ERRORS as error:
         reason = f"schema {schema.name}: its protobuf descriptors are malformed: {error}"
@@ -124,12 +140,22 @@ def _require(found: Descriptor, paths: tuple[str, ...]) -> None:
             inner = inner.fields_by_name[name].message_type
 
 
-def field_type(message: type[Any], path: str) -> Descriptor:
-    """Descriptor of the sub-message at a path of names with dots between."""
-    found: Any = message.DESCRIPTOR
-    for name in path.split("."):
-        found = found.fields_by_name[name].message_type
-    return found
+def object_class(message: type[Any]) -> type[Any]:
+    """The class of the moving objects in the messages of a class, which has them as bytes.
+
+    Raises
+    ------
+    TraceError
+        The descriptors lack the type, or a field that every version of OSI has.
+    """
+    try:
+        found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(MOVING_OBJECT)
+        _require(found, _MOVING_OBJECT_NEEDS)
+        return message_factory.GetMessageClass(found)
+    except DECODE_ERRORS as error:
+        raise TraceError(
+            f"schema {MOVING_OBJECT}: its protobuf descriptors are malformed: {error}"
+        ) from error
 
 
 def has_field(message: type[Any], path: str) -> bool:

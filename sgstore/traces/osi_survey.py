@@ -2,7 +2,7 @@
 
 The map may stand behind the frames, static data may come once and never again, and the ego is known by
 an id that has to name something. So every ground truth message is looked at once when a recording is
-opened: which channel leads, which messages later ones depend on, who the ego is.
+opened: which channel leads, which messages later ones depend on, who and what is in it.
 """
 
 from __future__ import annotations
@@ -13,23 +13,27 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import TraceError
+from sgstore.errors import MapError, TraceError
+from sgstore.traces.osi_cast import Cast
+from sgstore.traces.osi_lanes import FIELDS as LANE_FIELDS
+from sgstore.traces.osi_lanes import OsiLanes
 from sgstore.traces.osi_schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
+    HOST_DATA,
     ROAD_MAP,
     SENSOR_VIEW,
     ground_truth_of,
     has_field,
-    identifiers,
     message_class,
+    object_class,
     parse,
 )
-from sgstore.world import MessageRefs, TraceReport
+from sgstore.traces.osi_statics import Statics
+from sgstore.traces.references import Ref, ref_of
+from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from sgstore.traces.chunks import Messages
     from sgstore.traces.recording import Recording
 
@@ -48,92 +52,6 @@ STATIC_FIELDS: Final = (
 BEGINNING: Final = 1_000_000_000
 """How long after the first frame a message still comes with it; ns of log time."""
 
-LISTED: Final = 20
-"""Objects that an error lists by name."""
-
-Ref = tuple[int, int, int, int, int]
-"""Channel id, log time, chunk offset, offset, length."""
-
-
-def host_of(message: Any) -> list[str]:
-    """Ids that a message gives to the host vehicle, the most telling first; 0 is one too."""
-    hosts = [
-        str(part.host_vehicle_id.value)
-        for part in (message, ground_truth_of(message))
-        if "host_vehicle_id" in part.DESCRIPTOR.fields_by_name and part.HasField("host_vehicle_id")
-    ]
-    return list(dict.fromkeys(hosts))
-
-
-def names_of(moving_object: Any) -> list[str]:
-    """What a moving object is called: ``X`` of an identifier ``entity_name:X``, bare identifiers."""
-    return [
-        value if key == "entity_name" else key
-        for key, colon, value in (text.partition(":") for _, text in identifiers(moving_object))
-        if key == "entity_name" or not colon
-    ]
-
-
-@dataclass(slots=True)
-class EgoSearch:
-    """Who the ego is: the host vehicle, or what the user names.
-
-    Parameters
-    ----------
-    wanted : str
-        Id or name that the user gave; empty: the host vehicle.
-    """
-
-    wanted: str
-    found: str = ""
-    hosts: list[str] = field(default_factory=list[str])
-    seen: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-
-    def look(self, message: Any) -> None:
-        """Look for the ego among the moving objects of a message, until it is found."""
-        if self.found:
-            return
-        objects = ground_truth_of(message).moving_object
-        if self.wanted:
-            self._look_by_name(objects)
-            return
-        self.hosts = host_of(message) or self.hosts
-        ids = {str(thing.id.value) for thing in objects}
-        self.found = next((host for host in self.hosts if host in ids), "")
-
-    def _look_by_name(self, objects: Iterable[Any]) -> None:
-        for thing in objects:
-            ident = str(thing.id.value)
-            if ident not in self.seen:
-                self.seen[ident] = names_of(thing)
-        if self.wanted in self.seen:
-            self.found = self.wanted
-            return
-        named = [ident for ident, names in self.seen.items() if self.wanted in names]
-        if len(named) > 1:
-            raise TraceError(f"several objects are named {self.wanted!r}: ids {', '.join(named)}")
-        self.found = named[0] if named else ""
-
-    def settle(self) -> str:
-        """The ego's id, or the empty string.
-
-        Raises
-        ------
-        TraceError
-            Nothing bears the name that the user gave.
-        """
-        if self.wanted and not self.found:
-            things = [
-                f"{ident} ({', '.join(names)})" if names else ident
-                for ident, names in list(self.seen.items())[:LISTED]
-            ]
-            more = f" and {len(self.seen) - LISTED} more" if len(self.seen) > LISTED else ""
-            raise TraceError(
-                f"no moving object has the id or name {self.wanted!r}; there are: "
-                f"{', '.join(things) or 'none'}{more}"
-            )
-        return self.found
-
 
 @dataclass(slots=True)
 class _Latch:
@@ -150,7 +68,8 @@ class _Latch:
     last: Ref | None = None
     refs: dict[Ref, None] = field(default_factory=dict[Ref, None])
 
-    def look(self, ground: Any, ref: Ref) -> None:
+    def look(self, ground: Any, ref: Ref) -> bool:
+        """Take note of a message; whether it tells of a lane or boundary that none before it told of."""
         items = {(name, item.id.value) for name in self.fields for item in getattr(ground, name)}
         gone = self.repeated - items
         for item in gone:
@@ -162,20 +81,25 @@ class _Latch:
         if self.last is not None and self.lights - lights:
             self.refs[self.last] = None
         self.lights, self.last = lights, ref
+        return any(name in LANE_FIELDS for name, _ in new)
 
 
 @dataclass(slots=True)
 class Lead:
     """A channel that may lead: its message class, its messages that could be read, what they depend on.
 
-    ``first_ns``: least log time of its frames.
+    ``objects``: class of its moving objects. ``driven``: how many of its frames have some. ``first_ns``: least
+    log time of its frames. ``lanes``: what they tell of roads; ``None`` if that cannot
+    be read.
     """
 
     schema: str
     message: type[Any]
-    ego: EgoSearch
+    objects: type[Any]
     latch: _Latch
+    lanes: OsiLanes | None
     frames: int = 0
+    driven: int = 0
     first_ns: int = (1 << 63) - 1
 
 
@@ -187,35 +111,52 @@ class Survey:
     ----------
     leads : dict
         Channel id → :class:`Lead`, of the channels with ground truth.
+    hosts : dict
+        Channel id → class of the messages, of the channels with data of the host vehicle.
+    cast : Cast
+        The moving objects.
+    statics : Statics
+        What stands still.
     map_text, map_name : str
+        OpenDRIVE; in a recording that carries none, the lanes of its ground truth.
     map_refs : list of Ref
     others : dict
         Channel id → number of messages and the first of them, of all other channels.
     notes : list of str
         What is odd but lost nothing.
+    window : tuple of int
+        Log times, both included, between which messages are frames.
     """
 
     leads: dict[int, Lead] = field(default_factory=dict[int, Lead])
+    hosts: dict[int, type[Any]] = field(default_factory=dict[int, type[Any]])
+    cast: Cast = field(default_factory=Cast)
+    statics: Statics = field(default_factory=Statics)
     map_text: str = ""
     map_name: str = ""
     map_refs: list[Ref] = field(default_factory=list[Ref])
     others: dict[int, tuple[int, Ref]] = field(default_factory=dict[int, tuple[int, Ref]])
     notes: list[str] = field(default_factory=list[str])
+    window: tuple[int, int] = (0, 0)
 
     def leading(self) -> int | None:
-        """The channel with most frames, a ground truth before a sensor view; ``None`` if none has any."""
+        """The channel with most frames, a ground truth before a sensor view; ``None`` if none has any.
+
+        Frames with moving objects count first: of split channels the one that moves leads.
+        """
         ranked = [
-            (lead.frames, lead.schema == GROUND_TRUTH, -channel)
+            (lead.driven, lead.frames, lead.schema == GROUND_TRUTH, -channel)
             for channel, lead in self.leads.items()
             if lead.frames
         ]
-        return -max(ranked)[2] if ranked else None
+        return -max(ranked)[3] if ranked else None
 
-    def context(self, leading: int) -> list[Ref]:
-        """Messages that later ones depend on, in file order.
+    def context(self, leading: int) -> set[Ref]:
+        """Messages that later ones depend on.
 
         The only message of a channel is one of them if it comes with the first frame: what is told once
-        and at the beginning, such as the calibration of a camera, is told for all that follows.
+        and at the beginning, such as the calibration of a camera, is told for all that follows. Of a channel
+        beside the leading one it is whatever tells of static things for the first time.
         """
         lead = self.leads[leading]
         once = [
@@ -223,11 +164,15 @@ class Survey:
             for count, ref in self.others.values()
             if count == 1 and ref[1] <= lead.first_ns + BEGINNING
         ]
-        refs = {*self.map_refs, *lead.latch.refs, *once}
-        return sorted(refs, key=lambda ref: (ref[2] if ref[2] >= 0 else ref[3], ref[3]))
+        refs = {*self.map_refs, *once}
+        for channel, other in self.leads.items():
+            refs.update(other.latch.refs)
+            if channel != leading:
+                refs.update(other.latch.told_by.values())
+        return refs
 
 
-def survey(recording: Recording, ego: str) -> Survey:
+def survey(recording: Recording) -> Survey:
     """Read a recording once, from end to end.
 
     Raises
@@ -241,18 +186,37 @@ def survey(recording: Recording, ego: str) -> Survey:
         for channel, row, count in zip(
             *np.unique(run.channel, return_index=True, return_counts=True), strict=True
         ):
-            if not _meet(recording, int(channel), ego, result, maps):
-                before, ref = result.others.get(int(channel), (0, _ref(run, int(row))))
+            if not _meet(recording, int(channel), result, maps):
+                before, ref = result.others.get(int(channel), (0, ref_of(run, int(row))))
                 result.others[int(channel)] = (before + int(count), ref)
-        window = recording.window
+        result.window = recording.window
         known = np.isin(run.channel, [*result.leads, *maps])
         for row in np.flatnonzero(known):
             channel = int(run.channel[row])
             if channel in maps:
                 _look_at_map(result, maps[channel], run, int(row))
             else:
-                _look_at_frame(result.leads[channel], run, int(row), window)
+                _look_at_frame(result, channel, run, int(row))
+    if not result.map_text:
+        _make_map_of_lanes(result, recording.path.stem)
     return result
+
+
+def _make_map_of_lanes(result: Survey, name: str) -> None:
+    """The map that the lanes make, those of the leading channel before those of others."""
+    leading = result.leading()
+    for _, lead in sorted(result.leads.items(), key=lambda item: item[0] != leading):
+        if lead.lanes is None:
+            continue
+        try:
+            result.map_text, told = lead.lanes.text()
+        except MapError as error:
+            lead.lanes.warnings.append(str(error))
+        else:
+            if result.map_text:
+                result.map_name = told or f"{name} (lanes)"
+                return
+        result.notes += [f"its lanes make no road map: {what}" for what in lead.lanes.warnings]
 
 
 def schema_name(recording: Recording, channel: int) -> str:
@@ -263,37 +227,33 @@ def schema_name(recording: Recording, channel: int) -> str:
     return schema.name if schema is not None and protobuf else ""
 
 
-def _meet(
-    recording: Recording, channel: int, ego: str, result: Survey, maps: dict[int, type[Any]]
-) -> bool:
+def _meet(recording: Recording, channel: int, result: Survey, maps: dict[int, type[Any]]) -> bool:
     """Whether a channel may lead or carries maps; makes ready for it when it is met for the first time."""
     if channel in result.leads or channel in maps:
         return True
     name = schema_name(recording, channel)
-    if name not in {GROUND_TRUTH, SENSOR_VIEW, ROAD_MAP}:
+    if name not in {GROUND_TRUTH, SENSOR_VIEW, ROAD_MAP, HOST_DATA} or channel in result.hosts:
         return False
     message = message_class(recording.schemas[recording.channels[channel].schema_id])
+    if name == HOST_DATA:
+        result.hosts[channel] = message  # a message of its own, too, that belongs to a frame
+        return False
     if name == ROAD_MAP:
         maps[channel] = message
         return True
     prefix = "global_ground_truth." if name == SENSOR_VIEW else ""
     present = tuple(field for field in STATIC_FIELDS if has_field(message, prefix + field))
-    result.leads[channel] = Lead(name, message, EgoSearch(ego), _Latch(present))
+    try:
+        lanes = OsiLanes(recording.schemas[recording.channels[channel].schema_id])
+    except TraceError as error:
+        lanes = None
+        result.notes.append(f"its lanes cannot be read: {error.reason}")
+    result.leads[channel] = Lead(name, message, object_class(message), _Latch(present), lanes)
     return True
 
 
-def _ref(run: Messages, row: int) -> Ref:
-    return (
-        int(run.channel[row]),
-        int(run.log_time_ns[row]),
-        run.chunk_offset,
-        int(run.offset[row]),
-        int(run.length[row]),
-    )
-
-
 def _look_at_map(result: Survey, message: type[Any], run: Messages, row: int) -> None:
-    result.map_refs.append(_ref(run, row))
+    result.map_refs.append(ref_of(run, row))
     try:
         told = message.FromString(bytes(run.data(row)))
         text, name = str(told.open_drive_xml_content), str(told.map_reference)
@@ -310,21 +270,20 @@ def _look_at_map(result: Survey, message: type[Any], run: Messages, row: int) ->
         result.map_name = PurePosixPath(name.replace("\\", "/")).name
 
 
-def _look_at_frame(lead: Lead, run: Messages, row: int, window: tuple[int, int]) -> None:
+def _look_at_frame(result: Survey, channel: int, run: Messages, row: int) -> None:
+    lead = result.leads[channel]
+    log_time = int(run.log_time_ns[row])
     try:
-        message = parse(lead.message, bytes(run.data(row)))
-        lead.latch.look(ground_truth_of(message), _ref(run, row))
-        lead.ego.look(message)
+        data = bytes(run.data(row))
+        message = parse(lead.message, data)
+        ground = ground_truth_of(message)
+        if lead.latch.look(ground, ref_of(run, row)) and lead.lanes is not None:
+            lead.lanes.take(data)
+        result.statics.look(ground, lead.latch.fields, log_time)
+        result.cast.look(message, lead.objects)
     except DECODE_ERRORS:  # counted as a loss when the frames are read
         return
-    log_time = int(run.log_time_ns[row])
-    if window[0] <= log_time <= window[1]:
+    if result.window[0] <= log_time <= result.window[1]:
         lead.frames += 1
+        lead.driven += len(ground.moving_object) > 0
         lead.first_ns = min(lead.first_ns, log_time)
-
-
-def refs_of(refs: list[Ref], index: dict[int, int]) -> MessageRefs:
-    """References as columns. ``index``: channel id → index into the channels of the trace."""
-    columns = np.array(refs, np.int64).reshape(-1, 5).T
-    channel = np.array([index[int(number)] for number in columns[0]], np.int64)
-    return MessageRefs(channel, columns[1], columns[2], columns[3], columns[4])
