@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import networkx as nx
-    import numpy as np
 
     from sgstore.world import Codes, Floats, FrameBlock, Ints
 
@@ -30,6 +33,37 @@ class Edges:
     relation: Codes
     src: Ints
     dst: Ints
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def chained(cls, parts: Sequence[Edges]) -> Edges:
+        """One part, of which there is one at least, after another."""
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeNumbers:
+    """A number that goes with an edge; shape (K,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    relation : int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : int64
+        Node ids.
+    value : float64
+        Of ``leads`` and ``follows``: the gap along the lanes; m. NaN where it is not known.
+    """
+
+    frame: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+    value: Floats
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -101,12 +135,15 @@ class GraphBlock:
         All other edges.
     lanes : LaneStates
         Attributes of the ``isIn`` edges from entities to lanes.
+    numbers : EdgeNumbers
+        Attributes of ``leads`` and ``follows`` edges.
     """
 
     frames: FrameBlock
     presence: Presence
     edges: Edges
     lanes: LaneStates
+    numbers: EdgeNumbers
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -25,6 +25,7 @@ from sgstore.online import Online
 from sgstore.relations import RELATIONS
 from sgstore.relations.contact import contacts
 from sgstore.relations.extent import Extent, Places
+from sgstore.relations.following import gaps
 from sgstore.relations.keeping import Keeping
 from sgstore.relations.pairs import near_pairs, related_pairs
 from sgstore.relations.scene import Bodies, Scene
@@ -75,7 +76,7 @@ class SceneGraphGenerator:
         self._config = config
         self._road_map = road_map
         self._online: Online | None = None
-        self._survey = None if road_map is None else Survey(road_map)
+        self._survey = None if road_map is None else Survey(road_map, config.lanes.ahead)
         self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
         self._extent = Extent(config.range, road_map)
         self._keeping = Keeping(config, road_map)
@@ -160,8 +161,9 @@ class SceneGraphGenerator:
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground),
-            edges=self._keeping.edges(_chained([f.edges(scene) for f in self._families])),
+            edges=self._keeping.edges(Edges.chained([f.edges(scene) for f in self._families])),
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
+            numbers=gaps(bodies, ground),
         )
 
     def step(self, frame: Frame) -> SceneGraph:
@@ -371,10 +373,6 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
         heading_error=hits.heading_error,
         primary=hits.primary,
     )
-
-
-def _chained(parts: list[Edges]) -> Edges:
-    return Edges(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Edges)))
 
 
 def _stacked(first: States, second: States) -> States:

@@ -17,7 +17,8 @@ import shapely
 import shapely.affinity
 
 from sgstore.config import Config
-from sgstore.roads import STOREY, LaneHits, MapEdges, MapNodes, RoadMap
+from sgstore.geometry import wrapped
+from sgstore.roads import STOREY, LaneHits, MapEdges, MapNodes, Ribbons, RoadMap
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.world import Entities, Floats, FrameBlock, Ints, MessageRefs, States
@@ -163,7 +164,10 @@ def present(graph: GraphBlock, frame: int = 0) -> set[int]:
 
 @dataclass(frozen=True)
 class Patch:
-    """A rectangle of a paper map: a lane, unless ``crosswalk``; or the ground that a signal stands on."""
+    """A rectangle of a paper map: a lane, unless ``crosswalk``; or the ground that a signal stands on.
+
+    ``to``: the lanes that ``travelsTo`` leads to; they need not touch.
+    """
 
     name: str
     x0: float
@@ -176,6 +180,7 @@ class Patch:
     road: str = ""
     junction: str = ""
     controlled_by: str = ""
+    to: tuple[str, ...] = ()
 
 
 class PaperMap(RoadMap):
@@ -198,13 +203,20 @@ class PaperMap(RoadMap):
         self.patches, self.objects, self.at = patches, objects, at
         self.shapes = {p.name: at.placed(shapely.box(p.x0, p.y0, p.x1, p.y1)) for p in patches}
         self.nodes = _map_nodes(names, kinds, patches)
-        inside = [(p.name, p.road) for p in patches if p.road]
-        inside += list(dict.fromkeys((p.road, p.junction) for p in patches if p.junction))
+        links = [("isIn", p.name, p.road) for p in patches if p.road]
+        links += dict.fromkeys(("isIn", p.road, p.junction) for p in patches if p.junction)
+        links += [("travelsTo", p.name, other) for p in patches for other in p.to]
+        links += [
+            ("controlsTrafficOf", p.controlled_by, p.name)
+            for p in patches
+            if p.controlled_by in dict(objects)
+        ]
         self.edges = MapEdges(
-            relation=np.full(len(inside), RELATION_CODE["isIn"], np.int8),
-            src=np.array([self.ids[a] for a, _ in inside], np.int64),
-            dst=np.array([self.ids[b] for _, b in inside], np.int64),
+            relation=np.array([RELATION_CODE[name] for name, _, _ in links], np.int8),
+            src=np.array([self.ids[a] for _, a, _ in links], np.int64),
+            dst=np.array([self.ids[b] for _, _, b in links], np.int64),
         )
+        self.ribbons = _ribbons([p for p in patches if p.kind == "lane"], at)
         self.asked = 0
 
     def moved(self, at: Place) -> PaperMap:
@@ -242,7 +254,7 @@ class PaperMap(RoadMap):
             lane=np.array([self.ids[p.name] for _, p, _ in hits], np.int64),
             overlap=np.array(shares, float),
             offset=np.array(aside, float),
-            heading_error=boxes[rows, 2] - self.at.turn,
+            heading_error=wrapped(np.nan_to_num(boxes[rows, 2]) - self.at.turn),
             primary=np.append(True, rows[1:] != rows[:-1])[: len(rows)],
         )
 
@@ -275,9 +287,33 @@ class PaperMap(RoadMap):
         return np.array(lanes, np.int64)
 
 
+def _ribbons(lanes: list[Patch], at: Place) -> Ribbons:
+    """Two cross sections a lane, at its ends."""
+    x = np.array([(p.x0, p.x1) for p in lanes]).ravel()
+    left, right = (
+        np.array([(p.y1, p.y1, p.y0, p.y0) for p in lanes]).reshape(-1, 2, 2).swapaxes(0, 1)
+    )
+    cos, sin = np.cos(at.turn), np.sin(at.turn)
+    count = len(lanes)
+    along = np.array([(0.0, p.x1 - p.x0) for p in lanes]).ravel()
+    return Ribbons(
+        offsets=2 * np.arange(count + 1),
+        left_x=at.x + x * cos - left.ravel() * sin,
+        left_y=at.y + x * sin + left.ravel() * cos,
+        right_x=at.x + x * cos - right.ravel() * sin,
+        right_y=at.y + x * sin + right.ravel() * cos,
+        z=np.repeat([p.z + at.z for p in lanes], 2),
+        heading=np.full(2 * count, at.turn),
+        s=along,
+        along=along,
+    )
+
+
 def _map_nodes(names: tuple[str, ...], kinds: list[str], patches: tuple[Patch, ...]) -> MapNodes:
     count = len(names)
     types = {p.name: p.lane_type for p in patches if p.kind == "lane"}
+    junctions = {p.name: p.junction for p in patches if p.kind == "lane"}
+    widths = {p.name: p.y1 - p.y0 for p in patches}
     missing = np.full(count, np.nan)
     blank, none = ("",) * count, np.zeros(count, np.int64)
     return MapNodes(
@@ -289,12 +325,12 @@ def _map_nodes(names: tuple[str, ...], kinds: list[str], patches: tuple[Patch, .
         heading=np.zeros(count),
         lane_type=tuple(types.get(name, "") for name in names),
         road=blank,
-        junction=blank,
+        junction=tuple(junctions.get(name, "") for name in names),
         turn=blank,
         section=none,
         lane=none,
         length=missing,
-        width=missing,
+        width=np.array([widths.get(name, np.nan) for name in names]),
         speed_limit=missing,
     )
 

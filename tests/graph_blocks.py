@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.config import Config
-from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
+from sgstore.graph import EdgeNumbers, Edges, GraphBlock, LaneStates, Presence
 from sgstore.roads import MapEdges, MapNodes
 from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.world import (
@@ -154,7 +154,8 @@ class RandomTrace:
         )
         lanes = self._lanes(frame, node)
         edges = _with_lanes(self._edges(here), lanes)
-        return GraphBlock(frames, self._presence(count), edges, lanes)
+        numbers = _numbers(edges, self.rng)
+        return GraphBlock(frames, self._presence(count), edges, lanes, numbers)
 
     def _entities(self, new: bool) -> Entities:
         count = len(self.kinds) if new else 0
@@ -238,6 +239,16 @@ def _with_lanes(edges: Edges, lanes: LaneStates) -> Edges:
         np.concatenate([edges.src, lanes.node]),
         np.concatenate([edges.dst, lanes.lane]),
     )
+
+
+def _numbers(edges: Edges, rng: np.random.Generator) -> EdgeNumbers:
+    """A number for every edge that has one, some of them missing."""
+    having = np.isin(edges.relation, [RELATION_CODE["leads"], RELATION_CODE["follows"]])
+    rows = np.stack([edges.frame, edges.relation, edges.src, edges.dst])[:, having]
+    frame, relation, src, dst = np.unique(rows, axis=1).astype(np.int64)
+    values = rng.uniform(0, 90, len(frame))
+    values[rng.random(len(frame)) < 0.1] = np.nan
+    return EdgeNumbers(frame, relation.astype(np.int8), src, dst, values)
 
 
 def publish_long(store: StoreFile, frames: int, *, size: int = 240, moving: int = 20) -> None:

@@ -361,7 +361,7 @@ def columns(graph: GraphBlock, row: int, idents: list[str]) -> dict[str, set[Any
     within = zip(lanes.node[lane].tolist(), lanes.lane[lane].tolist(), strict=True)
     return {
         "nodes": {name(n) for n in (*moving.tolist(), *there.node[there.frame == row].tolist())},
-        "edges": {(name(a), RELATIONS[r], name(b)) for a, r, b in edges},
+        "edges": {(name(a), RELATIONS[r], name(b)) for a, r, b in edges if a >= 0},
         "lanes": {
             (name(a), b, *map(float, rest))
             for (a, b), *rest in zip(

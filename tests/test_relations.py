@@ -23,13 +23,15 @@ if TYPE_CHECKING:
 
 PI = math.pi
 TOWN = PaperMap(
-    Patch("east", -80, -4, 80, 0, road="main", controlled_by="s1"),
+    Patch("east", -80, -4, 80, 0, road="main", controlled_by="s1", to=("east on",)),
+    Patch("east on", 80, -4, 160, 0, road="main 2"),
     Patch("west", -80, 0, 80, 4, road="main"),
     Patch("path", -80, 4, 80, 6, road="main", lane_type="sidewalk"),
     Patch("cross", -2, -80, 2, 80, road="side", junction="middle", controlled_by="s1"),
     Patch("bridge", -80, -20, 80, -12, road="high", z=6),
     Patch("exit", -80, 12, 80, 16, road="ramp", lane_type="exit"),
     Patch("zebra", 8, -4, 12, 4, kind="crosswalk"),
+    objects=(("s1", "traffic_light"),),
 )
 KINDS = ("car", "truck", "bicycle", "person", "prop", "traffic_light", "animal", "unknown")
 SYMMETRIC = set(PROXIMITY) | {"overlaps", "opposes", "conflictsWith"}
@@ -104,7 +106,8 @@ def test_symmetric_relations_are_symmetric(family: Family, seed: int) -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_relations_stay_when_the_world_is_moved_and_turned(family: Family, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    things = busy(seed)
+    # A footprint without a heading lies along the x axis, however the world is turned.
+    things = [t for t in busy(seed) if not math.isnan(t.heading)]
     to = Place(*rng.uniform(-3000, 3000, 2), rng.uniform(-9, 9), rng.uniform(-50, 50))
 
     moved = found([t.moved(to) for t in things], family, town=TOWN.moved(to))
@@ -363,6 +366,14 @@ BOUNDS = (2, 4, 7, 10, 16, 25)
 NOISE = math.degrees(1e-6)
 
 
+DEFINED = {*PROXIMITY, *DIRECTIONS, *SIDES, "isIn", "controlsTrafficOf", "overlaps"}
+
+
+def told(things: list[Thing]) -> set[tuple[str, str, str]]:
+    """The edges that the generator gives, as far as they are defined here."""
+    return {e for e in edges(graph_of(frames(things), TOWN), 0, TOWN) if e[1] in DEFINED}
+
+
 def defined(things: list[Thing], radius: float = 50) -> set[tuple[str, str, str]]:
     """The edges of one frame as the specification has them, pair by pair."""
     ego = things[0]
@@ -465,7 +476,7 @@ def test_relations_equal_their_definition_on_random_scenes(
 ) -> None:
     things = crowd(seed, count, size)
 
-    assert set(edges(graph_of(frames(things), TOWN), 0, TOWN)) == defined(things)
+    assert told(things) == defined(things)
 
 
 on_a_grid = st.builds(
@@ -489,7 +500,7 @@ def test_relations_equal_their_definition_where_everything_lies_on_bounds(
     things = [thing("ego")]
     things += [Thing(**vars(t) | {"name": f"t{i}"}) for i, t in enumerate(others)]
 
-    of = {e for e in edges(graph_of(frames(things), TOWN), 0, TOWN) if e[1] != "isIn"}
+    of = {edge for edge in told(things) if edge[1] != "isIn"}
 
     assert of == {edge for edge in defined(things) if edge[1] != "isIn"}
 

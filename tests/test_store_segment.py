@@ -135,6 +135,7 @@ def pieces(graph: Any, size: int) -> list[Any]:
                 presence=_cut(graph.presence, first, end),
                 edges=_cut(graph.edges, first, end),
                 lanes=_cut(graph.lanes, first, end),
+                numbers=_cut(graph.numbers, first, end),
             )
         )
     return found

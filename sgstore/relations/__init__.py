@@ -11,11 +11,20 @@ from typing import TYPE_CHECKING, Final
 from sgstore.relations.bearing import DIRECTION, SIDE
 from sgstore.relations.contact import CONTACT
 from sgstore.relations.control import CONTROL
+from sgstore.relations.following import FOLLOWING
 from sgstore.relations.lanes import LANES
 from sgstore.relations.proximity import PROXIMITY
 
 if TYPE_CHECKING:
     from sgstore.relations.scene import Family
 
-RELATIONS: Final[tuple[Family, ...]] = (LANES, CONTROL, PROXIMITY, DIRECTION, SIDE, CONTACT)
+RELATIONS: Final[tuple[Family, ...]] = (
+    LANES,
+    CONTROL,
+    PROXIMITY,
+    DIRECTION,
+    SIDE,
+    CONTACT,
+    FOLLOWING,
+)
 """All families, in the order in which their edges are given."""

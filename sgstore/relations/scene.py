@@ -103,6 +103,8 @@ class Standing:
     ----------
     hits : LaneHits
         Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Signals touch none.
+    along : float64
+        For each hit the place of the body's centre along the lane; m.
     crosswalks : tuple of int64 arrays
         Rows of :class:`Bodies`, ascending, and node ids of the crosswalks that they touch.
     off_road : intp array
@@ -110,6 +112,7 @@ class Standing:
     """
 
     hits: LaneHits
+    along: Floats
     crosswalks: tuple[Ints, Ints]
     off_road: NDArray[np.intp]
 
@@ -121,6 +124,7 @@ class Standing:
         off_road = place[self.off_road]
         return Standing(
             replace(hits, **(columns | {"row": place[columns["row"]]})),
+            self.along[kept],
             (place[walkers[walking]], crosswalks[walking]),
             off_road[off_road >= 0],
         )
@@ -135,13 +139,20 @@ class Ground:
     standing : Standing
     present : (F, K) bool
         Which nodes of the map are in which graph; column i is node -1 - i.
-    controls : tuple of int64 arrays
-        Node ids of signals of the trace, ascending, and of a lane that each applies to.
+    controls, affects : tuple of int64 arrays
+        Node ids of signals of the trace, ascending, and of a lane that each applies to or may affect.
+    map_affects : tuple of int64 arrays
+        Node ids of signals of the map, and of a lane that each may affect.
+    following : tuple of intp, intp, float64 arrays
+        Rows of bodies: one that follows, the one that leads it, and the gap between them along the lanes; m.
     """
 
     standing: Standing
     present: Bools
     controls: tuple[Ints, Ints]
+    affects: tuple[Ints, Ints]
+    map_affects: tuple[Ints, Ints]
+    following: tuple[NDArray[np.intp], NDArray[np.intp], Floats]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.opendrive.nodes import DRIVING
+from sgstore.relations.along import Centrelines
+from sgstore.relations.following import next_ahead
+from sgstore.relations.lanenet import LaneNet
 from sgstore.relations.scene import IS_SIGNAL, Bodies, Ground, Standing, joined, kinds_mask
+from sgstore.relations.upstream import SignalReach
 from sgstore.roads import OFF_ROAD, LaneHits
 from sgstore.vocabulary import ENTITY_KINDS, RELATION_CODE, VEHICLES
 
@@ -41,6 +45,8 @@ class Survey:
     Parameters
     ----------
     road_map : RoadMap
+    ahead : float
+        How far along the lanes is looked; m.
 
     Notes
     -----
@@ -48,10 +54,13 @@ class Survey:
     the last block: its memory grows with the number of distinct entities, not with time.
     """
 
-    def __init__(self, road_map: RoadMap) -> None:
-        nodes = road_map.nodes
+    def __init__(self, road_map: RoadMap, ahead: float) -> None:
+        nodes, lines = road_map.nodes, Centrelines(road_map.ribbons)
         self._map = road_map
-        self._footing = _Footing(road_map)
+        self._ahead = ahead
+        self._net = LaneNet(road_map)
+        self._reach = SignalReach(road_map, self._net, lines, ahead)
+        self._footing = _Footing(road_map, lines)
         self._driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
         self._parent = _parents(road_map)
         self._columns: dict[tuple[bool, str], list[int]] = {}
@@ -62,6 +71,7 @@ class Survey:
         none = np.zeros(0, np.int64)
         self._twins: tuple[Ints, Ints] = (none, none)
         self._controls: tuple[Ints, Ints] = (none, none)
+        self._affects: tuple[Ints, Ints] = (none, none)
 
     def learn(self, entities: Entities, scenery: States) -> None:
         """Take note of entities, in order of node id, that appear for the first time, and of their poses."""
@@ -70,6 +80,7 @@ class Survey:
         )
         twins: list[tuple[int, int]] = []
         controls: list[tuple[int, int]] = []
+        affects: list[tuple[int, int]] = []
         for row, ref in enumerate(entities.map_ref):
             if not ref:
                 continue
@@ -79,8 +90,10 @@ class Survey:
                 twins.append((node, column))
             if is_signal:
                 controls += [(node, lane) for lane in self._map.lanes_of_signal(ref).tolist()]
+                affects += [(node, lane) for lane in self._reach.of(ref).tolist()]
         self._twins = _appended(self._twins, twins)
         self._controls = _appended(self._controls, controls)
+        self._affects = _appended(self._affects, affects)
 
     def _column(self, key: tuple[bool, str], place: tuple[float, float]) -> int | None:
         """The signal or object of the map that a reference means; of repeated ones the one at that place."""
@@ -94,14 +107,14 @@ class Survey:
 
     def standing(self, bodies: Bodies) -> Standing:
         """What the bodies of a block stand on; asked once for each block."""
-        hits, crosswalks = self._footing.of(bodies)
+        hits, along, crosswalks = self._footing.of(bodies)
         stands: Bools = np.zeros(len(bodies), np.bool_)
         stands[hits.row[self._driving[-1 - hits.lane]]] = True
         placed = np.isfinite(bodies.x) & np.isfinite(bodies.y)
         off_road = np.flatnonzero(
             ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
         )
-        return Standing(hits, crosswalks, off_road)
+        return Standing(hits, along, crosswalks, off_road)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Ground:
         """The map under bodies, and around the egos.
@@ -136,7 +149,14 @@ class Survey:
         nodes = np.concatenate([hits.lane, crosswalks, np.full(len(off_road), OFF_ROAD)])
         self._add_with_parents(present, bodies.frame[rows], -1 - nodes)
         present &= kept
-        return Ground(standing, present, self._controls)
+        return Ground(
+            standing,
+            present,
+            self._controls,
+            self._affects,
+            self._reach.of_map(present),
+            next_ahead(self._net, bodies, standing, self._ahead),
+        )
 
     def _add_with_parents(self, present: Bools, frame: Ints, column: Ints) -> None:
         for _ in range(DEPTH):
@@ -166,14 +186,15 @@ Table = tuple["NDArray[Any]", ...]
 class _Footing:
     """What footprints meet; one that is where it was when it was last seen is not asked about again."""
 
-    def __init__(self, road_map: RoadMap) -> None:
+    def __init__(self, road_map: RoadMap, lines: Centrelines) -> None:
         self._map = road_map
+        self._lines = lines
         self._node: Ints = np.zeros(0, np.int64)
         self._box = np.zeros((0, 6))
         self._lanes, self._crosswalks = self._ask(np.zeros(0, np.intp), self._box)
 
-    def of(self, bodies: Bodies) -> tuple[LaneHits, tuple[Ints, Ints]]:
-        """Lanes and crosswalks that bodies touch, by their rows; signals touch none."""
+    def of(self, bodies: Bodies) -> tuple[LaneHits, Floats, tuple[Ints, Ints]]:
+        """Lanes that bodies touch, with places along them, and crosswalks, by rows; signals touch none."""
         rows = np.flatnonzero(~IS_SIGNAL[bodies.kind])
         known = len(self._node)
         node = np.concatenate([self._node, bodies.node[rows]])
@@ -189,7 +210,8 @@ class _Footing:
         self._node, self._box = node[last], box[last]
         self._lanes, self._crosswalks = (_looked_up(table, same_as[last]) for table in tables)
         lanes, crosswalks = (_looked_up(table, same_as[known:]) for table in tables)
-        return LaneHits(rows[lanes[0]], *lanes[1:]), (rows[crosswalks[0]], crosswalks[1])
+        row, *hits, along = lanes
+        return LaneHits(rows[row], *hits), along, (rows[crosswalks[0]], crosswalks[1])
 
     def _ask(self, rows: Rows, box: Floats) -> tuple[Table, Table]:
         boxes, bottom = box[rows, :5], box[rows, 5]
@@ -197,7 +219,11 @@ class _Footing:
         walkers, crosswalks = self._map.crosswalks_of(boxes, bottom)
         order = np.argsort(walkers, kind="stable")
         return (
-            (rows[hits.row], *(getattr(hits, column.name) for column in fields(hits)[1:])),
+            (
+                rows[hits.row],
+                *(getattr(hits, column.name) for column in fields(hits)[1:]),
+                self._lines.along(-2 - hits.lane, boxes[hits.row, 0], boxes[hits.row, 1]),
+            ),
             (rows[walkers[order]], crosswalks[order]),
         )
 
