@@ -52,7 +52,8 @@ TYPES = {
     "BulbClassification": "color=1:Color icon=2:Icon mode=3:Mode is_out_of_service=6:bool",
     "TrafficLight": "id=1:Identifier base=2:BaseStationary classification=3:BulbClassification"
     " source_reference=5:ExternalReference*",
-    "SignClassification": "type=2:SignType",
+    "SignValue": "value=1:double value_unit=2:Unit text=3:string",
+    "SignClassification": "type=2:SignType value=3:SignValue",
     "MainSign": "base=1:BaseStationary classification=2:SignClassification",
     "TrafficSign": "id=1:Identifier main_sign=2:MainSign source_reference=4:ExternalReference*",
     "LaneClassification": "centerline=3:Vector3d*",
@@ -80,6 +81,7 @@ ENUMS = {
     "StationaryType": "TYPE_UNKNOWN=0 TYPE_OTHER=1 TYPE_BUILDING=3 TYPE_POLE=4 TYPE_TREE=7",
     "Color": "COLOR_UNKNOWN=0 COLOR_OTHER=1 COLOR_RED=2 COLOR_YELLOW=3 COLOR_GREEN=4 COLOR_WHITE=6",
     "Icon": "ICON_UNKNOWN=0 ICON_OTHER=1 ICON_NONE=2 ICON_WALK=16 ICON_DONT_WALK=17",
+    "Unit": "UNIT_UNKNOWN=0 UNIT_KILOMETER_PER_HOUR=3 UNIT_MILE_PER_HOUR=4",
     "Mode": "MODE_UNKNOWN=0 MODE_OTHER=1 MODE_OFF=2 MODE_CONSTANT=3 MODE_FLASHING=4",
     "SignType": "TYPE_UNKNOWN=0 TYPE_OTHER=1 TYPE_GIVE_WAY=16 TYPE_STOP=17"
     " TYPE_SPEED_LIMIT_BEGIN=52 TYPE_TRAFFIC_CONE=140 TYPE_ROUNDABOUT=29",

@@ -140,12 +140,11 @@ class MovingObjects:
         usable = np.zeros(len(objects), np.bool_)
         lights = np.full(len(objects), -1, np.int64)
         lengths = np.fromiter(map(len, objects), np.int64, len(objects))
-        starts = np.cumsum(lengths) - lengths
-        joined = np.frombuffer(b"".join(objects), np.uint8)
         order = np.argsort(lengths, kind="stable")
         cuts = np.flatnonzero(np.diff(lengths[order])) + 1
         for rows in np.split(order, cuts) if len(order) else ():
-            content = joined[starts[rows, None] + np.arange(int(lengths[rows[0]]))]
+            joined = b"".join([objects[row] for row in rows.tolist()])
+            content = np.frombuffer(joined, np.uint8).reshape(len(rows), -1)
             for row in self._read_alike(rows, content, values, usable, lights):
                 values[row], usable[row], lights[row] = self._read_one(objects[row])
         return values, usable, lights
