@@ -44,26 +44,23 @@ class Edges:
 
 
 @dataclass(frozen=True, slots=True)
-class EdgeNumbers:
-    """A number that goes with an edge; shape (K,).
+class LaneGaps:
+    """How far it is along the lanes from who follows to who leads: the attribute of both edges; shape (K,).
 
     Attributes
     ----------
     frame : int64
         Frame, counted in the block.
-    relation : int8
-        Codes of :data:`sgstore.vocabulary.RELATIONS`.
     src, dst : int64
-        Node ids.
-    value : float64
-        Of ``leads`` and ``follows``: the gap along the lanes; m. NaN where it is not known.
+        Node ids: src follows dst.
+    gap : float64
+        From bumper to bumper along the lanes; m. NaN where it is not known.
     """
 
     frame: Ints
-    relation: Codes
     src: Ints
     dst: Ints
-    value: Floats
+    gap: Floats
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -135,7 +132,7 @@ class GraphBlock:
         All other edges.
     lanes : LaneStates
         Attributes of the ``isIn`` edges from entities to lanes.
-    numbers : EdgeNumbers
+    gaps : LaneGaps
         Attributes of ``leads`` and ``follows`` edges.
     """
 
@@ -143,7 +140,7 @@ class GraphBlock:
     presence: Presence
     edges: Edges
     lanes: LaneStates
-    numbers: EdgeNumbers
+    gaps: LaneGaps
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -163,7 +163,7 @@ class SceneGraphGenerator:
             presence=_presence(bodies, ground),
             edges=self._keeping.edges(Edges.chained([f.edges(scene) for f in self._families])),
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
-            numbers=gaps(bodies, ground),
+            gaps=gaps(bodies, ground),
         )
 
     def step(self, frame: Frame) -> SceneGraph:

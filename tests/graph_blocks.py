@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.config import Config
-from sgstore.graph import EdgeNumbers, Edges, GraphBlock, LaneStates, Presence
+from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, Presence
 from sgstore.roads import MapEdges, MapNodes
 from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.world import (
@@ -154,8 +154,8 @@ class RandomTrace:
         )
         lanes = self._lanes(frame, node)
         edges = _with_lanes(self._edges(here), lanes)
-        numbers = _numbers(edges, self.rng)
-        return GraphBlock(frames, self._presence(count), edges, lanes, numbers)
+        gaps = _gaps(edges, self.rng)
+        return GraphBlock(frames, self._presence(count), edges, lanes, gaps)
 
     def _entities(self, new: bool) -> Entities:
         count = len(self.kinds) if new else 0
@@ -241,14 +241,17 @@ def _with_lanes(edges: Edges, lanes: LaneStates) -> Edges:
     )
 
 
-def _numbers(edges: Edges, rng: np.random.Generator) -> EdgeNumbers:
-    """A number for every edge that has one, some of them missing."""
-    having = np.isin(edges.relation, [RELATION_CODE["leads"], RELATION_CODE["follows"]])
-    rows = np.stack([edges.frame, edges.relation, edges.src, edges.dst])[:, having]
-    frame, relation, src, dst = np.unique(rows, axis=1).astype(np.int64)
+def _gaps(edges: Edges, rng: np.random.Generator) -> LaneGaps:
+    """A gap for every pair that follows, some of them missing."""
+    leads, follows = RELATION_CODE["leads"], RELATION_CODE["follows"]
+    ahead, behind = edges.relation == leads, edges.relation == follows
+    rows = np.stack([edges.frame, edges.src, edges.dst])
+    frame, src, dst = np.unique(
+        np.concatenate([rows[:, behind], rows[:, ahead][[0, 2, 1]]], axis=1), axis=1
+    )
     values = rng.uniform(0, 90, len(frame))
     values[rng.random(len(frame)) < 0.1] = np.nan
-    return EdgeNumbers(frame, relation.astype(np.int8), src, dst, values)
+    return LaneGaps(frame, src, dst, values)
 
 
 def publish_long(store: StoreFile, frames: int, *, size: int = 240, moving: int = 20) -> None:

@@ -135,7 +135,7 @@ def pieces(graph: Any, size: int) -> list[Any]:
                 presence=_cut(graph.presence, first, end),
                 edges=_cut(graph.edges, first, end),
                 lanes=_cut(graph.lanes, first, end),
-                numbers=_cut(graph.numbers, first, end),
+                gaps=_cut(graph.gaps, first, end),
             )
         )
     return found

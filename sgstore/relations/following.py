@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.graph import EdgeNumbers, Edges
-from sgstore.relations.scene import Family, kinds_mask
-from sgstore.vocabulary import RELATION_CODE, VEHICLES
+from sgstore.graph import Edges, LaneGaps
+from sgstore.relations.scene import Family, edges_between, kinds_mask
+from sgstore.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 SAME_WAY: Final = np.pi / 4
 """Greatest difference of heading from a lane of a junction that a vehicle takes; rad."""
-
-FOLLOWS: Final = ("leads", "follows")
 
 IS_VEHICLE: Final = kinds_mask(VEHICLES)
 
@@ -175,22 +173,24 @@ def _same_lane(own: OwnLanes) -> list[Column]:
 
 
 def _names(config: Config) -> tuple[str, ...]:
-    return FOLLOWS if config.lanes.ahead > 0 else ()
+    return ("leads", "follows") if config.lanes.ahead > 0 else ()
 
 
-def gaps(bodies: Bodies, ground: Ground | None) -> EdgeNumbers:
-    """The edges, each with its gap."""
+def gaps(bodies: Bodies, ground: Ground | None) -> LaneGaps:
+    """Who follows whom, by node ids, and the gaps."""
     none = np.zeros(0, np.intp)
     a, b, gap = (none, none, np.zeros(0)) if ground is None else ground.following
-    codes = np.repeat([RELATION_CODE[name] for name in FOLLOWS], len(a)).astype(np.int8)
-    src, dst = np.concatenate([b, a]), np.concatenate([a, b])
-    both = np.concatenate([gap, gap])
-    return EdgeNumbers(bodies.frame[src], codes, bodies.node[src], bodies.node[dst], both)
+    return LaneGaps(bodies.frame[a], bodies.node[a], bodies.node[b], gap)
 
 
 def _edges(scene: Scene) -> Edges:
-    of = gaps(scene.bodies, scene.ground)
-    return Edges(of.frame, of.relation, of.src, of.dst)
+    ground = scene.ground
+    if ground is None:
+        raise ValueError("who follows whom needs a map")
+    a, b, _ = ground.following
+    return Edges.chained(
+        [edges_between(scene, "leads", b, a), edges_between(scene, "follows", a, b)]
+    )
 
 
 FOLLOWING = Family(_names, needs_map=True, edges=_edges)
