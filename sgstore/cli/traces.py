@@ -30,15 +30,22 @@ def ingest(
     config: Annotated[
         Path | None, typer.Option("--config", help="TOML file with settings of the scene graphs.")
     ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
+    ] = None,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
     """Read recordings into a store; what is in it already is left as it is."""
     from sgstore.cli.progress import ingest_bar
     from sgstore.config import load
+    from sgstore.config import preset as preset_named
     from sgstore.ingest import ingest as ingest_traces
 
-    settings = load(config) if config else None
+    if config and preset:
+        raise typer.BadParameter("give --config or --preset; a file may name a preset itself")
+    settings = preset_named(preset) if preset else load(config) if config else None
     with ingest_bar() as on_progress:
         outcomes = ingest_traces(
             store, _recordings(traces), road_map=road_map, config=settings, on_progress=on_progress

@@ -21,13 +21,13 @@ class Preset:
     ----------
     summary : str
         What it is, in a line.
-    notes : tuple of str
-        What is to be known of it.
+    notes : str
+        What is to be known of it, as lines of Markdown.
     config : Config
     """
 
     summary: str
-    notes: tuple[str, ...]
+    notes: str
     config: Config
 
 
@@ -81,20 +81,45 @@ _ROADSCENE2VEC: Final = Config(
     without=("leads", "follows", "overlaps", "sees"),
 )
 
+_OF_CARLASGG: Final = """\
+* *Imitated.* The rectangle, 50 m ahead, 2 m behind, 25 m to each side; in it count the footprints of
+  what moves and the centres of what stands. The rule that keeps roads of other storeys out (less than 2
+  m higher or lower, or a grade of less than 0.1), for the map alone. Distances between the origins of
+  actors. Which bearing is what, and who has the ties; what is dead ahead or dead behind is to the left.
+  Relations of the ego with people, bicycles, cars, motorcycles, buses, trains and trucks up to 25 m, and
+  of nobody else; vans it leaves out. Lanes of type driving alone, and `off_road` for what touches none
+  of them.
+* *Defects, not imitated.* It has no lane changes, although its documentation promises them. Its lanes
+  stick out by 1 m beyond their ends and beside their bends, and stop up to 2 m short of their ends. Of
+  lanes that begin in one place, one seems to lead to the others. A traffic light is there twice, as a
+  pole and as a landmark. What has no edge to a lane is "Off Road", lights and signs too. An entity is in
+  the lanes of every storey above and below it.
+* Lanes keep the section in their names (`road/section/lane`). CARLASGG takes all sections of a road for
+  one, and calls the lane `road_lane`, after what the columns `road` and `lane` of a lane hold.
+* `python -m bench.against_carlasgg TRACE ORACLE` counts all of it against graphs that CARLASGG itself
+  made.
+"""
+
+_OF_ROADSCENE2VEC: Final = """\
+* On a bound of two directions both hold. Of the distances one holds, the nearest, as there.
+* Relations of the ego alone, with what RoadScene2Vec knows: cars, motorcycles, bicycles, people, lights
+  and signs, up to 25 m.
+"""
+
 PRESETS: Final[Mapping[str, Preset]] = {
     "default": Preset(
         "All round the ego, all kinds, all lane types, storeys kept apart, numbers kept.",
-        (),
+        "",
         Config(),
     ),
     "carlasgg": Preset(
-        "The relations of CARLASGG as its code computes them.",
-        (),
+        "The graphs of CARLASGG as its code computes them, without its defects.",
+        _OF_CARLASGG,
         _CARLASGG,
     ),
     "roadscene2vec": Preset(
-        "The thresholds of RoadScene2Vec, whose bins hold both their bounds.",
-        (),
+        "The relations and thresholds of RoadScene2Vec, whose bins hold both their bounds.",
+        _OF_ROADSCENE2VEC,
         _ROADSCENE2VEC,
     ),
 }

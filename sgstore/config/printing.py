@@ -111,12 +111,9 @@ def as_markdown(presets: Mapping[str, Preset]) -> str:
 
 
 def _preset_text(name: str, one: Preset) -> str:
-    lines = [f"### `{name}`", "", one.summary, ""]
     different = list(_differences(Config().as_dict(), one.config.as_dict(), ""))
-    if different:
-        lines += ["```toml", *different, "```", ""]
-    lines += [f"* {note}" for note in one.notes]
-    return "\n".join([*lines, ""] if one.notes else lines)
+    changes = ["```toml", *different, "```", ""] if different else []
+    return "\n".join([f"### `{name}`", "", one.summary, "", *changes, one.notes])
 
 
 def _differences(

@@ -411,7 +411,7 @@ def _expected(name: str, known: Iterable[str]) -> str:
 
 def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
     checked: dict[str, TypeMeaning] = {}
-    for name, meaning in sorted(types.items()):
+    for name, meaning in sorted(types.items(), key=lambda item: item[0].lower()):
         where = f'types."{name}"'
         check(bool(name.strip()), where, name, "the type name of a simulator")
         known = meaning.kind in ENTITY_KINDS
