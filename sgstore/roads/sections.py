@@ -29,9 +29,9 @@ _STEP: Final = 1.0
 """Distance of the cross sections of a way through an area; m."""
 _FEW: Final = 20_000
 """Pairs of a place and a piece of a line up to which looking at all of them takes less than a tree."""
-_SLACK: Final = 0.2
-_STRAYS: Final = 0.5
-"""A border's nearest point that lies farther ahead or behind than this share of its distance is its end."""
+_AHEAD: Final = 0.2, 0.1, 0.5
+"""How far ahead or behind a cross section the end of a border may be that is taken for it: so many metres, and
+this share of its distance to the side; at the ends of a lane, which need not be square, this share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +85,12 @@ def run_of(line: Floats) -> Floats:
 class Feet:
     """The points of lines that are nearest to some places; shape (n,) and (n, 2).
 
-    ``along``: length of the line up to there, lines laid end to end.
+    ``along``: length of the line up to there, lines laid end to end. ``is_end``: it is the end of a line.
     """
 
     at: Floats
     along: Floats
+    is_end: Bools
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
@@ -110,7 +111,11 @@ def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
     share = ((places - start[piece]) * way[piece]).sum(axis=1) / squared[piece]
     share = np.clip(share, 0.0, 1.0)
     before = np.cumsum(length) - length
-    return Feet(start[piece] + share[:, None] * way[piece], before[piece] + share * length[piece])
+    last = np.cumsum([len(line) - 1 for line in lines]) - 1
+    is_end = (share <= 0) & np.isin(piece, np.append(0, last[:-1] + 1))
+    is_end |= (share >= 1) & np.isin(piece, last)
+    along = before[piece] + share * length[piece]
+    return Feet(start[piece] + share[:, None] * way[piece], along, is_end)
 
 
 def along_line(line: Floats, places: Floats) -> Floats:
@@ -183,10 +188,13 @@ def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats
     """Where the cross sections through places end on one side; ``None`` if no border is beside any of them."""
     if not borders:
         return None
-    nearest = feet(places, borders).at
+    found = feet(places, borders)
+    nearest = found.at
     way = nearest - places
     away, beyond = (way * aside).sum(axis=1), (way * ahead).sum(axis=1)
-    beside: Bools = np.abs(beyond) <= _SLACK + _STRAYS * np.abs(away)
+    share = np.full(len(away), _AHEAD[1])
+    share[[0, -1]] = _AHEAD[2]
+    beside: Bools = ~found.is_end | (np.abs(beyond) <= _AHEAD[0] + share * np.abs(away))
     if not beside.any():
         return None
     rows: Ints = np.flatnonzero(beside)
