@@ -13,7 +13,7 @@ first rows come at once and memory does not grow with their number.
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog
+    from sgstore.lang.evaluation import FrameView
     from sgstore.lang.results import Statement
+    from sgstore.lang.whynot import WhyNot
     from sgstore.store import Rows, StoredTrace
 
 FIRST_WINDOW: Final = 64
@@ -176,6 +178,53 @@ class Store:
     def explain(self, text: str, /, **parameters: object) -> str:
         """What becomes of a query, stage by stage: parse, bind, rewrite, emit."""
         return self.find(text, **parameters).explain()
+
+    def why_not(self, frame: int | str | FrameRef, text: str, /, **parameters: object) -> WhyNot:
+        """How far a pattern holds in a frame: the first part of it that fails, and how near it came.
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+        text : str
+            A pattern, as :meth:`find` takes it.
+        **parameters
+            Values of ``$name``.
+
+        Raises
+        ------
+        QueryError
+            The text is no query.
+        StoreError
+            There is no such frame.
+        """
+        from sgstore.lang.whynot import WhyNot, why_not  # with numpy: only for who asks
+
+        with self.file.snapshot():
+            compiled = compile_query(text, self.catalog(), parameters)
+            ref = self.file.frame(_ref(frame))
+            if ref.trace in compiled.left_out:
+                answers = self.file.trace(ref.trace_id).answers
+                unknown = sorted(compiled.bound.relations - set(answers))
+                return WhyNot(
+                    (),
+                    f"the trace {ref.trace} knows of {', '.join(unknown)}",
+                    {},
+                    "such relations are unknown of it (no road map, perhaps)",
+                )
+            return why_not(compiled.bound, self._view(ref))
+
+    def _view(self, frame: FrameRef) -> FrameView:
+        """A frame as patterns in memory see it."""
+        from sgstore.lang.evaluation import FrameView
+
+        trace = self.file.trace(frame.trace_id)
+        about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
+        whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
+        whole |= {"id": trace.trace_id, "uri": str(trace.path), "ego": trace.ego or None}
+        whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}
+        whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
+        return FrameView(self.file.graph(frame.frame_id), about, whole)
 
 
 class Matches:

@@ -388,3 +388,20 @@ def test_a_question_can_be_asked_in_a_bounded_process(store: str, sgstore) -> No
     assert found[0] == 4
     assert (late[0], late[1]) == (2, "")
     assert "stopped after 0.3 s" in late[2]
+
+
+def test_what_fails_in_a_frame_is_told(store: str, sgstore) -> None:
+    query = "MATCH (e:Ego) WHERE e.speed > 20"
+    told, data = (
+        sgstore("why-not", store, "town@20s", query),
+        sgstore("why-not", store, "town@20s", query, "--json"),
+    )
+
+    assert told[1].splitlines() == [
+        "holds   (e) is the ego",
+        "FAILS   e.speed > 20",
+        "found   e.speed = 5.697",
+        "nearest e = car 0",
+    ]
+    assert json.loads(data[1])["failed"] == "e.speed > 20"
+    assert (told[0], data[0]) == (0, 0)

@@ -18,6 +18,7 @@ from sgstore.ingest import ingest
 from sgstore.lang import compile_query
 from sgstore.lang.evaluation import FrameView
 from sgstore.lang.match import Matcher
+from sgstore.lang.whynot import why_not
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -79,6 +80,74 @@ def test_queries_find_in_memory_what_exhaustive_search_finds(text: str) -> None:
     world = random_world(2, frames=5, static=True)
 
     assert found(text, world) == answer(text, world)[0]
+
+
+def test_what_fails_is_named_exactly_where_nothing_matches() -> None:
+    failed = held = 0
+    for number in range(60):
+        if number % 20 == 0:
+            world = random_world(number, frames=4, static=number % 40 == 0)
+        try:
+            query = compile_query(Writer(number).query(), world.catalog).bound
+        except QueryError:
+            continue
+        matcher = Matcher(query)
+        for frame in world.frames:
+            answer = why_not(query, view_of(frame))
+            assert bool(answer.failed) != matcher.holds(view_of(frame)), (number, answer)
+            failed += bool(answer.failed)
+            held += not answer.failed
+
+    assert min(failed, held) > 20
+
+
+@pytest.mark.parametrize(
+    ("text", "failed", "found"),
+    [
+        (
+            "MATCH (e:Ego)-[:isIn]->(l:Lane)<-[:isIn]-(p:Person)",
+            "(p)-[isIn]->(l)",
+            "no edge between them",
+        ),
+        ("MATCH (e:Ego) WHERE e.speed > 20", "e.speed > 20", "e.speed = 5.697"),
+        ("MATCH (e:Ego), (t:Train)", "(t) is train", "6 car, 1 van, 1 bus"),
+        (
+            "MATCH (e:Ego) WHERE COUNT {(e)-[:near]->(:Person)} > 3",
+            "COUNT {…} > 3",
+            "COUNT {…} = 2",
+        ),
+        ("MATCH (e:Ego)-[:safety_hazard]->(v:Bus)", "(e)-[safety_hazard]->(v)", "m apart"),
+    ],
+)
+def test_the_first_part_that_fails_is_shown_with_what_is_there(
+    town: Store, text: str, failed: str, found: str
+) -> None:
+    answer = town.why_not("town@20s", text)
+
+    assert answer.failed == failed
+    assert found in answer.found
+    assert answer.held[0] == "(e) is the ego"
+
+
+def test_the_nearest_is_the_one_that_misses_by_the_least(town: Store) -> None:
+    answer = town.why_not("town@20s", "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 1")
+    distances = town.sql(
+        "SELECT p.distance, n.name FROM pairs p JOIN frames f USING (frame_id)"
+        " JOIN nodes n ON n.frame_id = p.frame_id AND n.node_id = p.dst"
+        " WHERE f.seq = 200 AND p.src = f.ego"
+        " AND n.kind IN ('car', 'truck', 'van', 'bus', 'motorcycle', 'bicycle')"
+    ).values
+    least, name = min(distances)
+
+    assert answer.nearest["v"] == name
+    assert answer.found == f"dist(e, v) = {least:.4g}"
+
+
+def test_what_a_trace_cannot_answer_is_said(town: Store, tmp_path: Path) -> None:
+    text = "MATCH (e:Ego)-[:sees]->(p:Person)"
+
+    assert "sees" in town.why_not("town#0", text).failed
+    assert town.find(text).left_out == ("town",)
 
 
 @pytest.fixture(scope="module")

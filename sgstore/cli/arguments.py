@@ -26,6 +26,9 @@ ERROR, USAGE, LOSS, NO_MATCH, INTERRUPTED = 1, 2, 3, 4, 130
 """Exit codes; 0 is done."""
 
 StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="The store: one DuckDB file.")]
+FrameName = Annotated[
+    str, typer.Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")
+]
 QueryText = Annotated[
     str | None, typer.Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")
 ]

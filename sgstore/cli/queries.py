@@ -11,6 +11,7 @@ import typer
 from sgstore.cli.arguments import (
     NO_MATCH,
     AsJson,
+    FrameName,
     Output,
     Parameters,
     QueryFile,
@@ -25,7 +26,7 @@ from sgstore.cli.arguments import (
     say_left_out,
     seconds_of,
 )
-from sgstore.cli.output import Format, say, write_rows
+from sgstore.cli.output import Format, say, write_document, write_rows
 
 if TYPE_CHECKING:
     from sgstore.sandbox import Answer, Sandbox
@@ -92,6 +93,24 @@ def find(
         if not number and form is Format.table:
             say("nothing matches")
     return NO_MATCH if require and not number else 0
+
+
+@app.command("why-not")
+def why_not(
+    store: StorePath,
+    frame: FrameName,
+    query: QueryText = None,
+    file: QueryFile = None,
+    parameters: Parameters = None,
+    as_json: AsJson = False,
+) -> int:
+    """Say how far a pattern holds in a frame: what fails first, and how near it came."""
+    answer = open_store(store).why_not(frame, query_of(query, file), **parameters_of(parameters))
+    if as_json:
+        write_document(answer.as_dict(), Format.json)
+    else:
+        typer.echo(str(answer))
+    return 0
 
 
 @app.command()

@@ -115,7 +115,7 @@ class Search:
                     step.edges.append(edge)
             for found in [c for c in conditions if c[1] <= bound and c[2] <= bound_edges]:
                 conditions.remove(found)
-                test = evaluator(found[0], self._block)
+                test = expression(found[0], injective=injective)
                 place = next((n for n in step.named if n.edge.key in found[2]), None)
                 (place.tests if place else step.tests).append(test)
 
@@ -203,22 +203,35 @@ class Search:
                 return True
         return False
 
-    def _block(self, block: BlockValue) -> Evaluate:
-        inner = Search(block.scope, injective=self._injective)
-        value = evaluator(block.value, self._block) if block.value is not None else None
 
-        def of_block(at: Binding) -> Any:
-            # Names of a block may hide those outside, and its search must leave these as they are.
-            within = Binding(at.view, dict(at.nodes), dict(at.edges))
-            found = inner.run(within)
-            if block.word == "EXISTS":
-                return any(True for _ in found)
-            if value is None:
-                return sum(1 for _ in found)
-            known = [v for v in (value(within) for _ in found) if v is not None]
-            return _over(block.word, known)
+def expression(of: b.Bound, *, injective: bool) -> Evaluate:
+    """The function that gives the value of an expression for a binding.
 
-        return of_block
+    Parameters
+    ----------
+    of : Bound
+    injective : bool
+        Whether different nodes of a block are bound to different nodes.
+    """
+    return evaluator(of, lambda block: _block(block, injective=injective))
+
+
+def _block(block: BlockValue, *, injective: bool) -> Evaluate:
+    inner = Search(block.scope, injective=injective)
+    value = expression(block.value, injective=injective) if block.value is not None else None
+
+    def of_block(at: Binding) -> Any:
+        # The search binds as it goes, and must leave what is bound outside as it is.
+        within = Binding(at.view, dict(at.nodes), dict(at.edges))
+        found = inner.run(within)
+        if block.word == "EXISTS":
+            return any(True for _ in found)
+        if value is None:
+            return sum(1 for _ in found)
+        known = [v for v in (value(within) for _ in found) if v is not None]
+        return _over(block.word, known)
+
+    return of_block
 
 
 def _over(word: str, values: list[Any]) -> Any:

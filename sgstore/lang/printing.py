@@ -84,18 +84,19 @@ def _scope(scope: Scope, indent: str) -> list[str]:
         for node in scope.nodes.values()
     ]
     lines += [f"{indent}outside {key}: {kinds_text(kinds)}" for key, kinds in scope.outer.items()]
-    lines += [f"{indent}edge {_edge(edge)}" for edge in scope.edges]
+    lines += [f"{indent}edge {edge.key}: {edge_text(edge)}" for edge in scope.edges]
     lines += [f"{indent}where {value_text(condition, indent)}" for condition in scope.where]
     pairs = ", ".join(f"{a} ≠ {b}" for a, b in sorted(scope.distinct))
     return [*lines, f"{indent}distinct {pairs}"] if pairs else lines
 
 
-def _edge(edge: Edge) -> str:
+def edge_text(edge: Edge) -> str:
+    """An edge between the keys of its nodes."""
     some = [relation for relation in RELATIONS if relation in edge.relations]
     label = "any" if edge.relations == ANY_RELATION else "|".join(some)
     times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
     arrow = "-" if edge.both else "->"
-    return f"{edge.key}: ({edge.src})-[{label}{times}]{arrow}({edge.dst})"
+    return f"({edge.src})-[{label}{times}]{arrow}({edge.dst})"
 
 
 def kinds_text(kinds: Kinds) -> str:
