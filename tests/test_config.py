@@ -13,6 +13,7 @@ import pytest
 from conftest import REPOSITORY
 from hypothesis import given
 from hypothesis import strategies as st
+from opendrive_maps import a_map, a_road, element, line
 
 from sgstore.cli import run
 from sgstore.config import (
@@ -33,10 +34,13 @@ from sgstore.config import (
     preset,
 )
 from sgstore.errors import ConfigError
-from sgstore.vocabulary import TypeMeaning
+from sgstore.opendrive import read_map
+from sgstore.vocabulary import KINDS, SIGNALS, TypeMeaning
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from sgstore.roads import RoadMap
 
 
 def written(folder: Path, text: str) -> Path:
@@ -310,3 +314,26 @@ def test_the_verb_lists_presets_and_says_what_is_wrong(
     code, _, err = said(capsys, written(tmp_path, "rage = 3"))
     assert (code, "did you mean 'range'" in err) == (2, True)
     assert said(capsys, "--list", "--page")[0] == 2
+
+
+# Signs of the map ------------------------------------------------------------------------------------
+
+
+def test_signals_of_a_map_are_what_the_client_says_and_make_another_map() -> None:
+    def stand(code: str, s: float) -> str:
+        return element("signal", id=code, type=code, s=s, t=4, orientation="+", dynamic="no")
+
+    text = a_map(a_road("1", line(90, x=0, y=0, hdg=0), signals=stand("206", 9) + stand("Z-9", 30)))
+    config = Config(types={"z-9": TypeMeaning("stop_sign"), "x": TypeMeaning("car")})
+
+    plain, told = read_map(text, "m"), read_map(text, "m", config.signs)
+
+    def kinds(of: RoadMap) -> dict[str, str]:
+        names = zip(of.nodes.name, of.nodes.kind.tolist(), strict=True)
+        return {name: KINDS[kind] for name, kind in names if KINDS[kind] in SIGNALS}
+
+    assert kinds(plain) == {"206": "stop_sign", "Z-9": "sign"}
+    assert kinds(told) == {"206": "stop_sign", "Z-9": "stop_sign"}
+    assert told.digest != plain.digest
+    other = Config(types={"elsewhere": TypeMeaning("yield_sign")})
+    assert read_map(text, "m", other.signs).digest == plain.digest

@@ -17,6 +17,7 @@ from sgstore.vocabulary import (
     ENTITY_KINDS,
     PROXIMITY,
     RELATIONS,
+    SIGNALS,
     TypeMeaning,
     folded,
     kinds_labelled,
@@ -282,8 +283,8 @@ class Config:
     )
     types: Mapping[str, TypeMeaning] = setting(
         {},
-        "type names of the simulator, without regard to case -> what they mean: kind, special kind and "
-        "subkind of entities and signs, before what sgstore knows of them:\n"
+        "type names of the simulator, and type codes of the map's signals ('206'), without regard to case -> "
+        "what they mean: kind, special kind and subkind, before what sgstore knows of them:\n"
         '"vehicle.acme.patrol" = { kind = "car", special = "emergency" }',
     )
 
@@ -302,6 +303,11 @@ class Config:
 
     def __hash__(self) -> int:
         return hash(repr(self))
+
+    @property
+    def signs(self) -> tuple[tuple[str, str], ...]:
+        """Type names and the kinds of signals that they mean: what :func:`sgstore.opendrive.read_map` takes."""
+        return tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as they stand in TOML and JSON."""

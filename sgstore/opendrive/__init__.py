@@ -54,7 +54,7 @@ _KEPT: Final = 4
 
 
 @lru_cache(maxsize=_KEPT)
-def read_map(text: str, name: str) -> RoadMap:
+def read_map(text: str, name: str, signs: tuple[tuple[str, str], ...] = ()) -> RoadMap:
     """The road map that a text describes; the same one again if it was asked for lately.
 
     Parameters
@@ -64,6 +64,9 @@ def read_map(text: str, name: str) -> RoadMap:
         memory are bounded by its length.
     name : str
         What people call it; empty: the name in its header, or the first digits of its digest.
+    signs : tuple of (str, str)
+        Type codes of signals, in lower case, and the kinds that the client says they are. A map in which one of
+        them stands is another map: it has another digest.
 
     Returns
     -------
@@ -75,10 +78,10 @@ def read_map(text: str, name: str) -> RoadMap:
     MapError
         The text is no XML or no OpenDRIVE, exceeds a bound, or has no road that can be used.
     """
-    return parse_map(text, name)
+    return parse_map(text, name, signs)
 
 
-def parse_map(text: str, name: str) -> RoadMap:
+def parse_map(text: str, name: str, signs: tuple[tuple[str, str], ...] = ()) -> RoadMap:
     """The same, read anew."""
     if is_lane_text(text):
         return read_lane_text(text, name or _short_digest(text))
@@ -88,7 +91,9 @@ def parse_map(text: str, name: str) -> RoadMap:
         if not len(document["road"]):
             break
         try:
-            return _build(document, text, name, [str(error) for error in skip.values()])
+            road_map = _build(document, text, name, dict(signs))
+            road_map.warnings = (*map(str, skip.values()), *road_map.warnings)
+            return road_map
         except Spoiled as spoiled:
             found = {document.ordinals[row]: error for row, error in spoiled.roads.items()}
             skip |= found
@@ -99,14 +104,14 @@ def parse_map(text: str, name: str) -> RoadMap:
     raise MapError("has no road", element="OpenDRIVE")
 
 
-def _build(document: Document, text: str, name: str, warnings: list[str]) -> RoadMap:
+def _build(document: Document, text: str, name: str, signs: dict[str, str]) -> RoadMap:
     plan = read_plan_view(document)
     lanes = read_lanes(document)
     document.settle()
     ribbons = surface(document, lanes, plan)
     network = Network.of(document, lanes)
     surfaces = lane_nodes(document, lanes, ribbons)
-    signals = read_signals(document, plan, network)
+    signals = read_signals(document, plan, network, signs)
     furniture = read_objects(document, plan, network.warnings)
     spaces = ribbons_of(furniture.parking)
     before = [
@@ -141,7 +146,8 @@ def _build(document: Document, text: str, name: str, warnings: list[str]) -> Roa
         lane_changes=lane_changes,
         road_types=road_types(document),
         controllers=read_controllers(document),
-        warnings=[*warnings, *odd_sections(document), *network.warnings],
+        warnings=[*odd_sections(document), *network.warnings],
+        variant=signals.told,
     )
 
 

@@ -22,6 +22,8 @@ from sgstore.roads import MapNodes
 from sgstore.roads.lanetypes import DRIVING
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from sgstore.opendrive.document import Document
     from sgstore.opendrive.links import Network
     from sgstore.opendrive.planview import PlanView
@@ -55,10 +57,13 @@ class Signals:
     nodes : MapNodes
     lanes : list of frozenset of int
         Lanes, counted from 0, that each applies to.
+    told : str
+        Which kinds are what the client says that they are; empty: none.
     """
 
     nodes: MapNodes
     lanes: list[frozenset[int]]
+    told: str = ""
 
     def edges(self, first: int) -> Edge:
         """``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
@@ -67,12 +72,19 @@ class Signals:
         return ("controlsTrafficOf", signal, FIRST_LANE + lane)
 
 
-def read_signals(document: Document, plan: PlanView, network: Network) -> Signals:
-    """The signals of a map; one whose place is broken is left out with a warning."""
+def read_signals(
+    document: Document, plan: PlanView, network: Network, signs: Mapping[str, str]
+) -> Signals:
+    """The signals of a map; one whose place is broken is left out with a warning.
+
+    ``signs``: type codes in lower case, and the kinds that the client says they are.
+    """
     reach = _Reach(document, network)
-    parts = (_elements(document, plan, reach), _signal_objects(document, plan, reach))
+    parts = (_elements(document, plan, reach, signs), _signal_objects(document, plan, reach))
     return Signals(
-        MapNodes.joined([part.nodes for part in parts]), [s for p in parts for s in p.lanes]
+        MapNodes.joined([part.nodes for part in parts]),
+        [s for p in parts for s in p.lanes],
+        parts[0].told,
     )
 
 
@@ -162,14 +174,19 @@ def _validities(document: Document, kind: str) -> dict[int, list[tuple[float, fl
     return ranges
 
 
-def _elements(document: Document, plan: PlanView, reach: _Reach) -> Signals:
+def _elements(
+    document: Document, plan: PlanView, reach: _Reach, signs: Mapping[str, str]
+) -> Signals:
     kind = "road/signal"
     rows = standing(document, kind, np.arange(len(document[kind])), reach.warnings)
     attributes = [document[kind].attributes[row] for row in rows.tolist()]
     ids = [a.get("id", "") for a in attributes]
+    codes = [a.get("type", "") for a in attributes]
+    told = {code: signs[code.lower()] for code in sorted(set(codes)) if code.lower() in signs}
     kinds = [
-        kind_of_signal(a.get("type", ""), dynamic=a.get("dynamic") == "yes", name=a.get("name", ""))
-        for a in attributes
+        told.get(code)
+        or kind_of_signal(code, dynamic=a.get("dynamic") == "yes", name=a.get("name", ""))
+        for code, a in zip(codes, attributes, strict=True)
     ]
     limits = [
         _limit(a) if kind == "speed_limit" else np.nan
@@ -183,7 +200,8 @@ def _elements(document: Document, plan: PlanView, reach: _Reach) -> Signals:
         for row, name, a in zip(rows.tolist(), ids, attributes, strict=True)
     ]
     columns = node_columns(document, plan, kind, rows)
-    return Signals(MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns), lanes)
+    nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
+    return Signals(nodes, lanes, repr(told) if told else "")
 
 
 def _referred(document: Document, reach: _Reach) -> dict[str, frozenset[int]]:

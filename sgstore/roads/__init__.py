@@ -229,6 +229,8 @@ class RoadMap:
     lane_changes : LaneChanges, optional
     road_types, controllers : mapping, optional
     warnings : iterable of str, optional
+    variant : str, optional
+        In what it differs from the map that the text alone describes.
 
     Attributes
     ----------
@@ -237,7 +239,7 @@ class RoadMap:
     text : str
         The text it was read from.
     digest : str
-        SHA-256 of the text, in hexadecimal digits: what identifies the map.
+        SHA-256 of the text and the variant, in hexadecimal digits: what identifies the map.
     nodes : MapNodes
     edges : MapEdges
         Static relations: ``isIn`` (lane → road, road → junction), ``travelsTo``, ``opposes``, ``toLeftOf``,
@@ -267,10 +269,11 @@ class RoadMap:
         road_types: Mapping[str, tuple[tuple[float, str], ...]] | None = None,
         controllers: Mapping[str, tuple[str, ...]] | None = None,
         warnings: Iterable[str] = (),
+        variant: str = "",
     ) -> None:
         self.name = name
         self.text = text
-        self.digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+        self.digest = hashlib.sha256((text + variant).encode("utf-8", "surrogatepass")).hexdigest()
         self.nodes = nodes
         self.edges = edges
         self.ribbons = ribbons
