@@ -9,6 +9,7 @@ import pytest
 from oracle import answer
 from oracle_patterns import Writer
 from oracle_worlds import World, random_world
+from recordings import Recorder, car
 from test_lang_oracle import QUERIES
 
 from sgstore.demo import QUESTIONS, RECORDING
@@ -143,11 +144,15 @@ def test_the_nearest_is_the_one_that_misses_by_the_least(town: Store) -> None:
     assert answer.found == f"dist(e, v) = {least:.4g}"
 
 
-def test_what_a_trace_cannot_answer_is_said(town: Store, tmp_path: Path) -> None:
-    text = "MATCH (e:Ego)-[:sees]->(p:Person)"
+def test_what_a_trace_cannot_answer_is_said(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "field.mcap") as recorder:
+        recorder.ground_truth(0.0, [car(1, 0, 0), car(2, 9, 0)], host=1)
+    assert ingest(tmp_path / "s.sgstore", [tmp_path / "field.mcap"])[0].error is None
+    field = Store(tmp_path / "s.sgstore")
+    text = "MATCH (e:Ego)-[:isIn]->(l:Lane)"
 
-    assert "sees" in town.why_not("town#0", text).failed
-    assert town.find(text).left_out == ("town",)
+    assert "isIn" in field.why_not("field#0", text).failed
+    assert field.find(text).left_out == ("field",)
 
 
 @pytest.fixture(scope="module")
