@@ -298,6 +298,11 @@ class Bridge:
         topic = "/carla/hero/vehicle_control_cmd"
         self.write(topic, "carla_msgs/CarlaEgoVehicleControl", told, time)
 
+    def vehicle(self, ident: int, role: str, time: float = 0.0) -> None:
+        told = {"id": ident, "type": "vehicle.audi.tt", "rolename": role}
+        topic = f"/carla/{role}/vehicle_info"
+        self.write(topic, "carla_msgs/CarlaEgoVehicleInfo", told, time)
+
     def odometry(self, time: float, x: float, y: float, *, role: str = "hero", **more: Any) -> None:
         """``v``: in the axes of the vehicle."""
         told = {
@@ -372,13 +377,15 @@ ACTORS = {
 
 
 def drive(
-    path: Path, frames: int = 20, *, camera: bool = True, period: float = 0.1, **how: Any
+    path: Path, frames: int = 20, *, everything: bool = False, period: float = 0.1, **how: Any
 ) -> Path:
-    """A drive of a car and a bus, past a walker and a light."""
+    """A drive of a car and a bus, past a walker and a light. ``everything``: messages of every kind."""
     with Bridge(path, **how) as bridge:
         bridge.world("<OpenDRIVE/>")
         bridge.actors(ACTORS)
         bridge.light_places([light(80, 25, -4)])
+        if everything:
+            bridge.vehicle(7, "hero")
         for i in range(frames):
             t = i * period
             if i % 5 == 0:
@@ -393,8 +400,16 @@ def drive(
             )
             bridge.status(t, steer=0.1, throttle=i / 100)
             bridge.odometry(t, 10 * t, 0, v=(10, 0, 0))
-            if camera and i % 2 == 0:
+            if i % 2 == 0:
                 bridge.camera(t)
+            if everything:
+                bridge.command(t, steer=0, throttle=1, brake=0)
+                bridge.vehicle_lights(t, {7: 3, 3: 16})
+                bridge.objects(t, [vehicle(3)], topic="/carla/hero/objects")
+                bridge.odometry(t, 5, 5, role="stranger")
+                bridge.collision(t, 3, (1, 2, 3))
+                bridge.lane_invasion(t, [1, 10])
+                bridge.write("/carla/map", "std_msgs/String", {"data": "<OpenDRIVE/>"}, t)
     return path
 
 
