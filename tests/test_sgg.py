@@ -373,7 +373,8 @@ def test_a_footprint_in_the_range_of_several_egos_is_looked_up_once() -> None:
 def test_without_a_map_nothing_is_known_of_lanes() -> None:
     without = SceneGraphGenerator(None, Config()).answers
 
-    assert set(without) == {*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf", "overlaps"}
+    sides = {"toLeftOf", "toRightOf"}
+    assert set(without) == {*PROXIMITY, *DIRECTIONS, *sides, "overlaps", "sees"}
     graph = graph_of(frames([thing("ego")]))
     assert len(graph.lanes) == len(graph.edges) == len(graph.presence) == 0
 
@@ -394,11 +395,11 @@ def test_relations_that_the_config_leaves_out_are_not_answered() -> None:
 
     answers = SceneGraphGenerator(None, config).answers
 
-    assert set(answers) == {"near", "inDFrontOf", "toLeftOf", "toRightOf", "overlaps"}
+    assert set(answers) == {"near", "inDFrontOf", "toLeftOf", "toRightOf", "overlaps", "sees"}
 
 
 def test_where_no_pairs_are_related_their_relations_are_unknown() -> None:
-    config = Config(pairs=Pairs(within=0, ego=False))
+    config = Config(pairs=Pairs(within=0, ego=False), sees=False)
 
     assert SceneGraphGenerator(None, config).answers == ()
     assert edges(graph_of(frames([thing("ego"), thing("c", 3)]), None, config)) == []

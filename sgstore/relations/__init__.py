@@ -14,6 +14,7 @@ from sgstore.relations.control import CONTROL
 from sgstore.relations.following import FOLLOWING
 from sgstore.relations.lanes import LANES
 from sgstore.relations.proximity import PROXIMITY
+from sgstore.relations.sight import SIGHT
 
 if TYPE_CHECKING:
     from sgstore.relations.scene import Family
@@ -26,5 +27,6 @@ RELATIONS: Final[tuple[Family, ...]] = (
     SIDE,
     CONTACT,
     FOLLOWING,
+    SIGHT,
 )
 """All families, in the order in which their edges are given."""
