@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING
 from bench.measure import Measure
 from bench.sgg import town
 from sgstore.config import Config
-from sgstore.ingest import BLOCK_FRAMES, ingest
+from sgstore.ingest import ingest
+from sgstore.ingest.running import BLOCK_FRAMES
 from sgstore.opendrive import read_map
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile

@@ -21,7 +21,7 @@ import duckdb
 from bench.ingest import CARS, MINUTE, recording
 from bench.measure import Measure
 from sgstore.config import Config
-from sgstore.ingest import BLOCK_FRAMES
+from sgstore.ingest.running import BLOCK_FRAMES
 from sgstore.opendrive import read_map
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile

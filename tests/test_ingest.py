@@ -14,10 +14,9 @@ import pytest
 from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive
 
-from sgstore import ingest as module
 from sgstore.config import Config, Range
 from sgstore.errors import MapError, StoreError, TraceError
-from sgstore.ingest import Progress, ingest, read_map_file
+from sgstore.ingest import Progress, ingest, maps, read_map_file, running
 from sgstore.opendrive import read_map
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
@@ -75,7 +74,7 @@ def test_many_blocks_are_as_good_as_one(tmp_path, monkeypatch) -> None:
     path = drive(tmp_path / "drive.mcap", frames=130)
     found = []
     for name, size in (("one.db", 240), ("many.db", 60), ("odd.db", 17)):
-        monkeypatch.setattr(module, "BLOCK_FRAMES", size)
+        monkeypatch.setattr(running, "BLOCK_FRAMES", size)
         ingest(tmp_path / name, [path])
         found.append(rows(tmp_path / name, "SELECT * FROM edge ORDER BY ALL"))
 
@@ -159,7 +158,7 @@ def test_a_map_in_a_recording_that_cannot_be_read_is_a_warning(tmp_path) -> None
 
 def test_a_map_is_read_once_a_run(tmp_path, monkeypatch) -> None:
     read = []
-    monkeypatch.setattr(module, "read_map", lambda *map_: (read.append(map_), read_map(*map_))[1])
+    monkeypatch.setattr(maps, "read_map", lambda *map_: (read.append(map_), read_map(*map_))[1])
     paths = [recorded(tmp_path / f"{n}.mcap", frames=n) for n in (2, 3, 4)]
 
     ingest(tmp_path / "s.db", paths)
@@ -256,7 +255,7 @@ def test_what_is_no_store_is_not_written_to(tmp_path) -> None:
 
 
 def test_progress_is_told_block_by_block(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(module, "BLOCK_FRAMES", 60)
+    monkeypatch.setattr(running, "BLOCK_FRAMES", 60)
     path = drive(tmp_path / "drive.mcap", frames=130, chunk_size=2000)
     seen: list[Progress] = []
 
@@ -271,7 +270,7 @@ def test_progress_is_told_block_by_block(tmp_path, monkeypatch) -> None:
 def test_an_interrupted_run_leaves_a_whole_store_and_nothing_beside_it(
     tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(module, "BLOCK_FRAMES", 60)
+    monkeypatch.setattr(running, "BLOCK_FRAMES", 60)
     paths = [recorded(tmp_path / "a.mcap"), drive(tmp_path / "b.mcap", frames=130)]
 
     def interrupt(progress: Progress) -> None:
@@ -289,7 +288,7 @@ def test_an_interrupted_run_leaves_a_whole_store_and_nothing_beside_it(
 def test_ctrl_c_in_the_middle_is_an_interruption_too(tmp_path) -> None:
     path = drive(tmp_path / "long.mcap", frames=1500)
     code = (
-        "import sys; from sgstore import ingest as m; m.BLOCK_FRAMES = 60\n"
+        "import sys; from sgstore.ingest import running as m; m.BLOCK_FRAMES = 60\n"
         f"m.ingest({str(tmp_path / 's.db')!r}, [{str(path)!r}],"
         " on_progress=lambda p: print(p.frames, flush=True))"
     )
@@ -303,8 +302,7 @@ def test_ctrl_c_in_the_middle_is_an_interruption_too(tmp_path) -> None:
         _, errors = run.communicate(timeout=20)
 
     assert "KeyboardInterrupt" in errors
-    assert StoreFile(tmp_path / "s.db").traces() == ()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["long.mcap", "s.db"]
+    assert [p.name for p in tmp_path.iterdir()] == ["long.mcap"]
 
 
 PEAK = """

@@ -13,6 +13,7 @@ from sgstore.errors import TraceError
 from sgstore.store import rows, schema
 from sgstore.store.access import Access, default_memory, spill_folder, translated
 from sgstore.store.folder import Folder
+from sgstore.store.packing import plain
 from sgstore.store.payloads import payload_place
 from sgstore.store.publishing import copy_sorted, publish_in, remove
 from sgstore.store.rows import Batches, Rows
@@ -25,6 +26,7 @@ from sgstore.store.traces import (
     StoredTrace,
     already_stored,
     frame_named,
+    stored_name,
     stored_traces,
     trace_named,
 )
@@ -417,6 +419,36 @@ class StoreFile:
             The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
         """
         return publish_in(self._access, sealed, replace=replace)
+
+    def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
+        """The name under which the store has the trace of a segment; ``None`` if it has it not.
+
+        Parameters
+        ----------
+        sealed : Sealed
+        as_it_is : bool
+            Whether it must have been read in the same way.
+
+        Raises
+        ------
+        StoreError
+            As :meth:`stored`.
+        """
+        found = already_stored if as_it_is else stored_name
+        with self._reading() as connection:
+            return found(connection, sealed.identity)
+
+    def known_digest(self, path: Path) -> str:
+        """The digest of a recording that has been ingested from a path and looks the same since; else empty."""
+        try:
+            now = path.stat()
+        except OSError:
+            return ""
+        sql = "SELECT any_value(digest) FROM trace WHERE uri = ? AND size = ? AND mtime_ns = ?"
+        with self._reading() as connection:
+            marks = [plain(str(path.resolve())), now.st_size, now.st_mtime_ns]
+            found = connection.execute(sql, marks).fetchone()
+        return str(found[0]) if found and found[0] else ""
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
         """Delete traces, in one transaction, with the settings and the maps that no other trace has.

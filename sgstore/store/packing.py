@@ -246,24 +246,24 @@ def message_columns(messages: MessageRefs, channel_ids: Ints) -> Columns:
 
 
 def origin_of(frames: FrameBlock) -> Origin | None:
-    """A place in the first frame that has any: the ego's, else anything's; in whole metres.
+    """The middle of all that has a place in the first frame that has any, in whole metres.
 
-    Where nothing that moves has a place, one of the scenery; ``None`` while nothing has one.
+    It is the same for any ego. Where nothing that moves has a place, that of the scenery; ``None`` while
+    nothing has one.
     """
     states, scenery = frames.states, frames.scenery
     placed = np.flatnonzero(np.isfinite(states.x) & np.isfinite(states.y))
     if len(placed):
         frame = frames.frame_of[placed]
-        here = placed[frame == frame[0]]
-        ego = here[states.node[here] == frames.ego[frame[0]]]
-        return _origin_at(states, int((ego if len(ego) else here)[0]))
-    standing = np.flatnonzero(np.isfinite(scenery.x) & np.isfinite(scenery.y))
-    return _origin_at(scenery, int(standing[0])) if len(standing) else None
+        return _middle(states.take(placed[frame == frame[0]]))
+    standing = np.isfinite(scenery.x) & np.isfinite(scenery.y)
+    return _middle(scenery.take(standing)) if standing.any() else None
 
 
-def _origin_at(states: States, row: int) -> Origin:
-    x, y, z = np.round([states.x[row], states.y[row], states.z[row]]).tolist()
-    return Origin(x, y, z if math.isfinite(z) else 0.0)
+def _middle(states: States) -> Origin:
+    z = states.z[np.isfinite(states.z)]
+    x, y = round(float(np.median(states.x))), round(float(np.median(states.y)))
+    return Origin(float(x), float(y), float(round(float(np.median(z)))) if len(z) else 0.0)
 
 
 def as_kept(frames: FrameBlock, origin: Origin) -> FrameBlock:

@@ -11,7 +11,7 @@ from sgstore.errors import StoreError
 from sgstore.store.access import spill_folder
 from sgstore.store.packing import plain
 from sgstore.store.staging import quoted, scratch
-from sgstore.store.traces import already_stored, free_name
+from sgstore.store.traces import already_stored, free_name, stored_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -79,16 +79,16 @@ def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
 def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -> str:
     """Copy the files of a trace into the attached store; the name of the trace there."""
     identity = sealed.identity
-    taken = dict(connection.execute("SELECT trace_id, name FROM store.trace").fetchall())
-    if replace and identity.trace_id in taken:
-        name = taken[identity.trace_id]
-        _delete(connection, identity.trace_id)
+    taken = connection.execute("SELECT name FROM store.trace").fetchall()
+    if not replace and already_stored(connection, identity, catalog="store."):
+        name = stored_name(connection, identity, catalog="store.")
+        raise StoreError(f"{sealed.path}: came into the store meanwhile, as {name!r}")
+    name = stored_name(connection, identity, catalog="store.")
+    if name is None:
+        name = free_name(plain(sealed.path.stem), {name for (name,) in taken})
     else:
-        found = already_stored(connection, identity, catalog="store.")
-        if found is not None:
-            raise StoreError(f"{sealed.path}: came into the store meanwhile, as {found!r}")
-        name = free_name(plain(sealed.path.stem), set(taken.values()))
-    given = {"name": name, "ingested_at": datetime.now(UTC).replace(tzinfo=None)}
+        _delete(connection, identity.trace_id)
+    given: dict[str, Any] = {"name": name, "ingested_at": datetime.now(UTC).replace(tzinfo=None)}
     given["map_id"] = _map_id(connection, sealed)
     given["config_id"] = _config_id(connection, identity)
     for table in sealed.files:

@@ -16,20 +16,20 @@ from sgstore.store import packing, payloads
 from sgstore.store.access import translated
 from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
 from sgstore.store.publishing import MAP_TABLES, fill_trace, publish_in
-from sgstore.store.reports import report_of
 from sgstore.store.sealed import Sealed
 from sgstore.store.staging import Staging
+from sgstore.store.traces import Identity
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from sgstore.config import Config
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
     from sgstore.store.access import Access
     from sgstore.store.packing import Columns
-    from sgstore.store.traces import Identity
     from sgstore.world import FrameBlock, TraceInfo, TraceReport
 
 
@@ -193,13 +193,12 @@ class Segment:
 
     def _trace_values(self, report: TraceReport, more: Mapping[str, Any] | None) -> dict[str, Any]:
         origin = self._origin or Origin(0.0, 0.0, 0.0)
-        found = report_of(self._staging.connection)
         return {
             "origin_x": origin.x,
             "origin_y": origin.y,
             "origin_z": origin.z,
             "answers": list(self._answers),
-            "report": packing.as_json(asdict(report) | found | dict(more or {})),
+            "report": packing.as_json(asdict(report) | dict(more or {})),
         }
 
     def _insert_about(self) -> None:
@@ -235,6 +234,32 @@ class Segment:
         channel = messages["channel"]
         for number in np.unique(channel).tolist():
             self._periods.see(number, messages["log_time_ns"][channel == number])
+
+
+def new_segment(
+    store: Path,
+    info: TraceInfo,
+    config: Config,
+    *,
+    road_map: RoadMap | None = None,
+    answers: tuple[str, ...] = (),
+    part: tuple[float | None, float | None] = (None, None),
+    folder: Path,
+) -> Segment:
+    """A segment for a store that need not be there yet, to be sealed and published by another process.
+
+    Parameters
+    ----------
+    store : Path
+    info, config, road_map, answers
+        As :meth:`StoreFile.segment` takes them.
+    part : tuple
+        The part of the recording that is read: since and until; s.
+    folder : Path
+        Where it is built. It belongs to the caller, who removes it.
+    """
+    identity = Identity.of(info, config, road_map, part)
+    return Segment(store, info, identity, road_map, answers, folder=folder)
 
 
 def _channel_columns(info: TraceInfo) -> Columns:

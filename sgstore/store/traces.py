@@ -122,8 +122,8 @@ class StoredTrace:
     answers : tuple of str
         Relations that it can answer.
     report : dict
-        What reading it brought to light: :class:`sgstore.world.TraceReport`, and what
-        :func:`sgstore.store.reports.report_of` says.
+        What reading it brought to light: :class:`sgstore.world.TraceReport`, and what was counted of entities,
+        jumps of the clock and gaps.
     settings : dict
         The config it was ingested with.
     ingested_at : datetime
@@ -203,6 +203,29 @@ def stored_traces(connection: DuckDBPyConnection) -> tuple[StoredTrace, ...]:
     return tuple(StoredTrace(**row) for row in found)
 
 
+def stored_name(
+    connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
+) -> str | None:
+    """The name under which a store has a trace, however it was read; ``None`` if it has it not.
+
+    Raises
+    ------
+    StoreError
+        It has another trace under its id.
+    """
+    sql = f"SELECT name, digest, coalesce(ego, '') FROM {catalog}trace WHERE trace_id = ?"
+    found = connection.execute(sql, [identity.trace_id]).fetchone()
+    if found is None:
+        return None
+    name, digest, ego = found
+    if (digest, ego) != (identity.digest, identity.ego):
+        raise StoreError(
+            f"its id {identity.trace_id} is taken by another trace, {name!r}, by chance; put one of them into a"
+            " store of its own"
+        )
+    return name
+
+
 def already_stored(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
@@ -213,23 +236,19 @@ def already_stored(
     StoreError
         It has the trace with other settings or another map, or another trace under its id.
     """
-    found = connection.execute(
+    name = stored_name(connection, identity, catalog=catalog)
+    if name is None:
+        return None
+    (row,) = connection.execute(
         f"""
-        SELECT t.name, t.digest, coalesce(t.ego, ''), c.digest, coalesce(m.digest, ''), t.since, t.until
+        SELECT c.digest, coalesce(m.digest, ''), t.since, t.until
         FROM {catalog}trace t JOIN {catalog}config c ON c.config_id = t.config_id
              LEFT JOIN {catalog}map m ON m.map_id = t.map_id
         WHERE t.trace_id = ?
         """,
         [identity.trace_id],
-    ).fetchone()
-    if found is None:
-        return None
-    name, digest, ego, settings, map_digest, *part = found
-    if (digest, ego) != (identity.digest, identity.ego):
-        raise StoreError(
-            f"its id {identity.trace_id} is taken by another trace, {name!r}, by chance; put one of them into a"
-            " store of its own"
-        )
+    ).fetchall()
+    settings, map_digest, *part = row
     same = {
         "with other settings": settings == identity.settings_digest,
         "with another road map": map_digest == identity.map_digest,
