@@ -103,6 +103,9 @@ CREATE TABLE lane_state (                                      -- attributes of 
   kind kind, frame_id BIGINT, node_id INTEGER, lane INTEGER,
   overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN);   -- offset to the left, m; rad
 
+CREATE TABLE lane_gap (                                        -- attribute of the edges src follows dst and dst leads src
+  frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);       -- from bumper to bumper along the lanes, m
+
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
   bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
   chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
@@ -184,13 +187,18 @@ FROM frame f JOIN (
   WHERE (s.mask & d.mask) <> 0
 ) e ON e.bucket = f.bucket AND (e.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst).';
+COMMENT ON VIEW edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
 
 CREATE VIEW lane_states AS
 SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary
 FROM lane_state;
 
 COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all.';
+
+CREATE VIEW lane_gaps AS
+SELECT frame_id, src, dst, gap FROM lane_gap;
+
+COMMENT ON VIEW lane_gaps IS 'How far it is along the lanes: one row for each edge src follows dst (and dst leads src). gap: from bumper to bumper along the centre lines, m; 0 where they overlap, NULL where a length is not known.';
 
 -- Pairs are not stored: they are functions of two states. The same formulas as geometry.py (a test holds them together);
 -- each layer names what the next one needs, because DuckDB shares named columns and not repeated expressions. Around the

@@ -129,7 +129,7 @@ def sql(
 ) -> int:
     """Ask a store in SQL, read only.
 
-    Views: frames, nodes, edges, lane_states, pairs, lanes, entities, payloads; DESCRIBE names their columns.
+    Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE tells columns.
     """
     if safe:
         with _sandbox(store, timeout, max_rows) as box:

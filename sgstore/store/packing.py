@@ -211,6 +211,17 @@ def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
     }
 
 
+def gap_columns(graph: GraphBlock, trace_id: int) -> Columns:
+    """Table ``lane_gap``."""
+    gaps = graph.gaps
+    return {
+        "frame_id": frame_ids(trace_id, graph.frames.seq)[gaps.frame],
+        "src": gaps.src,
+        "dst": gaps.dst,
+        "gap": number(gaps.gap),
+    }
+
+
 def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
     """Table ``entity``; kinds as codes."""
     entities, scenery = graph.frames.entities, graph.frames.scenery

@@ -213,6 +213,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
 _SORTED: Final = {
     "state": "SELECT * FROM store.state ORDER BY kind, frame_id >> 6, node_id, frame_id",
     "lane_state": "SELECT * FROM store.lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
+    "lane_gap": "SELECT * FROM store.lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
     "node": "SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM store.node GROUP BY ALL ORDER BY ALL",
     "edge": """
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask

@@ -42,6 +42,7 @@ WHERE bucket = $bucket AND mask & $bit <> 0 ORDER BY src, relation, dst
 _LANES: Final = """
 SELECT src, dst, overlap, lane_offset, heading_error, is_primary FROM lane_states WHERE frame_id = $frame_id
 """
+_GAPS: Final = "SELECT src, dst, gap FROM lane_gaps WHERE frame_id = $frame_id"
 _MAP_NODES: Final = """
 SELECT node_id, kind, name, x, y, z, degrees(heading) AS heading, length, width, lane_type, road, section,
        lane, junction, turn, speed_limit
@@ -86,8 +87,12 @@ class Scenes:
         fixed = {"is_ego": False, "is_static": True}
         nodes |= {row["node_id"]: _known(row | fixed) for row in rows(_STANDING)}
         lanes = {(row.pop("src"), row.pop("dst")): _known(row) for row in rows(_LANES)}
+        gaps = {(row.pop("src"), row.pop("dst")): _known(row) for row in rows(_GAPS)}
+        known = {("isIn", *ends): about for ends, about in lanes.items()}
+        known |= {("follows", *ends): about for ends, about in gaps.items()}
+        known |= {("leads", b, a): dict(about) for (a, b), about in gaps.items()}
         edges = [
-            (src, relation, dst, lanes.get((src, dst), {}) if relation == "isIn" else {})
+            (src, relation, dst, known.get((relation, src, dst), {}))
             for src, relation, dst in run(
                 connection, _EDGES, {k: where[k] for k in ("bucket", "bit")}
             ).values

@@ -221,6 +221,7 @@ class Segment:
         insert("node", packing.node_columns(graph, trace_id, kinds))
         insert("edge", packing.edge_columns(graph, trace_id, kinds))
         insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
+        insert("lane_gap", packing.gap_columns(graph, trace_id))
 
     def _owned(self, columns: Columns) -> Columns:
         """The columns, and whose they are."""
