@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import carla
+import numpy as np
 from mcap.reader import make_reader
 
 from sgstore.demo import RECORDING
@@ -56,6 +58,7 @@ class StandInActor:
     stops: tuple[Any, ...] = ()
     listener: Callable[[Any], None] | None = None
     gone: bool = False
+    parent: StandInActor | None = None
 
     def get_transform(self) -> carla.Transform:
         return self.pose
@@ -89,6 +92,55 @@ class StandInActor:
         return True
 
 
+BLUEPRINTS = {
+    "sensor.camera.rgb": {"image_size_x", "image_size_y", "fov", "sensor_tick"},
+    "sensor.lidar.ray_cast": {"range"},
+    "sensor.other.imu": set[str](),
+}
+
+
+@dataclass
+class StandInBlueprint:
+    id: str
+    set: dict[str, str] = field(default_factory=dict)
+
+    def has_attribute(self, name: str) -> bool:
+        return name in BLUEPRINTS[self.id]
+
+    def set_attribute(self, name: str, value: str) -> None:
+        self.set[name] = value
+
+
+class Image(SimpleNamespace):
+    """As ``carla.Image``."""
+
+
+class LidarMeasurement(SimpleNamespace):
+    """As ``carla.LidarMeasurement``."""
+
+
+class IMUMeasurement(SimpleNamespace):
+    """As ``carla.IMUMeasurement``."""
+
+
+def measured(actor: StandInActor, clock: carla.Timestamp) -> Any:
+    """What a sensor measures at a tick."""
+    about = {"timestamp": clock.elapsed_seconds, "frame": clock.frame, "transform": actor.pose}
+    match actor.type_id:
+        case "sensor.camera.rgb":
+            width, height = int(actor.attributes["image_size_x"]), 6
+            pixels = np.zeros((height, width, 4), np.uint8)
+            pixels[..., 0], pixels[..., 1], pixels[..., 2] = 10, clock.frame % 256, 30
+            raw = pixels.tobytes()
+            return Image(width=width, height=height, fov=90.0, raw_data=raw, **about)
+        case "sensor.lidar.ray_cast":
+            points = np.array([(1, 2, 3, 0.5), (4, -5, 6, 1.0)], "<f4")
+            return LidarMeasurement(raw_data=points.tobytes(), channels=2, **about)
+        case _:
+            push, turn = carla.Vector3D(1.0, 2.0, 3.0), carla.Vector3D(0.1, 0.2, 0.3)
+            return IMUMeasurement(accelerometer=push, gyroscope=turn, compass=0.5, **about)
+
+
 @dataclass
 class StandInObject:
     id: int
@@ -120,6 +172,10 @@ class StandInWorld:
         self.clock = carla.Timestamp(100, 5.0, 0.05, 0.0)
         self.lists = 0
         self.script: Callable[[StandInWorld], None] = lambda _: None
+        self.step = 0.05
+        self.settings = SimpleNamespace(synchronous_mode=False, fixed_delta_seconds=0.0)
+        self.applied: list[tuple[bool, float]] = []
+        self.stands_still = False
 
     def get_map(self) -> carla.Map:
         return self.map
@@ -137,8 +193,10 @@ class StandInWorld:
     def get_vehicles_light_states(self) -> dict[int, carla.VehicleLightState]:
         return {a.id: a.light_state for a in self.actors if a.type_id.startswith("vehicle.")}
 
-    def tick(self, step: float = 0.05) -> int:
-        clock = self.clock
+    def tick(self, _seconds: float = 0.0) -> int:
+        if self.stands_still:
+            raise RuntimeError("time-out of 10000ms while waiting for the simulator")
+        clock, step = self.clock, self.step
         self.clock = carla.Timestamp(clock.frame + 1, clock.elapsed_seconds + step, step, 0.0)
         for actor in self.actors:
             place, speed = actor.pose.location, actor.velocity
@@ -147,7 +205,33 @@ class StandInWorld:
             )
             actor.pose = carla.Transform(moved, actor.pose.rotation)
         self.script(self)
+        for actor in self.actors:
+            if actor.listener is not None:
+                actor.listener(measured(actor, self.clock))
         return int(self.clock.frame)
+
+    def get_settings(self) -> SimpleNamespace:
+        return self.settings
+
+    def apply_settings(self, settings: SimpleNamespace) -> None:
+        self.applied.append((settings.synchronous_mode, settings.fixed_delta_seconds))
+        self.step = settings.fixed_delta_seconds or 0.05
+
+    def get_blueprint_library(self) -> StandInWorld:
+        return self
+
+    def find(self, name: str) -> StandInBlueprint:
+        if name not in BLUEPRINTS:
+            raise IndexError(f"blueprint '{name}' not found")
+        return StandInBlueprint(name)
+
+    def spawn_actor(
+        self, blueprint: StandInBlueprint, pose: carla.Transform, attach_to: StandInActor
+    ) -> StandInActor:
+        actor = StandInActor(1000 + len(self.actors), blueprint.id, pose, attributes=blueprint.set)
+        actor.parent = attach_to
+        self.actors.append(actor)
+        return actor
 
     def wait_for_tick(self, _seconds: float = 0.0) -> StandInSnapshot:
         self.tick()

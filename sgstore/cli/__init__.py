@@ -11,14 +11,14 @@ import sys
 
 import typer
 
-from sgstore.cli import exports, payloads, pictures, queries, settings, tour, traces
+from sgstore.cli import exports, live, payloads, pictures, queries, settings, tour, traces
 from sgstore.cli.arguments import ERROR, INTERRUPTED, USAGE, app
 from sgstore.cli.output import say
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
 __all__ = ["app", "main"]
 
-VERBS = (traces, settings, queries, payloads, pictures, exports, tour)
+VERBS = (traces, live, settings, queries, payloads, pictures, exports, tour)
 """The modules of the verbs: importing them makes the verbs known; help lists them in this order."""
 
 app.registered_commands.sort(

@@ -100,6 +100,7 @@ TIMEOUT_S: Final = 10.0
 TRAFFIC_LIGHT: Final = "traffic.traffic_light"
 
 _NAN: Final = math.nan
+_STILL: Final = ("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate")
 _NO_BOX: Final = (0.0, 0.0, 0.0, _NAN, _NAN, _NAN, 0.0)
 _STOPS: Final = 64
 """Stop waypoints of a light that are looked at."""
@@ -173,6 +174,8 @@ class LiveWorld:
     world : carla.World
     map_text, map_name : str
         The road map as OpenDRIVE, and what the simulator calls it.
+    ego : carla.Vehicle or None
+        The ego of the last frame.
 
     Raises
     ------
@@ -191,6 +194,7 @@ class LiveWorld:
         self._actors: dict[int, _Actor | None] = {}
         self._scenery = scenery
         self._told = False
+        self.ego: Any = None
 
     @cached_property
     def road_map(self) -> RoadMap:
@@ -220,7 +224,8 @@ class LiveWorld:
         states = {state.id: state for state in snapshot}
         self._look(set(states))
         here = {i: a for i in states if (a := self._actors[i]) is not None}
-        ego = self._ego(here)
+        ego = self._ego_of(here)
+        self.ego = None if ego is None else here[ego].handle
         frame = Frame(round(snapshot.timestamp.elapsed_seconds * 1e9), ego)
         lights = self.world.get_vehicles_light_states()
         for ident, actor in here.items():
@@ -246,7 +251,7 @@ class LiveWorld:
                 None if handle is None else _described(handle, signals.get(ident, ""))
             )
 
-    def _ego(self, actors: dict[int, _Actor]) -> int | None:
+    def _ego_of(self, actors: dict[int, _Actor]) -> int | None:
         if self._wanted.isdecimal() and int(self._wanted) in actors:
             return int(self._wanted)
         for role in (self._wanted,) if self._wanted else EGO_ROLES:
@@ -329,7 +334,7 @@ class LiveWorld:
             if kind == "sign":
                 more["map_ref"] = self._sign_at(*place[:2])
             if kind in MOVING:
-                more |= {"vx": 0.0, "vy": 0.0, "vz": 0.0}
+                more |= dict.fromkeys(_STILL, 0.0)
             found.append((f"level:{thing.id}", kind, place, more))
         return found
 
