@@ -106,14 +106,16 @@ class Workers:
                 given += 1
 
     def _hire(self, count: int) -> None:
+        # The same modules as here, and none that happen to lie in the folder where this was called.
+        modules = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
         while len(self._workers) < count:
             separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
             process = subprocess.Popen(
-                [sys.executable, "-m", "sgstore.ingest.worker"],
+                [sys.executable, "-P", "-m", "sgstore.ingest.worker"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 encoding="utf-8",
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                env=os.environ | {"PYTHONPATH": modules},
                 **separate,  # Ctrl-C is for us to deal with
             )
             worker = _Worker(process)

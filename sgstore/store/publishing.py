@@ -178,7 +178,7 @@ DELETE FROM store.config WHERE config_id NOT IN (SELECT config_id FROM store.tra
 DELETE FROM store.map WHERE map_id NOT IN (SELECT map_id FROM store.trace WHERE map_id IS NOT NULL);
 DELETE FROM store.map_node WHERE map_id NOT IN (SELECT map_id FROM store.map);
 DELETE FROM store.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.map);
-DELETE FROM store.manifest WHERE map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.manifest WHERE map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM store.map);
 """
 
 
