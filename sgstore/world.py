@@ -309,6 +309,38 @@ class Loss:
     offset: int = -1
 
 
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that a simulator says has happened to one of its vehicles.
+
+    Attributes
+    ----------
+    kind : str
+        ``collision`` or ``lane_invasion``.
+    time_ns, log_time_ns : int
+        Simulation time and log time.
+    seq : int
+        Number of the last frame before it in the file; -1: there is none.
+    ident : str
+        Id of the vehicle; empty: not known.
+    other : str
+        Id of what it collided with; empty: nothing.
+    value : float or None
+        Length of the impulse of a collision; N·s.
+    detail : str
+        Markings that were crossed: ``broken``, ``solid``, ``other``, with commas.
+    """
+
+    kind: str
+    time_ns: int
+    log_time_ns: int
+    seq: int
+    ident: str = ""
+    other: str = ""
+    value: float | None = None
+    detail: str = ""
+
+
 @dataclass(slots=True)
 class TraceReport:
     """What reading a trace brought to light; filled while its blocks are read.
@@ -323,6 +355,8 @@ class TraceReport:
         What is odd but lost nothing.
     losses : list of Loss
         What could not be used.
+    events : list of Event
+        What the simulator says has happened, in the order of the file.
     """
 
     frames: int = 0
@@ -330,6 +364,7 @@ class TraceReport:
     unknown_types: dict[str, int] = field(default_factory=dict[str, int])
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
+    events: list[Event] = field(default_factory=list[Event])
 
 
 @dataclass(frozen=True, slots=True)

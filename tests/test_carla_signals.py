@@ -27,7 +27,7 @@ from sgstore.opendrive import read_map
 from sgstore.traces import open_trace
 from sgstore.traces.carla_lights import Light, signals_of
 from sgstore.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
-from sgstore.world import Clip
+from sgstore.world import Clip, Event
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -348,3 +348,46 @@ def test_a_clip_keeps_what_lasts_and_only_its_own_frames(tmp_path: Path, path: P
     assert [f["80"]["light_state"] for f in states(blocks)] == [
         f["80"]["light_state"] for f in states(whole)[8:13]
     ]
+
+
+# Events -------------------------------------------------------------------------------------------
+
+
+def test_collisions_and_crossed_markings_are_events_of_their_vehicle(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.actors(HERO | {2: ("vehicle.audi.tt", "hero2")})
+        bridge.lane_invasion(0.0, [1])
+        for i in range(4):
+            bridge.objects(0.1 + i * 0.1, [vehicle(1), vehicle(2)])
+            if i == 1:
+                bridge.collision(0.2, 2, (3, 0, 4))
+            if i == 2:
+                bridge.lane_invasion(0.3, [2, 1, 2, 10, 0], role="hero2")
+                bridge.collision(0.3, 0, (math.nan, 0, 0), role="stranger")
+
+    report = read(path, 2)[2]
+
+    assert report.events == [
+        Event("lane_invasion", 0, 5_000_000, -1, "1", detail="broken"),
+        Event("collision", 200_000_000, 205_000_000, 1, "1", "2", 5.0),
+        Event("lane_invasion", 300_000_000, 305_000_000, 2, "2", detail="solid, broken, other"),
+        Event("collision", 300_000_000, 305_000_000, 2, "", "0"),
+    ]
+    assert (report.losses, report.warnings) == (
+        [],
+        ["several egos: 'hero' (1), 'hero2' (2); the first is taken unless one is named"],
+    )
+
+
+def test_events_without_end_are_counted(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.objects(0.0, [vehicle(1)])
+        bridge.collision(0.0, 2, (1, 0, 0))
+        data = bridge.encode("carla_msgs/CarlaCollisionEvent", {})
+        for _ in range(10_004):
+            bridge.writer.add_message(bridge.channels["/carla/hero/collision"], 9, data, 9)
+
+    report = read(path)[2]
+
+    assert len(report.events) == 10_000
+    assert "5 more events than the 10000 that are listed" in report.warnings

@@ -8,8 +8,9 @@ Source: carla-simulator/ros-bridge, ros-carla-msgs, astuff_sensor_msgs (message 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.traces.cdr import number
 from sgstore.traces.ros2msg import parse_definition, short_name
 
 if TYPE_CHECKING:
@@ -54,6 +55,12 @@ LASTING: Final = frozenset({ACTORS, LIGHT_PLACES, LIGHT_STATES, WORLD, VEHICLE})
 OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISION, LANE_INVASION})
 """What the bridge publishes under the role name of a vehicle."""
 
+NEVER: Final = -(1 << 62)
+"""Time of what bears none; ns."""
+MAX_IDENT: Final = 1 << 53
+"""Ids are below it, as far as a double is exact."""
+_MAX_SECONDS: Final = 1 << 32
+
 
 def content_of(recording: Recording, channel: int) -> str:
     """What the messages of a channel are; empty where the reader knows nothing of them.
@@ -93,3 +100,16 @@ def role_in(topic: str) -> str:
     """The role name of the vehicle that a topic is of: ``hero`` in ``/carla/hero/vehicle_status``."""
     parts = topic.split("/")
     return parts[-2] if len(parts) > 2 else ""
+
+
+def ident_of(message: dict[str, Any], path: str) -> int | None:
+    """The id at a path of a message; ``None`` if there is none."""
+    value = number(message, path)
+    return int(value) if abs(value) < MAX_IDENT else None
+
+
+def stamp_of(message: dict[str, Any]) -> int:
+    """Time in a message's header; ns. :data:`NEVER` if it has none, or one beyond all clocks."""
+    seconds, nanos = (number(message, f"header.stamp.{part}") for part in ("sec", "nanosec"))
+    told = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
+    return int(seconds) * 1_000_000_000 + int(nanos) if told else NEVER

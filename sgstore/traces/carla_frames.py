@@ -18,6 +18,7 @@ ego_vehicle.py); carla.VehicleLightState.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,12 +29,16 @@ from sgstore.traces.carla_actors import meaning_of_object
 from sgstore.traces.carla_channels import (
     COMMANDS,
     LIGHT_STATES,
+    MAX_IDENT,
+    NEVER,
     ODOMETRY,
     STATUS,
     VEHICLE_LIGHTS,
+    stamp_of,
 )
+from sgstore.traces.carla_events import EVENTS, Events
 from sgstore.traces.carla_lights import Lights
-from sgstore.traces.carla_survey import SAME_TICK, stamp_of
+from sgstore.traces.carla_survey import SAME_TICK
 from sgstore.traces.cdr import Table, decode, number
 from sgstore.traces.frames import FAR, NAN, POSE, FrameRows, Roster
 from sgstore.traces.tally import Tally
@@ -75,7 +80,6 @@ _SPHERE, _CYLINDER, _CONE = 2, 3, 4
 _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
 """Bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS` → bit of ``carla.VehicleLightState``. These are: position 0,
 low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
-_NEVER: Final = -(1 << 62)
 _NO_CONTROLS: Final = (NAN, NAN, NAN)
 
 
@@ -156,12 +160,15 @@ class FrameDecoder:
         self._idents: dict[int, int] = {}
         self._people: set[int] = set()
         self._lights = Lights(found.lights, signals, self.roster)
+        self._events = Events(report)
+        self._seq = -1
+        self._untimed = 0
         self._unusable = Tally()
         self._unreadable = Tally()
         self._frame: RawFrame | None = None
-        self._controls = _NEVER, _NO_CONTROLS
-        self._vehicle_lights: tuple[int, Mapping[int, int]] = _NEVER, {}
-        self._odometry: tuple[int, Floats | None] = _NEVER, None
+        self._controls = NEVER, _NO_CONTROLS
+        self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
+        self._odometry: tuple[int, Floats | None] = NEVER, None
         self._take = self._takers()
         self.channels = frozenset({leading, *self._take})
 
@@ -184,6 +191,7 @@ class FrameDecoder:
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
         losses, warn = self._report.losses, self._report.warnings.append
+        self._events.settle()
         losses += self._unreadable.losses()
         for loss in self._unusable.losses():
             reason = f"{loss.reason}: {loss.messages} states were left out"
@@ -193,6 +201,8 @@ class FrameDecoder:
                 f"of {self._lights.unplaced} traffic lights the recording does not say where they stand:"
                 " they are listed as entities, but are in no graph"
             )
+        if self._untimed:
+            warn(f"{self._untimed} frames bear no time of their own: their log time is taken")
         if not self._survey.egos.actors:
             warn(
                 "no list of actors: what a vehicle is, is what the bridge guesses, and mostly a car"
@@ -202,9 +212,14 @@ class FrameDecoder:
 
     def _raw(self, log_time: int, data: memoryview) -> RawFrame:
         head, objects = self._table.read(data)
-        known = np.isfinite(objects[:, _ID])
-        objects = objects if known.all() else objects[known]
+        known = np.abs(objects[:, _ID]) < MAX_IDENT
+        if not known.all():
+            self._unusable.add("an object has no id", log_time)
+            objects = objects[known]
         time_ns = stamp_of(head)
+        if time_ns == NEVER:
+            self._untimed += 1
+            time_ns = log_time
         idents = objects[:, _ID].astype(np.int64).tolist()
         nodes = self._nodes
         for row, ident in enumerate(idents):
@@ -224,6 +239,7 @@ class FrameDecoder:
         if abs(time_ns - stamp) <= SAME_TICK:
             frame.vehicle_lights = lights
         self._frame = frame
+        self._seq += 1
         self._see_odometry()
         return frame
 
@@ -315,6 +331,8 @@ class FrameDecoder:
                 takers[channel] = self._take_command
             elif channel in own and content == ODOMETRY:
                 takers[channel] = self._take_odometry
+            elif content in EVENTS:
+                takers[channel] = self._take_event
         return takers
 
     def _take_light_states(self, channel: int, _log_time: int, data: memoryview) -> None:
@@ -332,6 +350,17 @@ class FrameDecoder:
         self._controls = stamp, controls
         if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
             self._frame.controls = controls
+
+    def _take_event(self, channel: int, log_time: int, data: memoryview) -> None:
+        if not self._window[0] <= log_time <= self._window[1]:
+            return
+        found = self._survey
+        message = decode(found.structures[channel], data)
+        ident = found.egos.id_of(found.driven[channel])
+        stamp = stamp_of(message)
+        place = log_time if stamp == NEVER else stamp, log_time, self._seq
+        named = "" if ident is None else str(ident)
+        self._events.take(found.contents[channel], message, place, named)
 
     def _take_vehicle_lights(self, _channel: int, _log_time: int, data: memoryview) -> None:
         stamp, lights = _vehicle_lights(data)
@@ -436,9 +465,8 @@ def _rotated(quaternion: Floats, vector: Floats) -> Floats:
 
 
 def _controls_of(message: dict[str, Any], prefix: str) -> tuple[float, float, float]:
-    steer, throttle, brake = (
-        number(message, prefix + name) for name in ("steer", "throttle", "brake")
-    )
+    told = (number(message, prefix + name) for name in ("steer", "throttle", "brake"))
+    steer, throttle, brake = (value if math.isfinite(value) else NAN for value in told)
     return 0.0 - steer, throttle, brake
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.traces.carla_channels import ident_of
 from sgstore.traces.cdr import number, records
 from sgstore.traces.frames import FAR, NAN, POSE
 from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
@@ -62,8 +63,8 @@ def read_places(message: dict[str, Any]) -> dict[int, Light]:
         x, y, z = (number(told, f"transform.position.{axis}") for axis in "xyz")
         turn = [number(told, f"transform.orientation.{part}") for part in "xyzw"]
         heading = heading_of(*turn)
-        ident = number(told, "id")
-        if math.isnan(ident) or not all(abs(value) < FAR for value in (x, y, z, heading)):
+        ident = ident_of(told, "id")
+        if ident is None or not all(abs(value) < FAR for value in (x, y, z, heading)):
             continue
         dx, dy, dz = (number(told, f"trigger_volume.center.{axis}") for axis in "xyz")
         length, width = (number(told, f"trigger_volume.size.{axis}") for axis in "xy")
@@ -71,7 +72,7 @@ def read_places(message: dict[str, Any]) -> dict[int, Light]:
         centre = (x + dx * cos - dy * sin, y + dx * sin + dy * cos, z + dz)
         box = (*centre, heading, abs(length), abs(width))
         known = all(abs(value) < FAR for value in box)
-        lights[int(ident)] = Light(x, y, z, heading, box if known else (NAN,) * 6)
+        lights[ident] = Light(x, y, z, heading, box if known else (NAN,) * 6)
     return lights
 
 
@@ -189,10 +190,9 @@ class Lights:
         """Take up a ``CarlaTrafficLightStatusList``; lights that it does not name stay as they are."""
         states = self._states.copy()  # frames keep the array that they were given
         for told in records(message, "traffic_lights"):
-            numbers = number(told, "id"), number(told, "state")
-            if not all(map(math.isfinite, numbers)):
+            ident, state = ident_of(told, "id"), ident_of(told, "state")
+            if ident is None or state is None:
                 continue
-            ident, state = map(int, numbers)
             row = self._row.get(ident)
             if row is not None:
                 states[row] = LIGHT_STATE_CODE[

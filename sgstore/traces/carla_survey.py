@@ -19,6 +19,7 @@ from sgstore.traces.carla_channels import (
     LASTING,
     LIGHT_PLACES,
     LIGHT_STATES,
+    MAX_IDENT,
     OBJECTS,
     ODOMETRY,
     OF_ONE_VEHICLE,
@@ -26,7 +27,9 @@ from sgstore.traces.carla_channels import (
     VEHICLE,
     WORLD,
     content_of,
+    ident_of,
     role_in,
+    stamp_of,
     structure,
 )
 from sgstore.traces.carla_lights import Light, read_places
@@ -54,12 +57,6 @@ _PLACES: Final = ("id", "pose.position.x", "pose.position.y", "pose.position.z")
 _ODOMETRY: Final = tuple(f"pose.{path}" for path in _PLACES[1:])
 _MAP_BEGINS: Final = 4096
 _MOST_TRIES: Final = 200
-
-
-def stamp_of(message: dict[str, Any]) -> int:
-    """Time in a message's header; ns. 0 if it has none."""
-    seconds, nanos = (number(message, f"header.stamp.{part}") for part in ("sec", "nanosec"))
-    return 0 if np.isnan(seconds + nanos) else int(seconds) * 1_000_000_000 + int(nanos)
 
 
 @dataclass(slots=True)
@@ -276,9 +273,9 @@ class Survey:
         return True
 
     def _take_vehicle(self, message: dict[str, Any]) -> bool:
-        ident = number(message, "id")
-        if not np.isnan(ident):
-            self.egos.by_role.setdefault(text(message, "rolename"), int(ident))
+        ident = ident_of(message, "id")
+        if ident is not None:
+            self.egos.by_role.setdefault(text(message, "rolename"), ident)
         return True
 
     def _take_text(self, message: dict[str, Any]) -> bool:
@@ -290,10 +287,9 @@ class Survey:
         actors = self.egos.actors
         known = len(actors)
         for told in records(message, "actors"):
-            number_of = number(told, "id")
-            if np.isnan(number_of):
+            ident, role = ident_of(told, "id"), text(told, "rolename")
+            if ident is None:
                 continue
-            ident, role = int(number_of), text(told, "rolename")
             actor = Actor(text(told, "type"), "" if role == "None" else role)
             before = actors.setdefault(ident, actor)
             if before.type_name != actor.type_name:
@@ -335,7 +331,7 @@ class Survey:
         lost = any(egos.id_of(role) is None for role in self._whereabouts.odometry)
         if not egos.seen or named or (lost and self._whereabouts.tries < _MOST_TRIES):
             head, table = self._tables[channel].read(data)
-            table = table[np.isfinite(table).all(axis=1)]
+            table = table[(np.abs(table) < MAX_IDENT).all(axis=1)]
             egos.seen.update(table[:, 0].astype(np.int64).tolist())
             self._whereabouts.objects = stamp_of(head), table
             self._find_egos()
