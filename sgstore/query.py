@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog
     from sgstore.lang.evaluation import FrameView
+    from sgstore.lang.pattern import Pattern
     from sgstore.lang.results import Statement
     from sgstore.lang.whynot import WhyNot
     from sgstore.store import Rows, StoredTrace
@@ -115,13 +116,14 @@ class Store:
                 self._held = stamp, self.file.catalog()
             return self._held[1]
 
-    def find(self, text: str, /, **parameters: object) -> Matches:
+    def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> Matches:
         """What matches a pattern; nothing is searched before it is asked for.
 
         Parameters
         ----------
-        text : str
-            ``MATCH … WHERE … RETURN …``; see the documentation of the language.
+        query : str, Pattern or networkx graph
+            ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a pattern that was built
+            step by step, or drawn as a graph: see :class:`sgstore.lang.pattern.Pattern`.
         **parameters
             Values of ``$name``: numbers, texts, truth values, or lists of these.
 
@@ -130,7 +132,12 @@ class Store:
         QueryError
             The text is no query, or names what the store does not know; it says where, and what would be right.
         """
-        return Matches(self, text, parameters)
+        if isinstance(query, str):
+            return Matches(self, query, parameters)
+        from sgstore.lang.pattern import Pattern
+
+        pattern = query if isinstance(query, Pattern) else Pattern.of(query)
+        return Matches(self, str(pattern), {**pattern.parameters, **parameters})
 
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None
