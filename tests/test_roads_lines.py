@@ -222,6 +222,17 @@ def test_the_ways_through_an_area_are_lanes() -> None:
     assert ("area/0/1", "area/0/2") not in pairs(road_map, "conflictsWith")
 
 
+def test_a_way_that_the_lanes_at_its_ends_do_not_know_is_none_and_it_is_said() -> None:
+    lines, _ = crossing()
+    lines.append(a_line("far", x=900, before=(Joint("other"),)))
+    lines.append(a_line("silent", x=20, y=3.5))
+
+    road_map = made(*lines, areas=(Area("area", (("west", "far"), ("west", "silent"))),))
+
+    assert pairs(road_map, "travelsTo") == {("west", "area/0/1"), ("area/0/1", "silent")}
+    assert [w for w in road_map.warnings if "area from west to far" in w]
+
+
 def test_lanes_that_lie_in_a_junction_without_a_name_are_grouped_by_where_they_are() -> None:
     def way(ident: str, *points: tuple[float, float]) -> LaneLine:
         return LaneLine(ident, "driving", path(*points), junction=None)

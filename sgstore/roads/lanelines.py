@@ -295,16 +295,31 @@ def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
 def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
     """Lanes for the ways through areas."""
     missing: list[str] = []
+    astray: list[str] = []
     for area in areas:
         number = 0
         for start, end in dict.fromkeys(area.ways):
             lanes = network.index.get(start), network.index.get(end)
             if lanes[0] is None or lanes[1] is None:
                 missing.append(area.ident)
-                continue
-            number += 1
-            _add_way(network, area.ident, number, (lanes[0], lanes[1]))
+            elif not all(
+                _touches(network.lines[lane], area.ident, at_exit=at_exit)
+                for lane, at_exit in ((lanes[0], True), (lanes[1], False))
+            ):
+                astray.append(f"{area.ident} from {start} to {end}")
+            else:
+                number += 1
+                _add_way(network, area.ident, number, (lanes[0], lanes[1]))
     _tell(network, list(dict.fromkeys(missing)), "a way through it leads to a missing lane")
+    _tell(network, astray, "told to be a way through, but not by the lanes at its ends: it is none")
+
+
+def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
+    """Whether a lane's traffic comes from or leaves into an area, as far as the lane tells what it touches."""
+    joints = line.after if line.forward == at_exit else line.before
+    joints = (*line.before, *line.after) if line.both else joints
+    untold = not line.before and not line.after
+    return untold or any(joint.lane == area for joint in joints)
 
 
 def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) -> None:

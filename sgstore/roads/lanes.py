@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from sgstore.world import Bools, Floats, Ints
 
+_SIDEWAYS: Final = 0.9
+"""A step of which a larger share than this goes across the lane is a jump."""
 _FIRST_LANE: Final = 1
 """Row of the first lane among the nodes: ``off_road`` comes before it."""
 
@@ -105,10 +107,16 @@ def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
     x, y = ((left + right) / 2).T
     first = np.zeros(len(x), np.bool_)
     first[offsets[:-1]] = True
-    step = np.hypot(np.diff(x, prepend=0.0), np.diff(y, prepend=0.0))
-    step[first] = 0.0
+    run_x, run_y = np.diff(x, prepend=0.0), np.diff(y, prepend=0.0)
+    step = np.where(first, 0.0, np.hypot(run_x, run_y))
     run = np.cumsum(step)
     along = run - np.repeat(run[offsets[:-1]], counts)
+    # Where a lane jumps to the side, no traffic goes that way.
+    across_x, across_y = (left - right).T
+    aside = np.abs(run_x * across_x + run_y * across_y)
+    width = np.hypot(across_x, across_y)
+    jumps = (width > 0) & (aside > _SIDEWAYS * step * width)
+    square = np.arctan2(-across_x, across_y)
     return Ribbons(
         offsets=offsets,
         left_x=left[:, 0],
@@ -116,18 +124,18 @@ def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
         right_x=right[:, 0],
         right_y=right[:, 1],
         z=np.concatenate([np.zeros(0), *(lane.z for lane in lanes)]),
-        heading=headings(x, y, first),
+        heading=headings(x, y, first | jumps, square),
         s=along,
         along=along,
     )
 
 
-def headings(x: Floats, y: Floats, first: Bools) -> Floats:
+def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) -> Floats:
     """Headings of polylines at their points: (N,), not wrapped; ``first`` marks where each line begins.
 
-    Within a line it is the mean of the two pieces' directions, weighted by their lengths, so that the cubic
-    through points and headings strays from neither far; at an end it is what the nearest piece would
-    have if it were part of a circle.
+    A line of one point has that of ``alone``. Within a line it is the mean of the two pieces' directions,
+    weighted by their lengths, so that the cubic through points and headings strays from neither far; at an end
+    it is what the nearest piece would have if it were part of a circle.
     """
     if not len(x):
         return np.zeros(0)
@@ -141,6 +149,8 @@ def headings(x: Floats, y: Floats, first: Bools) -> Floats:
     both = (before > 0) & (after > 0)
     share = after / np.where(total > 0, total, 1.0)
     heading = np.where(both, into + turn * share, np.where(after > 0, out, into))
+    if alone is not None:
+        heading = np.where(total > 0, heading, alone)
     # A line's ends: as far beyond the piece's direction as its other end is before it.
     starts, ends = np.flatnonzero(~both & (after > 0)), np.flatnonzero(~both & (before > 0))
     for rows, others, pieces in ((starts, starts + 1, out), (ends, ends - 1, into)):

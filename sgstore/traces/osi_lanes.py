@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -131,6 +131,8 @@ _RULES: Final = {
 }
 """Rule → whether traffic may cross from right to left, and from left to right, along the reference line."""
 
+_JUMP: Final = 1e-3
+"""Least distance by which a border jumps; m."""
 _FAR: Final = 1e8
 """Greatest distance of a place from the origin; m."""
 
@@ -383,15 +385,25 @@ def _logical_line(lane: Any, borders: _Borders) -> LaneLine:
     right, right_s, rights = borders.logical(lane.right_boundary_id)
     if len(left) < 2 or len(right) < 2:
         raise ValueError("it has no boundary with points on each side")
-    start = lane.start_s if lane.HasField("start_s") else max(left_s[0], right_s[0])
-    end = lane.end_s if lane.HasField("end_s") else min(left_s[-1], right_s[-1])
+    # A lane is where both borders are.
+    start, end = max(left_s[0], right_s[0]), min(left_s[-1], right_s[-1])
+    start = max(start, lane.start_s) if lane.HasField("start_s") else start
+    end = min(end, lane.end_s) if lane.HasField("end_s") else end
+    if not abs(lane.start_s) + abs(lane.end_s) < _FAR or not end > start:
+        raise ValueError("there is no s at which it has a boundary on each side")
     cuts = np.concatenate(([start], left_s, right_s, [end]))
     cuts = np.unique(cuts[(cuts >= start) & (cuts <= end)])
-    if len(cuts) < 2:
-        raise ValueError(f"it runs from s {start} to s {end}, where its boundaries are not")
+    before, after = (
+        [_at(line, s, cuts, side) for line, s in ((left, left_s), (right, right_s))]
+        for side in ("left", "right")
+    )
+    jumps = np.abs(np.hstack(after) - np.hstack(before)).max(axis=1) > _JUMP
+    # Where a border jumps there are two cross sections, but none beyond the lane's own ends.
+    early, late = np.ones(len(cuts), np.bool_), jumps.copy()
+    early[0], late[-1] = not jumps[0], False
     one, other = (
-        np.column_stack([np.interp(cuts, s, column) for column in line.T])
-        for line, s in ((left, left_s), (right, right_s))
+        np.stack((b, a), axis=1).reshape(-1, 3)[np.stack((early, late), axis=1).ravel()]
+        for b, a in zip(before, after, strict=True)
     )
     ways = enum_name(lane, "move_direction")
     physical = _physical(lane)
@@ -417,6 +429,14 @@ def _logical_line(lane: Any, borders: _Borders) -> LaneLine:
         junction=str(crossing[0]) if crossing else "",
         **_source(lane),
     )
+
+
+def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -> Floats:
+    """Points (n, 3) of a line at places; where it jumps, as it is before (``left``) or after (``right``)."""
+    at = np.searchsorted(s, cuts, side)
+    at = np.minimum(at, len(s) - 1) if side == "left" else np.maximum(at - 1, 0)
+    between = np.column_stack([np.interp(cuts, s, column) for column in line.T])
+    return np.where((s[at] == cuts)[:, None], line[at], between)
 
 
 def _physical(lane: Any) -> set[int]:
