@@ -44,7 +44,7 @@ from sgstore.config import preset
 from sgstore.ingest import read_map_file
 from sgstore.opendrive import read_map
 from sgstore.relations.pairs import IS_VEHICLE
-from sgstore.sgg import SceneGraphGenerator
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.traces import open_trace
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, KINDS, PROXIMITY, RELATIONS
 
@@ -166,6 +166,7 @@ class Ours:
         given = None if road_map is None else read_map_file(road_map)
         self.road_map = read_map(info.map_text, info.map_name) if given is None else given
         self._generator = SceneGraphGenerator(self.road_map, config)
+        self._shown = map_of_graphs(self.road_map, config) or self.road_map
         self._idents: list[str] = []
         self._place: dict[str, str] = {}
         nodes, lane = self.road_map.nodes, KIND_CODE["lane"]
@@ -185,7 +186,7 @@ class Ours:
                 yield from (self._view(graph, frame) for frame in range(len(graph)))
 
     def _view(self, graph: GraphBlock, frame: int) -> View:
-        frames, edges, of = graph.frames, graph.edges, self.road_map.edges
+        frames, edges, of = graph.frames, graph.edges, self._shown.edges
         rows = np.arange(frames.offsets[frame], frames.offsets[frame + 1])
         states = frames.states.take(rows)
         view = View(ego=self._idents[frames.ego[frame]])

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sgstore.relations.extent import Areas
     from sgstore.relations.scene import Ground, Standing
     from sgstore.roads import RoadMap
-    from sgstore.world import Codes, Floats, FrameBlock, Ints
+    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
 
     Rows = NDArray[np.intp]
 
@@ -58,7 +58,8 @@ class SceneGraphGenerator:
     Parameters
     ----------
     road_map : RoadMap or None
-        None: there are no parts of a map in the graphs, and no relation that needs one.
+        None: there are no parts of a map in the graphs, and no relation that needs one. The nodes and static
+        edges of the graphs are those of :func:`map_of_graphs`.
     config : Config
 
     Attributes
@@ -160,10 +161,10 @@ class SceneGraphGenerator:
         scene = Scene(self._config, bodies, view.ego, pairs, part.contacts, ground)
         return GraphBlock(
             frames=view.frames,
-            presence=_presence(bodies, ground),
+            presence=_presence(bodies, ground and self._keeping.present(ground.present)),
             edges=self._keeping.edges(Edges.chained([f.edges(scene) for f in self._families])),
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
-            gaps=gaps(bodies, ground),
+            gaps=self._keeping.gaps(gaps(bodies, ground)),
         )
 
     def step(self, frame: Frame) -> SceneGraph:
@@ -192,7 +193,8 @@ class SceneGraphGenerator:
         """
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
-            self._online = Online(fresh, self._road_map, self._config.ego)
+            shown = map_of_graphs(self._road_map, self._config)
+            self._online = Online(fresh, shown, self._config.ego)
         return self._online.step(frame)
 
     def _learn(self, frames: FrameBlock) -> None:
@@ -264,6 +266,13 @@ class SceneGraphGenerator:
             width=width,
             height=height,
         )
+
+
+def map_of_graphs(road_map: RoadMap | None, config: Config) -> RoadMap | None:
+    """The map whose nodes and static edges are those of the graphs that a config makes: the one to store."""
+    if road_map is None or config.lanes.sections:
+        return road_map
+    return road_map.without_sections
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,10 +357,10 @@ def _bottom(states: States) -> Floats:
     return states.z - np.nan_to_num(states.height) / 2
 
 
-def _presence(bodies: Bodies, ground: Ground | None) -> Presence:
+def _presence(bodies: Bodies, present: Bools | None) -> Presence:
     """The static nodes of the graphs: scenery, and parts of the map."""
     still = np.flatnonzero(~bodies.moves)
-    frame, column = np.nonzero(ground.present) if ground else (still[:0], still[:0])
+    frame, column = np.nonzero(present) if present is not None else (still[:0], still[:0])
     return Presence(
         np.concatenate([bodies.frame[still], frame]),
         np.concatenate([bodies.node[still], -1 - column]),

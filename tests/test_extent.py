@@ -12,14 +12,14 @@ import pytest
 import shapely
 from builders import Thing, edges, frames, graph_of, present, thing
 from conftest import REPOSITORY
-from opendrive_maps import a_map, a_road, cubic, lane, line, section
+from opendrive_maps import a_map, a_road, cubic, lane, line, link, section
 
 from sgstore.config import Config, Lanes, Pairs, Range, configured
 from sgstore.opendrive import read_map
 from sgstore.opendrive.nodes import DRIVING
 from sgstore.relations.extent import STEP, Extent, Places
-from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import KIND_CODE, KINDS, RELATION_CODE, TypeMeaning
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
+from sgstore.vocabulary import KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
 
 if TYPE_CHECKING:
     from sgstore.graph import GraphBlock
@@ -546,3 +546,63 @@ def test_what_is_dead_ahead_is_left_only_where_sides_are_closed(
         assert found == ({expected} if expected else set())
         answers = SceneGraphGenerator(None, config).answers
         assert ("toLeftOf" in answers) == (name != "none")
+
+
+# Sections ---------------------------------------------------------------------------------------
+
+SECTIONS = a_map(
+    a_road(
+        "one",
+        line(60, x=0, y=0, hdg=0),
+        sections=section(lane(0), lane(-1, after=-1))
+        + section(lane(0), lane(-1, before=-1, after=-1), lane(-2), s=20)
+        + section(lane(0), lane(-1, before=-1, after=-1), s=40),
+        links=link("successor", "road", "two", "start"),
+    ),
+    a_road(
+        "two",
+        line(60, x=60, y=0, hdg=0),
+        sections=section(lane(0), lane(-1, before=-1)),
+        links=link("predecessor", "road", "one", "end"),
+    ),
+)
+
+
+def test_lanes_of_a_number_are_one_node_where_sections_do_not_count() -> None:
+    road_map, config = read_map(SECTIONS, "m"), Config(lanes=Lanes(sections=False))
+    shown = map_of_graphs(road_map, config)
+    assert shown is not None
+    things = [thing("ego", 19, -1.75), thing("wide", 42, -3.5, width=5.0), thing("c", 70, -1.75)]
+
+    graph, plain = (graph_of(frames(things), road_map, of) for of in (config, Config()))
+
+    def without(name: str) -> str:
+        road, slash, number = name.partition("/")
+        return f"{road}_{number.rpartition('/')[2]}" if slash else name
+
+    merged = {(without(s), r, without(d)) for s, r, d in edges(plain, 0, road_map)}
+    assert edges(graph, 0, shown) == sorted(merged)
+    names = {shown.nodes.name[-1 - node] for node in present(graph) if node < 0}
+    assert names == {"one", "two", "one_-1", "one_-2", "two_-1"}
+    static = {
+        (shown.nodes.name[-1 - s], RELATIONS[r], shown.nodes.name[-1 - d])
+        for r, s, d in zip(shown.edges.relation, shown.edges.src, shown.edges.dst, strict=True)
+    }
+    assert ("one_-1", "travelsTo", "two_-1") in static
+    assert {d for s, r, d in static if r == "travelsTo"} == {"two_-1"}
+    assert shown.digest != road_map.digest
+
+
+def test_of_sections_that_are_one_lane_the_shares_add_up_and_one_is_primary() -> None:
+    road_map, config = read_map(SECTIONS, "m"), Config(lanes=Lanes(sections=False))
+    things = [thing("ego", 20.5, -1.75), thing("c", 40, -3.5)]
+
+    lanes = graph_of(frames(things), road_map, config).lanes
+    plain = graph_of(frames(things), road_map).lanes
+
+    ego = lanes.node == 0
+    assert lanes.overlap[ego].tolist() == pytest.approx([1.0])
+    assert lanes.primary[ego].tolist() == [True]
+    assert len(lanes) == 3 < len(plain)
+    assert lanes.overlap.sum() == pytest.approx(plain.overlap.sum())
+    assert [int(lanes.primary[lanes.node == node].sum()) for node in (0, 1)] == [1, 1]

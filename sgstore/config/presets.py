@@ -52,7 +52,7 @@ _CARLASGG: Final = Config(
             for label in ("Person", "Bicycle", "Car", "Motorcycle", "Bus", "Train", "Truck")
         ),
     ),
-    lanes=Lanes(ahead=50.0, types=("driving",)),
+    lanes=Lanes(ahead=50.0, types=("driving",), sections=False),
     sees=False,
     kinds=(
         *("Car", "Truck", "Van", "Bus", "Motorcycle", "Bicycle", "Person"),
@@ -87,15 +87,13 @@ _OF_CARLASGG: Final = """\
   m higher or lower, or a grade of less than 0.1), for the map alone. Distances between the origins of
   actors. Which bearing is what, and who has the ties; what is dead ahead or dead behind is to the left.
   Relations of the ego with people, bicycles, cars, motorcycles, buses, trains and trucks up to 25 m, and
-  of nobody else; vans it leaves out. Lanes of type driving alone, and `off_road` for what touches none
-  of them.
+  of nobody else; vans it leaves out. Lanes of type driving alone, whatever their section, and `off_road`
+  for what touches none of them.
 * *Defects, not imitated.* It has no lane changes, although its documentation promises them. Its lanes
   stick out by 1 m beyond their ends and beside their bends, and stop up to 2 m short of their ends. Of
   lanes that begin in one place, one seems to lead to the others. A traffic light is there twice, as a
   pole and as a landmark. What has no edge to a lane is "Off Road", lights and signs too. An entity is in
   the lanes of every storey above and below it.
-* Lanes keep the section in their names (`road/section/lane`). CARLASGG takes all sections of a road for
-  one, and calls the lane `road_lane`, after what the columns `road` and `lane` of a lane hold.
 * `python -m bench.against_carlasgg TRACE ORACLE` counts all of it against graphs that CARLASGG itself
   made.
 """

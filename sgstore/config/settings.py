@@ -139,6 +139,12 @@ class Lanes:
         "types of lanes that are kept, as OpenDRIVE has them ('driving', 'sidewalk', …); empty: all",
     )
 
+    sections: bool = setting(
+        default=True,
+        comment="whether each section of a road has lanes of its own ('12/0/-1'); otherwise the lanes of a "
+        "number are one node ('12_-1'), as CARLASGG has it",
+    )
+
     def __post_init__(self) -> None:
         known = 0 <= self.ahead <= MOST_LENGTH
         check(known, "lanes.ahead", self.ahead, "a length of 0 or more, in metres")

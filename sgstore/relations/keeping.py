@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from sgstore.graph import Edges, LaneStates
 from sgstore.relations.scene import kinds_mask
+from sgstore.roads import first_sections
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     KIND_CODE,
@@ -21,6 +21,7 @@ from sgstore.vocabulary import (
 
 if TYPE_CHECKING:
     from sgstore.config import Config
+    from sgstore.graph import Edges, LaneGaps, LaneStates
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Codes, Entities, Ints
 
@@ -29,6 +30,9 @@ ROAD_RELATIONS: Final = (
     *("controlsTrafficOf", "mayAffect"),
 )
 """Relations that have a part of a map at one end."""
+
+
+Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
 
 
 class Keeping:
@@ -60,8 +64,11 @@ class Keeping:
         self._relations: Bools = np.ones(len(RELATIONS), np.bool_)
         self._relations[dropped] = False
         self.parts: Bools = np.ones(0, np.bool_)
+        self._same: Ints | None = None
         if road_map is not None:
             self.parts = self._kept_parts(road_map, config.lanes.types)
+            if not config.lanes.sections:
+                self._same = first_sections(road_map.nodes)
 
     def _kept_parts(self, road_map: RoadMap, lane_types: tuple[str, ...]) -> Bools:
         nodes, edges = road_map.nodes, road_map.edges
@@ -105,16 +112,54 @@ class Keeping:
         kept = self._relations[edges.relation]
         if not self.parts.all():
             kept &= self._stays(edges.src) & self._stays(edges.dst)
-        return (
-            edges if kept.all() else Edges(*(getattr(edges, f.name)[kept] for f in fields(Edges)))
-        )
+        edges = edges if kept.all() else _taken(edges, kept)
+        if self._same is None:
+            return edges
+        src, dst = self._standing_for(edges.src), self._standing_for(edges.dst)
+        merged = replace(edges, src=src, dst=dst)
+        key = np.column_stack([edges.frame, edges.relation, src, dst])
+        return _taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
-        """Those in lanes that are kept."""
+        """Those in lanes that are kept. Of sections that are one lane, the one with the larger share speaks."""
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
-        if kept.all():
+        lanes = lanes if kept.all() else _taken(lanes, kept)
+        if self._same is None or not len(lanes):
             return lanes
-        return LaneStates(*(getattr(lanes, f.name)[kept] for f in fields(LaneStates)))
+        lane = self._standing_for(lanes.lane)
+        order = np.lexsort((-lanes.overlap, ~lanes.primary, lane, lanes.node, lanes.frame))
+        key = np.column_stack([lanes.frame, lanes.node, lane])[order]
+        first = np.flatnonzero(np.append(True, (np.diff(key, axis=0) != 0).any(axis=1)))
+        overlap = np.minimum(np.add.reduceat(lanes.overlap[order], first), 1.0)
+        merged = _taken(replace(lanes, lane=lane), order[first])
+        return replace(merged, overlap=overlap)
+
+    def gaps(self, gaps: LaneGaps) -> LaneGaps:
+        """Those that belong to a relation that is kept."""
+        wanted = self._relations[[RELATION_CODE["leads"], RELATION_CODE["follows"]]].any()
+        return gaps if wanted else _taken(gaps, np.zeros(0, np.intp))
+
+    def present(self, present: Bools) -> Bools:
+        """(F, K): which nodes of the map are in the graphs, of those that are in range."""
+        present = present & self.parts
+        if self._same is None:
+            return present
+        other = np.flatnonzero(self._same != np.arange(len(self._same)))
+        frame, row = np.nonzero(present[:, other])
+        present[frame, self._same[other[row]]] = True
+        present[:, other] = False
+        return present
+
+    def _standing_for(self, node: Ints) -> Ints:
+        """Nodes, lanes among them by the node of all sections."""
+        if self._same is None:
+            return node
+        return np.where(node < 0, -1 - self._same[np.where(node < 0, -1 - node, 0)], node)
 
     def _stays(self, node: Ints) -> Bools:
         return np.append(self.parts, True)[np.where(node < 0, -1 - node, -1)]
+
+
+def _taken(table: Columns, rows: Any) -> Columns:
+    """Some of the rows of a table, in the order given."""
+    return type(table)(*(getattr(table, column.name)[rows] for column in fields(table)))

@@ -11,7 +11,7 @@ Nodes. Every part of a map that can be a node of a scene graph has a node id bel
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -41,6 +41,7 @@ __all__ = [
     "MapNodes",
     "Ribbons",
     "RoadMap",
+    "first_sections",
 ]
 
 OFF_ROAD: Final = -1
@@ -282,6 +283,7 @@ class RoadMap:
         self.controllers = dict(controllers or {})
         self.warnings = tuple(warnings)
         self._shapes = shapes
+        self._variant = variant
         self._lanes = len(ribbons.offsets) - 1
 
     def outlines(self) -> Geometries:
@@ -403,6 +405,38 @@ class RoadMap:
         return waypoints(self.ribbons, spacing)
 
     @cached_property
+    def without_sections(self) -> RoadMap:
+        """The same map with one node for all lanes of a number in a road, whatever their section.
+
+        The node is that of the first of them, by the name ``road_number``. The nodes of the others stay, so
+        that node ids mean the same, without any edge. What is asked of the surface is still told by section.
+        It is another map: it has another digest.
+        """
+        nodes, same = self.nodes, first_sections(self.nodes)
+        first = same == np.arange(len(nodes))
+        lane = nodes.kind == KIND_CODE["lane"]
+        name = tuple(
+            f"{road}_{number}" if merged else name
+            for name, road, number, merged in zip(
+                nodes.name, nodes.road, nodes.lane.tolist(), lane & first, strict=True
+            )
+        )
+        length = np.bincount(same, np.nan_to_num(nodes.length), len(nodes))
+        return RoadMap(
+            name=self.name,
+            text=self.text,
+            nodes=replace(nodes, name=name, length=np.where(lane & first, length, nodes.length)),
+            edges=merged_edges(self.edges, same),
+            ribbons=self.ribbons,
+            shapes=self._shapes,
+            lane_changes=self.lane_changes,
+            road_types=self.road_types,
+            controllers=self.controllers,
+            warnings=self.warnings,
+            variant=f"{self._variant} without sections",
+        )
+
+    @cached_property
     def graph(self) -> LaneGraph:
         """Distances and routes along the lanes, which are counted from 0."""
         flow, change = (
@@ -452,6 +486,25 @@ class RoadMap:
         controls = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
         src, dst = self.edges.src[controls], self.edges.dst[controls]
         return {self.nodes.name[-1 - node]: dst[src == node] for node in np.unique(src).tolist()}
+
+
+def first_sections(nodes: MapNodes) -> Ints:
+    """(K,): column of the first lane with the road and the number of each lane; of other nodes their own."""
+    same = np.arange(len(nodes))
+    first: dict[tuple[str, int], int] = {}
+    for column in np.flatnonzero(nodes.kind == KIND_CODE["lane"]).tolist():
+        key = nodes.road[column], int(nodes.lane[column])
+        if key[1]:  # what is numbered in no section, as parking spaces are, stays as it is
+            same[column] = first.setdefault(key, column)
+    return same
+
+
+def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
+    """Edges among the nodes that stand for others, each once; ``same`` as of :func:`first_sections`."""
+    src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
+    table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
+    relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
+    return MapEdges(relation.astype(np.int8), src, dst)
 
 
 def _rectangles(boxes: Floats) -> Geometries:
