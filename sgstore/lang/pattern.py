@@ -135,9 +135,9 @@ class Pattern:
         Parameters
         ----------
         graph : networkx graph, directed or not, with one or many edges between two nodes
-            Of a node: ``label`` (or ``kind``), ``where`` (a condition on its name, or on that of others), and any
-            other attribute as a property that it must have. Of an edge: ``relation`` (a text such as
-            ``near|visible``, or several), without one any; it may run either way if the graph is not directed.
+            Of a node: ``label`` (or ``kind``), ``where`` (a condition on its name, or on that of others), and
+            any other attribute as a property that it must have. Of an edge: ``relation`` (a text such as
+            ``near|visible``, or several), without one any; either way if the graph is not directed.
 
         Raises
         ------
