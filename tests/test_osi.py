@@ -9,7 +9,6 @@ from itertools import pairwise
 from time import process_time
 from typing import TYPE_CHECKING, Any
 
-import carla_recordings
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -21,7 +20,7 @@ from mcap.records import Schema
 from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
 
 from sgstore.errors import TraceError
-from sgstore.traces import READERS, open_trace, read_message
+from sgstore.traces import open_trace
 from sgstore.traces.frames import POSE, derive
 from sgstore.traces.osi_lights import lit, shown
 from sgstore.traces.osi_objects import MovingObjects, light_bits
@@ -260,114 +259,6 @@ def test_indicators_and_brake_lights_of_a_real_recording_are_read(data: Path) ->
 
     assert column(blocks, "lights")[moving].tolist() == expected
     assert {0, 1, 4, 5} <= set(expected)
-
-
-# The laws of every reader --------------------------------------------------------------------------
-
-EXAMPLES = {
-    "osi": lambda path: drive(path, frames=25, chunk_size=3000),
-    "carla": lambda path: carla_recordings.drive(path, frames=25, chunk_size=3000),
-}
-each_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-
-
-@pytest.fixture
-def example(tmp_path: Path, reader: Any) -> Path:
-    return EXAMPLES[reader.name](tmp_path / "example.mcap")
-
-
-@each_reader
-def test_a_reader_is_found_by_the_schemas(example: Path, reader: Any) -> None:
-    info, _, report = read(example)
-
-    assert info.flavour == reader.name
-    assert report.frames == 25
-    assert report.losses == []
-    assert report.warnings == []
-
-
-@each_reader
-def test_frames_are_numbered_and_times_increase(example: Path, reader: Any) -> None:
-    _, blocks, _ = read(example, 7)
-
-    assert [block.seq[0] for block in blocks] == [0, 7, 14, 21]
-    assert np.concatenate([block.seq for block in blocks]).tolist() == list(range(25))
-    assert (np.diff(np.concatenate([block.time_ns for block in blocks])) > 0).all()
-    assert (np.diff(np.concatenate([block.log_time_ns for block in blocks])) > 0).all()
-
-
-@each_reader
-def test_ids_are_unique_and_entities_come_in_order_before_their_states(
-    example: Path, reader: Any
-) -> None:
-    _, blocks, _ = read(example, 4)
-    known = 0
-    for block in blocks:
-        assert block.entities.first == known
-        known += len(block.entities)
-        assert block.states.node.max() < known
-        for frame in range(len(block)):
-            nodes = block.states.node[block.offsets[frame] : block.offsets[frame + 1]]
-            assert len(set(nodes)) == len(nodes)
-
-    assert len(set(idents(blocks))) == len(idents(blocks)) == known
-
-
-@each_reader
-def test_numbers_are_plausible_in_si_units(example: Path, reader: Any) -> None:
-    _, blocks, _ = read(example)
-
-    assert np.nanmax(np.abs(column(blocks, "heading"))) <= math.pi
-    assert np.nanmax(np.abs(column(blocks, "vx"))) < 100
-    assert np.nanmin(column(blocks, "length")) >= 0
-    assert all((block.ego >= 0).all() for block in blocks)
-
-
-@each_reader
-@pytest.mark.parametrize("size", [1, 2, 5, 24, 25, 26])
-def test_nothing_depends_on_where_a_block_ends(example: Path, reader: Any, size: int) -> None:
-    _, whole, _ = read(example)
-    _, blocks, _ = read(example, size)
-
-    assert idents(blocks) == idents(whole)
-    for name in States.__dataclass_fields__:
-        np.testing.assert_array_equal(column(blocks, name), column(whole, name))
-    assert sum(len(block.messages) for block in blocks) == sum(len(b.messages) for b in whole)
-
-
-@each_reader
-def test_every_message_of_a_block_is_read_back_by_its_place(example: Path, reader: Any) -> None:
-    info, blocks, _ = read(example, 7)
-    with example.open("rb") as stream:
-        official = {
-            (channel.topic, message.log_time): message.data
-            for _, channel, message in make_reader(stream).iter_messages()
-        }
-    found = {}
-    for block in [*blocks]:
-        refs = block.messages
-        for row in range(len(refs)):
-            channel = info.channels[refs.channel[row]]
-            found[channel.topic, int(refs.log_time_ns[row])] = read_message(
-                example,
-                chunk_offset=int(refs.chunk_offset[row]),
-                offset=int(refs.offset[row]),
-                length=int(refs.length[row]),
-            )
-
-    owned = {c.topic for c in info.channels if c.role in {"ground_truth", "payload"}}
-    assert found == {key: data for key, data in official.items() if key[0] in owned}
-
-
-@each_reader
-def test_reading_again_gives_the_same(example: Path, reader: Any) -> None:
-    with open_trace(example) as trace:
-        first, second = list(trace.blocks()), list(trace.blocks())
-
-        assert trace.report.frames == 25
-        assert trace.info.digest == read(example)[0].digest
-    for name in States.__dataclass_fields__:
-        np.testing.assert_array_equal(column(first, name), column(second, name))
 
 
 # Moving objects --------------------------------------------------------------------------------------

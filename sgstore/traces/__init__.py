@@ -16,6 +16,7 @@ from sgstore.errors import TraceError
 from sgstore.traces.carla import CarlaTrace
 from sgstore.traces.fetch import digest_of
 from sgstore.traces.fetch import read_message as _read_message
+from sgstore.traces.foxglove import FoxgloveTrace
 from sgstore.traces.mcap_file import McapFile
 from sgstore.traces.osi import OsiTrace
 from sgstore.traces.osi_file import ENDINGS as _OSI_ENDINGS
@@ -87,7 +88,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: Final[tuple[Reader, ...]] = (OsiTrace, CarlaTrace)
+READERS: Final[tuple[Reader, ...]] = (OsiTrace, CarlaTrace, FoxgloveTrace)
 """The flavours of recordings, in the order in which they are asked."""
 
 

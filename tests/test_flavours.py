@@ -1,0 +1,153 @@
+"""The laws of every flavour of recording, and that one more is one file."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import carla_recordings
+import numpy as np
+import pytest
+import recordings
+from foxglove_scenes import SceneRecorder, cube
+from mcap.reader import make_reader
+
+from sgstore.traces import READERS, open_trace, read_message
+from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@cache
+def read(path: Path, size: int = 60) -> tuple[TraceInfo, list[FrameBlock], TraceReport]:
+    with open_trace(path) as trace:
+        return trace.info, list(trace.blocks(size)), trace.report
+
+
+def idents(blocks: list[FrameBlock]) -> list[str]:
+    return [ident for block in blocks for ident in block.entities.ident]
+
+
+def column(blocks: list[FrameBlock], name: str) -> np.ndarray[Any, Any]:
+    return np.concatenate([getattr(block.states, name) for block in blocks])
+
+
+def scene(path: Path, encoding: str, frames: int = 25) -> Path:
+    """A car that turns left, the ego behind it as axes, a light, and a person who is deleted."""
+    with SceneRecorder.of(path, encoding, chunk_size=3000) as recorder:
+        for i in range(frames):
+            t = 10 + i * 0.1
+            recorder.transform(t, "map", "base_link", (8 * t, 0, 0))
+            things = [
+                cube("leader", (8 * t + 20, i * i / 50, 0.75), yaw=i / 25, type="car", speed=8.0),
+                cube("lamp", (300, 5, 4), type="traffic_light", stamp=t),
+            ]
+            if i < 10:
+                things.append(cube("walker", (200, -i, 0.9), type="pedestrian", locked=False))
+            recorder.scene(t, things, deleted=["walker"] if i == 10 else [])
+            recorder.camera(t + 0.02)
+    return path
+
+
+EXAMPLES = {
+    "osi": lambda path: recordings.drive(path, frames=25, chunk_size=3000),
+    "carla": lambda path: carla_recordings.drive(path, frames=25, chunk_size=3000),
+    "foxglove protobuf": lambda path: scene(path, "protobuf"),
+    "foxglove json": lambda path: scene(path, "json"),
+}
+
+
+@pytest.fixture(params=EXAMPLES)
+def example(tmp_path: Path, request: Any) -> Path:
+    return EXAMPLES[request.param](tmp_path / f"{request.param}.mcap")
+
+
+def test_every_reader_has_an_example() -> None:
+    assert {name.split()[0] for name in EXAMPLES} == {reader.name for reader in READERS}
+
+
+def test_a_reader_is_found_by_the_schemas(example: Path) -> None:
+    info, _, report = read(example)
+
+    assert info.flavour in example.stem
+    assert report.frames == 25
+    assert report.losses == []
+    assert [w for w in report.warnings if "a box without a size" not in w] == []
+
+
+def test_frames_are_numbered_and_times_increase(example: Path) -> None:
+    _, blocks, _ = read(example, 7)
+
+    assert [block.seq[0] for block in blocks] == [0, 7, 14, 21]
+    assert np.concatenate([block.seq for block in blocks]).tolist() == list(range(25))
+    assert (np.diff(np.concatenate([block.time_ns for block in blocks])) > 0).all()
+    assert (np.diff(np.concatenate([block.log_time_ns for block in blocks])) > 0).all()
+
+
+def test_ids_are_unique_and_entities_come_in_order_before_their_states(example: Path) -> None:
+    _, blocks, _ = read(example, 4)
+    known = 0
+    for block in blocks:
+        assert block.entities.first == known
+        known += len(block.entities)
+        assert block.states.node.max() < known
+        for frame in range(len(block)):
+            nodes = block.states.node[block.offsets[frame] : block.offsets[frame + 1]]
+            assert len(set(nodes)) == len(nodes)
+
+    assert len(set(idents(blocks))) == len(idents(blocks)) == known
+
+
+def test_numbers_are_plausible_in_si_units(example: Path) -> None:
+    _, blocks, _ = read(example)
+
+    assert np.nanmax(np.abs(column(blocks, "heading"))) <= math.pi
+    assert np.nanmax(np.abs(column(blocks, "vx"))) < 100
+    assert np.nanmin(column(blocks, "length")) >= 0
+    assert all((block.ego >= 0).all() for block in blocks)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 24, 25, 26])
+def test_nothing_depends_on_where_a_block_ends(example: Path, size: int) -> None:
+    _, whole, _ = read(example)
+    _, blocks, _ = read(example, size)
+
+    assert idents(blocks) == idents(whole)
+    for name in States.__dataclass_fields__:
+        np.testing.assert_array_equal(column(blocks, name), column(whole, name))
+    assert sum(len(block.messages) for block in blocks) == sum(len(b.messages) for b in whole)
+
+
+def test_every_message_of_a_block_is_read_back_by_its_place(example: Path) -> None:
+    info, blocks, _ = read(example, 7)
+    with example.open("rb") as stream:
+        official = {
+            (channel.topic, message.log_time): message.data
+            for _, channel, message in make_reader(stream).iter_messages()
+        }
+    found = {}
+    for block in [*blocks]:
+        refs = block.messages
+        for row in range(len(refs)):
+            channel = info.channels[refs.channel[row]]
+            found[channel.topic, int(refs.log_time_ns[row])] = read_message(
+                example,
+                chunk_offset=int(refs.chunk_offset[row]),
+                offset=int(refs.offset[row]),
+                length=int(refs.length[row]),
+            )
+
+    owned = {c.topic for c in info.channels if c.role in {"ground_truth", "payload"}}
+    assert found == {key: data for key, data in official.items() if key[0] in owned}
+
+
+def test_reading_again_gives_the_same(example: Path) -> None:
+    with open_trace(example) as trace:
+        first, second = list(trace.blocks()), list(trace.blocks())
+
+        assert trace.report.frames == 25
+        assert trace.info.digest == read(example)[0].digest
+    for name in States.__dataclass_fields__:
+        np.testing.assert_array_equal(column(first, name), column(second, name))
