@@ -11,6 +11,7 @@
     ├── QueryError               a query text: span, reason, hint
     │   ├── QuerySyntaxError     expected something else here
     │   └── QueryNameError       unknown label, relation, attribute, variable; did you mean …?
+    ├── AbstractionError         an abstraction, or a derived set of relations: none of that name
     ├── ExportError              a clip or file that cannot be written
     └── MissingExtraError        an optional package that is not installed, and how to install it
 
@@ -172,6 +173,10 @@ class QuerySyntaxError(QueryError):
 
 class QueryNameError(QueryError):
     """A name that the catalogue does not know, or a variable that is not bound."""
+
+
+class AbstractionError(SgstoreError):
+    """An abstraction or a derived set of relations: there is none of the name, or it cannot be made."""
 
 
 class ExportError(SgstoreError):
