@@ -339,11 +339,13 @@ def test_a_graph_is_all_that_the_views_show_of_its_frame(store, name) -> None:
 
         assert graph.nodes == nodes
         assert Counter((s, r, d) for s, r, d, _ in graph.edges) == Counter(edges)
-        assert {(s, d): a for s, r, d, a in graph.edges if a} == {
-            (row["src"], row["dst"]): {
-                k: row[k] for k in ("overlap", "lane_offset", "heading_error", "is_primary")
-            }
-            for row in lanes
+        kept = ("overlap", "lane_offset", "heading_error", "is_primary")
+        known = {("isIn", row["src"], row["dst"]): {k: row[k] for k in kept} for row in lanes}
+        gaps = store.rows("SELECT src, dst, gap FROM lane_gaps WHERE frame_id = ?", [frame]).values
+        known |= {("follows", a, b): {"gap": gap} for a, b, gap in gaps if gap is not None}
+        known |= {("leads", b, a): {"gap": gap} for a, b, gap in gaps if gap is not None}
+        assert {(r, s, d): a for s, r, d, a in graph.edges if a} == {
+            edge: about for edge, about in known.items() if (edge[1], edge[0], edge[2]) in edges
         }
         assert (graph.trace, graph.seq, graph.frame_id) == (name, seq, frame)
         ego = TRACES[name].blocks[seq // len(TRACES[name].blocks[0])].frames.ego

@@ -320,9 +320,19 @@ EDGE_ATTRIBUTES: Final = _named(
             "the one lane that it is in above all",
             Unit.plain,
         ),
+        _of_lane(
+            "gap",
+            Type.number,
+            "gap",
+            "of leads and follows: from bumper to bumper along the lanes; m",
+            Unit.plain,
+        ),
     )
 )
-"""Attributes of ``isIn`` edges from entities to lanes (table ``lane_state``)."""
+"""Attributes of edges: of ``isIn`` from entities to lanes (table ``lane_state``), and ``gap`` (``lane_gap``)."""
+
+FOLLOWING: Final = ("leads", "follows")
+"""Relations whose edges have the attribute ``gap``."""
 
 EDGE_ALIASES: Final = {"offset": "laneoffset", "primary": "isprimary"}
 """Shorter words for them, folded."""

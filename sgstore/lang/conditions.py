@@ -11,6 +11,7 @@ from sgstore.lang import syntax as s
 from sgstore.lang.catalog import (
     EDGE_ALIASES,
     EDGE_ATTRIBUTES,
+    FOLLOWING,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
     TRACE_ATTRIBUTES,
@@ -178,6 +179,9 @@ def node_attribute(key: str, name: str, span: Span, names: Names) -> b.NodeAttri
     return b.NodeAttribute(key, found, found.type)
 
 
+FOLLOWED: Final = tuple(frozenset({relation}) for relation in FOLLOWING)
+
+
 def edge_attribute(key: str, name: str, span: Span, names: Names) -> b.EdgeAttribute:
     """An attribute of an edge.
 
@@ -186,7 +190,7 @@ def edge_attribute(key: str, name: str, span: Span, names: Names) -> b.EdgeAttri
     QueryNameError
         There is none of that name.
     QueryError
-        The edge is not one of those that have attributes: ``isIn``, by itself.
+        The edge is not one of those that have it: ``isIn`` by itself, or ``leads`` or ``follows`` one way.
     """
     found = EDGE_ATTRIBUTES.get(EDGE_ALIASES.get(folded(name), folded(name)))
     if found is None:
@@ -195,7 +199,14 @@ def edge_attribute(key: str, name: str, span: Span, names: Names) -> b.EdgeAttri
     edge = next((edge for edge in names.scope.edges if edge.key == key), None)
     if edge is None:
         names.session.refuse("an edge is known only in the pattern that binds it", span)
-    if edge.relations != frozenset({"isIn"}) or edge.high > 1:
+    if found.name == "gap":
+        if not (edge.relations in FOLLOWED and edge.high == 1 and not edge.both):
+            names.session.refuse(
+                "only edges leads or follows, one of them and one way, have 'gap'",
+                span,
+                "write -[:follows]->",
+            )
+    elif edge.relations != frozenset({"isIn"}) or edge.high > 1:
         names.session.refuse(
             f"only isIn edges from an entity to a lane have '{found.name}'",
             span,

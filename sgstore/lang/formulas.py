@@ -343,13 +343,21 @@ def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> li
     ]
 
 
-def lane_ends(src: str, dst: str, edge: Edge) -> tuple[str, str]:
-    """The ends of an ``isIn`` edge as entity and lane: ids of entities are 0 and above, of lanes below."""
-    return (f"greatest({src}, {dst})", f"least({src}, {dst})") if edge.both else (src, dst)
+def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
+    """The table with the attributes of an edge, and its columns for the ends with the nodes that they must be.
+
+    Of an ``isIn`` edge the ends are an entity, whose id is 0 or above, and a lane, whose id is below. A gap is
+    kept once, with who follows first.
+    """
+    if edge.relations == {"isIn"}:
+        ends = (f"greatest({src}, {dst})", f"least({src}, {dst})") if edge.both else (src, dst)
+        return "lane_state", dict(zip(("node_id", "lane"), ends, strict=True))
+    behind, ahead = (dst, src) if edge.relations == {"leads"} else (src, dst)
+    return "lane_gap", {"src": behind, "dst": ahead}
 
 
 def lane_text(leaf: Leaf, alias: str) -> str:
-    """The value of an attribute of an edge, whose row of ``lane_state`` stands under an alias."""
+    """The value of an attribute of an edge, whose row of :func:`edge_table` stands under an alias."""
     assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
     return attribute_text(leaf.attribute, Aliases(state=alias))
 

@@ -35,7 +35,7 @@ from sgstore.lang.formulas import (
     expression_text,
     frame_text,
     is_position,
-    lane_ends,
+    edge_table,
     lane_text,
     leaves,
     nested,
@@ -263,10 +263,10 @@ class Frames(Masks):
         if alias not in join.lanes:
             join.lanes.add(alias)
             edge = next(edge for edge in scope.edges if edge.key == key)
-            entity, lane = lane_ends(join.nodes[edge.src], join.nodes[edge.dst], edge)
-            on = [f'{alias}."frame_id" = {join.frame}', f'{alias}."node_id" = {entity}']
-            on.append(f'{alias}."lane" = {lane}')
-            join.select.join(f'"lane_state" AS {alias}', on, "LEFT JOIN")
+            table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
+            on = [f'{alias}."frame_id" = {join.frame}']
+            on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
+            join.select.join(f"{quoted(table)} AS {alias}", on, "LEFT JOIN")
         return lane_text(leaf, alias)
 
     def _of_block(self, join: Join, given: Given | None, leaf: BlockValue) -> str:

@@ -42,7 +42,7 @@ from sgstore.lang.formulas import (
     expression_text,
     is_constant,
     is_position,
-    lane_ends,
+    edge_table,
     lane_text,
     leaves,
     nested,
@@ -491,12 +491,13 @@ class Masks(ABC):
         return '"t"'
 
     def _join_lane(self, base: Base, edge: Edge, conditions: list[Bound]) -> None:
-        """The frames in which an edge from an entity to a lane meets conditions on its attributes."""
+        """The frames in which an edge meets conditions on its attributes."""
         frame = '"l"."frame_id"'
-        ends = ['"l"."node_id"', '"l"."lane"']
+        table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
+        ends = [f'"l".{quoted(column)}' for column in nodes]
         select = Select(
             [f'{frame} >> 6 AS "bucket"', *ends, f'bit_or({bit_of(frame)}) AS "mask"'],
-            ['"lane_state" AS "l"'],
+            [f'{quoted(table)} AS "l"'],
             self.within(frame, 64),
             [f"{frame} >> 6", *ends],
         )
@@ -504,9 +505,8 @@ class Masks(ABC):
             expression_text(c, lambda leaf: lane_text(leaf, '"l"'), self.values) for c in conditions
         ]
         name = f"{edge.key}:in"
-        entity, lane = lane_ends(base.nodes[edge.src], base.nodes[edge.dst], edge)
         alias = quoted(name)
-        on = [f'{alias}."node_id" = {entity}', f'{alias}."lane" = {lane}']
+        on = [f"{alias}.{quoted(column)} = {node}" for column, node in nodes.items()]
         base.join(nested(select.text(), name), alias, {}, on)
 
     # Blocks
