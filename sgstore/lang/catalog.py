@@ -329,7 +329,7 @@ EDGE_ATTRIBUTES: Final = _named(
         ),
     )
 )
-"""Attributes of edges: of ``isIn`` from entities to lanes (table ``lane_state``), and ``gap`` (``lane_gap``)."""
+"""Attributes of edges: of ``isIn`` from entities to lanes (table ``lane_state``); ``gap`` (``lane_gap``)."""
 
 FOLLOWING: Final = ("leads", "follows")
 """Relations whose edges have the attribute ``gap``."""

@@ -349,10 +349,10 @@ def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
     Of an ``isIn`` edge the ends are an entity, whose id is 0 or above, and a lane, whose id is below. A gap is
     kept once, with who follows first.
     """
-    if edge.relations == {"isIn"}:
+    if "isIn" in edge.relations:
         ends = (f"greatest({src}, {dst})", f"least({src}, {dst})") if edge.both else (src, dst)
         return "lane_state", dict(zip(("node_id", "lane"), ends, strict=True))
-    behind, ahead = (dst, src) if edge.relations == {"leads"} else (src, dst)
+    behind, ahead = (dst, src) if "leads" in edge.relations else (src, dst)
     return "lane_gap", {"src": behind, "dst": ahead}
 
 
