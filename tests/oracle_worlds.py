@@ -235,7 +235,7 @@ def random_trace(rng: random.Random, number: int, frames: int, *, static: bool) 
     answers = tuple(
         r for r in ("isIn", "near", "visible", "opposes", "travelsTo") if rng.random() < 0.95
     )
-    answers += ("inDFrontOf", "toLeftOf", "controlsTrafficOf")
+    answers += ("inDFrontOf", "toLeftOf", "controlsTrafficOf", "leads", "follows")
     trace = Trace(number, f"trace{number}", 0, answers, entities)
     first = 60 - rng.randint(1, frames - 1)
     time_ns = 0
@@ -266,9 +266,21 @@ def random_frame(rng: random.Random, trace: Trace, seq: int, time_ns: int) -> Fr
                 for n in sorted(present & {-2, -3})
                 if rng.random() < 0.6
             ]
+    edges += following(random.Random(time_ns + seq), moving)
     bucket = (trace.trace_id << 18) + seq // 60
     ego = trace.ego if trace.ego in moving else None
     return Frame(bucket * 64 + seq % 60, trace, seq, time_ns, ego, states, present, edges)
+
+
+def following(rng: random.Random, moving: list[int]) -> list[tuple[int, str, int, dict[str, Any]]]:
+    """Who follows whom, with the gap or without one."""
+    edges: list[tuple[int, str, int, dict[str, Any]]] = []
+    for a in moving:
+        for b in moving:
+            if a != b and rng.random() < 0.2:
+                gap = rng.choice(({"gap": 3.0}, {"gap": 8.5}, {"gap": 0.0}, {}))
+                edges += [(a, "follows", b, dict(gap)), (b, "leads", a, dict(gap))]
+    return edges
 
 
 def lane_state(rng: random.Random) -> dict[str, Any]:
@@ -375,6 +387,7 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
     insert(connection, "frame", [frame_row(frame) for frame in trace.frames])
     insert(connection, "state", [row for frame in trace.frames for row in state_rows(frame)])
     insert(connection, "lane_state", [row for frame in trace.frames for row in lane_rows(frame)])
+    insert(connection, "lane_gap", [row for frame in trace.frames for row in gap_rows(frame)])
     store_masks(connection, trace, rng)
 
 
@@ -399,8 +412,17 @@ def lane_rows(frame: Frame) -> list[dict[str, Any]]:
     return [
         {"frame_id": frame.frame_id, "node_id": src, "lane": dst, "kind": entities[src]["kind"]}
         | attributes
-        for src, _, dst, attributes in frame.edges
-        if attributes
+        for src, relation, dst, attributes in frame.edges
+        if attributes and relation == "isIn"
+    ]
+
+
+def gap_rows(frame: Frame) -> list[dict[str, Any]]:
+    """Rows of who follows whom; where the gap is not known there may be a row or none."""
+    return [
+        {"frame_id": frame.frame_id, "src": src, "dst": dst, "gap": attributes.get("gap")}
+        for src, relation, dst, attributes in frame.edges
+        if relation == "follows" and (attributes or (src + dst) % 2)
     ]
 
 

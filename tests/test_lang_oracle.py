@@ -59,6 +59,13 @@ QUERIES = [
     pytest.param(
         "MATCH (v)-[r:isIn {primary: TRUE}]->(l) WHERE r.overlap >= 0.5 OR r.offset > 0", id="lanes"
     ),
+    pytest.param("MATCH (a)-[r:follows]->(b) WHERE r.gap < 5", id="who follows closely"),
+    pytest.param("MATCH (a)-[r:leads {gap: 3.0}]->(b:Car)", id="who leads at a distance"),
+    pytest.param(
+        "MATCH (a:Car)<-[r:leads]-(b)-[q:follows]->(c) WHERE r.gap + q.gap < dist(a, c)",
+        id="gaps and distances",
+    ),
+    pytest.param("MATCH (a)-[:leads]-(b) WHERE a.speed > 1", id="who leads or is led"),
     pytest.param("MATCH (a:Car) WHERE MIN {(a)-[:near]->(b) | b.x} < a.x", id="least of a block"),
     pytest.param("MATCH (a) WHERE SUM {(a)-[:near]-(b) | b.speed} >= 10", id="sum of a block"),
     pytest.param("MATCH (v:Vehicle) WHERE v.light_left OR v.light_right", id="lights"),
