@@ -380,8 +380,8 @@ def shown(graph: SceneGraph) -> dict[str, set[Any]]:
         "edges": {(name[a], r, name[b]) for a, r, b, _ in graph.edges if a >= 0},
         "lanes": {
             (name[a], b, *(float(attributes[k]) for k in kept))
-            for a, _, b, attributes in graph.edges
-            if attributes
+            for a, relation, b, attributes in graph.edges
+            if attributes and relation == "isIn"
         },
     }
 

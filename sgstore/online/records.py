@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TRACE: Final = "online"
 """What the graphs of the online mode have for the name of a trace."""
 
-_IS_IN: Final = RELATION_CODE["isIn"]
+_IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
 _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _INPUTS: Final = ("steer", "throttle", "brake")
@@ -183,10 +183,12 @@ def _edges(graph: GraphBlock, outer: Ints) -> list[Edge]:
         | {"is_primary": bool(lanes.primary[row])}
         for row, key in enumerate(keys)
     }
-    return [
-        (a, RELATIONS[code], b, dict(within.get((a, b), {})) if code == _IS_IN else {})
-        for a, code, b in ends
-    ]
+    known = {(_IS_IN, *key): about for key, about in within.items()}
+    gaps = graph.gaps
+    columns = (_outward(gaps.src, outer), _outward(gaps.dst, outer), gaps.gap)
+    for a, b, gap in zip(*(column.tolist() for column in columns), strict=True):
+        known[_FOLLOWS, a, b] = known[_LEADS, b, a] = _numbers({"gap": gap})
+    return [(a, RELATIONS[code], b, dict(known.get((code, a, b), {}))) for a, code, b in ends]
 
 
 def _outward(nodes: Ints, outer: Ints) -> Ints:
