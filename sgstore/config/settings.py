@@ -265,6 +265,11 @@ class Config:
     lanes: Lanes = field(default_factory=Lanes)
     payloads: Payloads = field(default_factory=Payloads)
     ego: str = setting("", "the simulator's id, role or name of the ego; empty: as the trace says")
+    mapping: str = setting(
+        "",
+        "what the boxes of a Foxglove scene are: a mapping that is shipped ('nuscenes2mcap') or the path of a "
+        "TOML file; empty: the shipped one that fits. Other recordings need none",
+    )
     sees: bool = setting(
         default=True,
         comment="whether it is computed what the ego sees; otherwise nothing is known of it",
@@ -314,6 +319,10 @@ class Config:
     def signs(self) -> tuple[tuple[str, str], ...]:
         """Type names and the kinds of signals that they mean: what :func:`sgstore.opendrive.read_map` takes."""
         return tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
+
+    def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
+        """Those of the type names that no mapping knows whose meaning the client does not tell either."""
+        return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as they stand in TOML and JSON."""
