@@ -26,7 +26,7 @@ from sgstore.relations import RELATIONS
 from sgstore.relations.contact import contacts
 from sgstore.relations.extent import Extent, Places
 from sgstore.relations.following import gaps
-from sgstore.relations.keeping import Keeping
+from sgstore.relations.keeping import Keeping, renamed
 from sgstore.relations.pairs import near_pairs, related_pairs
 from sgstore.relations.scene import Bodies, Scene
 from sgstore.relations.survey import Survey
@@ -126,7 +126,7 @@ class SceneGraphGenerator:
         ValueError
             As for :meth:`block`.
         """
-        frames = replace(frames, entities=self._keeping.renamed(frames.entities))
+        frames = replace(frames, entities=renamed(frames.entities, self._config.types))
         self._learn(frames)
         views = [self._view(replace(frames, ego=ego)) for ego in egos]
         keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(view.keys for view in views)]))

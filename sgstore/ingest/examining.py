@@ -120,12 +120,13 @@ def examine(
     MapError
         The file given for the road map cannot be read.
     """
-    maps = Maps(None if road_map is None else Path(road_map))
+    config = config or Config()
+    maps = Maps(None if road_map is None else Path(road_map), config.signs)
     found = Examination(Path(path))
     report = TraceReport()
     try:
         channels = _channels(found, report)
-        _read(found, config or Config(), maps, channels)
+        _read(found, config, maps, channels)
     except SgstoreError as error:
         found.error = str(error)
         found.warnings = found.warnings or report.warnings
@@ -161,7 +162,7 @@ def _read(
     found: Examination, config: Config, maps: Maps, channels: dict[int, ChannelFound]
 ) -> None:
     tally = Tally()
-    with open_trace(found.path, ego=config.ego) as trace:
+    with open_trace(found.path, ego=config.ego, mapping=config.mapping) as trace:
         _tell(found, trace.info, channels)
         used, odd = maps.of(trace.info)
         found.road_map = used.name if used else ""
@@ -173,7 +174,7 @@ def _read(
             for name, value in tally.as_dict().items():
                 setattr(found, name, value)
             found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
-            found.unknown_types = report.unknown_types
+            found.unknown_types = config.unknown_of(report.unknown_types)
             found.warnings, found.losses = [*odd, *report.warnings], report.losses
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import MapError
 from sgstore.opendrive import read_map
+from sgstore.roads.lanetext import OF_LANES
 
 if TYPE_CHECKING:
     from sgstore.roads import RoadMap
@@ -24,8 +25,8 @@ _SHOWN_WARNINGS: Final = 5
 _ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-9._-]{1,40})["']""")
 
 
-def read_map_file(path: Path) -> RoadMap:
-    """The road map in an OpenDRIVE file.
+def read_map_file(path: Path, signs: tuple[tuple[str, str], ...] = ()) -> RoadMap:
+    """The road map in an OpenDRIVE file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
 
     Raises
     ------
@@ -40,7 +41,7 @@ def read_map_file(path: Path) -> RoadMap:
         reason = getattr(error, "strerror", None) or error
         raise MapError(f"{path}: cannot be read as an OpenDRIVE map: {reason}") from error
     try:
-        return read_map(text, path.name)
+        return read_map(text, path.name, signs)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
 
@@ -61,6 +62,8 @@ class Maps:
     given : Path or None
         A file, for the recordings that carry no OpenDRIVE of their own; or a folder of files ``NAME.xodr``,
         for those that name their map.
+    signs : tuple of (str, str)
+        Type codes of their signals, and the kinds that the client says they are.
 
     Raises
     ------
@@ -68,10 +71,12 @@ class Maps:
         The file cannot be read, or there is nothing.
     """
 
-    def __init__(self, given: Path | None) -> None:
+    def __init__(self, given: Path | None, signs: tuple[tuple[str, str], ...] = ()) -> None:
+        self._signs = signs
         self._read: dict[str, RoadMap | MapError] = {}
         self._folder = given if given is not None and given.is_dir() else None
-        self._given = read_map_file(given) if given is not None and not self._folder else None
+        one_file = given is not None and not self._folder
+        self._given = read_map_file(given, signs) if given is not None and one_file else None
 
     def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
         """The map of a recording, and what is odd about it.
@@ -98,7 +103,7 @@ class Maps:
     def _own(self, text: str, name: str) -> RoadMap | MapError:
         if text not in self._read:
             try:
-                self._read[text] = read_map(text, name)
+                self._read[text] = read_map(text, name, self._signs)
             except MapError as error:
                 self._read[text] = error
         return self._read[text]
@@ -107,7 +112,8 @@ class Maps:
         """The map of that name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
         if self._folder is None:
             return None
-        stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(".xodr")
+        stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
+        stem = stem.removesuffix(".xodr")
         path = self._folder / f"{stem}.xodr"
         if not stem or not path.is_file():
             wanted = (
@@ -118,7 +124,7 @@ class Maps:
         key = str(path)
         if key not in self._read:
             try:
-                self._read[key] = read_map_file(path)
+                self._read[key] = read_map_file(path, self._signs)
             except MapError as error:
                 self._read[key] = error
         found = self._read[key]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,20 +14,20 @@ from sgstore.errors import SgstoreError, TraceError
 from sgstore.ingest.maps import Maps
 from sgstore.ingest.outcomes import TraceOutcome
 from sgstore.ingest.tally import Tally
-from sgstore.sgg import SceneGraphGenerator
+from sgstore.relations.keeping import renamed
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import Segment, StoreFile, new_segment
 from sgstore.traces import open_trace
 from sgstore.vocabulary import KIND_CODE, kinds_labelled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from sgstore.ingest.jobs import Job
     from sgstore.roads import RoadMap
     from sgstore.traces import Trace
-    from sgstore.vocabulary import TypeMeaning
-    from sgstore.world import Entities, FrameBlock, Ints, TraceInfo
+    from sgstore.world import FrameBlock, Ints, TraceInfo
 
 EGOS_AT_ONCE: Final = 4
 """Egos whose graphs are built in one pass over a recording: each needs the memory of a segment."""
@@ -77,7 +77,7 @@ class Reading:
     def __init__(self, job: Job, on_block: Callable[[int, int, int], None]) -> None:
         self._job = job
         self._on_block = on_block
-        self._maps = Maps(job.road_map)
+        self._maps = Maps(job.road_map, job.config.signs)
         self._file: StoreFile | None = None
 
     def read(self, path: Path, folder: Path) -> list[View]:
@@ -97,7 +97,12 @@ class Reading:
 
     def _read(self, path: Path, folder: Path, views: list[View]) -> None:
         job = self._job
-        with open_trace(path, ego=job.config.ego, digest=self._known_digest(path)) as trace:
+        with open_trace(
+            path,
+            ego=job.config.ego,
+            digest=self._known_digest(path),
+            mapping=job.config.mapping,
+        ) as trace:
             road_map, odd = self._maps.of(trace.info)
             wanted = [one for one in self._wanted(trace, views) if self._is_new(one, road_map)]
             if job.dry_run:
@@ -127,7 +132,8 @@ class Reading:
             view = View(TraceOutcome(info.path, ego=name or ""))
             views.append(view)
             try:
-                found = ident if ident is not None else _ident(info, name or "")
+                mapping = self._job.config.mapping
+                found = ident if ident is not None else _ident(info, name or "", mapping)
             except SgstoreError as error:
                 view.outcome.error = error
                 continue
@@ -156,7 +162,8 @@ class Reading:
             return True
         part = (job.part.since, job.part.until)
         try:
-            name = store.stored(wanted.info, job.config, road_map, part)
+            shown = map_of_graphs(road_map, job.config)
+            name = store.stored(wanted.info, job.config, shown, part)
         except SgstoreError as error:
             outcome.error = error
             return False
@@ -199,7 +206,7 @@ class Reading:
                     job.store,
                     one.info,
                     job.config,
-                    road_map=road_map,
+                    road_map=map_of_graphs(road_map, job.config),
                     answers=generator.answers,
                     part=part,
                     folder=place,
@@ -238,7 +245,7 @@ class Reading:
             outcome.frames = tally.frames
             outcome.entities = tally.entities
             outcome.clock_jumps, outcome.gaps = told["clock_jumps"], told["gaps"]
-            outcome.unknown_types = dict(report.unknown_types)
+            outcome.unknown_types = self._job.config.unknown_of(report.unknown_types)
             outcome.warnings += report.warnings
             outcome.losses += report.losses
             segment.seal(replace(report, warnings=outcome.warnings), told)
@@ -246,32 +253,12 @@ class Reading:
 
     def _meant(self, block: FrameBlock) -> FrameBlock:
         """The frames, their entities as the client says that type names are meant."""
-        types = self._job.config.types
-        if not types or not len(block.entities):
-            return block
-        return replace(block, entities=_relabelled(block.entities, types))
+        return replace(block, entities=renamed(block.entities, self._job.config.types))
 
 
-def _relabelled(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
-    by_name = {name.lower(): meaning for name, meaning in types.items()}
-    found = [by_name.get(name.lower()) for name in entities.type_name]
-    columns: dict[str, Any] = {
-        name: tuple(
-            getattr(meaning, name) if meaning else old
-            for meaning, old in zip(found, getattr(entities, name), strict=True)
-        )
-        for name in ("special", "subkind")
-    }
-    kinds = entities.kind.tolist()
-    columns["kind"] = np.array(
-        [KIND_CODE[m.kind] if m else kind for m, kind in zip(found, kinds, strict=True)], np.int8
-    )
-    return replace(entities, **columns)
-
-
-def _ident(info: TraceInfo, name: str) -> str:
+def _ident(info: TraceInfo, name: str, mapping: str) -> str:
     """The id of the ego that a name means, as the reader of the recording understands it."""
-    with open_trace(info.path, ego=name, digest=info.digest) as trace:
+    with open_trace(info.path, ego=name, digest=info.digest, mapping=mapping) as trace:
         return trace.info.ego
 
 

@@ -122,7 +122,9 @@ class _Run:
         with ExitStack() as stack:
             folder = Path() if job.dry_run else stack.enter_context(Folder(job.store)).path
             if min(jobs, len(self._paths)) > 1:
-                Maps(job.road_map)  # one that cannot be read stops the run before anything is done
+                Maps(
+                    job.road_map, job.config.signs
+                )  # one that cannot be read stops the run before anything is done
                 workers = stack.enter_context(Workers(job, jobs, self._meter.see))
                 read = workers.read(self._paths, folder)
             else:

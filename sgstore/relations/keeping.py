@@ -20,9 +20,12 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from sgstore.config import Config
     from sgstore.graph import Edges, LaneGaps, LaneStates
     from sgstore.roads import RoadMap
+    from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Bools, Codes, Entities, Ints
 
 ROAD_RELATIONS: Final = (
@@ -57,7 +60,6 @@ class Keeping:
             kept -= set(MAP_KINDS)
         self._kinds = kinds_mask(tuple(sorted(kept)))
         self._every_kind = set(ENTITY_KINDS) <= kept
-        self._types = config.types
         self._without = frozenset(config.without)
         self._no_roads = config.lanes.granularity == "none"
         dropped = [RELATION_CODE[name] for name in config.without]
@@ -89,19 +91,6 @@ class Keeping:
         """Those of the relations that graphs can hold."""
         left_out = self._without | (set(ROAD_RELATIONS) if self._no_roads else set())
         return relations - left_out
-
-    def renamed(self, entities: Entities) -> Entities:
-        """Entities, of the kinds that the client says their types are."""
-        if not self._types or not len(entities):
-            return entities
-        meanings = [self._types.get(name.lower()) for name in entities.type_name]
-        kind = entities.kind.copy()
-        special, subkind = list(entities.special), list(entities.subkind)
-        for row, meaning in enumerate(meanings):
-            if meaning is not None:
-                kind[row] = KIND_CODE[meaning.kind]
-                special[row], subkind[row] = meaning.special, meaning.subkind
-        return replace(entities, kind=kind, special=tuple(special), subkind=tuple(subkind))
 
     def entities(self, kind: Codes) -> Bools:
         """Whether entities of these kinds are kept."""
@@ -158,6 +147,20 @@ class Keeping:
 
     def _stays(self, node: Ints) -> Bools:
         return np.append(self.parts, True)[np.where(node < 0, -1 - node, -1)]
+
+
+def renamed(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
+    """Entities, of the kinds that the client says their types are; type names are in lower case."""
+    if not types or not len(entities):
+        return entities
+    kind = entities.kind.copy()
+    special, subkind = list(entities.special), list(entities.subkind)
+    for row, name in enumerate(entities.type_name):
+        meaning = types.get(name.lower())
+        if meaning is not None:
+            kind[row] = KIND_CODE[meaning.kind]
+            special[row], subkind[row] = meaning.special, meaning.subkind
+    return replace(entities, kind=kind, special=tuple(special), subkind=tuple(subkind))
 
 
 def _taken(table: Columns, rows: Any) -> Columns:
