@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
+import sys
+import tomllib
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import carla_recordings
 import numpy as np
@@ -13,11 +18,12 @@ import recordings
 from foxglove_scenes import SceneRecorder, cube
 from mcap.reader import make_reader
 
+import sgstore
+from sgstore.errors import TraceError
+from sgstore.ingest import ingest
 from sgstore.traces import READERS, open_trace, read_message
+from sgstore.traces.foxglove_mapping import Ego, Entity, Scene, shipped
 from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @cache
@@ -151,3 +157,98 @@ def test_reading_again_gives_the_same(example: Path) -> None:
         assert trace.info.digest == read(example)[0].digest
     for name in States.__dataclass_fields__:
         np.testing.assert_array_equal(column(first, name), column(second, name))
+
+
+# One more flavour is one file -----------------------------------------------------------------------------
+
+PAGE = Path(__file__).parents[1] / "docs/flavours.md"
+
+
+def toybox(path: Path, frames: int = 30) -> Path:
+    """The ego overtakes a car that stands; one message is broken."""
+    with recordings.Recorder(path) as recorder:
+        channel = recorder.channel("world", "toybox.World", b'{"type": "object"}')
+        for i in range(frames):
+            cars = [{"id": "a", "x": i, "y": 0, "yaw": 0}, {"id": "b", "x": 15, "y": 3, "yaw": 0}]
+            world = {"t": i / 10, "ego": "a", "cars": cars}
+            recorder.write(channel, i / 10, json.dumps(world).encode())
+            recorder.camera(i / 10)
+        recorder.write(channel, frames / 10, b'{"t": 3, "cars": [{}]}')
+    return path
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The flavour of the page, as a package that is installed beside sgstore."""
+    page = PAGE.read_text(encoding="utf-8")
+    (block,) = re.findall(r'```python\n("""Recordings of Toybox.*?)```', page, re.DOTALL)
+    (entry,) = re.findall(r'\[project.entry-points."sgstore.readers"\]\ntoybox = "(.*)"', page)
+    site = tmp_path / "site"
+    about = site / "toybox-1.0.dist-info"
+    about.mkdir(parents=True)
+    (site / "toybox.py").write_text(block, encoding="utf-8")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toybox\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[sgstore.readers]\ntoybox = {entry}\n")
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    monkeypatch.delitem(sys.modules, "toybox", raising=False)
+    return site
+
+
+def test_a_flavour_of_one_file_is_ingested_and_queried(tmp_path: Path, installed: Path) -> None:
+    path = toybox(tmp_path / "toys.mcap")
+    store_path = tmp_path / "toys.sgstore"
+    (outcome,) = ingest(store_path, [path])
+
+    assert read(path)[0].flavour == "toybox"
+    assert outcome.status == "added", outcome.error
+    assert outcome.frames == 30
+    assert [(loss.messages, "not a world" in loss.reason) for loss in outcome.losses] == [(1, True)]
+    store = sgstore.open(store_path)
+    matches = list(
+        store.find("MATCH (e:Ego)-[:near_coll]->(c:Car {ident: 'b'}) RETURN e.x, e.speed")
+    )
+    # 3 m apart across: within 4 m for |x - 15| <= 2.6, and always beyond 2 m.
+    assert [row[-2] for row in matches] == [13.0, 14.0, 15.0, 16.0, 17.0]
+    assert {round(row[-1], 6) for row in matches} == {10.0}
+    assert len(store.payload("toys#7", "camera")) == 200
+
+
+def test_a_flavour_of_one_file_keeps_the_laws(tmp_path: Path, installed: Path) -> None:
+    path = toybox(tmp_path / "toys.mcap")
+    _, whole, _ = read(path)
+    for size in (1, 7, 29, 30, 31):
+        _, blocks, report = read(path, size)
+        assert idents(blocks) == idents(whole) == ["a", "b"]
+        assert (report.frames, len(report.losses)) == (30, 1)
+        for name in States.__dataclass_fields__:
+            np.testing.assert_array_equal(column(blocks, name), column(whole, name))
+
+
+def test_a_flavour_that_cannot_be_loaded_is_named_only_where_it_is_needed(
+    tmp_path: Path, installed: Path
+) -> None:
+    (installed / "toybox.py").write_text("raise RuntimeError('no toys')")
+
+    assert read(recordings.drive(tmp_path / "drive.mcap", 3))[2].frames == 3
+    with pytest.raises(TraceError, match=r"flavour 'toybox' \(toybox:ToyboxTrace\).*no toys"):
+        open_trace(toybox(tmp_path / "toys.mcap"))
+
+
+def test_what_nobody_reads_is_answered_with_the_flavours_there_are(tmp_path: Path) -> None:
+    with pytest.raises(
+        TraceError, match=r"flavour known \(osi, carla, foxglove\).*'world' \(toybox"
+    ):
+        open_trace(toybox(tmp_path / "toys.mcap"))
+
+
+def test_the_page_of_flavours_names_them_all() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    for reader in READERS:
+        assert f"`{reader.name}`" in page
+    for mapping in shipped():
+        assert f"`{mapping}`" in page
+    (example,) = re.findall(r"```toml\n(\[scene\].*?)```", page, re.DOTALL)
+    told = tomllib.loads(example)
+    for section, cls in (("scene", Scene), ("entity", Entity), ("ego", Ego)):
+        assert set(told[section]) == set(cls.__dataclass_fields__)
