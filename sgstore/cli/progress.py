@@ -24,20 +24,27 @@ def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.fields[frames]} frames"),
+        TextColumn("{task.fields[files]}{task.fields[frames]} frames"),
         TextColumn("{task.fields[speed]}"),
         TimeRemainingColumn(),
         console=Console(stderr=True),
         transient=True,
     )
-    task = bar.add_task("", total=None, frames=0, speed="")
+    task = bar.add_task("", total=None, files="", frames=0, speed="")
 
     def show(progress: Progress) -> None:
-        if bar.tasks[task].description != progress.path.name:
-            bar.reset(task, description=progress.path.name, total=progress.size)
         elapsed = bar.tasks[task].elapsed or 0
-        speed = f"{progress.bytes_done / elapsed / 1e6:.0f} MB/s" if elapsed > 0.5 else ""
-        bar.update(task, completed=progress.bytes_done, frames=progress.frames, speed=speed)
+        speed = f"{progress.all_bytes / elapsed / 1e6:.1f} MB/s" if elapsed > 0.5 else ""
+        several = f"{progress.files_done}/{progress.files} files, " if progress.files > 1 else ""
+        bar.update(
+            task,
+            description=progress.path.name,
+            total=progress.all_size,
+            completed=progress.all_bytes,
+            files=several,
+            frames=progress.all_frames,
+            speed=speed,
+        )
 
     with bar:
         yield show

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import TraceError
+from sgstore.errors import StoreError, TraceError
 from sgstore.store import rows, schema
 from sgstore.store.access import Access, default_memory, spill_folder, translated
 from sgstore.store.folder import Folder
@@ -33,7 +33,7 @@ from sgstore.store.traces import (
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Callable, Generator, Iterable
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store.rows import Parameters
     from sgstore.store.sealed import Sealed
+    from sgstore.store.verifying import Fault, Verification
     from sgstore.traces.carried import Carried
     from sgstore.world import TraceInfo
 
@@ -464,6 +465,32 @@ class StoreFile:
             for trace_id in gone:
                 remove(connection, trace_id)
         return tuple(gone.values())
+
+    def verify(self, *, recordings: bool = False) -> Verification:
+        """Look whether everything is as it was published.
+
+        Parameters
+        ----------
+        recordings : bool
+            Whether the recordings are hashed again, too: each is read as a whole.
+        """
+        from sgstore.store import verifying
+        from sgstore.traces import digest_of
+
+        def attempt(check: Callable[[], Iterable[Fault]]) -> list[Fault]:
+            try:
+                with translated(self.path):
+                    return list(check())
+            except StoreError as error:
+                return [verifying.Fault("", "rows", str(error))]
+
+        with self._reading() as connection:
+            found = verifying.verify(connection, attempt)
+            if recordings:
+                again = verifying.verify_recordings(connection, digest_of)
+                found.recordings = again.recordings
+                found.faults += again.faults
+        return found
 
     def compact(self) -> None:
         """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
