@@ -191,6 +191,13 @@ def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
     return {road: tuple(sorted(types)) for road, types in found.items()}
 
 
+def junction_types(document: Document) -> dict[str, str]:
+    """Id of each junction → its type (ASAM OpenDRIVE 1.8, 12: one that does not say is ``default``)."""
+    table = document["junction"]
+    pairs = zip(table.texts("id"), table.texts("type", "default"), strict=True)
+    return {name: kind.strip() or "default" for name, kind in pairs}
+
+
 def containment(document: Document, road: Ints) -> list[Edge]:
     """``isIn``: lanes in their roads, roads in their junctions. They stand in the order of their nodes.
 

@@ -228,7 +228,7 @@ class RoadMap:
     shapes : (K,) object
         Geometries of the nodes that are neither lanes nor made of lanes; ``None`` where there is none.
     lane_changes : LaneChanges, optional
-    road_types, controllers : mapping, optional
+    road_types, junction_types, controllers : mapping, optional
     warnings : iterable of str, optional
     variant : str, optional
         In what it differs from the map that the text alone describes.
@@ -251,6 +251,8 @@ class RoadMap:
         Where along their lanes the ``laneChange`` edges hold.
     road_types : mapping of str to tuple of (float, str)
         Id of a road → what it is (``town``, ``motorway``, …) from which place along its reference line on; m.
+    junction_types : mapping of str to str
+        Id of a junction → ``default``, ``direct``, ``virtual``, …
     controllers : mapping of str to tuple of str
         Id of a controller → ids of the signals that it switches together.
     warnings : tuple of str
@@ -268,6 +270,7 @@ class RoadMap:
         shapes: Geometries,
         lane_changes: LaneChanges | None = None,
         road_types: Mapping[str, tuple[tuple[float, str], ...]] | None = None,
+        junction_types: Mapping[str, str] | None = None,
         controllers: Mapping[str, tuple[str, ...]] | None = None,
         warnings: Iterable[str] = (),
         variant: str = "",
@@ -280,6 +283,7 @@ class RoadMap:
         self.ribbons = ribbons
         self.lane_changes = lane_changes or LaneChanges.none()
         self.road_types = dict(road_types or {})
+        self.junction_types = dict(junction_types or {})
         self.controllers = dict(controllers or {})
         self.warnings = tuple(warnings)
         self._shapes = shapes
@@ -414,7 +418,7 @@ class RoadMap:
         """
         nodes, same = self.nodes, first_sections(self.nodes)
         first = same == np.arange(len(nodes))
-        lane = nodes.kind == KIND_CODE["lane"]
+        lane = (nodes.kind == KIND_CODE["lane"]) & (nodes.lane != 0)
         name = tuple(
             f"{road}_{number}" if merged else name
             for name, road, number, merged in zip(
@@ -431,6 +435,7 @@ class RoadMap:
             shapes=self._shapes,
             lane_changes=self.lane_changes,
             road_types=self.road_types,
+            junction_types=self.junction_types,
             controllers=self.controllers,
             warnings=self.warnings,
             variant=f"{self._variant} without sections",

@@ -40,6 +40,8 @@ MAX_COORDINATE: Final = 1e8
 MAX_NAME: Final = 200
 MAX_RELATED: Final = 1_000
 """Greatest number of lanes that a lane can be related to in one way."""
+OF_LANES: Final = " (lanes)"
+"""What the names of such maps end in: they are less than the OpenDRIVE of the same name."""
 DIGITS: Final = 4
 """Digits that are kept of a length in metres."""
 

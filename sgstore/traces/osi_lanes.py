@@ -30,7 +30,7 @@ from sgstore.roads.lanelines import (
     LaneLine,
     plain_lanes,
 )
-from sgstore.roads.lanetext import lane_text
+from sgstore.roads.lanetext import OF_LANES, lane_text
 from sgstore.roads.sections import Sections
 from sgstore.traces.osi_schema import (
     DECODE_ERRORS,
@@ -239,7 +239,7 @@ class OsiLanes:
         name = PurePosixPath(self._map.replace("\\", "/")).name
         name = name.removesuffix(".xodr")
         plain = name.isprintable() and 0 < len(name) <= 64 and not name.startswith("+proj")
-        return f"{name} (lanes)" if plain else ""
+        return f"{name}{OF_LANES}" if plain else ""
 
     def _place(self, points: Iterable[Any]) -> Floats:
         """Points (n, 3) of a line."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import MapError, TraceError
+from sgstore.roads.lanetext import OF_LANES
 from sgstore.traces.osi_cast import Cast
 from sgstore.traces.osi_lanes import FIELDS as LANE_FIELDS
 from sgstore.traces.osi_lanes import OsiLanes
@@ -214,7 +215,7 @@ def _make_map_of_lanes(result: Survey, name: str) -> None:
             lead.lanes.warnings.append(str(error))
         else:
             if result.map_text:
-                result.map_name = told or f"{name} (lanes)"
+                result.map_name = told or f"{name}{OF_LANES}"
                 return
         result.notes += [f"its lanes make no road map: {what}" for what in lead.lanes.warnings]
 
