@@ -17,6 +17,7 @@ from sgstore.traces.chunks import (
     read_chunk_head,
     read_records,
 )
+from sgstore.traces.parts import bag_folder, part_at, parts_of
 
 if TYPE_CHECKING:
     from io import BufferedReader
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
     """The data of one message, by its place; see :class:`sgstore.world.MessageRefs`.
 
+    In a bag, places count from the beginning of its first file.
+
     Raises
     ------
     TraceError
@@ -33,6 +36,10 @@ def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> 
         was replaced.
     """
     record = b""
+    path, base = _file_at(path, offset if chunk_offset < 0 else chunk_offset)
+    chunk_offset, offset = (
+        (-1, offset - base) if chunk_offset < 0 else (chunk_offset - base, offset)
+    )
     with open_regular(path) as file:
         try:
             if chunk_offset < 0:
@@ -58,18 +65,34 @@ def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> 
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a whole file, in hexadecimal digits.
+    """SHA-256 of a whole file, or of the files of a bag one after another, in hexadecimal digits.
 
     Raises
     ------
     TraceError
-        The file cannot be read.
+        A file cannot be read.
     """
-    with open_regular(path) as file:
-        try:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
+    folder = bag_folder(path)
+    files = [path] if folder is None else [p.path for p in parts_of(folder) if p.size >= 0]
+    digest = hashlib.sha256()
+    for one in files:
+        with open_regular(one) as file:
+            try:
+                hashlib.file_digest(file, lambda: digest)
+            except OSError as error:
+                raise TraceError(f"cannot be read: {error.strerror}", path=one) from error
+    return digest.hexdigest()
+
+
+def _file_at(path: Path, place: int) -> tuple[Path, int]:
+    """The file in which a place of a recording lies, and the place at which that file begins."""
+    folder = bag_folder(path)
+    if folder is None:
+        return path, 0
+    part = part_at(parts_of(folder), place)
+    if part is None:
+        raise TraceError("no file of the bag is there: it was replaced", path=path, offset=place)
+    return part.path, part.base
 
 
 def open_regular(path: Path) -> BufferedReader:

@@ -26,7 +26,7 @@ import struct
 from array import array
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -49,6 +49,7 @@ from sgstore.traces.chunks import (
     read_records,
 )
 from sgstore.traces.fetch import open_regular
+from sgstore.traces.parts import bag_folder
 from sgstore.traces.summary import MAGIC, Summary, read_summary
 from sgstore.world import Loss, TraceReport
 
@@ -114,6 +115,8 @@ class McapFile:
     Parameters
     ----------
     path : Path
+        The file. The folder of a bag, or its ``metadata.yaml``, opens all files of it as one
+        (:class:`~sgstore.traces.bag.McapBag`).
 
     Attributes
     ----------
@@ -137,6 +140,14 @@ class McapFile:
     TraceError
         The file cannot be opened or is no MCAP file.
     """
+
+    def __new__(cls, path: Path) -> Self:
+        """A file, or all files of a bag."""
+        if cls is McapFile and bag_folder(path) is not None:
+            from sgstore.traces.bag import McapBag
+
+            return object.__new__(cast("type[Self]", McapBag))
+        return object.__new__(cls)
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -167,6 +178,17 @@ class McapFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def reopen(self) -> None:
+        """Open the file again after it was closed.
+
+        Raises
+        ------
+        TraceError
+            It cannot be opened any more.
+        """
+        if self._file.closed:
+            self._file = open_regular(self.path)
 
     @property
     def window(self) -> tuple[int, int]:
