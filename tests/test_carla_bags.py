@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,9 +12,12 @@ from carla_recordings import COMPRESSIONS, drive, idents, kinds, read, reasons, 
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+import sgstore
+from sgstore.cli import run
 from sgstore.errors import TraceError
 from sgstore.exporters import Source
 from sgstore.exporters.mcap import write_clips
+from sgstore.ingest.files import recordings
 from sgstore.traces import digest_of, open_trace, read_message
 from sgstore.traces.mcap_file import McapFile
 from sgstore.traces.parts import read_metadata
@@ -243,14 +247,42 @@ def test_metadata_that_cannot_be_used_are_refused(tmp_path: Path, text: str, rea
     (tmp_path / "metadata.yaml").write_text(text)
 
     with pytest.raises(TraceError, match=reason):
-        read(tmp_path)
+        read(tmp_path / "metadata.yaml")
 
 
 def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_bytes(b"\xff\xfe\x00")
 
     with pytest.raises(TraceError, match="cannot be read"):
+        read(tmp_path / "metadata.yaml")
+    with pytest.raises(TraceError, match="a folder; expected an MCAP recording"):
         read(tmp_path)
+
+
+def test_in_a_folder_a_bag_is_one_recording(
+    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = split(path, tmp_path / "bag", 3)
+    (bag / "beside.mcap").write_bytes(path.read_bytes())
+    (bag / "drive_1.mcap").unlink()
+    store = tmp_path / "s.db"
+
+    assert recordings([tmp_path]) == [bag, bag / "beside.mcap", path]
+    assert recordings([bag / "metadata.yaml"]) == [bag]
+    code = run(["ingest", str(store), str(bag / "metadata.yaml"), "--json"])
+    out, err = capsys.readouterr()
+    (row,) = json.loads(out)
+
+    assert code == 3, err
+    assert (row["trace"], row["status"]) == ("bag", "added")
+    assert "drive_1.mcap: metadata.yaml lists it, but there is no such file" in err
+    opened = sgstore.open(store)
+    picture = opened.payload("bag#0", "/carla/hero/rgb_front/image/compressed")
+    last = opened.payload(f"bag#{row['frames'] - 1}", "/carla/objects")
+    with path.open("rb") as stream:
+        told = {(c.topic, m.data) for _, c, m in make_reader(stream).iter_messages()}
+    assert ("/carla/hero/rgb_front/image/compressed", picture) in told
+    assert ("/carla/objects", last) in told
 
 
 @pytest.mark.parametrize(

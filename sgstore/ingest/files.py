@@ -6,11 +6,14 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, TraceError
 from sgstore.traces import ENDINGS
+from sgstore.traces.parts import METADATA, bag_folder, parts_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
+
+    from sgstore.traces.parts import Part
 
 
 def recordings(names: Iterable[str | Path]) -> list[Path]:
@@ -19,8 +22,9 @@ def recordings(names: Iterable[str | Path]) -> list[Path]:
     Parameters
     ----------
     names : iterable of str or Path
-        Files; folders, which stand for the recordings in them and below; and patterns (``drives/*/day?.mcap``,
-        ``**`` for any depth) that no shell has expanded. What is in a folder or fits a pattern is sorted.
+        Files; folders, which stand for the recordings in them and below; bags, by their folder or their
+        ``metadata.yaml``; and patterns (``drives/*/day?.mcap``, ``**`` for any depth) that no shell has
+        expanded. What is in a folder or fits a pattern is sorted.
 
     Raises
     ------
@@ -31,8 +35,10 @@ def recordings(names: Iterable[str | Path]) -> list[Path]:
 
 
 def _meant(path: Path) -> Iterator[Path]:
-    if path.is_dir():
-        inside = sorted(p for p in path.rglob("*") if is_recording(p))
+    if path.name == METADATA:
+        yield path.parent
+    elif path.is_dir():
+        inside = sorted(_inside(path))
         if not inside:
             raise StoreError(
                 f"{path}: no recording ({', '.join(ENDINGS)}) in this folder or below it"
@@ -46,6 +52,22 @@ def _meant(path: Path) -> Iterator[Path]:
             yield from _meant(Path(name))
     else:
         yield path
+
+
+def _inside(folder: Path) -> Iterator[Path]:
+    """The recordings in a folder and below it; the files that a bag consists of are none themselves."""
+    bags = {path.parent for path in folder.rglob(METADATA) if bag_folder(path.parent) is not None}
+    own = {part.path for bag in bags for part in _parts(bag)}
+    yield from bags
+    yield from (path for path in folder.rglob("*") if is_recording(path) and path not in own)
+
+
+def _parts(bag: Path) -> tuple[Part, ...]:
+    """The files of a bag; of one that cannot be read none, and reading it says why."""
+    try:
+        return parts_of(bag)
+    except TraceError:
+        return ()
 
 
 def is_recording(path: Path) -> bool:

@@ -23,6 +23,8 @@ MAX_METADATA: Final = 16 << 20
 MAX_PARTS: Final = 10_000
 """Most files of a bag."""
 
+_MARK: Final = b"rosbag2_bagfile_information"
+_BEGINNING: Final = 4096
 _ENTRY: Final = re.compile(r"(?P<indent> *)(?P<dash>- +)?(?P<rest>\S.*?)\s*")
 _KEY: Final = re.compile(r"(relative_file_paths|storage_identifier|compression_mode)\s*:\s*(.*)")
 
@@ -46,11 +48,17 @@ class Part:
 
 
 def bag_folder(path: Path) -> Path | None:
-    """The folder of the bag that a path means: itself, or that of a ``metadata.yaml``; ``None``: no bag."""
+    """The folder of the bag that a path means: itself, or that of a ``metadata.yaml``; ``None``: no bag.
+
+    A folder is a bag if its ``metadata.yaml`` begins as rosbag2 writes it; other tools write such files, too.
+    """
     if path.name == METADATA:
         return path.parent
     try:
-        return path if (path / METADATA).is_file() else None
+        if not path.is_dir():
+            return None
+        with (path / METADATA).open("rb") as file:
+            return path if _MARK in file.read(_BEGINNING) else None
     except (OSError, ValueError):
         return None
 
