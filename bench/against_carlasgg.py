@@ -44,6 +44,7 @@ from sgstore.config import preset
 from sgstore.ingest import read_map_file
 from sgstore.opendrive import read_map
 from sgstore.relations.pairs import IS_VEHICLE
+from sgstore.relations.scene import IS_SIGNAL
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.traces import open_trace
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, KINDS, PROXIMITY, RELATIONS
@@ -116,6 +117,7 @@ class View:
 
     entities: set[str] = field(default_factory=set)
     lights: set[str] = field(default_factory=set)
+    signals: set[str] = field(default_factory=set)
     lanes: set[str] = field(default_factory=set)
     edges: set[Edge] = field(default_factory=set)
     box: dict[str, tuple[float, ...]] = field(default_factory=dict)
@@ -148,6 +150,9 @@ def theirs(line: str) -> View:
         elif kind == "traffic_light":
             name = placed(node["attr"]["vertex"][0], -node["attr"]["vertex"][1])
             view.lights.add(name)
+        elif str(kind).startswith("landmark"):
+            name = f"signal {node['attr']['landmark_id']}"
+            view.signals.add(name)
         names[node["i"]] = name
     view.edges = {(names[s], label, names[d]) for s, d, label in frame["edges"]}
     return view
@@ -169,9 +174,14 @@ class Ours:
         self._shown = map_of_graphs(self.road_map, config) or self.road_map
         self._idents: list[str] = []
         self._place: dict[str, str] = {}
+        self._signal: dict[str, str] = {}
         nodes, lane = self.road_map.nodes, KIND_CODE["lane"]
         self._names = [
-            f"{road}_{number}" if kind == lane else f"{KINDS[kind]} {name}"
+            f"{road}_{number}"
+            if kind == lane
+            else f"signal {name}"
+            if IS_SIGNAL[kind]
+            else f"{KINDS[kind]} {name}"
             for kind, name, road, number in zip(
                 nodes.kind.tolist(), nodes.name, nodes.road, nodes.lane.tolist(), strict=True
             )
@@ -182,8 +192,20 @@ class Ours:
         with self._open as trace:
             for block in trace.blocks(60):
                 self._idents += block.entities.ident
+                refs = zip(block.entities.ident, block.entities.map_ref, strict=True)
+                self._signal |= {ident: f"signal {ref}" for ident, ref in refs if ref}
                 graph = self._generator.block(block)
                 yield from (self._view(graph, frame) for frame in range(len(graph)))
+
+    def controlled(self, signal: str) -> set[str]:
+        """Lanes that a signal of the map controls."""
+        nodes = self.road_map.lanes_of_signal(signal.removeprefix("signal "))
+        return {self._names[-1 - node] for node in nodes.tolist()}
+
+    def is_light(self, signal: str) -> bool:
+        """Whether a signal of the map is a traffic light."""
+        column = self._names.index(signal)
+        return int(self.road_map.nodes.kind[column]) == KIND_CODE["traffic_light"]
 
     def _view(self, graph: GraphBlock, frame: int) -> View:
         frames, edges, of = graph.frames, graph.edges, self._shown.edges
@@ -212,15 +234,18 @@ class Ours:
                 table.dst[rows].tolist(),
             )
             view.edges |= {
-                (self._name(s), RELATIONS[r], self._name(d))
+                (self._name(s, RELATIONS[r]), RELATIONS[r], self._name(d))
                 for s, r, d in zip(*columns, strict=True)
             }
+        view.signals = {s for s, r, _ in view.edges if r == "mayAffect"}
         return view
 
-    def _name(self, node: int) -> str:
+    def _name(self, node: int, relation: str = "") -> str:
+        """An entity by its id, a light by its place, or as a signal of the map where it may affect lanes."""
         if node < 0:
             return self._names[-1 - node]
-        return self._place.get(self._idents[node], self._idents[node])
+        ident = self._idents[node]
+        return (self._signal if relation == "mayAffect" else self._place).get(ident, ident)
 
 
 class Comparison:
@@ -242,6 +267,7 @@ class Comparison:
             *("entities with equal lanes", "entities on or off the road", "lanes in range"),
             *("opposes, lanes in both", "left and right of lanes, lanes in both"),
             *("travelsTo, lanes in both", "traffic lights in range", "lanes that these control"),
+            "mayAffect, signals and lanes in both",
         )
         self.rows = [Row(name) for name in names]
         self.defects: Counter[str] = Counter()
@@ -295,7 +321,7 @@ class Comparison:
                 row.causes[self._why_lanes(ours, edge, mine=mine)] += 1
 
     def _compare_lights(self, ours: View, peer: View) -> None:
-        lights, control = self.rows[10:]
+        lights, control, affect = self.rows[10:]
         for light, _ in lights.add(ours.lights, peer.lights):
             pole = shapely.Point(*map(float, light.split()[1:]))
             near = self._rectangle(ours).exterior.distance(pole) <= REACH_OF_HEADS
@@ -313,15 +339,28 @@ class Comparison:
                 fork = any(self._start_together(edge[2], lane) for lane in lanes)
                 control.causes["fork" if mine and fork else "unexplained"] += 1
 
+        common = (ours.lanes & peer.lanes) | (ours.signals & peer.signals)
+        both = (
+            {e for e in v.edges if e[1] == "mayAffect" and {e[0], e[2]} <= common}
+            for v in (ours, peer)
+        )
+        for edge, mine in affect.add(*both):
+            affect.causes[self._why_affected(ours, edge, mine=mine)] += 1
+
+    def _why_affected(self, view: View, edge: Edge, *, mine: bool) -> str:
+        """A signal at the very start of a lane is ahead of no point of it, if another lane keeps the first."""
+        lanes = self._ours.controlled(edge[0]) & set(self._points)
+        twins = [lane for lane in lanes | view.lanes if lane != edge[2]]
+        fork = any(self._start_together(edge[2], lane) for lane in twins)
+        return "fork" if mine and fork and edge[2] in lanes else "unexplained"
+
     def _count_defects(self, ours: View, peer: View) -> None:
         found = self.defects
         for name, view in (("CARLASGG", peer), ("sgstore", ours)):
             changes = sum(relation == "laneChange" for _, relation, _ in view.edges)
             found[f"lane changes, {name}"] += changes
-        doubled = [e for e in peer.edges if e[0].startswith("landmark_OpenDRIVE_1000001")]
-        found["traffic lights that are there a second time, as landmarks"] += len(
-            {e[0] for e in doubled}
-        )
+        lights = {signal for signal in peer.signals if self._ours.is_light(signal)}
+        found["traffic lights that are there a second time, as landmarks"] += len(lights)
         nowhere = {s for s, r, d in peer.edges if d == "Off Road" and s not in peer.entities}
         found["lights and signs that are 'Off Road' for lack of an edge"] += len(nowhere)
 
