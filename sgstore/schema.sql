@@ -106,6 +106,12 @@ CREATE TABLE lane_state (                                      -- attributes of 
 CREATE TABLE lane_gap (                                        -- attribute of the edges src follows dst and dst leads src
   frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);       -- from bumper to bumper along the lanes, m
 
+CREATE TABLE frame_class (                                     -- ordered by all columns; made at ingest
+  abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);  -- class: NULL where too symmetric to be told
+
+CREATE TABLE later_class (                                     -- the same of abstractions that were asked for later
+  abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);
+
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
   bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
   chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
@@ -237,6 +243,13 @@ FROM (
           FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))));
 
 COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s.';
+
+CREATE VIEW classes AS
+SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class
+FROM frame f JOIN (SELECT * FROM frame_class UNION ALL SELECT * FROM later_class) c
+     ON c.bucket = f.bucket AND (c.mask & (1::BIGINT << f.bit)) <> 0;
+
+COMMENT ON VIEW classes IS 'One row a frame and abstraction (E, EL, ER, RSV, junction; others once they were asked for). class: equal exactly where the labelled graphs are the same but for which node is which (isomorphic), in every store; 32 hexadecimal digits, NULL where a graph is so symmetric that it was given up.';
 
 CREATE VIEW lanes AS
 SELECT m.name AS map, n.node_id, n.name, n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.x, n.y, n.z, degrees(n.heading) AS heading,

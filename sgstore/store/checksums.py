@@ -27,7 +27,7 @@ _MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
 _ASSIGNED: Final = {"map_id", "config_id", "name", "ingested_at"}
 """Columns that a store gives a value of its own."""
 
-_TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP"}
+_TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP", "UUID"}
 
 
 @dataclass(slots=True)

@@ -219,6 +219,8 @@ _SORTED: Final = {
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
 FROM store.edge GROUP BY ALL ORDER BY ALL""",
     "frame": "SELECT * FROM store.frame ORDER BY frame_id",
+    "frame_class": "SELECT * FROM store.frame_class ORDER BY ALL",
+    "later_class": "SELECT * FROM store.later_class ORDER BY ALL",
 }
 """The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
 

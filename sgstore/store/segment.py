@@ -14,6 +14,7 @@ import numpy as np
 from sgstore.errors import StoreError
 from sgstore.store import packing, payloads
 from sgstore.store.access import translated
+from sgstore.store.classes import TraceClasses
 from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
 from sgstore.store.publishing import MAP_TABLES, fill_trace, publish_in
 from sgstore.store.sealed import Sealed
@@ -80,6 +81,7 @@ class Segment:
         )
         self._origin: Origin | None = None
         self._periods = payloads.Periods()
+        self._classes = TraceClasses(road_map)
         self._next_seq = 0
         self._staging = Staging(store, folder)
         try:
@@ -222,6 +224,7 @@ class Segment:
         insert("edge", packing.edge_columns(graph, trace_id, kinds))
         insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
         insert("lane_gap", packing.gap_columns(graph, trace_id))
+        insert("frame_class", self._classes.columns(graph, trace_id, kinds.entities))
 
     def _owned(self, columns: Columns) -> Columns:
         """The columns, and whose they are."""

@@ -61,6 +61,7 @@ ORDER BY s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
     "node": "SELECT kind, bucket, node_id, mask FROM node ORDER BY ALL",
     "edge": """
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask FROM edge ORDER BY ALL""",
+    "frame_class": "SELECT * FROM frame_class ORDER BY ALL",
     "message": "SELECT * FROM message",
 }
 """The tables that grow with a trace, sorted as they are published."""
@@ -70,6 +71,8 @@ _MERGED: Final = {
     "edge": """
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
 FROM edge GROUP BY ALL ORDER BY ALL""",
+    "frame_class": """
+SELECT abstraction, class, bucket, bit_or(mask) AS mask FROM frame_class GROUP BY ALL ORDER BY ALL""",
 }
 """The same where blocks split buckets: the pieces of a mask become one row again."""
 

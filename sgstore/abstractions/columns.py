@@ -1,0 +1,312 @@
+"""What abstractions are made of, and what they make: the graphs of many frames as columns.
+
+An abstraction is a function from :class:`Seen`, what a scene graph holds of nodes and edges, to
+:class:`Labelled`, a directed multigraph for each frame whose nodes and edges have nothing but labels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.abstractions.roles import Strands
+from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.world import Bools, Codes, Floats, Ints
+
+Labels = NDArray[np.int32]
+
+Part = tuple[NDArray[Any], ...]
+"""Columns of nodes or of edges."""
+
+EGO: Final = "ego"
+"""Label of the ego in every abstraction, as the literature has it."""
+
+_ENTITY_KINDS: Final = len(ENTITY_KINDS)
+_LANE: Final = KIND_CODE["lane"]
+
+
+@dataclass(frozen=True, eq=False)
+class Grounds:
+    """Parts of a road map, and the edges among them: row i has node id -1 - i.
+
+    Attributes
+    ----------
+    kind : (K,) int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    name, lane_type, road, junction : (K,) str
+        As in :class:`sgstore.roads.MapNodes`; empty where there is none.
+    lane : (K,) int64
+        Number of the lane in its road; 0 for what is no lane.
+    relation : (M,) int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : (M,) int64
+        Node ids, below zero.
+    """
+
+    kind: Codes
+    name: NDArray[Any]
+    lane_type: NDArray[Any]
+    road: NDArray[Any]
+    junction: NDArray[Any]
+    lane: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+
+    @classmethod
+    def of(cls, road_map: RoadMap) -> Grounds:
+        """What a road map has of it."""
+        nodes, edges = road_map.nodes, road_map.edges
+        name, lane_type, road, junction = (
+            np.array(column, object)
+            for column in (nodes.name, nodes.lane_type, nodes.road, nodes.junction)
+        )
+        return cls(
+            nodes.kind,
+            name,
+            lane_type,
+            road,
+            junction,
+            nodes.lane,
+            edges.relation,
+            edges.src,
+            edges.dst,
+        )
+
+    @cached_property
+    def strands(self) -> Strands:
+        """The strands of its lanes."""
+        return Strands(self)
+
+    @cached_property
+    def driving(self) -> Bools:
+        """(K,): whether it is a lane that is driven on."""
+        return (self.kind == _LANE) & np.isin(self.lane_type, DRIVEN)
+
+
+DRIVEN: Final = (
+    *("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"),
+    *("bidirectional", "bus", "taxi", "HOV"),
+)
+"""Types of lanes that traffic drives on."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Nodes and edges of the scene graphs of many frames.
+
+    Attributes
+    ----------
+    frames : int
+        How many there are.
+    node_frame, node : (N,) int64
+        Frame, counted from 0, and node id; ascending.
+    kind : (N,) int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    is_ego : (N,) bool
+    x, y, z, heading : (N,) float64
+        Of what moves or changes; m, rad. NaN of what stands, and where it is missing.
+    frame : (E,) int64
+    relation : (E,) int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : (E,) int64
+        Node ids. Edges among parts of the map are not here: see :meth:`lasting`.
+    ego_lane : (frames,) int64
+        Node id of the lane that the ego is in above all; 0 where there is none.
+    grounds : Grounds or None
+        The road map; ``None`` without one.
+    """
+
+    frames: int
+    node_frame: Ints
+    node: Ints
+    kind: Codes
+    is_ego: Bools
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    frame: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+    ego_lane: Ints
+    grounds: Grounds | None
+
+    @classmethod
+    def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> Seen:
+        """From nodes in any order: ``node_frame, node, kind, is_ego, x, y, z, heading``."""
+        order = np.lexsort((nodes["node"], nodes["node_frame"]))
+        return cls(frames, **{name: of[order] for name, of in nodes.items()}, **columns)
+
+    @classmethod
+    def of(cls, graph: GraphBlock, kinds: Codes, grounds: Grounds | None) -> Seen:
+        """What a block of scene graphs holds.
+
+        Parameters
+        ----------
+        graph : GraphBlock
+        kinds : int8
+            Kinds of all entities of the trace so far, by node id.
+        grounds : Grounds or None
+        """
+        frames, states, presence = graph.frames, graph.frames.states, graph.presence
+        of_map = np.zeros(0, np.int8) if grounds is None else grounds.kind
+        row, still = frames.frame_of, len(presence.node)
+        entity = presence.node >= 0
+        kind = np.empty(still, np.int8)
+        kind[entity] = kinds[presence.node[entity]]
+        kind[~entity] = of_map[-1 - presence.node[~entity]]
+        nodes = {
+            "node_frame": np.concatenate([row, presence.frame]),
+            "node": np.concatenate([states.node, presence.node]),
+            "kind": np.concatenate([kinds[states.node], kind]),
+            "is_ego": np.append(states.node == frames.ego[row], np.zeros(still, np.bool_)),
+        } | {
+            name: np.append(getattr(states, name), np.full(still, np.nan))
+            for name in ("x", "y", "z", "heading")
+        }
+        edges, lanes = graph.edges, graph.lanes
+        own = lanes.primary & (lanes.node == frames.ego[lanes.frame])
+        ego_lane = np.zeros(len(frames), np.int64)
+        ego_lane[lanes.frame[own]] = lanes.lane[own]
+        return cls.sorted(
+            len(frames),
+            nodes,
+            frame=edges.frame,
+            relation=edges.relation,
+            src=edges.src,
+            dst=edges.dst,
+            ego_lane=ego_lane,
+            grounds=grounds,
+        )
+
+    @cached_property
+    def is_entity(self) -> Bools:
+        """(N,): whether a node is an entity; else it is a part of the map."""
+        return self.kind < _ENTITY_KINDS
+
+    def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
+        """Edges among parts of the map, in each frame in which both their ends are present.
+
+        Returns
+        -------
+        frame, relation, src, dst : (K,)
+        """
+        none = np.zeros(0, np.int64)
+        grounds = self.grounds
+        rows = np.flatnonzero(self.node < 0)
+        if grounds is None or not len(rows):
+            return none, none.astype(np.int8), none, none
+        here, column = np.unique(-1 - self.node[rows], return_inverse=True)
+        place = np.full(len(grounds.kind), -1)
+        place[here] = np.arange(len(here))
+        src, dst = place[-1 - grounds.src], place[-1 - grounds.dst]
+        wanted = np.flatnonzero((src >= 0) & (dst >= 0) & np.isin(grounds.relation, relations))
+        present = np.zeros((self.frames, len(here)), np.bool_)
+        present[self.node_frame[rows], column] = True
+        frame, edge = np.nonzero(present[:, src[wanted]] & present[:, dst[wanted]])
+        edge = wanted[edge]
+        return frame, grounds.relation[edge], grounds.src[edge], grounds.dst[edge]
+
+    def row_of(self, frame: Ints, node: Ints) -> Ints:
+        """Rows of nodes in frames; -1 where they are not in the graph."""
+        return found(self.node_frame, self.node, frame, node)
+
+
+def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
+    """Rows of (frame, node) in columns that are sorted by both; -1 where there is none."""
+    if not len(nodes):
+        return np.full(len(node), -1)
+    low = min(int(nodes.min()), int(node.min(initial=0)))
+    span = max(int(nodes.max()), int(node.max(initial=0))) - low + 1
+    keys = frames * span + (nodes - low)
+    wanted = frame * span + (node - low)
+    row = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[row] == wanted, row, -1)
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A directed multigraph for each of many frames, with labels on nodes and edges.
+
+    Attributes
+    ----------
+    frames : int
+        How many frames there are; a frame without nodes has the empty graph.
+    labels : tuple of str
+        All labels, of nodes and of edges; no two are equal.
+    node_frame, node : (N,) int64
+        Frame, counted from 0, and a number that tells the nodes of a frame apart: a node id, or one that the
+        abstraction makes up. Ascending.
+    node_label : (N,) int32
+        Index into ``labels``.
+    frame, src, dst : (E,) int64
+        Edges; both ends are nodes of the same frame. An edge may be there more than once.
+    label : (E,) int32
+        Index into ``labels``.
+    names : mapping of int to str
+        What nodes are called that are not called by their label: parts of the map.
+    """
+
+    frames: int
+    labels: tuple[str, ...]
+    node_frame: Ints
+    node: Ints
+    node_label: Labels
+    frame: Ints
+    src: Ints
+    label: Labels
+    dst: Ints
+    names: Mapping[int, str] = field(default_factory=dict[int, str])
+
+    @classmethod
+    def assembled(
+        cls,
+        frames: int,
+        nodes: Sequence[Part],
+        edges: Sequence[Part],
+        labels: Sequence[str],
+        names: Mapping[int, str] | None = None,
+    ) -> Labelled:
+        """From parts: nodes ``(frame, node, label)`` in any order, edges ``(frame, src, label, dst)``.
+
+        Labels are indices into ``labels``, which may repeat texts. A node that comes twice in a frame is one.
+        """
+        table = tuple(dict.fromkeys(labels))
+        index = {text: i for i, text in enumerate(table)}
+        renumbered = np.array([index[text] for text in labels] or [0], np.int32)
+        frame, node, label = _columns(nodes, 3)
+        order = np.lexsort((node, frame))
+        frame, node, label = frame[order], node[order], label[order]
+        fresh = np.ones(len(node), np.bool_)
+        fresh[1:] = (frame[1:] != frame[:-1]) | (node[1:] != node[:-1])
+        edge_frame, src, edge_label, dst = _columns(edges, 4)
+        return cls(
+            frames,
+            table,
+            frame[fresh],
+            node[fresh],
+            renumbered[label[fresh]],
+            edge_frame,
+            src,
+            renumbered[edge_label],
+            dst,
+            names or {},
+        )
+
+
+def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
+    none = np.zeros(0, np.int64)
+    columns = zip(*parts, (none,) * count, strict=True)
+    return [np.concatenate(column).astype(np.int64) for column in columns]

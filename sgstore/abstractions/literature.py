@@ -1,0 +1,349 @@
+"""The abstractions of the literature: ``E``, ``EL``, ``ER``, ``RSV``, ``junction`` and ``SG``.
+
+The names are those of S3C (Woodlief et al., 2024) and of CARLASGG. In all but ``SG``, entities are traffic,
+people, animals, signals and props, without the scenery (buildings, poles, barriers, vegetation); an entity is
+labelled with its kind, the ego with ``ego``; and relations are those of proximity and direction, and left and
+right. ``leads``, ``follows``, ``overlaps``, ``sees`` and ``conflictsWith`` are unknown to the literature.
+
+Where our graphs have what theirs lack, this is how it is:
+
+* ``EL``, ``RSV``: lanes are strands (:mod:`sgstore.abstractions.roles`) that are driven on. The ego's is that
+  of its primary lane; those beside it that run the same way are ``Left n`` and ``Right n of Ego Lane``, and are
+  there if they are in range. Any other strand that an entity is in is an ``Opposing Lane k`` (CARLASGG's word,
+  whichever way it runs), by the distance of the nearest entity in it from the ego, then by node id; where the
+  ego's place or lane is not known, plainly a ``Lane``. All lanes are in ``Root Road``. What is off the road is
+  in ``Off Road``.
+* ``junction``: lanes, roads and junctions of the map. The sections of a road are one, as with CARLASGG: its
+  lanes are called ``Lane 5_-1``. What a thing is called does not count for the class: a lane that is driven on
+  is labelled ``Lane``, another with its type; so the same scene in another place is of the same class.
+* ``SG``: the scene graph itself, all of it; with waypoints if these were asked for at ingest.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.abstractions.columns import EGO, Labelled
+from sgstore.abstractions.roles import OPPOSING, role_name
+from sgstore.vocabulary import (
+    DIRECTIONS,
+    KIND_CODE,
+    KINDS,
+    PROXIMITY,
+    RELATION_CODE,
+    RELATIONS,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.abstractions.columns import Grounds, Part, Seen
+    from sgstore.abstractions.roles import Strands
+    from sgstore.world import Bools, Ints
+
+SCENERY: Final = ("building", "pole", "barrier", "vegetation")
+"""Kinds of entities that only ``SG`` has."""
+
+ROOT_ROAD: Final = -(1 << 40)
+"""Node number of ``Root Road``."""
+
+BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
+OF_JUNCTION: Final = (
+    *BETWEEN_ENTITIES,
+    *("isIn", "travelsTo", "laneChange", "opposes", "controlsTrafficOf", "mayAffect"),
+)
+
+_MAPS: Final = 4
+"""Maps of which what follows from them is remembered."""
+
+_EGO_LABEL: Final = len(KINDS)
+_KIND_LABELS: Final = (*KINDS, EGO)
+_IS_IN: Final = RELATION_CODE["isIn"]
+_OFF_ROAD: Final = -1
+_SMALL: Final = np.array([kind in SCENERY for kind in KINDS])
+
+
+def entities(seen: Seen) -> Labelled:
+    """``E``: the entities."""
+    return Labelled.assembled(seen.frames, [_entities(seen)], [], _KIND_LABELS)
+
+
+def related(seen: Seen) -> Labelled:
+    """``ER``: the entities and their relations."""
+    labels = (*_KIND_LABELS, *RELATIONS)
+    return Labelled.assembled(seen.frames, [_entities(seen)], [_relations(seen)], labels)
+
+
+def in_lanes(seen: Seen) -> Labelled:
+    """``EL``: the entities, and their lanes as the ego has them."""
+    return _with_lanes(seen, related=False)
+
+
+def road_scene(seen: Seen) -> Labelled:
+    """``RSV``: the entities with their relations, and their lanes as the ego has them."""
+    return _with_lanes(seen, related=True)
+
+
+def whole(seen: Seen) -> Labelled:
+    """``SG``: the scene graph as it is."""
+    label = np.where(seen.is_ego, _EGO_LABEL, seen.kind)
+    first = len(_KIND_LABELS)
+    frame, relation, src, dst = seen.lasting(range(len(RELATIONS)))
+    edges = [
+        (seen.frame, seen.src, first + seen.relation.astype(np.int64), seen.dst),
+        (frame, src, first + relation.astype(np.int64), dst),
+    ]
+    labels = (*_KIND_LABELS, *RELATIONS)
+    nodes = [(seen.node_frame, seen.node, label)]
+    return Labelled.assembled(seen.frames, nodes, edges, labels, _names(seen.grounds))
+
+
+def junction(seen: Seen) -> Labelled:
+    """``junction``: the entities with their relations; lanes, roads and junctions of the map."""
+    grounds = seen.grounds
+    first = len(_KIND_LABELS)
+    wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
+    nodes, kept = [_entities(seen)], _kept(seen)
+    labels = [*_KIND_LABELS, *RELATIONS]
+    edges: list[Part] = []
+    if grounds is not None:
+        whose = _merged(grounds)
+        own = [KIND_CODE[name] for name in ("lane", "road", "junction", "off_road")]
+        rows = np.flatnonzero(np.isin(seen.kind, own))
+        label, more = _ground_labels(grounds, len(labels))
+        labels += more
+        nodes.append(
+            (
+                seen.node_frame[rows],
+                whose[-1 - seen.node[rows]],
+                label[-1 - seen.node[rows]],
+            )
+        )
+        kept = kept.copy()
+        kept[rows] = True
+        edges.append(_drawn(seen, kept, seen.lasting(wanted), whose))
+    moving = np.flatnonzero(np.isin(seen.relation, wanted))
+    columns = (seen.frame[moving], seen.relation[moving], seen.src[moving], seen.dst[moving])
+    edges.append(_drawn(seen, kept, columns, None if grounds is None else _merged(grounds)))
+    parts = [(frame, src, first + relation, dst) for frame, relation, src, dst in edges]
+    return Labelled.assembled(seen.frames, nodes, parts, labels, _names(grounds))
+
+
+def _drawn(seen: Seen, kept: Bools, columns: Part, whose: Ints | None) -> Part:
+    """Edges both of whose ends are kept, between what stands for these, each once and none to itself."""
+    frame, relation, src, dst = columns
+    a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
+    both = (a >= 0) & (b >= 0) & kept[a] & kept[b]
+    frame, relation, src, dst = frame[both], relation[both].astype(np.int64), src[both], dst[both]
+    if whose is None or not len(frame):
+        return frame, relation, src, dst
+    of_map = (src < 0) | (dst < 0)
+    src, dst = _standing_for(whose, src), _standing_for(whose, dst)
+    rows = np.flatnonzero(of_map)
+    again = _repeated((frame[rows], relation[rows], src[rows], dst[rows]))
+    keep = np.ones(len(frame), np.bool_)
+    keep[rows[again]] = False
+    keep &= src != dst
+    return frame[keep], relation[keep], src[keep], dst[keep]
+
+
+def _standing_for(whose: Ints, node: Ints) -> Ints:
+    return np.where(node < 0, whose[np.minimum(-1 - node, len(whose) - 1)], node)
+
+
+def _repeated(columns: Part) -> Bools:
+    """Which rows have come before."""
+    again = np.zeros(len(columns[0]), np.bool_)
+    if len(again):
+        order = np.lexsort(columns)
+        same = np.ones(len(order) - 1, np.bool_)
+        for column in columns:
+            same &= column[order][1:] == column[order][:-1]
+        again[order[1:]] = same
+    return again
+
+
+@lru_cache(maxsize=_MAPS)
+def _merged(grounds: Grounds) -> Ints:
+    """For each part of the map the node id that stands for it: of a lane in several sections, the greatest."""
+    found = -1 - np.arange(len(grounds.kind))
+    lanes = np.flatnonzero(grounds.kind == KIND_CODE["lane"])
+    first: dict[tuple[str, int, str], int] = {}
+    keys = zip(grounds.road[lanes], grounds.lane[lanes].tolist(), strict=True)
+    for row, (road, lane) in zip(lanes.tolist(), keys, strict=True):
+        key = (road, lane, "Lane" if grounds.driving[row] else grounds.lane_type[row])
+        found[row] = first.setdefault(key, -1 - row)
+    return found
+
+
+@lru_cache(maxsize=_MAPS)
+def _ground_labels(grounds: Grounds, first: int) -> tuple[Ints, list[str]]:
+    """Label of each part of the map, from ``first`` on, and the labels."""
+    words = {"road": "Road", "junction": "Junction", "off_road": "Off Road"}
+    text: list[str] = [
+        ("Lane" if driven else f"Lane ({kind_of_lane or 'none'})")
+        if KINDS[kind] == "lane"
+        else words.get(str(KINDS[kind]), str(KINDS[kind]))
+        for kind, kind_of_lane, driven in zip(
+            grounds.kind.tolist(), grounds.lane_type, grounds.driving.tolist(), strict=True
+        )
+    ]
+    table = {label: first + i for i, label in enumerate(dict.fromkeys(text))}
+    return np.array([table[label] for label in text], np.int64), list(table)
+
+
+@lru_cache(maxsize=_MAPS)
+def _names(grounds: Grounds | None) -> dict[int, str]:
+    """What the literature calls parts of the map."""
+    if grounds is None:
+        return {}
+    names: dict[int, str] = {}
+    columns = zip(
+        grounds.kind.tolist(), grounds.name, grounds.road, grounds.lane.tolist(), strict=True
+    )
+    for row, (kind, name, road, lane) in enumerate(columns):
+        match KINDS[kind]:
+            case "lane":
+                names[-1 - row] = f"Lane {road}_{lane:+d}"
+            case "road":
+                names[-1 - row] = f"Road {name}"
+            case "junction":
+                names[-1 - row] = f"Junction {name}"
+            case "off_road":
+                names[-1 - row] = "Off Road"
+            case _:
+                pass
+    return names
+
+
+def _kept(seen: Seen) -> Bools:
+    """Which nodes are entities that the literature has."""
+    return seen.is_entity & ~_SMALL[seen.kind]
+
+
+def _entities(seen: Seen) -> Part:
+    rows = np.flatnonzero(_kept(seen))
+    label = np.where(seen.is_ego[rows], _EGO_LABEL, seen.kind[rows])
+    return seen.node_frame[rows], seen.node[rows], label
+
+
+def _relations(seen: Seen) -> Part:
+    """Edges between entities; labels follow those of the kinds."""
+    wanted = np.isin(seen.relation, [RELATION_CODE[name] for name in BETWEEN_ENTITIES])
+    rows = np.flatnonzero(wanted)
+    columns = (seen.frame[rows], seen.relation[rows], seen.src[rows], seen.dst[rows])
+    frame, relation, src, dst = _drawn(seen, _kept(seen), columns, None)
+    return frame, src, len(_KIND_LABELS) + relation, dst
+
+
+def _with_lanes(seen: Seen, *, related: bool) -> Labelled:
+    labels = [*_KIND_LABELS, *RELATIONS]
+    nodes, edges = [_entities(seen)], [_relations(seen)] if related else []
+    if seen.grounds is not None:
+        lanes, inside, names = _lanes(seen, len(labels))
+        labels += names
+        nodes += lanes
+        edges += inside
+    return Labelled.assembled(seen.frames, nodes, edges, labels)
+
+
+def _lanes(seen: Seen, first: int) -> tuple[list[Part], list[Part], list[str]]:
+    """Nodes, ``isIn`` edges and labels of the lanes as the ego has them; labels count from ``first``."""
+    assert seen.grounds is not None  # noqa: S101 - the caller has looked
+    is_in = len(_KIND_LABELS) + _IS_IN
+    strands = seen.grounds.strands
+    rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
+    entity = seen.row_of(seen.frame[rows], seen.src[rows])
+    rows = rows[(entity >= 0) & _kept(seen)[entity]]
+    frame, src, dst = seen.frame[rows], seen.src[rows], seen.dst[rows]
+    off = dst == _OFF_ROAD
+    strand = strands.of[-1 - dst]
+    on = np.flatnonzero(strand != 0)
+    on = on[~_repeated((frame[on], src[on], strand[on]))]
+    inside = (frame[on], src[on], strand[on])
+    lane_frame, lane, role = _roles(seen, strands, inside)
+    off_frames = np.unique(frame[off])
+    roots = np.unique(lane_frame)
+    names = ["Root Road", "Off Road", "Lane"]
+    present = np.unique(role)
+    label = first + len(names) + np.searchsorted(present, role)
+    label[role == _NAMELESS] = first + 2
+    names += [role_name(one) if one != _NAMELESS else "Lane" for one in present.tolist()]
+    nodes = [
+        (lane_frame, lane, label),
+        (roots, np.full(len(roots), ROOT_ROAD), np.full(len(roots), first)),
+        (off_frames, np.full(len(off_frames), _OFF_ROAD), np.full(len(off_frames), first + 1)),
+    ]
+    edges = [
+        (inside[0], inside[1], np.full(len(on), is_in), inside[2]),
+        (lane_frame, lane, np.full(len(lane), is_in), np.full(len(lane), ROOT_ROAD)),
+        (frame[off], src[off], np.full(int(off.sum()), is_in), dst[off]),
+    ]
+    return nodes, edges, names
+
+
+_NAMELESS: Final = -(1 << 20)
+"""Role of a lane of which nobody can say how it lies to the ego."""
+
+
+def _roles(seen: Seen, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
+    """The lanes of each frame and their roles: ``(frame, strand, role)``."""
+    frame, src, strand = inside
+    ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
+    present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
+    here_frame = np.concatenate([seen.node_frame[present], frame])
+    here = np.concatenate([strands.of[-1 - seen.node[present]], strand])
+    reached = np.append(np.zeros(len(present), np.bool_), np.ones(len(frame), np.bool_))
+    role = np.full(len(here), OPPOSING)
+    own = ego[here_frame]
+    for one in np.unique(own[own != 0]).tolist():
+        roles = strands.roles(one)
+        known = np.array(sorted(roles))
+        values = np.array([roles[s] for s in known.tolist()])
+        of = np.flatnonzero(own == one)
+        at = np.minimum(np.searchsorted(known, here[of]), len(known) - 1)
+        role[of] = np.where(known[at] == here[of], values[at], OPPOSING)
+    keep = (here != 0) & (reached | (role != OPPOSING))
+    fresh = np.flatnonzero(keep)
+    fresh = fresh[~_repeated((here_frame[fresh], here[fresh]))]
+    here_frame, here, role = here_frame[fresh], here[fresh], role[fresh]
+    return here_frame, here, _numbered(seen, (frame, src, strand), (here_frame, here, role))
+
+
+def _numbered(seen: Seen, inside: Part, lanes: Part) -> Ints:
+    """The roles of lanes, with the opposing ones numbered by the distance of what is in them."""
+    here_frame, here, role = lanes
+    distance, has_ego = _from_ego(seen)
+    rows = np.flatnonzero(role == OPPOSING)
+    if not len(rows):
+        return role
+    order = rows[np.lexsort((here[rows], here_frame[rows]))]
+    frame, src, strand = inside
+    low = int(strand.min())
+    span = 1 - low
+    keys = here_frame[order] * span + (here[order] - low)
+    wanted = frame * span + (strand - low)
+    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    hit = keys[at] == wanted
+    nearest = np.full(len(order), np.inf)
+    np.minimum.at(nearest, at[hit], distance[seen.row_of(frame[hit], src[hit])])
+    ranked = np.lexsort((-here[order], nearest, here_frame[order]))
+    sorted_frame = here_frame[order][ranked]
+    starts = np.searchsorted(sorted_frame, sorted_frame)
+    numbers = OPPOSING + np.arange(len(order)) - starts
+    numbers[~(has_ego & (seen.ego_lane < 0))[sorted_frame]] = _NAMELESS
+    role = role.copy()
+    role[order[ranked]] = numbers
+    return role
+
+
+def _from_ego(seen: Seen) -> tuple[NDArray[np.float64], Bools]:
+    """Distance of each node from the ego in the plane, infinite if unknown; and which frames have an ego."""
+    x, y = (np.full(seen.frames, np.nan) for _ in range(2))
+    ego = np.flatnonzero(seen.is_ego)
+    x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]
+    away = np.hypot(seen.x - x[seen.node_frame], seen.y - y[seen.node_frame])
+    return np.where(np.isfinite(away), away, np.inf), np.isfinite(x + y)
