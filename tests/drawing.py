@@ -211,7 +211,7 @@ def crowd(road_map: Crossing, count: int = 40, seed: int = 3) -> SceneGraph:
         at = {"x": float(road_map.nodes.x[row]), "y": float(road_map.nodes.y[row])}
         nodes[node] = {"kind": kind, "name": name, "is_ego": False, **at}
     nodes[-1] = {"kind": "off_road", "name": "off_road", "is_ego": False}
-    edges.append((0, "isIn", road_map.node("3/0/1"), {"primary": True, "overlap": 1.0}))
+    edges.append((0, "isIn", road_map.node("3/0/1"), {"is_primary": True, "overlap": 1.0}))
     edges.append((count + 3, "controlsTrafficOf", road_map.node("3/0/1"), {}))
     return graph_of(nodes, edges)
 

@@ -130,7 +130,7 @@ def test_an_edge_to_a_node_that_is_not_in_the_graph_is_not_drawn() -> None:
 
 def test_the_lane_of_the_ego_is_the_primary_one() -> None:
     lanes = {n: {"kind": "lane", "name": str(n)} for n in (-2, -3, -4)}
-    edges = [(0, "isIn", n, {"primary": n == -3}) for n in lanes]
+    edges = [(0, "isIn", n, {"is_primary": n == -3}) for n in lanes]
 
     assert ego_lane(graph_of({0: entity("car", 0, 0, is_ego=True), **lanes}, edges)) == -3
 

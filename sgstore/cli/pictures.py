@@ -56,6 +56,9 @@ def show(
     north_up: Annotated[
         bool, typer.Option("--north-up", help="North is up, not the ego's heading.")
     ] = False,
+    graph: Annotated[
+        bool, typer.Option("--graph", help="Beside it the graph as nodes and edges.")
+    ] = False,
 ) -> int:
     """Draw a frame from above; with a QUERY, what it matches there is marked."""
     from sgstore.draw.stored import draw_stored
@@ -71,6 +74,7 @@ def show(
         relations=relations.value,
         radius=radius,
         north_up=north_up,
+        diagram=graph,
     )
     if text and not marked:
         say(f"the query does not match in {frame}: nothing is marked")

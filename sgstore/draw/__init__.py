@@ -37,6 +37,9 @@ _TITLE: Final = 40.0
 _WINDOW: Final = 520.0
 _PANEL: Final = 244.0
 _CELL: Final = 300.0
+_READ_DIAGRAM: Final = (
+    "above: entities, where the ego sees them; below: the map, from left to right"
+)
 _NS_OF_A_YEAR: Final = 31_536_000 * 10**9
 
 
@@ -51,6 +54,7 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
     title: str | None = None,
     relations: Relations = "ego",
     north_up: bool = False,
+    diagram: bool = False,
 ) -> None:
     """Draw a frame from above.
 
@@ -74,6 +78,8 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
         ``ego``: what is near the ego, and all that holds among matched nodes.
     north_up : bool
         Otherwise the ego's heading is up.
+    diagram : bool
+        Beside it the graph as nodes and edges; then there is no camera picture.
 
     Raises
     ------
@@ -83,20 +89,58 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
         If the drawing packages are not installed.
     """
     _check_installed()
-    from sgstore.draw.page import Page, check_format, own_style
-    from sgstore.draw.scene import Scene, paint_scene
+    from sgstore.draw.page import check_format, own_style
+    from sgstore.draw.scene import Scene
 
     check_format(to)
     with own_style():
-        page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE)
         matched = _matched(highlight)
         view = view_of(graph, _checked(radius), matched, north_up=north_up)
         scene = Scene.of(graph, road_map, matched, view, relations)
-        stage = page.stage((_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW), view)
-        unnamed = paint_scene(stage, scene)
-        _paint_title(page, title or title_of(graph), _subtitle(scene, unnamed))
-        _paint_panel(page, scene, stage.half, picture)
-        page.save(to)
+        title = title or title_of(graph)
+        shown = (
+            _diagram_page(scene, title, relations)
+            if diagram
+            else _frame_page(scene, title, picture)
+        )
+        shown.save(to)
+
+
+def _frame_page(scene: Scene, title: str, picture: bytes | None) -> Page:
+    """The view from above, and beside it what a camera saw, what was matched, what is around, the legend."""
+    from sgstore.draw.page import Page
+    from sgstore.draw.scene import paint_scene
+
+    page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE)
+    stage = page.stage((_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW), scene.view)
+    unnamed = paint_scene(stage, scene)
+    _paint_title(page, title, _subtitle(scene, unnamed))
+    _paint_panel(page, scene, stage.half, picture)
+    return page
+
+
+def _diagram_page(scene: Scene, title: str, relations: Relations) -> Page:
+    """The view from above, beside it the graph as nodes and edges, the legend below."""
+    from sgstore.draw.diagram import diagram_entries, paint_diagram
+    from sgstore.draw.legend import entries_of
+    from sgstore.draw.page import Page
+    from sgstore.draw.panel import key_height, paint_key
+    from sgstore.draw.scene import paint_scene
+
+    half = scene.view.radius
+    entries = [e for e in entries_of(scene, (half, half)) if not e.is_long]
+    entries += diagram_entries()
+    foot = key_height(len(entries)) + _MARGIN
+    page = Page(3 * _MARGIN + 2 * _WINDOW, _MARGIN + foot + _WINDOW + _TITLE)
+    bottom, middle = _MARGIN + foot, 2 * _MARGIN + _WINDOW
+    stage = page.stage((_MARGIN, bottom, _MARGIN + _WINDOW, bottom + _WINDOW), scene.view)
+    unnamed = paint_scene(stage, scene)
+    _paint_title(page, title, _subtitle(scene, unnamed))
+    box = (middle, bottom, middle + _WINDOW, bottom + _WINDOW)
+    told = paint_diagram(page, box, scene, relations)
+    _paint_title(page, "Its scene graph", f"{told}  ·  {_READ_DIAGRAM}", left=middle)
+    paint_key(page, entries, (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2))
+    return page
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,12 +298,12 @@ def _subtitle(scene: Scene, unnamed: int) -> str:
     return "  ·  ".join(text for text in told if text)
 
 
-def _paint_title(page: Page, title: str, subtitle: str) -> None:
+def _paint_title(page: Page, title: str, subtitle: str, left: float = _MARGIN) -> None:
     from sgstore.draw.palette import FAINT_INK
 
     top = page.height
-    page.text(_MARGIN, top - 19, clean(title, 110), fontsize=11, weight="bold")
-    page.text(_MARGIN, top - 32, subtitle, fontsize=7.2, color=FAINT_INK)
+    page.text(left, top - 19, clean(title, 110), fontsize=11, weight="bold")
+    page.text(left, top - 32, subtitle, fontsize=7.2, color=FAINT_INK)
 
 
 def _panel_box(page: Page) -> Rect:

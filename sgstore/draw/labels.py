@@ -65,7 +65,7 @@ class Placer:
             for step in _STEPS
             for a in _ROUND
         ]
-        return self._first_free(spots, size)
+        return self.first_free(spots, size)
 
     def along(
         self, a: tuple[float, float], b: tuple[float, float], size: tuple[float, float]
@@ -75,11 +75,12 @@ class Placer:
             (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]))
             for t in (0.55, 0.65, 0.45, 0.75, 0.35)
         ]
-        return self._first_free(spots, size)
+        return self.first_free(spots, size)
 
-    def _first_free(
+    def first_free(
         self, spots: list[tuple[float, float]], size: tuple[float, float]
     ) -> tuple[float, float] | None:
+        """The first of some spots that is free for a text of a size; taken at once."""
         middles = np.array(spots)
         half = np.array(size) / 2
         low, high = middles - half, middles + half

@@ -94,7 +94,7 @@ def _quiet_family(a: object, b: object) -> Family:
 def ego_lane(graph: SceneGraph) -> int | None:
     """The lane that the ego is in above all, or ``None``."""
     lanes = [
-        (not attributes.get("primary", False), dst)
+        (not attributes.get("is_primary", False), dst)
         for src, relation, dst, attributes in graph.edges
         if src == graph.ego
         and relation == "isIn"
@@ -119,6 +119,14 @@ def sentences(link: Link, names: Mapping[int, str]) -> list[str]:
     a, b = (clean(names.get(node) or node, 16) for node in (link.a, link.b))
     there = [f"{b} {', '.join(link.there)} {a}"] if link.there else []
     return there + ([f"{a} {', '.join(link.back)} {b}"] if link.back else [])
+
+
+def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Relations of each pair of nodes ``(a, b)``, most telling first: those from b to a, and those from a to b.
+
+    The ego is ``a``.
+    """
+    return {ends: (_sorted(there), _sorted(back)) for ends, (there, back) in _pairs(graph).items()}
 
 
 def _pairs(graph: SceneGraph) -> dict[tuple[int, int], tuple[list[str], list[str]]]:

@@ -36,6 +36,16 @@ ROAD_EDGE: Final = "#5b7194"
 ENTITY_EDGE: Final = "#b06a9d"
 MIXED_EDGE: Final = "#8a8fa0"
 
+DIAGRAM_TINTS: Final[Mapping[str, str]] = {
+    "lane": "#3f74bd",
+    "crosswalk": "#6f97cf",
+    "off_road": "#8aa3c4",
+    "waypoint": "#6f97cf",
+    "road": "#2c5591",
+    "junction": "#1d3a66",
+}
+"""Nodes of a diagram that are parts of the map; entities have their own colours."""
+
 LANE_TINTS: Final[Mapping[str, str]] = {
     "driving": "#d3d9e2",
     "bidirectional": "#d3d9e2",

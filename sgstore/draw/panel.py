@@ -17,6 +17,7 @@ from sgstore.draw.view import SCENERY, caption, clean, distance
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from sgstore.draw.labels import Rect
     from sgstore.draw.legend import Entry
     from sgstore.draw.page import Page
     from sgstore.draw.scene import Scene
@@ -151,6 +152,23 @@ def paint_legend(panel: Panel, entries: Sequence[Entry]) -> None:
         if entry.is_long:
             panel.y -= ROW
             _paint_entry(panel, entry, panel.left, panel.y)
+
+
+_KEY_COLUMNS: Final = 9
+
+
+def key_height(entries: int) -> float:
+    """Height of a legend that lies under a picture; points."""
+    return ROW * math.ceil(entries / _KEY_COLUMNS)
+
+
+def paint_key(page: Page, entries: Sequence[Entry], box: Rect) -> None:
+    """A legend under a picture: entries in columns, without a heading."""
+    left, _, right, top = box
+    step, down = (right - left) / _KEY_COLUMNS, math.ceil(len(entries) / _KEY_COLUMNS)
+    panel = Panel(page, left, right, 0.0, top)
+    for index, entry in enumerate(entries):
+        _paint_entry(panel, entry, left + step * (index // down), top - ROW * (index % down + 1))
 
 
 def _paint_entry(panel: Panel, entry: Entry, x: float, y: float) -> None:

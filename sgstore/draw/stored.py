@@ -33,6 +33,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     relations: Relations = "ego",
     radius: float | None = None,
     north_up: bool = False,
+    diagram: bool = False,
 ) -> bool:
     """Draw a frame of a store from above.
 
@@ -47,7 +48,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
         What they bind in this frame is marked.
     camera : str, optional
         Channel of the picture to put beside it; by default the first that carries pictures, ``none`` for none.
-    relations, radius, north_up
+    relations, radius, north_up, diagram
         See :func:`sgstore.draw.draw_frame`.
 
     Returns
@@ -68,10 +69,11 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
             map_of(store, ref.trace),
             to,
             highlight=bindings[0] if bindings else {},
-            picture=_picture(store, ref, camera),
+            picture=None if diagram else _picture(store, ref, camera),
             relations=relations,
             radius=radius,
             north_up=north_up,
+            diagram=diagram,
         )
     return bool(bindings)
 
