@@ -4,13 +4,17 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test lint format bench sample clean
+.PHONY: help demo test lint format bench fuzz oracle sample clean
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
 	@echo "make test    format, lint, types and tests"
 	@echo "make lint    format, lint and types only"
 	@echo "make bench   print speeds and sizes, each beside a baseline measured in the same run"
+	@echo "make fuzz    read 100,000 recordings that were hurt on purpose (about half an hour)"
+	@echo "make kill    kill ingest 200 times at random and look whether the stores are whole and equal"
+	@echo "make soak    one writer and eight readers on one store for ten minutes"
+	@echo "make oracle  100,000 random patterns and formulas against exhaustive search (hours)"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -47,6 +51,20 @@ test: lint
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m bench
+
+fuzz: $(VENV)/.dev
+	$(BIN)/python tests/fuzz.py
+
+kill: $(VENV)/.dev
+	$(BIN)/python tests/killing.py 200
+
+soak: $(VENV)/.dev
+	$(BIN)/python tests/soaking.py 600
+
+oracle: $(VENV)/.dev
+	$(BIN)/python tests/oracle_temporal.py 100000
+	$(BIN)/python tests/oracle.py 100000
+	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py
 
 sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py
