@@ -150,13 +150,30 @@ def _sign(span: Span, children: Children) -> s.Expression:
 
 
 def _temporal(span: Span, children: Children) -> s.Temporal:
-    word, _, operand = children
-    return s.Temporal(word.text.upper(), (operand,), Span(span.start, word.span.end))
+    word, bound, operand = children
+    return s.Temporal(word.text.upper(), (operand,), Span(span.start, word.span.end), bound)
 
 
 def _temporal_pair(_: Span, children: Children) -> s.Temporal:
-    left, word, _, right = children
-    return s.Temporal(word.text.upper(), (left, right), word.span)
+    left, word, bound, right = children
+    return s.Temporal(word.text.upper(), (left, right), word.span, bound)
+
+
+def _bound(span: Span, children: Children) -> tuple[Any, Any]:
+    """``[0s, 2s]``, or ``WITHIN 2s``, which begins at once."""
+    (found,) = children
+    if isinstance(found, s.Duration | s.Parameter):
+        return s.Duration(0, "s", span), found
+    low, high = (part.strip() for part in found.text[1:-1].split(","))
+    return _end(low, span), None if high.upper() == "INF" else _end(high, span)
+
+
+def _end(text: str, span: Span) -> s.Duration | s.Parameter:
+    if text.startswith("$"):
+        return s.Parameter(text[1:], span)
+    found = _DURATION.fullmatch(text)
+    assert found is not None, text  # noqa: S101 - the lexer's pattern is narrower
+    return s.Duration(float(found[1]), found[2].lower(), span)
 
 
 def _block_expression(word: str) -> Callable[[Span, Children], s.BlockExpression]:
@@ -315,8 +332,9 @@ def _match(span: Span, children: Children) -> s.Match:
     return s.Match(settings or (), block, late, returns, span)
 
 
-def _check(span: Span, _: Children) -> s.Check:
-    return s.Check(Span(span.start, span.start + 5))
+def _check(span: Span, children: Children) -> s.Check:
+    _, name, *_, formula, _ = children
+    return s.Check(name and name.text, formula, Span(span.start, span.start + 5))
 
 
 def _using(_: Span, children: Children) -> tuple[s.Setting, ...]:
@@ -440,7 +458,7 @@ BUILDERS: Final[dict[str, Callable[[Span, Children], Any]]] = {
     "negation": _logic("NOT"),
     "temporal": _temporal,
     "temporal_pair": _temporal_pair,
-    "bound": _only,
+    "bound": _bound,
     "compare": _compare,
     "equal": _comparison("="),
     "is_null": _null_test(negated=False),

@@ -156,11 +156,15 @@ class BlockExpression:
 
 @dataclass(frozen=True, slots=True)
 class Temporal:
-    """An operator of the temporal layer with its bound and operands."""
+    """An operator of the temporal layer with its operands and its bound: times from and to, or ``None``.
+
+    The upper end of a bound is ``None`` where it is ``INF``.
+    """
 
     word: str
     operands: tuple[Expression, ...]
     span: Span
+    bound: tuple[Duration | Parameter, Duration | Parameter | None] | None = None
 
 
 Expression = (
@@ -349,8 +353,10 @@ class Define:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """``CHECK …``, which belongs to the temporal layer."""
+    """``CHECK name: formula``, which belongs to the temporal layer."""
 
+    name: str | None
+    formula: Expression
     span: Span
 
 
