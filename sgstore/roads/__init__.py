@@ -444,8 +444,10 @@ class RoadMap:
     @cached_property
     def graph(self) -> LaneGraph:
         """Distances and routes along the lanes, which are counted from 0."""
+        among = (self.edges.src >= _FIRST_LANE - self._lanes + 1) & (self.edges.src <= _FIRST_LANE)
         flow, change = (
-            self.edges.relation == RELATION_CODE[name] for name in ("travelsTo", "laneChange")
+            among & (self.edges.relation == RELATION_CODE[name])
+            for name in ("travelsTo", "laneChange")
         )
         return LaneGraph(
             self.ribbons.lengths,
