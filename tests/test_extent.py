@@ -235,6 +235,40 @@ def test_a_block_of_one_frame_has_the_same_range(of: Range) -> None:
         assert (areas.parts(town())[0] == whole.parts(town())[i]).all()
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("of", [of for of in SHAPES.values() if of.shape != "corridor"])
+def test_a_range_stays_when_the_world_is_moved_and_turned(of: Range, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    egos = places(seed)
+    frame, boxes = boxes_around(egos, seed)
+    held = Extent(of, None).areas(egos).hold(frame, boxes, np.zeros(len(frame)))
+    (dx, dy), turn = rng.uniform(-3000, 3000, 2), rng.uniform(-9, 9)
+
+    def moved(x: Any, y: Any) -> tuple[Any, Any]:
+        cos, sin = math.cos(turn), math.sin(turn)
+        return dx + x * cos - y * sin, dy + x * sin + y * cos
+
+    there = Places(*moved(egos.x, egos.y), egos.heading + turn, egos.ground)
+    boxes[:, 0], boxes[:, 1] = moved(boxes[:, 0], boxes[:, 1])
+    boxes[:, 2] += turn
+
+    again = Extent(of, None).areas(there).hold(frame, boxes, np.zeros(len(frame)))
+
+    assert again.tolist() == held.tolist()
+
+
+@shapes
+@pytest.mark.parametrize("far", [1e12, 1e200, 1e308, -1.7e308])
+def test_absurd_positions_are_far_from_everything_else(of: Range, far: float) -> None:
+    egos = Places(*(np.array([value]) for value in (far, 0.0, 1.0, 0.0)))
+    with np.errstate(over="ignore", invalid="ignore"):  # as the generator has it
+        areas = Extent(of, town()).areas(egos)
+        held = areas.hold(np.array([0]), np.array([[0.0, 0, 0, 4, 2]]), np.zeros(1))
+
+        assert not held.any()
+        assert not areas.parts(town()).any()
+
+
 def test_a_corridor_without_a_map_runs_straight_ahead() -> None:
     config = configured(range={"shape": "corridor", "width": 4, "length": 30})
     things = [thing("ego"), thing("ahead", 31), thing("behind", -6), thing("aside", 10, 3.1)]

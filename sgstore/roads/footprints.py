@@ -250,7 +250,7 @@ class LaneIndex:
         low, high = (centre - reach)[:, rows], (centre + reach)[:, rows]
         top = grid.origin + grid.shape * grid.cell
         first = np.maximum(grid.cells(np.minimum(low, top)), 0)
-        last = np.minimum(grid.cells(np.maximum(high, grid.origin - 1.0)), grid.shape - 1)
+        last = np.minimum(grid.cells(np.clip(high, grid.origin - 1.0, top)), grid.shape - 1)
         total = np.cumsum(np.maximum(last - first + 1, 0).prod(axis=0))
         cuts = np.searchsorted(total, np.arange(_CHUNK, total[-1] + _CHUNK, _CHUNK)) + 1
         for begin, end in pairwise([0, *np.unique(cuts).tolist()]):
