@@ -66,7 +66,6 @@ _ROADSCENE2VEC: Final = Config(
     proximity=Proximity(
         names=("near_coll", "super_near", "very_near", "near", "visible"),
         upper=(4.0, 7.0, 10.0, 16.0, 25.0),
-        between="origins",
     ),
     direction=Direction(ties="both"),
     pairs=Pairs(
@@ -74,7 +73,10 @@ _ROADSCENE2VEC: Final = Config(
         ego_within=25.0,
         kinds=tuple(
             ("Ego", label)
-            for label in ("Car", "Motorcycle", "Bicycle", "Person", "TrafficLight", "Sign")
+            for label in (
+                *("Car", "Truck", "Van", "Bus", "Trailer"),
+                *("Motorcycle", "Bicycle", "Person", "Signal"),
+            )
         ),
     ),
     sees=False,
@@ -100,8 +102,10 @@ _OF_CARLASGG: Final = """\
 
 _OF_ROADSCENE2VEC: Final = """\
 * On a bound of two directions both hold. Of the distances one holds, the nearest, as there.
-* Relations of the ego alone, with what RoadScene2Vec knows: cars, motorcycles, bicycles, people, lights
-  and signs, up to 25 m.
+* Relations of the ego alone, up to 25 m, with what RoadScene2Vec knows: cars (whatever is as large),
+  motorcycles, bicycles, people, lights and signs.
+* The settings are those of relations. Its three lanes, and left and right by them, are what the abstraction
+  `roadscene2vec` makes of any graph, ingested with whatever settings.
 """
 
 PRESETS: Final[Mapping[str, Preset]] = {
