@@ -46,7 +46,17 @@ if TYPE_CHECKING:
 TOWNS = ("Town01", "Town02", "Town07")
 RECORDED = {"Town04": "esmini/swarm_Town04.mcap", "Town10HD": "sumo/Town10HD_sumo_osi.mcap"}
 """Towns whose maps stand in recordings."""
+ESMINI = ("e6mini", "fabriksgatan", "multi_intersections", "soderleden", "straight_500m", "tunnels")
+"""Maps of esmini; of ``parking_demo`` LibCarla makes places that are no numbers."""
+APART = {
+    ("soderleden", "lane_successors"): "LibCarla knows no direct junctions",
+    ("tunnels", "lane_changes"): "LibCarla lets solid lines be crossed that have no laneChange",
+    ("multi_intersections", "signals"): "LibCarla turns orientations round, and loses signals",
+}
+"""Where LibCarla leaves the standard: map and test."""
 SPACING = 1.0
+NARROW = 1e-3
+"""A lane that is no wider is there, but nothing is in it; m."""
 
 
 def generated() -> str:
@@ -187,12 +197,15 @@ def both(source: Path | str) -> tuple[RoadMap, Any]:
     params=[
         *GENERATED,
         "sample",
-        *(pytest.param(town, marks=pytest.mark.data) for town in (*TOWNS, *RECORDED)),
+        *(pytest.param(town, marks=pytest.mark.data) for town in (*TOWNS, *RECORDED, *ESMINI)),
     ]
 )
 def maps(request: pytest.FixtureRequest) -> tuple[RoadMap, Any]:
     """A map as we and as LibCarla read it."""
     name = request.param
+    for (other, test), reason in APART.items():
+        if name == other and request.function.__name__.startswith(f"test_{test}"):
+            pytest.skip(reason)
     if name in GENERATED:
         return both(name)
     if name == "sample":
@@ -248,7 +261,7 @@ def test_centre_lines_widths_and_headings_are_those_of_carla(maps: tuple[RoadMap
 def test_a_random_point_is_in_its_own_lane(maps: tuple[RoadMap, Any]) -> None:
     road_map, peer = maps
     rng = np.random.default_rng(7)
-    every = peer.generate_waypoints(0.25)
+    every = [w for w in peer.generate_waypoints(0.25) if w.lane_width > NARROW]
     chosen = [every[i] for i in rng.integers(0, len(every), 2000)]
     theirs = places_of(chosen)
     aside = rng.uniform(-0.4, 0.4, len(chosen)) * [w.lane_width for w in chosen]
@@ -280,7 +293,7 @@ def test_a_random_point_is_in_its_own_lane(maps: tuple[RoadMap, Any]) -> None:
 def test_what_carla_takes_for_the_lane_of_a_point_is_among_ours(maps: tuple[RoadMap, Any]) -> None:
     road_map, peer = maps
     rng = np.random.default_rng(8)
-    every = peer.generate_waypoints(0.5)
+    every = [w for w in peer.generate_waypoints(0.5) if w.lane_width > NARROW]
     chosen = [every[i] for i in rng.integers(0, len(every), 500)]
     theirs = places_of(chosen)
     boxes = np.column_stack((theirs[:, :2], np.zeros((len(chosen), 3))))
@@ -290,7 +303,9 @@ def test_what_carla_takes_for_the_lane_of_a_point_is_among_ours(maps: tuple[Road
     rows = lanes_by_name(road_map)
     found = set(zip(hits.row.tolist(), (-2 - hits.lane).tolist(), strict=True))
     answers = [peer.get_waypoint(w.transform.location) for w in chosen]
-    assert np.mean([(i, rows[name_of(w)]) in found for i, w in enumerate(answers)]) >= 0.999
+    wide = [(i, w) for i, w in enumerate(answers) if w.lane_width > NARROW]
+    # Where lanes narrow, LibCarla has been seen to answer with one that is two metres away.
+    assert np.mean([(i, rows[name_of(w)]) in found for i, w in wide]) >= 0.998
 
 
 def test_lane_successors_are_identical(maps: tuple[RoadMap, Any]) -> None:
@@ -378,7 +393,7 @@ def covers(road_map: RoadMap, lane: int, s: float) -> bool:
 def test_crosswalks_have_the_corners_of_carla(maps: tuple[RoadMap, Any]) -> None:
     road_map, peer = maps
     theirs = {(round(p.x, 2), round(-p.y, 2)) for p in peer.get_crosswalks()}
-    if not theirs:
+    if not theirs and "<outlines>" in road_map.text:
         pytest.skip("LibCarla sees no crosswalk: it knows no <outlines>")
     shapes = road_map.outlines()
 

@@ -51,7 +51,7 @@ _ROUNDS: Final = 8
 
 
 _KEPT: Final = 4
-"""Maps that are kept: one of 30 MB of text and 12,000 lanes takes 95 MB, a town a tenth of it."""
+"""Maps that are kept: one of 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth of it."""
 
 
 @lru_cache(maxsize=_KEPT)
