@@ -10,12 +10,16 @@ from conftest import REPOSITORY
 from sgstore.cli import run
 from sgstore.config import Config, configured, from_dict, preset
 from sgstore.ingest import ingest
+from sgstore.ingest.maps import Maps
 from sgstore.query import Store
 from sgstore.store import StoreFile
-from sgstore.vocabulary import TypeMeaning
+from sgstore.traces import open_trace
+from sgstore.vocabulary import KIND_CODE, TypeMeaning
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from sgstore.roads import RoadMap
 
 SAMPLE = REPOSITORY / "sgstore/sample/town.mcap"
 
@@ -80,3 +84,17 @@ def test_graphs_in_a_store_have_the_range_that_was_asked_for(tmp_path: Path, of:
     assert behind > (-4 if of == "rectangle" else -9)
     assert before <= (30 if of == "rectangle" else 100) + 6
     assert aside <= (9 if of == "rectangle" else 100) + 6
+
+
+def test_signs_of_a_recordings_own_map_are_what_the_client_says() -> None:
+    config = Config(types={"306": TypeMeaning("yield_sign"), "TYPE_CAR": TypeMeaning("bus")})
+    with open_trace(SAMPLE) as trace:
+        plain, told = (Maps(None, signs).of(trace.info)[0] for signs in ((), config.signs))
+    assert plain is not None
+    assert told is not None
+
+    def count(of: RoadMap) -> int:
+        return int((of.nodes.kind == KIND_CODE["yield_sign"]).sum())
+
+    assert (count(plain), count(told)) == (1, 2)
+    assert plain.digest != told.digest
