@@ -22,6 +22,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -464,6 +465,7 @@ def read_whole(trace: Any) -> str:
 def run(flavours: list[str], runs: int, seed: int, keep: Path) -> dict[str, dict[str, int]]:
     """Try cases of each flavour; a file that fails is kept."""
     endings: dict[str, dict[str, int]] = {}
+    warnings.simplefilter("error")
     with tempfile.TemporaryDirectory() as folder:
         for flavour in flavours:
             counts = endings.setdefault(flavour, {})

@@ -1223,3 +1223,17 @@ def test_one_malformed_object_does_not_cost_the_others(tmp_path: Path) -> None:
     assert len(of(blocks, "2")) == 2
     (loss,) = report.losses
     assert "a moving object cannot be read" in loss.reason
+
+
+def test_numbers_that_nothing_on_earth_has_are_missing_and_counted(tmp_path: Path) -> None:
+    fast = car(1, v=(1e300, math.inf), a=(1e9, 3.0))
+    large = house(50)
+    large.base.dimension.length = 1e200
+    _, blocks, report = read(
+        record(tmp_path / "a.mcap", [{"moving": [fast], "houses": [large]}] * 2)
+    )
+
+    assert np.isnan(of(blocks, "1").vx).all()
+    assert of(blocks, "1").ay.tolist() == [3.0]
+    assert np.isnan(blocks[0].scenery.length).all()
+    assert "4 numbers of 1e+09 and more are taken as missing" in report.warnings

@@ -94,10 +94,15 @@ class Roster:
     ----------
     report : TraceReport
         Takes up the type names that nothing maps.
+    size : int
+        How many there are.
+    absurd : int
+        Numbers that nothing on earth has, in states and poses.
     """
 
     report: TraceReport
     size: int = 0
+    absurd: int = 0
     _first: int = 0
     _rows: list[tuple[str, int, str, str, str, bool, str]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
     _poses: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
@@ -167,6 +172,9 @@ class Roster:
         )
         nodes = [node for node in range(self._first, upto) if node in self._poses]
         values = np.array([self._poses.pop(node) for node in nodes], np.float64)
+        absurd = np.abs(values) >= FAR
+        self.absurd += int(absurd.sum())
+        values[absurd] = np.nan
         self._first = upto
         return entities, _states(np.array(nodes, np.int64), values.reshape(-1, len(POSE)))
 
@@ -237,7 +245,7 @@ def assemble(
                 continue
             window = size + (first > 0)
             if len(done) + len(raw) > window:  # the frame behind the block is complete now, too
-                done += decoder.complete(raw)
+                done += _on_earth(decoder.complete(raw), decoder.roster)
                 yield _block(first, done, size, block_refs, decoder.roster.take(known))
                 first, done, raw = first + size, done[-2:], []
                 window = size + 1
@@ -247,11 +255,14 @@ def assemble(
                 block_refs, open_refs = open_refs, []
             raw.append(frame)
         open_refs.append(refs(run.span(start, len(run))))
-    done += decoder.complete(raw)
+    done += _on_earth(decoder.complete(raw), decoder.roster)
     if len(done) - (first > 0) > size:
         yield _block(first, done, size, block_refs, decoder.roster.take(known))
         first, done = first + size, done[-2:]
     left = len(done) - (first > 0)
+    if decoder.roster.absurd:
+        words = f"{decoder.roster.absurd} numbers of {FAR:g} and more are taken as missing"
+        decoder.roster.report.warnings.append(words)
     if left:
         yield _block(first, done, left, open_refs, decoder.roster.take(decoder.roster.size))
 
@@ -293,7 +304,7 @@ def _block(
         np.concatenate([frame.node for frame in window]),
         np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
         np.array([frame.time_ns for frame in window], np.int64),
-        _finite(np.concatenate([frame.values for frame in window])),
+        np.concatenate([frame.values for frame in window]),
         np.concatenate([frame.light_state for frame in window]) >= 0,
         rows,
     )
@@ -325,9 +336,14 @@ def _block(
     )
 
 
-def _finite(values: Floats) -> Floats:
-    values[np.isinf(values)] = np.nan
-    return values
+def _on_earth(frames: list[FrameRows], roster: Roster) -> list[FrameRows]:
+    """The same frames without numbers that nothing on earth has; they are counted, and missing from now on."""
+    for frame in frames:
+        absurd = np.abs(frame.values) >= FAR
+        if absurd.any():
+            roster.absurd += int(absurd.sum())
+            frame.values[absurd] = np.nan
+    return frames
 
 
 def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> dict[str, Floats]:
