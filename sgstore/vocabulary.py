@@ -93,6 +93,44 @@ RELATION_ALIASES: Final[Mapping[str, str]] = {
 }
 """``safe_hazard`` is the spelling of CARLASGG's documentation and of SceneFlow."""
 
+LANE_TYPES: Final = (
+    *(
+        "none",
+        "driving",
+        "stop",
+        "shoulder",
+        "biking",
+        "sidewalk",
+        "walking",
+        "border",
+        "restricted",
+    ),
+    *(
+        "parking",
+        "bidirectional",
+        "median",
+        "special1",
+        "special2",
+        "special3",
+        "roadWorks",
+        "tram",
+    ),
+    *(
+        "rail",
+        "entry",
+        "exit",
+        "offRamp",
+        "onRamp",
+        "connectingRamp",
+        "slipLane",
+        "bus",
+        "taxi",
+        "HOV",
+    ),
+    *("mwyEntry", "mwyExit", "curb", "shared", "roadMarks"),
+)
+"""Types of lanes. (ASAM OpenDRIVE 1.4 to 1.8, ``e_laneType``.)"""
+
 LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
 """What a traffic light shows. ``flashing``: a bulb that flashes, whatever its colour."""
 

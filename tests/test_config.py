@@ -142,6 +142,10 @@ def test_a_config_survives_json_and_toml(tmp_path: Path, config: Config) -> None
         ("[range]\nheight = [2, -2]", "expected nothing, or [lowest, highest]"),
         ("[range]\ngrade = -0.1", "setting 'range.grade' is -0.1; expected 0 or more"),
         ("[lanes]\ngranularity = 'road'", "expected 'none', 'lane' or 'waypoint'"),
+        (
+            "[lanes]\ntypes = ['drivin']",
+            "setting 'lanes.types' is 'drivin'; expected 'driving', perhaps",
+        ),
         ("[lanes]\nspacing = 0", "expected a length of 0.1 or more"),
         ("[proximity]\nbetween = 'edges'", "expected 'centres', 'origins' or 'footprints'"),
         ("[direction]\nties = 'left'", "expected 'ahead', 'both' or 'carlasgg'"),

@@ -16,8 +16,8 @@ from opendrive_maps import a_map, a_road, cubic, lane, line, link, section
 
 from sgstore.config import Config, Lanes, Pairs, Range, configured
 from sgstore.opendrive import read_map
-from sgstore.opendrive.nodes import DRIVING
 from sgstore.relations.extent import STEP, Extent, Places
+from sgstore.roads.lanetypes import DRIVING
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.vocabulary import KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
 

@@ -15,6 +15,7 @@ from sgstore.errors import ConfigError
 from sgstore.vocabulary import (
     DIRECTIONS,
     ENTITY_KINDS,
+    LANE_TYPES,
     PROXIMITY,
     RELATIONS,
     SIGNALS,
@@ -150,6 +151,9 @@ class Lanes:
         check(known, "lanes.ahead", self.ahead, "a length of 0 or more, in metres")
         right = self.granularity in GRANULARITIES
         check(right, "lanes.granularity", self.granularity, one_of(GRANULARITIES))
+        known_types = {name.lower() for name in LANE_TYPES}
+        for name in self.types:
+            check(name.lower() in known_types, "lanes.types", name, _expected(name, LANE_TYPES))
         right = 0.1 <= self.spacing <= MOST_LENGTH
         check(right, "lanes.spacing", self.spacing, "a length of 0.1 or more, in metres")
 

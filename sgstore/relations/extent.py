@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import gap, gap_to_points
-from sgstore.opendrive.nodes import DRIVING
 from sgstore.relations.scene import joined, spread
+from sgstore.roads.lanetypes import DRIVING
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
