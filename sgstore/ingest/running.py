@@ -16,7 +16,7 @@ from sgstore.config import Config
 from sgstore.errors import SgstoreError
 from sgstore.ingest.jobs import Job
 from sgstore.ingest.maps import Maps
-from sgstore.ingest.outcomes import Progress
+from sgstore.ingest.outcomes import Progress, TraceOutcome
 from sgstore.ingest.parts import Part
 from sgstore.ingest.reading import Reading
 from sgstore.ingest.workers import Workers
@@ -26,7 +26,6 @@ from sgstore.world import BUCKET_FRAMES
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from sgstore.ingest.outcomes import TraceOutcome
     from sgstore.ingest.reading import View
 
 BLOCK_FRAMES: Final = 2 * BUCKET_FRAMES
@@ -158,7 +157,8 @@ class _Run:
             sealed = Sealed.read(view.sealed)
             name = store.has(sealed, as_it_is=not self._job.force)
             if name is not None and not self._job.force:  # the same recording twice in one run
-                outcome.status, outcome.name = "present", name
+                known = (outcome.path, "present", name, outcome.ego, outcome.frames)
+                view.outcome = TraceOutcome(*known, seconds=outcome.seconds)
                 return
             outcome.name = store.publish(sealed, replace=self._job.force)
             outcome.status = "added" if name is None else "replaced"

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -41,6 +42,7 @@ class _Worker:
 
     process: subprocess.Popen[str]
     tasks: deque[int] = field(default_factory=deque[int])
+    listener: threading.Thread | None = None
 
     def tell(self, values: dict[str, Any]) -> None:
         stdin = self.process.stdin
@@ -50,6 +52,18 @@ class _Worker:
                 stdin.flush()
             except OSError:  # it has died: that is told where its stdout ends
                 return
+
+    def end(self) -> int:
+        """End the process if it still runs; its exit code."""
+        self.process.kill()
+        code = self.process.wait()
+        if self.listener is not None:
+            self.listener.join()
+        for pipe in (self.process.stdin, self.process.stdout):
+            with suppress(OSError):  # what was not written is for nobody
+                if pipe is not None:
+                    pipe.close()
+        return code
 
 
 class Workers:
@@ -84,7 +98,7 @@ class Workers:
         for worker in self._workers:
             worker.process.kill()
         for worker in self._workers:
-            worker.process.wait()
+            worker.end()
 
     def read(self, paths: list[Path], folder: Path) -> Iterator[list[View]]:
         """What became of each recording, in order; segments are built in folders below the one given."""
@@ -120,7 +134,8 @@ class Workers:
             )
             worker = _Worker(process)
             self._workers.append(worker)
-            threading.Thread(target=self._listen, args=(worker,), daemon=True).start()
+            worker.listener = threading.Thread(target=self._listen, args=(worker,), daemon=True)
+            worker.listener.start()
             worker.tell(self._job.as_dict())
 
     def _listen(self, worker: _Worker) -> None:
@@ -144,7 +159,7 @@ class Workers:
     ) -> None:
         """A process has died: what it was reading has failed, what it should have read next is still to do."""
         self._workers.remove(worker)
-        code = worker.process.wait()
+        code = worker.end()
         if worker.tasks:
             index = worker.tasks.popleft()
             reason = f"the process that read it ended unexpectedly (code {code}); is there too little memory?"

@@ -1,0 +1,137 @@
+"""One writer and eight readers on one store, for a while: nobody meets a lock, and nobody sees half a trace.
+
+::
+
+    python tests/soaking.py 600        # how many seconds
+
+The writer reads recordings in, replaces them and takes them out; the readers ask what must hold of whole
+traces.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from recordings import drive
+
+from sgstore.ingest import ingest
+
+READERS = 8
+
+WRITER = """
+import sys, time
+from sgstore.ingest import ingest
+from sgstore.store import StoreFile
+store, seconds, *paths = sys.argv[1:]
+end, written, slowest = time.monotonic() + float(seconds), 0, 0.0
+print("begun", flush=True)
+while time.monotonic() < end:
+    path = paths[written % len(paths)]
+    start = time.monotonic()
+    (outcome,) = ingest(store, [path], force=True)
+    assert outcome.status in ("added", "replaced"), outcome
+    if written % 3 == 2:
+        StoreFile(store).remove(outcome.name)
+    slowest = max(slowest, time.monotonic() - start)
+    written += 1
+print(written, slowest)
+"""
+
+READER = """
+import sys, time
+import sgstore
+from sgstore.store import StoreFile
+store, seconds = sys.argv[1:]
+WHOLE = '''
+SELECT (SELECT coalesce(sum(frames), 0) FROM trace) = (SELECT count(*) FROM frame),
+       (SELECT coalesce(sum(rows), 0) FROM manifest WHERE "table" = 'state') = (SELECT count(*) FROM state),
+       (SELECT coalesce(sum(rows), 0) FROM manifest WHERE "table" = 'edge') = (SELECT count(*) FROM edge),
+       (SELECT count(*) FROM edge WHERE bucket NOT IN (SELECT bucket FROM bucket)) = 0
+'''
+file = StoreFile(store)
+end, reads, slowest = time.monotonic() + float(seconds), 0, 0.0
+print("begun", flush=True)
+while time.monotonic() < end:
+    start = time.monotonic()
+    assert file.rows(WHOLE).values == [(True, True, True, True)]
+    opened = sgstore.open(store)
+    with opened.file.snapshot():
+        count = opened.find("MATCH (e:Ego)-[:near|visible|very_near]->(v)").count()
+        again = opened.find("MATCH (e:Ego)-[:near|visible|very_near]->(v)").count()
+    assert count == again
+    slowest = max(slowest, time.monotonic() - start)
+    reads += 1
+print(reads, slowest)
+"""
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """What came of it: how often was written and read, and how long the slowest of each took; s."""
+
+    written: int
+    read: int
+    slowest_write: float
+    slowest_read: float
+
+
+def soak(folder: Path, seconds: float, readers: int = READERS) -> Soaked:
+    """Let a writer and readers use one store.
+
+    Raises
+    ------
+    AssertionError
+        One of them met an error, or saw half a trace.
+    """
+    paths = [drive(folder / f"d{i}.mcap", frames=40 + 30 * i) for i in range(5)]
+    store = folder / "s.db"
+    ingest(store, paths[:1])
+    arguments = [str(store), str(seconds)]
+    runs = [_begun(READER, *arguments) for _ in range(readers)]
+    runs.append(_begun(WRITER, *arguments, *map(str, paths)))
+    told: list[tuple[int, float]] = []
+    for run in runs:
+        output, errors = run.communicate(timeout=seconds + 120)
+        assert run.returncode == 0, errors
+        count, slowest = output.split()[-2:]
+        told.append((int(count), float(slowest)))
+    *read, (written, slowest_write) = told
+    assert all(count for count, _ in read)
+    return Soaked(
+        written,
+        sum(count for count, _ in read),
+        slowest_write,
+        max(slowest for _, slowest in read),
+    )
+
+
+def _begun(code: str, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def main() -> None:
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 600
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        soaked = soak(Path(folder), seconds)
+        spent = time.perf_counter() - start
+    print(
+        f"{spent:.0f} s, {READERS} readers: {soaked.read} reads (slowest {soaked.slowest_read:.2f} s), "
+        f"{soaked.written} writes (slowest {soaked.slowest_write:.2f} s), no error"
+    )
+
+
+if __name__ == "__main__":
+    main()
