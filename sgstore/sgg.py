@@ -30,6 +30,7 @@ from sgstore.relations.keeping import Keeping, renamed
 from sgstore.relations.pairs import near_pairs, related_pairs
 from sgstore.relations.scene import Bodies, Scene
 from sgstore.relations.survey import Survey
+from sgstore.relations.waypoints import waypoints_of
 from sgstore.vocabulary import RELATIONS as VOCABULARY
 from sgstore.world import States
 
@@ -76,8 +77,10 @@ class SceneGraphGenerator:
     def __init__(self, road_map: RoadMap | None, config: Config) -> None:
         self._config = config
         self._road_map = road_map
+        waypoints = waypoints_of(road_map, config.lanes)
+        road_map = road_map if waypoints is None else waypoints.road_map
         self._online: Online | None = None
-        self._survey = None if road_map is None else Survey(road_map, config.lanes.ahead)
+        self._survey = None if road_map is None else Survey(road_map, config.lanes.ahead, waypoints)
         self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
         self._extent = Extent(config.range, road_map)
         self._keeping = Keeping(config, road_map)
@@ -270,6 +273,8 @@ class SceneGraphGenerator:
 
 def map_of_graphs(road_map: RoadMap | None, config: Config) -> RoadMap | None:
     """The map whose nodes and static edges are those of the graphs that a config makes: the one to store."""
+    waypoints = waypoints_of(road_map, config.lanes)
+    road_map = road_map if waypoints is None else waypoints.road_map
     if road_map is None or config.lanes.sections:
         return road_map
     return road_map.without_sections

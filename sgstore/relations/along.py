@@ -33,7 +33,7 @@ class Centrelines:
         self._squared = np.where(squared > 0, squared, 1.0)
 
     def along(self, lane: Ints, x: Floats, y: Floats) -> Floats:
-        """Length of the centre line from the lane's start up to its point that is nearest to a place.
+        """Length of the centre line from the lane's start up to the foot of the perpendicular from a place.
 
         Parameters
         ----------
@@ -45,7 +45,8 @@ class Centrelines:
         Returns
         -------
         (N,) float64
-            m, from 0 to the length of the lane. Of several nearest points the first counts.
+            m. The foot is the nearest point, of several the first; where that is an end of the lane, it is
+            where the lane would be if it went straight on: below 0, or above its length.
         """
         count = self._count[lane]
         found = np.empty(len(lane))
@@ -59,8 +60,8 @@ class Centrelines:
             return np.zeros(len(first))
         run_x, run_y = self._run_x[piece], self._run_y[piece]
         away_x, away_y = x[owner] - self._x[piece], y[owner] - self._y[piece]
-        share = (away_x * run_x + away_y * run_y) / self._squared[piece]
-        share = np.minimum(np.maximum(share, 0.0), 1.0)
+        onward = (away_x * run_x + away_y * run_y) / self._squared[piece]
+        share = np.minimum(np.maximum(onward, 0.0), 1.0)
         squared = (away_x - share * run_x) ** 2 + (away_y - share * run_y) ** 2
         starts = np.cumsum(count) - count
         least = np.repeat(np.minimum.reduceat(squared, starts), count)
@@ -69,4 +70,5 @@ class Centrelines:
         _, at = np.unique(owner[nearest], return_index=True)
         at = nearest[at]
         before, after = self._along[piece[at]], self._along[piece[at] + 1]
-        return before + share[at] * (after - before)
+        out = ((at == starts) & (onward[at] < 0)) | ((at == starts + count - 1) & (onward[at] > 1))
+        return before + np.where(out, onward[at], share[at]) * (after - before)

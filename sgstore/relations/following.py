@@ -90,7 +90,8 @@ def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
     own = (hits.primary & (turned < np.pi / 2)) | (beside & within & (turned <= SAME_WAY))
     known = IS_VEHICLE[bodies.kind] & ~np.isnan(bodies.heading)
     kept = np.flatnonzero(own & net.traffic[lane] & known[hits.row])
-    row, lane, along = hits.row[kept], lane[kept], standing.along[kept]
+    row, lane = hits.row[kept], lane[kept]
+    along = np.clip(standing.along[kept], 0, net.lengths[lane])
     key = bodies.frame[row] * len(net.lengths) + lane
     order = np.lexsort((bodies.node[row], along, key))
     return OwnLanes(key[order], row[order], lane[order], along[order])

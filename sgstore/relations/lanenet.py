@@ -46,8 +46,8 @@ class LaneNet:
         names = {name: number for number, name in enumerate(dict.fromkeys(nodes.junction))}
         numbers = [names[name] if name else -1 for name in nodes.junction[lanes]]
         self.junction = np.array(numbers, np.int64)
-        flow = edges.relation == RELATION_CODE["travelsTo"]
-        src, dst = -2 - edges.src[flow], -2 - edges.dst[flow]
+        flow = (edges.relation == RELATION_CODE["travelsTo"]) & (edges.src >= -1 - count)
+        src, dst = -2 - edges.src[flow], -2 - edges.dst[flow]  # waypoints have ways of their own
         order = np.lexsort((dst, src))
         self._next = dst[order]
         self._first = np.searchsorted(src[order], np.arange(count + 1))

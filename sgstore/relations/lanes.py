@@ -1,4 +1,4 @@
-"""What bodies stand on: lanes of any type, crosswalks, or nothing that is made for driving.
+"""What bodies stand on: lanes of any type, waypoints, crosswalks, or nothing that is made for driving.
 
 A footprint is in every lane that it meets on its storey; how far, and which of them is the one above all, are
 attributes that go beside the edges (:class:`sgstore.graph.LaneStates`). What stands on no driving lane is in
@@ -29,12 +29,10 @@ def _edges(scene: Scene) -> Edges:
     if ground is None:
         raise ValueError("lanes need a map")
     standing = ground.standing
-    walkers, crosswalks = standing.crosswalks
-    rows = np.concatenate([standing.hits.row, walkers, standing.off_road])
+    at, parts = standing.parts
+    rows = np.concatenate([standing.hits.row, at, standing.off_road])
     nowhere = np.full(len(standing.off_road), OFF_ROAD)
-    return edges_to_map(
-        scene, "isIn", rows, np.concatenate([standing.hits.lane, crosswalks, nowhere])
-    )
+    return edges_to_map(scene, "isIn", rows, np.concatenate([standing.hits.lane, parts, nowhere]))
 
 
 LANES = Family(_names, needs_map=True, edges=_edges)

@@ -104,28 +104,28 @@ class Standing:
     hits : LaneHits
         Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Signals touch none.
     along : float64
-        For each hit the place of the body's centre along the lane; m.
-    crosswalks : tuple of int64 arrays
-        Rows of :class:`Bodies`, ascending, and node ids of the crosswalks that they touch.
+        For each hit the place of the body's centre along the lane, beyond its ends too; m.
+    parts : tuple of int64 arrays
+        Rows of :class:`Bodies`, ascending, and node ids of the crosswalks and waypoints that they are at.
     off_road : intp array
         Rows of the bodies that touch no driving lane, ascending.
     """
 
     hits: LaneHits
     along: Floats
-    crosswalks: tuple[Ints, Ints]
+    parts: tuple[Ints, Ints]
     off_road: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
         """The same of some of the bodies; ``place`` (N,): their new rows, -1 for those left out."""
-        hits, (walkers, crosswalks) = self.hits, self.crosswalks
-        kept, walking = place[hits.row] >= 0, place[walkers] >= 0
+        hits, (rows, nodes) = self.hits, self.parts
+        kept, there = place[hits.row] >= 0, place[rows] >= 0
         columns = {column.name: getattr(hits, column.name)[kept] for column in fields(hits)}
         off_road = place[self.off_road]
         return Standing(
             replace(hits, **(columns | {"row": place[columns["row"]]})),
             self.along[kept],
-            (place[walkers[walking]], crosswalks[walking]),
+            (place[rows[there]], nodes[there]),
             off_road[off_road >= 0],
         )
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.relations.extent import Areas
+    from sgstore.relations.waypoints import Waypoints
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Entities, Floats, Ints, States
 
@@ -47,6 +48,8 @@ class Survey:
     road_map : RoadMap
     ahead : float
         How far along the lanes is looked; m.
+    waypoints : Waypoints, optional
+        Those of the map, where it has any.
 
     Notes
     -----
@@ -54,9 +57,10 @@ class Survey:
     the last block: its memory grows with the number of distinct entities, not with time.
     """
 
-    def __init__(self, road_map: RoadMap, ahead: float) -> None:
+    def __init__(self, road_map: RoadMap, ahead: float, waypoints: Waypoints | None = None) -> None:
         nodes, lines = road_map.nodes, Centrelines(road_map.ribbons)
         self._map = road_map
+        self._waypoints = waypoints
         self._ahead = ahead
         self._net = LaneNet(road_map)
         self._reach = SignalReach(road_map, self._net, lines, ahead)
@@ -107,14 +111,19 @@ class Survey:
 
     def standing(self, bodies: Bodies) -> Standing:
         """What the bodies of a block stand on; asked once for each block."""
-        hits, along, crosswalks = self._footing.of(bodies)
+        hits, along, parts = self._footing.of(bodies)
+        if self._waypoints is not None:
+            rows, nodes = self._waypoints.of(hits, along, bodies)
+            rows, nodes = np.concatenate([parts[0], rows]), np.concatenate([parts[1], nodes])
+            order = np.argsort(rows, kind="stable")
+            parts = rows[order], nodes[order]
         stands: Bools = np.zeros(len(bodies), np.bool_)
         stands[hits.row[self._driving[-1 - hits.lane]]] = True
         placed = np.isfinite(bodies.x) & np.isfinite(bodies.y)
         off_road = np.flatnonzero(
             ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
         )
-        return Standing(hits, along, crosswalks, off_road)
+        return Standing(hits, along, parts, off_road)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Ground:
         """The map under bodies, and around the egos.
@@ -140,13 +149,9 @@ class Survey:
         present[:, -1 - OFF_ROAD] = False
         doubled, index = joined(self._twins[0], bodies.node)
         present[bodies.frame[doubled], self._twins[1][index]] = False
-        hits, (walkers, crosswalks), off_road = (
-            standing.hits,
-            standing.crosswalks,
-            standing.off_road,
-        )
-        rows = np.concatenate([hits.row, walkers, off_road])
-        nodes = np.concatenate([hits.lane, crosswalks, np.full(len(off_road), OFF_ROAD)])
+        hits, (at, parts), off_road = standing.hits, standing.parts, standing.off_road
+        rows = np.concatenate([hits.row, at, off_road])
+        nodes = np.concatenate([hits.lane, parts, np.full(len(off_road), OFF_ROAD)])
         self._add_with_parents(present, bodies.frame[rows], -1 - nodes)
         present &= kept
         return Ground(

@@ -69,6 +69,7 @@ class SignalReach:
             if np.isfinite(x) and np.isfinite(y):
                 here = np.ones(len(controlled))
                 places = self._lines.along(controlled, x * here, y * here)
+                places = np.clip(places, 0, self._net.lengths[controlled])
             lanes = {
                 lane
                 for at, along in zip(controlled.tolist(), places.tolist(), strict=True)
