@@ -260,11 +260,12 @@ def assemble(
         yield _block(first, done, size, block_refs, decoder.roster.take(known))
         first, done = first + size, done[-2:]
     left = len(done) - (first > 0)
+    entered = decoder.roster.take(decoder.roster.size)
     if decoder.roster.absurd:
         words = f"{decoder.roster.absurd} numbers of {FAR:g} and more are taken as missing"
         decoder.roster.report.warnings.append(words)
     if left:
-        yield _block(first, done, left, open_refs, decoder.roster.take(decoder.roster.size))
+        yield _block(first, done, left, open_refs, entered)
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
