@@ -11,14 +11,25 @@ import sys
 
 import typer
 
-from sgstore.cli import exports, live, payloads, pictures, queries, settings, tour, traces
+from sgstore.cli import (
+    exports,
+    live,
+    maps,
+    payloads,
+    pictures,
+    queries,
+    settings,
+    stores,
+    tour,
+    traces,
+)
 from sgstore.cli.arguments import ERROR, INTERRUPTED, USAGE, app
 from sgstore.cli.output import say
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
 __all__ = ["app", "main"]
 
-VERBS = (traces, live, settings, queries, payloads, pictures, exports, tour)
+VERBS = (traces, stores, maps, live, settings, queries, payloads, pictures, exports, tour)
 """The modules of the verbs: importing them makes the verbs known; help lists them in this order."""
 
 app.registered_commands.sort(
@@ -41,9 +52,7 @@ def run(arguments: list[str]) -> int:
     """
     try:
         return int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
-    except typer.Abort:
-        return INTERRUPTED
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):  # typer makes the one the other
         say("interrupted; what was finished is in the store")
         return INTERRUPTED
     except SgstoreError as error:
