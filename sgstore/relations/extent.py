@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Range
-    from sgstore.roads import RoadMap
+    from sgstore.roads import LanePoints, RoadMap
     from sgstore.world import Bools, Floats, Ints
 
     Rows = NDArray[np.intp]
@@ -58,6 +58,37 @@ class Places:
         return len(self.x)
 
 
+@dataclass(frozen=True, slots=True)
+class LaneHeights:
+    """Points along the centre lines of all lanes, and how low and how high each lane lies.
+
+    Attributes
+    ----------
+    points : LanePoints
+        Ordered by lane.
+    first : (L + 1,) int64
+        Rows of each lane in ``points``.
+    low, high : (L,) float64
+        m.
+    """
+
+    points: LanePoints
+    first: Ints
+    low: Floats
+    high: Floats
+
+    @classmethod
+    def of(cls, road_map: RoadMap) -> LaneHeights:
+        """The heights of the lanes of a map."""
+        points = road_map.waypoints(STEP)
+        first = np.searchsorted(points.lane, np.arange(len(road_map.ribbons) + 1))
+        low, high = (
+            of.reduceat(points.z, first[:-1]) if len(points) else points.z
+            for of in (np.minimum, np.maximum)
+        )
+        return cls(points, first, low, high)
+
+
 class Extent:
     """The range of egos, as settings describe it.
 
@@ -71,12 +102,20 @@ class Extent:
     def __init__(self, settings: Range, road_map: RoadMap | None) -> None:
         self.settings = settings
         self._map = road_map
+        self._heights: LaneHeights | None = None
+        if road_map is not None and settings.height:
+            self._heights = LaneHeights.of(road_map)
         self._driving: Bools = np.zeros(0, np.bool_)
         if road_map is not None and settings.shape == "corridor":
             self._driving = np.array([t in DRIVING for t in road_map.nodes.lane_type], np.bool_)
 
     def areas(self, egos: Places) -> Areas:
         """The areas around egos."""
+        areas = self._areas(egos)
+        areas.heights = self._heights
+        return areas
+
+    def _areas(self, egos: Places) -> Areas:
         settings = self.settings
         if settings.shape == "radius":
             return Discs(settings, egos, settings.radius)
@@ -140,7 +179,11 @@ class Areas:
     ----------
     exist : (F,) bool
         Whether a frame has an area; in those that have none everything is in range.
+    heights : LaneHeights or None
+        Of the lanes of the map, where storeys matter.
     """
+
+    heights: LaneHeights | None = None
 
     def __init__(self, settings: Range, egos: Places, reach: float, *, turned: bool = True) -> None:
         self.settings = settings
@@ -198,8 +241,8 @@ class Areas:
         inside[there] = False
         rows, nodes = self._meet_map(road_map)
         inside[rows, -1 - nodes] = True
-        if self.settings.height:
-            self._keep_storey(road_map, inside)
+        if self.heights is not None:
+            self._keep_storey(road_map, self.heights, inside)
         _add_parents(road_map, inside, there)
         return inside
 
@@ -218,12 +261,12 @@ class Areas:
         off = (rise < lowest) | (rise > highest)  # what is missing is not off
         return ~off | (np.abs(rise) < self.settings.grade * away) | ~self.exist[frame]
 
-    def _keep_storey(self, road_map: RoadMap, inside: Bools) -> None:
+    def _keep_storey(self, road_map: RoadMap, heights: LaneHeights, inside: Bools) -> None:
         """Take out what is on other storeys: lanes by points of their centre lines, else by the node's height.
 
         A lane is on the storey when one of its points within reach is; if none is in reach, its nearest counts.
         """
-        nodes, lanes = road_map.nodes, len(road_map.ribbons)
+        nodes, lanes = road_map.nodes, len(heights.low)
         frame, column = np.nonzero(inside & self.exist[:, None])
         is_lane = (column >= 1) & (column <= lanes)
         other = np.flatnonzero(~is_lane)
@@ -232,19 +275,25 @@ class Areas:
         off = ~self._level(at, away, nodes.z[place])
         inside[at[off], place[off]] = False
 
-        points = road_map.waypoints(STEP)
-        first = np.searchsorted(points.lane, np.arange(lanes + 1))
         frame, lane = frame[is_lane], column[is_lane] - 1
-        count = np.diff(first)[lane]
-        owner, point = spread(first[lane], count)
+        # Of most lanes all points are on the storey; only of the others they are looked at one by one.
+        level = self._level(frame, np.zeros(len(frame)), heights.low[lane])
+        level &= self._level(frame, np.zeros(len(frame)), heights.high[lane])
+        frame, lane = frame[~level], lane[~level]
+        kept = self._touch_storey(heights, frame, lane)
+        inside[frame[~kept], 1 + lane[~kept]] = False
+
+    def _touch_storey(self, heights: LaneHeights, frame: Ints, lane: Ints) -> Bools:
+        """Whether lanes have a point on the storey of the ego of a frame."""
+        points, count = heights.points, np.diff(heights.first)[lane]
+        owner, point = spread(heights.first[lane], count)
         at = frame[owner]
         away = np.hypot(points.x[point] - self.egos.x[at], points.y[point] - self.egos.y[at])
         level = self._level(at, away, points.z[point])
         starts = np.cumsum(count) - count
         nearest = np.minimum.reduceat(away, starts) if len(starts) else away
         counts = (away <= self.reach) | (away == nearest[owner])
-        kept = np.bincount(owner[level & counts], minlength=len(lane)) > 0
-        inside[frame[~kept], 1 + lane[~kept]] = False
+        return np.bincount(owner[level & counts], minlength=len(lane)) > 0
 
 
 class Discs(Areas):
@@ -354,8 +403,11 @@ class Strips(Areas):
         return inside
 
     def _meet_map(self, road_map: RoadMap) -> tuple[Rows, Ints]:
-        rows, nodes = road_map.near_shapes(self._ends, self.settings.width / 2)
-        return self._frame[rows], nodes
+        # An ego that drives on leaves most pieces of its lanes as they are: each is asked about once.
+        ends, same = np.unique(self._ends.reshape(-1, 4), axis=0, return_inverse=True)
+        rows, nodes = road_map.near_shapes(ends.reshape(-1, 2, 2), self.settings.width / 2)
+        line, index = joined(rows, same.ravel())
+        return self._frame[line], nodes[index]
 
 
 def _add_parents(road_map: RoadMap, inside: Bools, frames: Rows) -> None:
