@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     import networkx as nx
 
@@ -144,6 +144,38 @@ class GraphBlock:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+
+def named_graph(
+    nodes: Mapping[str, str], edges: Iterable[tuple[str, str, str]], **about: Any
+) -> nx.MultiDiGraph[str]:
+    """A graph of names and labels as a ``networkx.MultiDiGraph``, as the literature has them.
+
+    Parameters
+    ----------
+    nodes : mapping of str to str
+        Name → label.
+    edges : iterable of (str, str, str)
+        Source, label, destination.
+    **about
+        Attributes of the graph.
+
+    Returns
+    -------
+    networkx.MultiDiGraph
+        Names as nodes, with the attributes ``name`` and ``base_class``; edges with the attribute ``label``,
+        which is their key where two nodes have it once.
+    """
+    import networkx as nx  # half a second to import: only when asked for
+
+    graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(**about)
+    for name, label in nodes.items():
+        graph.add_node(name, name=name, base_class=label)
+    for src, label, dst in edges:
+        again = graph.has_edge(src, dst, key=label)
+        key = f"{label} {graph.number_of_edges(src, dst)}" if again else label
+        graph.add_edge(src, dst, key=key, label=label)
+    return graph
 
 
 @dataclass(frozen=True, slots=True)

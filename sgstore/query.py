@@ -16,9 +16,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, overload
 
 from sgstore.errors import MissingExtraError
+from sgstore.graph import named_graph
 from sgstore.lang import Compiled, compile_query
 from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.lang.phases import Window
@@ -151,20 +152,70 @@ class Store:
         """
         return self.file.user_sql(text, timeout_s=timeout_s, max_rows=max_rows)
 
-    def graph(self, frame: int | str | FrameRef) -> nx.MultiDiGraph[int]:
-        """The scene graph of a frame.
+    @overload
+    def graph(self, frame: int | str | FrameRef) -> nx.MultiDiGraph[int]: ...
+
+    @overload
+    def graph(self, frame: int | str | FrameRef, abstraction: str) -> nx.MultiDiGraph[str]: ...
+
+    def graph(self, frame: int | str | FrameRef, abstraction: str | None = None) -> Any:
+        """The scene graph of a frame, or what an abstraction makes of it.
 
         Parameters
         ----------
         frame : int, str or FrameRef
             Its ``frame_id``, ``TRACE#SEQ``, ``TRACE@12.3s``, or what :meth:`Matches.frames` gives.
+        abstraction : str, optional
+            ``E``, ``EL``, ``ER``, ``RSV``, ``junction``, ``SG``, ``roadscene2vec``, or a registered one.
+
+        Returns
+        -------
+        networkx.MultiDiGraph
+            Without an abstraction: node ids with all that is known of them; see
+            :meth:`sgstore.graph.SceneGraph.to_networkx`. With one: names, as the literature has them
+            (``ego``, ``car_12``, ``Ego Lane``, ``Lane 5_-1``), with the attributes ``name`` and ``base_class``,
+            and edges with the attribute ``label``.
 
         Raises
         ------
         StoreError
             There is no such frame.
+        AbstractionError
+            There is no such abstraction.
         """
-        return self.file.graph(_ref(frame)).to_networkx()
+        if abstraction is None:
+            return self.file.graph(_ref(frame)).to_networkx()
+        graph, about = self.file.abstracted.labelled(_ref(frame), abstraction)
+        nodes, edges = graph.named(0)
+        return named_graph(nodes, edges, **about)
+
+    def classes(
+        self, abstraction: str = "RSV", trace: int | str | None = None
+    ) -> dict[str, NDArray[np.generic]]:
+        """The class of each frame in an abstraction: equal exactly where the labelled graphs are isomorphic.
+
+        Parameters
+        ----------
+        abstraction : str
+            As :meth:`graph` takes it. Classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction`` are in the store
+            from the start; others are computed when they are first asked for, and then kept.
+        trace : int or str, optional
+            Only of this one.
+
+        Returns
+        -------
+        dict
+            ``frame_id``, ascending, and ``class``: 32 hexadecimal digits, empty where a graph is so symmetric
+            that it was given up.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            There is no such trace, or others keep the store for too long.
+        """
+        return self.file.abstracted.classes(abstraction, trace)
 
     def payload(self, frame: int | str | FrameRef, channel: str) -> bytes:
         """The data of the sensor message of a channel that belongs to a frame, read from the recording.

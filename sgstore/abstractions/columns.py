@@ -6,7 +6,8 @@ An abstraction is a function from :class:`Seen`, what a scene graph holds of nod
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,6 +31,9 @@ Part = tuple[NDArray[Any], ...]
 
 EGO: Final = "ego"
 """Label of the ego in every abstraction, as the literature has it."""
+
+EGOS: Final = (EGO, "ego_car")
+"""Labels that one node of a frame has, which is called by it."""
 
 _ENTITY_KINDS: Final = len(ENTITY_KINDS)
 _LANE: Final = KIND_CODE["lane"]
@@ -93,6 +97,8 @@ class Grounds:
         """(K,): whether it is a lane that is driven on."""
         return (self.kind == _LANE) & np.isin(self.lane_type, DRIVEN)
 
+
+_NODE_COLUMNS: Final = ("node", "kind", "is_ego", "x", "y", "z", "heading")
 
 DRIVEN: Final = (
     *("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"),
@@ -219,6 +225,20 @@ class Seen:
         edge = wanted[edge]
         return frame, grounds.relation[edge], grounds.src[edge], grounds.dst[edge]
 
+    def only(self, number: int) -> Seen:
+        """One of the frames, as the only one."""
+        nodes, edges = self.node_frame == number, self.frame == number
+        zero = np.zeros(1, np.int64)
+        return replace(
+            self,
+            frames=1,
+            node_frame=zero.repeat(int(nodes.sum())),
+            frame=zero.repeat(int(edges.sum())),
+            ego_lane=self.ego_lane[number : number + 1],
+            **{name: getattr(self, name)[nodes] for name in _NODE_COLUMNS},
+            **{name: getattr(self, name)[edges] for name in ("relation", "src", "dst")},
+        )
+
     def row_of(self, frame: Ints, node: Ints) -> Ints:
         """Rows of nodes in frames; -1 where they are not in the graph."""
         return found(self.node_frame, self.node, frame, node)
@@ -303,6 +323,29 @@ class Labelled:
             renumbered[edge_label],
             dst,
             names or {},
+        )
+
+    def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
+        """One of the frames by names: nodes ``name → label``, and edges ``(name, label, name)``.
+
+        The ego and what a graph has once are called by their label, parts of a map by their name, and all
+        else ``label_node``, such as ``car_12``.
+        """
+        rows = np.flatnonzero(self.node_frame == number)
+        labels = [self.labels[code] for code in self.node_label[rows].tolist()]
+        often = Counter(labels)
+        called = {
+            node: self.names.get(node)
+            or (label if node < 0 and often[label] == 1 else f"{label}_{abs(node)}")
+            for node, label in zip(self.node[rows].tolist(), labels, strict=True)
+        }
+        egos = {n: t for n, t in zip(called, labels, strict=True) if t in EGOS and often[t] == 1}
+        called |= egos
+        edges = np.flatnonzero(self.frame == number)
+        columns = (self.src[edges].tolist(), self.label[edges].tolist(), self.dst[edges].tolist())
+        return (
+            dict(zip(called.values(), labels, strict=True)),
+            [(called[a], self.labels[r], called[b]) for a, r, b in zip(*columns, strict=True)],
         )
 
 

@@ -1,25 +1,45 @@
 """The classes of frames in each abstraction: on their way into a store, and made when asked for.
 
-Classes are masks like edges: one row for each class of a bucket, because driving repeats itself.
+Classes are masks like edges: one row for each class of a bucket, because driving repeats itself. Those that
+are made at ingest are published with their trace; others wait until they are asked for, and are then kept.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from sgstore.abstractions import AT_INGEST, Classes, Grounds, Seen, abstraction_named
-from sgstore.store.packing import masks_of, texts, trace_bucket
+from sgstore.store.adding import add_files, note, writing
+from sgstore.store.packing import BUCKET_BITS, FRAME_BITS, masks_of, texts, trace_bucket
+from sgstore.store.seen import Graphs
+from sgstore.store.staging import Staging
+from sgstore.store.traces import frame_named, trace_named
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.abstractions import Labelled
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
+    from sgstore.store.access import Access
     from sgstore.store.packing import Columns
     from sgstore.world import Codes, Ints
+
+_LATER: Final = "later_class"
+
+_MISSING: Final = """
+SELECT trace_id FROM {0}trace WHERE trace_id NOT IN (
+  SELECT bucket >> 18 FROM {0}later_class WHERE abstraction = $name UNION ALL
+  SELECT bucket >> 18 FROM {0}frame_class WHERE abstraction = $name)
+ORDER BY ingested_at, name
+"""
 
 
 class TraceClasses:
@@ -27,31 +47,15 @@ class TraceClasses:
 
     Parameters
     ----------
-    road_map : RoadMap or None
-        What the graphs lie on.
     names : sequence of str
         Abstractions.
     """
 
-    def __init__(self, road_map: RoadMap | None, names: Sequence[str] = AT_INGEST) -> None:
-        self._grounds = None if road_map is None else Grounds.of(road_map)
+    def __init__(self, names: Sequence[str] = AT_INGEST) -> None:
         self._of = [(abstraction_named(name), Classes()) for name in names]
 
-    def columns(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> Columns:
-        """Table ``frame_class``.
-
-        Parameters
-        ----------
-        graph : GraphBlock
-        trace_id : int
-        kinds : int8
-            Kinds of the entities of the trace so far, by node id.
-        """
-        seen = Seen.of(graph, kinds, self._grounds)
-        return self.of_seen(seen, trace_id, graph.frames.seq)
-
-    def of_seen(self, seen: Seen, trace_id: int, seq: Ints) -> Columns:
-        """The same of what has been read of some frames; ``seq`` are their numbers."""
+    def columns(self, seen: Seen, trace_id: int, seq: Ints) -> Columns:
+        """Tables ``frame_class`` and ``later_class``, of frames whose numbers are ``seq``."""
         rows: list[tuple[str, str]] = []
         buckets: list[Ints] = []
         masks: list[Ints] = []
@@ -70,3 +74,126 @@ class TraceClasses:
             "bucket": np.concatenate(buckets),
             "mask": np.concatenate(masks),
         }
+
+
+class IngestedClasses:
+    """The classes of a trace that is being ingested on a map, if it has one."""
+
+    def __init__(self, road_map: RoadMap | None) -> None:
+        self._grounds = None if road_map is None else Grounds.of(road_map)
+        self._classes = TraceClasses()
+
+    def columns(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> Columns:
+        """Table ``frame_class``; ``kinds`` are those of the entities so far, by node id."""
+        seen = Seen.of(graph, kinds, self._grounds)
+        return self._classes.columns(seen, trace_id, graph.frames.seq)
+
+
+class Abstracted:
+    """The frames of a store as abstractions have them. Made by :attr:`StoreFile.abstracted`."""
+
+    def __init__(self, path: Path, access: Access) -> None:
+        self._path = path
+        self._access = access
+        self._graphs = Graphs()
+
+    def complete(self, name: str) -> int:
+        """Compute the classes in an abstraction of the traces that lack them, and keep them.
+
+        Each trace is one transaction: what is done stays done, and another call goes on from there.
+
+        Returns
+        -------
+        int
+            How many traces lacked them.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            Others keep the store for too long, or the disk is full.
+        """
+        name = abstraction_named(name).name
+        with self._access.reading() as connection:
+            traces = _missing(connection, name)
+        for trace_id in traces:
+            self._complete(name, trace_id)
+        return len(traces)
+
+    def _complete(self, name: str, trace_id: int) -> None:
+        staging = Staging(self._path)
+        try:
+            classes = TraceClasses((name,))
+            with self._access.reading() as connection:
+                for seq, seen in self._graphs.of_trace(connection, trace_id):
+                    staging.settle(whole=True)
+                    staging.insert(_LATER, classes.columns(seen, trace_id, seq))
+            files, _ = staging.seal()
+            with writing(self._access) as connection:
+                # Another process may have been faster, or have removed the trace.
+                if trace_id in _missing(connection, name, "store."):
+                    add_files(connection, staging, files)
+                    note(connection, trace_id, [_LATER])
+        finally:
+            staging.close()
+
+    def classes(self, name: str, trace: int | str | None = None) -> dict[str, NDArray[np.generic]]:
+        """The class of each frame in an abstraction, computed where it was not.
+
+        Returns
+        -------
+        dict
+            ``frame_id``, int64, ascending; ``class``, str, empty where a graph was given up.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            There is no such trace, or others keep the store for too long.
+        """
+        self.complete(name)
+        with self._access.reading() as connection:
+            low, high = 0, (1 << 63) - 1
+            if trace is not None:
+                low, _ = trace_named(connection, str(trace))
+                low, high = (one << (BUCKET_BITS + FRAME_BITS) for one in (low, low + 1))
+                high -= 1
+            found = connection.execute(
+                "SELECT frame_id, coalesce(class, '') AS class FROM classes WHERE abstraction = ?"
+                " AND frame_id >= ? AND frame_id <= ? ORDER BY frame_id",
+                [abstraction_named(name).name, low, high],
+            ).fetchnumpy()
+        return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
+
+    def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
+        """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            There is no such frame.
+        """
+        abstraction = abstraction_named(name)
+        with self._access.reading() as connection:
+            frame = frame_named(connection, ref)
+            bucket = frame.frame_id >> FRAME_BITS
+            seq, seen = self._graphs.of_buckets(connection, bucket, bucket + 1)
+        number = int(np.searchsorted(seq, frame.seq))
+        about = {
+            "frame_id": frame.frame_id,
+            "trace": frame.trace,
+            "seq": frame.seq,
+            "time_ns": frame.time_ns,
+            "abstraction": abstraction.name,
+        }
+        return abstraction.function(seen.only(number)), about
+
+
+def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> list[int]:
+    """Traces of which the classes in an abstraction are not kept."""
+    found = connection.execute(_MISSING.format(catalog), {"name": name}).fetchall()
+    return [trace_id for (trace_id,) in found]

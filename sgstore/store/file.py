@@ -12,6 +12,7 @@ import numpy as np
 from sgstore.errors import StoreError, TraceError
 from sgstore.store import rows, schema
 from sgstore.store.access import Access, default_memory, spill_folder, translated
+from sgstore.store.classes import Abstracted
 from sgstore.store.folder import Folder
 from sgstore.store.packing import plain
 from sgstore.store.payloads import payload_place
@@ -79,6 +80,7 @@ class StoreFile:
         self._access = Access(self.path, memory=self._memory, wait_s=wait_s)
         self._scenes = Scenes()
         self._seen: set[tuple[str, int, int]] = set()
+        self._abstracted: Abstracted | None = None
         with self._reading() as connection:
             schema.check_version(connection, self.path)
 
@@ -465,6 +467,13 @@ class StoreFile:
             for trace_id in gone:
                 remove(connection, trace_id)
         return tuple(gone.values())
+
+    @property
+    def abstracted(self) -> Abstracted:
+        """Frames as abstractions have them, and their classes."""
+        if self._abstracted is None:
+            self._abstracted = Abstracted(self.path, self._access)
+        return self._abstracted
 
     def verify(self, *, recordings: bool = False) -> Verification:
         """Look whether everything is as it was published.

@@ -14,7 +14,7 @@ import numpy as np
 from sgstore.errors import StoreError
 from sgstore.store import packing, payloads
 from sgstore.store.access import translated
-from sgstore.store.classes import TraceClasses
+from sgstore.store.classes import IngestedClasses
 from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
 from sgstore.store.publishing import MAP_TABLES, fill_trace, publish_in
 from sgstore.store.sealed import Sealed
@@ -81,7 +81,7 @@ class Segment:
         )
         self._origin: Origin | None = None
         self._periods = payloads.Periods()
-        self._classes = TraceClasses(road_map)
+        self._classes = IngestedClasses(road_map)
         self._next_seq = 0
         self._staging = Staging(store, folder)
         try:

@@ -62,6 +62,7 @@ ORDER BY s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
     "edge": """
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask FROM edge ORDER BY ALL""",
     "frame_class": "SELECT * FROM frame_class ORDER BY ALL",
+    "later_class": "SELECT * FROM later_class ORDER BY ALL",
     "message": "SELECT * FROM message",
 }
 """The tables that grow with a trace, sorted as they are published."""
