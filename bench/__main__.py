@@ -9,6 +9,7 @@ from bench.measure import show
 
 TITLES = {
     "ingest": "Ingest: a recording into a store",
+    "traces": "Recordings: objects decoded, large files skimmed",
     "sgg": "The scene graph generator",
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",

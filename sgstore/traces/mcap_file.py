@@ -134,6 +134,8 @@ class McapFile:
         Channel id → messages as the file's statistics say.
     compression : str
         That of the first chunk; ``zstd`` before a chunk was met.
+    chunk_offsets : (n,) int64
+        Where chunks begin as the summary has it, ascending.
 
     Raises
     ------
@@ -265,7 +267,7 @@ class McapFile:
         self.schemas.update(summary.schemas)
         self.channels.update(summary.channels)
         self.counts = summary.counts
-        self._chunk_offsets = summary.chunk_offsets
+        self.chunk_offsets = summary.chunk_offsets
         self._summary_fault = summary.fault
 
     # The walk ------------------------------------------------------------------------------------------------
@@ -388,10 +390,10 @@ class McapFile:
 
         The summary is believed where there is the head of a chunk indeed.
         """
-        if not len(self._chunk_offsets):
+        if not len(self.chunk_offsets):
             return None
-        first, last = np.searchsorted(self._chunk_offsets, [start + 1, stop])
-        for offset in self._chunk_offsets[first:last]:
+        first, last = np.searchsorted(self.chunk_offsets, [start + 1, stop])
+        for offset in self.chunk_offsets[first:last]:
             with suppress(TraceError):
                 return read_chunk_head(self._file, int(offset)).offset
         return None
