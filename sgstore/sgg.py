@@ -27,8 +27,9 @@ from sgstore.relations.contact import contacts
 from sgstore.relations.extent import Extent, Places
 from sgstore.relations.following import gaps
 from sgstore.relations.keeping import Keeping, renamed
-from sgstore.relations.pairs import near_pairs, related_pairs
+from sgstore.relations.pairs import joined_pairs, near_pairs, of_kinds, related_pairs
 from sgstore.relations.scene import Bodies, Scene
+from sgstore.relations.still import StillPairs
 from sgstore.relations.survey import Survey
 from sgstore.relations.waypoints import waypoints_of
 from sgstore.vocabulary import RELATIONS as VOCABULARY
@@ -86,14 +87,16 @@ class SceneGraphGenerator:
         self._keeping = Keeping(config, road_map)
         self._kinds: Codes = np.zeros(0, np.int8)
         self._scenery = States.of(node=np.zeros(0, np.int64))
+        self._still = StillPairs(config)
         self.answers = self._answers(road_map)
 
     def _answers(self, road_map: RoadMap | None) -> tuple[str, ...]:
         names = {name for family in self._families for name in family.names(self._config)}
+        of_map: set[str] = set()
         if road_map is not None:
             codes = np.unique(road_map.edges.relation).tolist()
-            names.update(MAP_RELATIONS, (VOCABULARY[code] for code in codes))
-        names = self._keeping.names(names)
+            of_map = {*MAP_RELATIONS, *(VOCABULARY[code] for code in codes)}
+        names = self._keeping.names(names, of_map)
         return tuple(name for name in VOCABULARY if name in names)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
@@ -146,10 +149,11 @@ class SceneGraphGenerator:
 
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
+        still = self._still.among(keys, len(frames.states), len(self._scenery))
         return _World(
             keys=keys,
             bodies=bodies,
-            near=near_pairs(bodies, self._config),
+            near=joined_pairs([near_pairs(bodies, self._config), still]),
             contacts=contacts(bodies),
             standing=None if self._survey is None else self._survey.standing(bodies),
         )
@@ -161,7 +165,8 @@ class SceneGraphGenerator:
         if self._survey is not None and standing is not None:
             ground = self._survey.ground(bodies, standing, view.areas, self._keeping.parts)
         pairs = related_pairs(bodies, view.ego, part.near, self._config)
-        scene = Scene(self._config, bodies, view.ego, pairs, part.contacts, ground)
+        touching = of_kinds(bodies, view.ego, part.contacts, self._config.pairs)
+        scene = Scene(self._config, bodies, view.ego, pairs, touching, ground)
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground and self._keeping.present(ground.present)),
@@ -210,6 +215,10 @@ class SceneGraphGenerator:
                 self._survey.learn(entities, frames.scenery)
         if len(frames.scenery):
             self._scenery = _stacked(self._scenery, frames.scenery)
+            if self._still.wanted:
+                states = len(frames.states)
+                everything = states + np.arange(len(self._scenery))
+                self._still.learn(self._bodies(frames, everything))
         for of in (nodes, frames.scenery.node):
             strange = of[(of < 0) | (of >= len(self._kinds))]
             if len(strange):

@@ -267,6 +267,42 @@ def test_scenery_is_related_to_the_ego_only() -> None:
     assert ("parked", "super_near", "ego") in edges(graph_of(frames([thing("ego"), parked])))
 
 
+def test_what_never_moves_is_related_to_its_like_when_that_is_asked() -> None:
+    post, sign = (
+        thing("post", 3, static=True, kind="pole"),
+        thing("s", 12, kind="sign", static=True),
+    )
+    far, mover = thing("far", 45, static=True), thing("mover", -9)
+    recording, generator = Recording(), SceneGraphGenerator(None, Config(pairs=Pairs(static=True)))
+
+    blocks = [[thing("ego", -2, 9), post, mover], [thing("ego", 20), sign, far, mover]]
+    graphs = [generator.block(recording.block(frame, frame)) for frame in blocks]
+    found = [
+        {(a, r, b) for a, r, b in edges(graph, 1, None, recording.names) if "ego" not in (a, b)}
+        for graph in graphs
+    ]
+
+    assert found[0] == set()
+    assert ("post", "very_near", "s") in found[1]
+    assert ("s", "inDFrontOf", "post") in found[1]
+    assert {frozenset((a, b)) for a, _, b in found[1]} == {frozenset(("post", "s"))}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_static_pairs_are_those_that_would_be_related_if_they_moved(seed: int) -> None:
+    things = [t for t in crowd(seed, 20, 30) if t.kind not in SIGNALS]
+    still = [Thing(**(vars(t) | {"static": t.name != "ego"})) for t in things]
+    moving = [Thing(**(vars(t) | {"static": False})) for t in things]
+    pairs = {*PROXIMITY, *DIRECTIONS, *SIDES}
+
+    found, expected = (
+        {e for e in edges(graph_of(frames(scene), None, config)) if e[1] in pairs}
+        for scene, config in ((still, Config(pairs=Pairs(static=True))), (moving, Config()))
+    )
+
+    assert found == expected
+
+
 def test_the_ego_is_related_to_everything_in_range_whatever_the_distance() -> None:
     far = thing("far", 49, 1)
 

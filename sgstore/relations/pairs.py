@@ -42,11 +42,15 @@ def if_related(config: Config, names: tuple[str, ...]) -> tuple[str, ...]:
 
 def near_pairs(bodies: Bodies, config: Config) -> Halves:
     """Each unordered pair of bodies that move, signals excepted, and are near enough to one another."""
+    return pairs_among(bodies, np.flatnonzero(bodies.moves & ~IS_SIGNAL[bodies.kind]), config)
+
+
+def pairs_among(bodies: Bodies, rows: Rows, config: Config) -> Halves:
+    """Each unordered pair of some rows that share a frame and are near enough to one another."""
     within, between = config.pairs.within, config.proximity.between
     if within <= 0:
         return NO_PAIRS
-    movers = np.flatnonzero(bodies.moves & ~IS_SIGNAL[bodies.kind])
-    return _joined([NO_PAIRS, *_near_pairs(bodies, movers, within, between)])
+    return joined_pairs([NO_PAIRS, *_near_pairs(bodies, rows, within, between)])
 
 
 def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Pairs:
@@ -58,14 +62,15 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Pa
     ego : (F,) intp
         Row of the ego of each frame, -1 where there is none.
     near : tuple of intp arrays
-        Pairs of bodies that are near one another.
+        Other pairs: bodies that are near one another.
     config : Config
-        Signals and scenery are related to the ego only. What has no position is near nothing; the ego is
-        related to it all the same, by numbers that are missing, unless there is a distance for the ego too.
+        Signals and scenery are related to the ego only, unless the settings relate what never moves to its
+        like (:mod:`sgstore.relations.still`). What has no position is near nothing; the ego is related to it
+        all the same, by numbers that are missing, unless there is a distance for the ego too.
     """
     settings, between = config.pairs, config.proximity.between
     if not settings.ego:
-        return _with_mirror_images(bodies, *_of_kinds(bodies, ego, near, settings), between)
+        return _with_mirror_images(bodies, *of_kinds(bodies, ego, near, settings), between)
     mine = ego[bodies.frame]
     others = np.flatnonzero((mine >= 0) & (mine != np.arange(len(bodies))))
     a, b = near
@@ -74,11 +79,11 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Pa
     if settings.ego_within > 0:
         close = distances(bodies, *with_ego, between) <= settings.ego_within
         with_ego = with_ego[0][close], with_ego[1][close]
-    halves = _of_kinds(bodies, ego, _joined([with_ego, (a[further], b[further])]), settings)
+    halves = of_kinds(bodies, ego, joined_pairs([with_ego, (a[further], b[further])]), settings)
     return _with_mirror_images(bodies, *halves, between)
 
 
-def _of_kinds(bodies: Bodies, ego: Rows, pairs: Halves, settings: PairSettings) -> Halves:
+def of_kinds(bodies: Bodies, ego: Rows, pairs: Halves, settings: PairSettings) -> Halves:
     """The pairs of the kinds that the settings list, in either order."""
     if not settings.kinds:
         return pairs
@@ -100,7 +105,8 @@ def _codes(label: str) -> list[int]:
     return [KIND_CODE[kind] for kind in kinds_labelled(label) or ()]
 
 
-def _joined(halves: list[Halves]) -> Halves:
+def joined_pairs(halves: list[Halves]) -> Halves:
+    """One list of pairs after another."""
     return np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves])
 
 
