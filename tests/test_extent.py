@@ -462,8 +462,22 @@ def test_relations_that_are_not_wanted_are_neither_computed_nor_answered() -> No
     answers = SceneGraphGenerator(read_map(STREET, "street"), config).answers
 
     assert "street/0/-1" in nodes
-    assert not {"isIn", "very_near"} & (names | set(answers))
+    assert not {"isIn", "very_near"} & names
+    assert "very_near" not in answers
     assert "inDFrontOf" in names
+
+
+def test_what_the_map_alone_says_stays_known() -> None:
+    road_map, config = read_map(SECTIONS, "m"), Config(without=("toLeftOf", "isIn"))
+
+    answers = SceneGraphGenerator(road_map, config).answers
+    alone = SceneGraphGenerator(None, config).answers
+
+    assert {"toLeftOf", "isIn", "travelsTo"} <= set(answers)
+    assert not {"toLeftOf", "isIn"} & set(alone)
+    no_lanes = SceneGraphGenerator(road_map, Config(kinds=("Vehicle", "Road"))).answers
+    assert "isIn" in no_lanes
+    assert not {"travelsTo", "controlsTrafficOf"} & set(no_lanes)
 
 
 def test_types_are_what_the_client_says_they_are() -> None:

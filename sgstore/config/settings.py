@@ -290,7 +290,7 @@ class Config:
     kinds: tuple[str, ...] = setting(
         (),
         "labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map ('Lane'); the "
-        "ego always is. Empty: everything",
+        "ego always is. What is not kept is as if it were not there. Empty: everything",
     )
     without: tuple[str, ...] = setting(
         (),

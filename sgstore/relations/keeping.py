@@ -10,7 +10,6 @@ import numpy as np
 from sgstore.relations.scene import kinds_mask
 from sgstore.roads import first_sections
 from sgstore.vocabulary import (
-    ENTITY_KINDS,
     KIND_CODE,
     KINDS,
     MAP_KINDS,
@@ -28,12 +27,10 @@ if TYPE_CHECKING:
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Bools, Codes, Entities, Ints
 
-ROAD_RELATIONS: Final = (
-    *("isIn", "travelsTo", "laneChange", "opposes", "conflictsWith"),
-    *("controlsTrafficOf", "mayAffect"),
+OF_LANES: Final = frozenset(
+    {"travelsTo", "laneChange", "opposes", "conflictsWith", "controlsTrafficOf", "mayAffect"}
 )
-"""Relations that have a part of a map at one end."""
-
+"""Relations that have a lane at one end."""
 
 Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
 
@@ -59,9 +56,10 @@ class Keeping:
         if config.lanes.granularity == "none":
             kept -= set(MAP_KINDS)
         self._kinds = kinds_mask(tuple(sorted(kept)))
-        self._every_kind = set(ENTITY_KINDS) <= kept
         self._without = frozenset(config.without)
-        self._no_roads = config.lanes.granularity == "none"
+        self._impossible = (set() if "lane" in kept else OF_LANES) | (
+            set() if set(MAP_KINDS) & kept else {"isIn"}
+        )
         dropped = [RELATION_CODE[name] for name in config.without]
         self._relations: Bools = np.ones(len(RELATIONS), np.bool_)
         self._relations[dropped] = False
@@ -87,10 +85,9 @@ class Keeping:
             used[parent[used[child]]] = True
         return kept & (used | ~(lane | road | junction))
 
-    def names(self, relations: set[str]) -> set[str]:
-        """Those of the relations that graphs can hold."""
-        left_out = self._without | (set(ROAD_RELATIONS) if self._no_roads else set())
-        return relations - left_out
+    def names(self, computed: set[str], of_map: set[str]) -> set[str]:
+        """The relations that graphs can hold, of those that are computed and those that come with a map."""
+        return ((computed - self._without) | of_map) - self._impossible
 
     def entities(self, kind: Codes) -> Bools:
         """Whether entities of these kinds are kept."""
