@@ -124,7 +124,7 @@ CREATE TABLE map_node (
   map_id INTEGER, node_id INTEGER, kind kind, name VARCHAR,   -- name: 'road/section/lane' of a lane, else the id in the map
   x DOUBLE, y DOUBLE, z DOUBLE, heading DOUBLE,                -- a point on it, and its direction there
   lane_type VARCHAR, road VARCHAR, section INTEGER, lane INTEGER, junction VARCHAR, turn VARCHAR,
-  length DOUBLE, width DOUBLE, speed_limit DOUBLE);            -- m, m (mean), m/s
+  length DOUBLE, width DOUBLE, speed_limit DOUBLE, curvature DOUBLE);   -- m, m (mean), m/s, 1/m
 
 CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
   map_id INTEGER, relation relation, src_kind kind, dst_kind kind, src INTEGER, dst INTEGER);
@@ -163,24 +163,24 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake,
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
-       NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit
+       NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit, NULL::DOUBLE AS curvature
 FROM state s JOIN trace t ON t.trace_id = s.frame_id >> 24
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
-       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit
+       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature
 FROM frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
-         m.length, m.width, NULL::FLOAT AS height, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit
+         m.length, m.width, NULL::FLOAT AS height, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature
   FROM bucket b JOIN node k ON k.bucket = b.bucket JOIN map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL
   SELECT k.bucket, k.mask, k.node_id, k.kind, k.kind || ' ' || k.node_id, e.special, e.subkind,
-         t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+         t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
   FROM node k JOIN trace t ON t.trace_id = k.bucket >> 18 JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s; accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s; accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
 
 CREATE VIEW edges AS
 SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego

@@ -332,6 +332,7 @@ def _map_nodes(names: tuple[str, ...], kinds: list[str], patches: tuple[Patch, .
         length=missing,
         width=np.array([widths.get(name, np.nan) for name in names]),
         speed_limit=missing,
+        curvature=missing,
     )
 
 

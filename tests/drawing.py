@@ -129,7 +129,8 @@ class Crossing(RoadMap):
         return MapNodes(
             kind=np.array([KIND_CODE[row["kind"]] for row in self._rows], np.int8),
             **{n: texts(n) for n in ("name", "lane_type", "road", "junction", "turn")},
-            **{n: numbers(n) for n in ("x", "y", "z", "heading", "length", "width", "speed_limit")},
+            **{n: numbers(n) for n in ("x", "y", "z", "heading", "length", "width")},
+            **{n: numbers(n) for n in ("speed_limit", "curvature")},
             section=zeros,
             lane=zeros,
         )

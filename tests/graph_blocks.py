@@ -81,6 +81,7 @@ def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
             length=np.where(is_lane, 80.0, np.nan),
             width=np.where(is_lane, 3.5, np.nan),
             speed_limit=np.full(count, np.nan),
+            curvature=np.full(count, np.nan),
         ),
         edges=MapEdges(
             relation=edges[:, 0].astype(np.int8),

@@ -285,6 +285,12 @@ NODE_ATTRIBUTES: Final = _named(
             values=("left", "right", "straight"),
         ),
         _of_map("speed_limit", Type.number, "m/s", _LANES | {"road"}),
+        _of_map(
+            "curvature",
+            Type.number,
+            "of a waypoint's lane there, positive to the left; 1/m",
+            frozenset({"waypoint"}),
+        ),
     )
 )
 """Attributes of nodes by folded name, in the order of the documentation."""

@@ -123,6 +123,7 @@ class Waypoints:
             heading=points.heading,
             length=high - low,
             width=points.width,
+            curvature=points.curvature,
         )
 
     def _inside(self, points: LanePoints) -> tuple[Ints, Ints]:

@@ -81,6 +81,8 @@ class MapNodes:
         Section and lane number in the road; 0 for what is no lane.
     length, width, speed_limit : (K,) float64
         m, mean m, m/s; NaN where there is none.
+    curvature : (K,) float64
+        Of the centre line at a waypoint, positive to the left; 1/m. NaN for what is none.
     """
 
     kind: Codes
@@ -98,6 +100,7 @@ class MapNodes:
     length: Floats
     width: Floats
     speed_limit: Floats
+    curvature: Floats
 
     def __len__(self) -> int:
         return len(self.kind)

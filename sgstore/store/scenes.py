@@ -45,7 +45,7 @@ SELECT src, dst, overlap, lane_offset, heading_error, is_primary FROM lane_state
 _GAPS: Final = "SELECT src, dst, gap FROM lane_gaps WHERE frame_id = $frame_id"
 _MAP_NODES: Final = """
 SELECT node_id, kind, name, x, y, z, degrees(heading) AS heading, length, width, lane_type, road, section,
-       lane, junction, turn, speed_limit
+       lane, junction, turn, speed_limit, curvature
 FROM map_node WHERE map_id = $map_id
 """
 _MAP_EDGES: Final = """

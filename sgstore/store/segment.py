@@ -285,7 +285,7 @@ def _map_node_columns(road_map: RoadMap) -> Columns:
         name: texts(getattr(nodes, name))
         for name in ("name", "lane_type", "road", "junction", "turn")
     }
-    for name in ("x", "y", "z", "heading", "length", "width", "speed_limit"):
+    for name in ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature"):
         columns[name] = getattr(nodes, name)
     for name in ("section", "lane"):
         columns[name] = packing.unless(getattr(nodes, name), ~is_lane)
