@@ -25,6 +25,8 @@ WIDE: Final = 3.5
 """Width of a lane of which nothing tells how wide it is; m."""
 NEIGHBOURS: Final = (2.0, 6.0)
 """Distances of centre lines between which lanes side by side tell how wide they are; m."""
+_LOOKS: Final = 9
+"""Places along a lane at which the distance of those beside it is looked at."""
 _STEP: Final = 1.0
 """Distance of the cross sections of a way through an area; m."""
 _FEW: Final = 20_000
@@ -97,25 +99,28 @@ def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
     """Where lines are nearest to places (n, 2); each line has two different points at least."""
     start = np.concatenate([line[:-1, :2] for line in lines])
     way = np.concatenate([line[1:, :2] for line in lines]) - start
-    length = np.hypot(*way.T)
-    squared = np.maximum(length**2, 1e-18)
+    x, y = places.T
+    squared = np.maximum(way[:, 0] ** 2 + way[:, 1] ** 2, 1e-18)
     if len(places) * len(start) <= _FEW:
-        apart = places[:, None] - start
-        shares = np.clip((apart * way).sum(axis=2) / squared, 0.0, 1.0)
-        apart -= shares[..., None] * way
-        piece = np.argmin((apart**2).sum(axis=2), axis=1)
+        away_x, away_y = x[:, None] - start[:, 0], y[:, None] - start[:, 1]
+        shares = (away_x * way[:, 0] + away_y * way[:, 1]) / squared
+        shares = np.minimum(np.maximum(shares, 0.0), 1.0)
+        away_x -= shares * way[:, 0]
+        away_y -= shares * way[:, 1]
+        piece = np.argmin(away_x * away_x + away_y * away_y, axis=1)
     else:
         pieces: Any = shapely.linestrings(np.stack((start, start + way), axis=1))
         points: Any = shapely.points(places)
         _, piece = shapely.STRtree(pieces).query_nearest(points, all_matches=False)
-    share = ((places - start[piece]) * way[piece]).sum(axis=1) / squared[piece]
-    share = np.clip(share, 0.0, 1.0)
+    begin, step = start[piece], way[piece]
+    share = ((x - begin[:, 0]) * step[:, 0] + (y - begin[:, 1]) * step[:, 1]) / squared[piece]
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
+    length = np.sqrt(squared)
     before = np.cumsum(length) - length
-    last = np.cumsum([len(line) - 1 for line in lines]) - 1
-    is_end = (share <= 0) & np.isin(piece, np.append(0, last[:-1] + 1))
-    is_end |= (share >= 1) & np.isin(piece, last)
-    along = before[piece] + share * length[piece]
-    return Feet(start[piece] + share[:, None] * way[piece], along, is_end)
+    first = np.zeros(len(start) + 1, np.bool_)
+    first[np.cumsum([0, *(len(line) - 1 for line in lines)])] = True
+    is_end = ((share <= 0) & first[piece]) | ((share >= 1) & first[piece + 1])
+    return Feet(begin + share[:, None] * step, before[piece] + share * length[piece], is_end)
 
 
 def along_line(line: Floats, places: Floats) -> Floats:
@@ -206,9 +211,9 @@ def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats
 
 def half_width(centre: Floats, others: Sequence[Floats]) -> float:
     """Half the width of a lane without borders, from the centre lines of the lanes beside it; m."""
-    middle = centre[:, :2]
-    if len(middle) == 2:
-        middle = np.vstack((middle, middle.mean(axis=0)))
+    run = run_of(centre)
+    places = np.linspace(0.0, run[-1], _LOOKS)
+    middle = np.column_stack([np.interp(places, run, column) for column in centre[:, :2].T])
     gaps: list[float] = []
     for other in others:
         found = feet(middle, [other])
