@@ -88,8 +88,10 @@ def begun(store: Path, paths: list[Path], jobs: int) -> subprocess.Popen[str]:
     return run
 
 
-def killed_and_resumed(folder: Path, kills: int, seed: int = 0) -> dict[str, int]:
-    """Kill ingest again and again.
+def killed_and_resumed(
+    folder: Path, kills: int, seed: int = 0, frames: int = 130
+) -> dict[str, int]:
+    """Kill ingest of recordings of so many frames again and again.
 
     Returns
     -------
@@ -101,7 +103,7 @@ def killed_and_resumed(folder: Path, kills: int, seed: int = 0) -> dict[str, int
     AssertionError
         A store was torn, something was left beside it, or it is not as one that was not disturbed.
     """
-    paths = made(folder)
+    paths = made(folder, frames)
     expected, duration = undisturbed(folder, paths)
     chance = random.Random(seed)
     done = {"kills": 0, "rounds": 0}

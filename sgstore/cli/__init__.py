@@ -51,10 +51,9 @@ def run(arguments: list[str]) -> int:
         The exit code, as the module says.
     """
     try:
-        return int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
-    except (KeyboardInterrupt, typer.Abort):  # typer makes the one the other
-        say("interrupted; what was finished is in the store")
-        return INTERRUPTED
+        code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
     except SgstoreError as error:
         say(str(error))
         return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR
@@ -69,3 +68,6 @@ def run(arguments: list[str]) -> int:
             raise
         show()
         return USAGE
+    if code == INTERRUPTED:  # typer, too, makes this code of Ctrl-C
+        say("interrupted; what was finished is in the store")
+    return code
