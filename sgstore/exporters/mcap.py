@@ -34,6 +34,7 @@ from sgstore.exporters.clips import (
     write_manifest,
 )
 from sgstore.exporters.mcap_writer import McapWriter
+from sgstore.traces import open_recording
 from sgstore.traces.fetch import digest_of
 from sgstore.traces.mcap_file import CLIP, McapFile
 from sgstore.world import Clip, Loss, TraceReport
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.traces.chunks import Messages
+    from sgstore.traces.osi_file import OsiFile
     from sgstore.world import Bools, Ints
 
 
@@ -93,7 +95,7 @@ def write_clips(
     written: dict[int, WrittenClip] = {}
     with export_folder(to, names) as folder:
         for trace in dict.fromkeys(clip.trace for clip in clips):
-            with McapFile(sources[trace].path) as recording:
+            with open_recording(sources[trace].path) as recording:
                 source = _survey(recording, sources[trace])
                 for number, clip in enumerate(clips):
                     if clip.trace == trace:
@@ -127,7 +129,7 @@ class _Surveyed:
         ]
 
 
-def _survey(recording: McapFile, source: Source) -> _Surveyed:
+def _survey(recording: McapFile | OsiFile, source: Source) -> _Surveyed:
     digest = digest_of(source.path)
     if source.digest and digest != source.digest:
         raise ExportError(f"{source.path}: the file has changed since it was ingested")
@@ -193,7 +195,7 @@ class _Cut:
 
 
 def _write_clip(
-    recording: McapFile, found: _Surveyed, clip: Clip, file: Path, told: dict[str, str]
+    recording: McapFile | OsiFile, found: _Surveyed, clip: Clip, file: Path, told: dict[str, str]
 ) -> WrittenClip:
     losses = found.losses_within(clip)
     with file.open("xb") as stream:
@@ -224,7 +226,7 @@ def _write_clip(
 
 def _write_head(
     writer: McapWriter,
-    recording: McapFile,
+    recording: McapFile | OsiFile,
     found: _Surveyed,
     clip: Clip,
     told: dict[str, str],
@@ -256,7 +258,7 @@ def _write_head(
     return losses
 
 
-def _write_messages(writer: McapWriter, recording: McapFile, cut: _Cut) -> int:
+def _write_messages(writer: McapWriter, recording: McapFile | OsiFile, cut: _Cut) -> int:
     """The messages of a clip; returns how many of them are context."""
     carried = 0
     for run in recording.walk(TraceReport(), cut.chunks.__contains__):
@@ -276,7 +278,7 @@ def _write_messages(writer: McapWriter, recording: McapFile, cut: _Cut) -> int:
     return carried
 
 
-def _counts(recording: McapFile, counts: dict[int, int]) -> tuple[ChannelCount, ...]:
+def _counts(recording: McapFile | OsiFile, counts: dict[int, int]) -> tuple[ChannelCount, ...]:
     result: list[ChannelCount] = []
     for number, channel in sorted(recording.channels.items()):
         schema = recording.schemas.get(channel.schema_id)

@@ -24,11 +24,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.traces import open_recording
+from sgstore.traces import read_message as read_one
 from sgstore.traces.cdr import decode
 from sgstore.traces.chunks import parse_records, read_chunk_head, read_records
 from sgstore.traces.fetch import open_regular, read_message
 from sgstore.traces.mcap_file import McapFile
-from sgstore.traces.osi_schema import DECODE_ERRORS, message_class
+from sgstore.traces.osi_camera import camera_of
+from sgstore.traces.osi_schema import DECODE_ERRORS, SENSOR_VIEW, message_class
 from sgstore.traces.ros2msg import parse_definition
 from sgstore.traces.summary import read_summary
 from sgstore.world import TraceReport
@@ -36,6 +39,8 @@ from sgstore.world import TraceReport
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from sgstore.traces.recording import Recording
 
 MAX_RUN: Final = 10_000
 """Most messages that are looked through for a key frame: minutes of video."""
@@ -119,8 +124,8 @@ def read_carried(
         As :func:`~sgstore.traces.fetch.read_message`; or it is a frame of a video that cannot be decoded,
         because the recording has no key frame or no parameter sets before it, or is damaged between.
     """
-    message = read_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
-    with McapFile(path) as recording:
+    message = read_one(path, chunk_offset=chunk_offset, offset=offset, length=length)
+    with open_recording(path) as recording:
         unwrap = _unwrapping(recording, channel)
     data, form = unwrap(message)
     for name, start in _PICTURES.items():
@@ -140,7 +145,7 @@ def read_carried(
 # What is in a message -------------------------------------------------------------------------------------
 
 
-def _unwrapping(recording: McapFile, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
+def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
     """A function that gives the data in messages of a channel, and what they call its format; empty: none."""
     if channel not in recording.channels:
         for _ in recording.walk(TraceReport()):  # no summary: channels come with their messages
@@ -153,6 +158,8 @@ def _unwrapping(recording: McapFile, channel: int) -> Callable[[bytes], tuple[by
         if encoding == "cdr" and schema and schema.encoding == "ros2msg":
             kind = parse_definition(schema.name, schema.data)
             return lambda message: _of_record(decode(kind, message))
+        if encoding == "protobuf" and schema and schema.name == SENSOR_VIEW:
+            return camera_of(schema)
         if encoding == "protobuf" and schema:
             made = message_class(schema)
             return lambda message: _of_protobuf(made, message)

@@ -14,6 +14,7 @@ import os
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
@@ -38,8 +39,12 @@ from sgstore.traces.osi_types import descriptors
 from sgstore.world import Loss, TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
+
+    from mcap.records import Metadata
+
+    from sgstore.traces.mcap_file import Place
 
 ENDINGS: Final = (".osi", ".osi.zst")
 """How the names of such files end; nothing in them tells what they are."""
@@ -71,6 +76,9 @@ class OsiFile:
         Nobody counted the messages.
     window : tuple of int
         All log times there are.
+    profile, compression : str
+    metadata, attachments
+        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
 
     Raises
     ------
@@ -80,6 +88,9 @@ class OsiFile:
 
     counts = None
     window = (0, (1 << 63) - 1)
+    profile, compression = "", "zstd"
+    metadata: Final[Mapping[Place, Metadata]] = MappingProxyType({})
+    attachments: tuple[Place, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -109,6 +120,11 @@ class OsiFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def pieces(self, place: Place) -> Iterator[memoryview]:
+        """The bytes of an attachment; there are none."""
+        del place
+        return iter(())
 
     def walk(
         self, report: TraceReport, wanted: Callable[[int], bool] | None = None

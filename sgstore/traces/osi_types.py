@@ -26,6 +26,7 @@ _SCALARS: Final = {
     "uint32": _FIELD.TYPE_UINT32,
     "bool": _FIELD.TYPE_BOOL,
     "string": _FIELD.TYPE_STRING,
+    "bytes": _FIELD.TYPE_BYTES,
 }
 
 
