@@ -16,6 +16,7 @@ import argparse
 import json
 import math
 import random
+import re
 import resource
 import struct
 import sys
@@ -146,7 +147,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "osi views": osi_views,
     "foxglove protobuf": lambda path: foxglove(path, "protobuf"),
     "foxglove json": lambda path: foxglove(path, "json"),
-    "carla": lambda path: carla_recordings.drive(path, FRAMES),
+    "carla": lambda path: carla_recordings.drive(path, FRAMES, everything=True),
 }
 FLAVOURS = [*WRITERS, ".osi", ".osi.zst"]
 
@@ -300,6 +301,32 @@ def hurt_cdr(data: bytes, draw: random.Random) -> bytes:
     return bytes(out)
 
 
+ODD_TYPES = [b"int8", b"float64", b"string", b"wstring", b"bool", b"string<=3", b"Object", b"Time"]
+ODD_SIZES = [b"", b"[]", b"[<=0]", b"[<=1]", b"[1]", b"[3]", b"[0]", b"[1000000]", b"[99999999999]"]
+
+
+def hurt_ros2msg(definition: bytes, draw: random.Random) -> bytes:
+    """Another definition for messages that stay as they are."""
+    lines = definition.split(b"\n")
+    at, other = draw.randrange(len(lines)), draw.randrange(len(lines))
+    match draw.randrange(7):
+        case 0:
+            del lines[at]
+        case 1:
+            lines.insert(at, lines[other])
+        case 2:
+            lines[at] = re.sub(rb"^\S+", lambda _: draw.choice(ODD_TYPES), lines[at])
+        case 3:
+            lines[at] = re.sub(rb"(\[\S*\])?\s", draw.choice(ODD_SIZES) + b" ", lines[at], count=1)
+        case 4:
+            lines[at], lines[other] = lines[other], lines[at]
+        case 5:
+            lines[at] = hurt_bytes(lines[at], draw)
+        case _:
+            del lines[at:]
+    return b"\n".join(lines)
+
+
 def hurt_bytes(data: bytes, draw: random.Random) -> bytes:
     out = bytearray(data)
     at = draw.randrange(len(out) + 1)
@@ -315,6 +342,7 @@ def hurt_bytes(data: bytes, draw: random.Random) -> bytes:
     return bytes(out)
 
 
+HURT_DEFINITION = {"protobuf": hurt_protobuf, "ros2msg": hurt_ros2msg}
 HURT = {"protobuf": hurt_protobuf, "json": hurt_json, "cdr": hurt_cdr}
 
 
@@ -338,10 +366,8 @@ def mutate(whole: Sample, draw: random.Random) -> Sample:  # noqa: C901, PLR0912
             message.data = hurt(message.data, draw)
         case "definition":
             channel = draw.choice(channels)
-            protobuf = channel.schema_encoding == "protobuf"
-            channel.definition = (hurt_protobuf if protobuf else hurt_bytes)(
-                channel.definition, draw
-            )
+            hurt = HURT_DEFINITION.get(channel.schema_encoding, hurt_bytes)
+            channel.definition = hurt(channel.definition, draw)
         case "channel":
             channel, other = draw.choice(channels), draw.choice(channels)
             match draw.randrange(4):
