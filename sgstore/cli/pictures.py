@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,6 +19,7 @@ from sgstore.cli.arguments import (
     query_of,
 )
 from sgstore.cli.output import say
+from sgstore.cli.progress import count_bar
 
 
 class DrawnRelations(StrEnum):
@@ -29,53 +30,71 @@ class DrawnRelations(StrEnum):
     none = "none"
 
 
+Frame = Annotated[
+    str,
+    typer.Argument(
+        metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s."
+    ),
+]
+Picture = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        help="The picture: .png or .svg; of a clip: .gif.",
+        show_default="frame.png, clip.gif",
+    ),
+]
+DrawnEdges = Annotated[DrawnRelations, typer.Option("--relations", help="Which edges are drawn.")]
+Camera = Annotated[
+    str | None,
+    typer.Option("--camera", help="Channel of a picture to put beside it; 'none' for no picture."),
+]
+Radius = Annotated[
+    float | None, typer.Option("--radius", help="Half the side of the window, in metres.")
+]
+NorthUp = Annotated[bool, typer.Option("--north-up", help="North is up, not the ego's heading.")]
+Diagram = Annotated[bool, typer.Option("--graph", help="Beside it the graph as nodes and edges.")]
+PicturesASecond = Annotated[
+    float, typer.Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
+]
+
+
 @app.command()
 def show(
     store: StorePath,
-    frame: Annotated[
-        str, typer.Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")
-    ],
+    frame: Frame,
     query: QueryText = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="The picture: .png or .svg.")
-    ] = Path("frame.png"),
+    output: Picture = None,
     file: QueryFile = None,
     parameters: Parameters = None,
-    relations: Annotated[
-        DrawnRelations, typer.Option("--relations", help="Which edges are drawn.")
-    ] = DrawnRelations.ego,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera", help="Channel of a picture to put beside it; 'none' for no picture."
-        ),
-    ] = None,
-    radius: Annotated[
-        float | None, typer.Option("--radius", help="Half the side of the window, in metres.")
-    ] = None,
-    north_up: Annotated[
-        bool, typer.Option("--north-up", help="North is up, not the ego's heading.")
-    ] = False,
-    graph: Annotated[
-        bool, typer.Option("--graph", help="Beside it the graph as nodes and edges.")
-    ] = False,
+    relations: DrawnEdges = DrawnRelations.ego,
+    camera: Camera = None,
+    radius: Radius = None,
+    north_up: NorthUp = False,
+    graph: Diagram = False,
+    fps: PicturesASecond = 10.0,
 ) -> int:
-    """Draw a frame from above; with a QUERY, what it matches there is marked."""
-    from sgstore.draw.stored import draw_stored
+    """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
+    from sgstore.draw.stored import draw_clip, draw_stored, range_of
 
     opened = open_store(store)
     text = query_of(query, file) if query or file else None
-    marked = draw_stored(
-        opened,
-        frame,
-        output,
-        matches=opened.find(text, **parameters_of(parameters)) if text else None,
-        camera=camera,
-        relations=relations.value,
-        radius=radius,
-        north_up=north_up,
-        diagram=graph,
-    )
+    clip = range_of(frame)
+    output = output or Path("clip.gif" if clip else "frame.png")
+    options: dict[str, Any] = {
+        "matches": opened.find(text, **parameters_of(parameters)) if text else None,
+        "camera": camera,
+        "relations": relations.value,
+        "radius": radius,
+        "north_up": north_up,
+        "diagram": graph,
+    }
+    if clip is None:
+        marked = int(draw_stored(opened, frame, output, **options))
+    else:
+        with count_bar(output.name, "pictures") as bar:
+            marked = draw_clip(opened, clip, output, fps=fps, on_frame=bar, **options)
     if text and not marked:
         say(f"the query does not match in {frame}: nothing is marked")
     typer.echo(output)

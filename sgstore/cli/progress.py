@@ -48,3 +48,26 @@ def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
 
     with bar:
         yield show
+
+
+@contextmanager
+def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | None]:
+    """A function that shows how many of how many things are done; ``None`` where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(things))
+    with Progress(
+        *columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True
+    ) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

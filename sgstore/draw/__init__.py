@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.draw.labels import Rect
+    from sgstore.draw.legend import Entry
     from sgstore.draw.page import Page
     from sgstore.draw.scene import Scene
     from sgstore.graph import SceneGraph
@@ -88,50 +89,64 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
     MissingExtraError
         If the drawing packages are not installed.
     """
-    _check_installed()
+    check_installed()
     from sgstore.draw.page import check_format, own_style
     from sgstore.draw.scene import Scene
 
     check_format(to)
     with own_style():
-        matched = _matched(highlight)
-        view = view_of(graph, _checked(radius), matched, north_up=north_up)
+        matched = matched_nodes(highlight)
+        view = view_of(graph, checked(radius), matched, north_up=north_up)
         scene = Scene.of(graph, road_map, matched, view, relations)
         title = title or title_of(graph)
-        shown = (
-            _diagram_page(scene, title, relations)
-            if diagram
-            else _frame_page(scene, title, picture)
+        page = (
+            diagram_page(scene, title, relations) if diagram else frame_page(scene, title, picture)
         )
-        shown.save(to)
+        page.save(to)
 
 
-def _frame_page(scene: Scene, title: str, picture: bytes | None) -> Page:
-    """The view from above, and beside it what a camera saw, what was matched, what is around, the legend."""
-    from sgstore.draw.page import Page
+def frame_page(
+    scene: Scene,
+    title: str,
+    picture: bytes | None,
+    entries: Sequence[Entry] | None = None,
+    dpi: float | None = None,
+) -> Page:
+    """The view from above, and beside it what a camera saw, what was matched, what is around, the legend.
+
+    ``entries``: the legend, by default of what occurs; ``dpi``: see :class:`sgstore.draw.page.Page`.
+    """
+    from sgstore.draw.page import DPI, Page
     from sgstore.draw.scene import paint_scene
 
-    page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE)
+    page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE, dpi or DPI)
     stage = page.stage((_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW), scene.view)
     unnamed = paint_scene(stage, scene)
     _paint_title(page, title, _subtitle(scene, unnamed))
-    _paint_panel(page, scene, stage.half, picture)
+    _paint_panel(page, scene, stage.half, picture, entries)
     return page
 
 
-def _diagram_page(scene: Scene, title: str, relations: Relations) -> Page:
-    """The view from above, beside it the graph as nodes and edges, the legend below."""
+def diagram_page(
+    scene: Scene,
+    title: str,
+    relations: Relations,
+    entries: Sequence[Entry] | None = None,
+    dpi: float | None = None,
+) -> Page:
+    """The view from above, beside it the graph as nodes and edges, the legend below; see :func:`frame_page`."""
     from sgstore.draw.diagram import diagram_entries, paint_diagram
     from sgstore.draw.legend import entries_of
-    from sgstore.draw.page import Page
+    from sgstore.draw.page import DPI, Page
     from sgstore.draw.panel import key_height, paint_key
     from sgstore.draw.scene import paint_scene
 
     half = scene.view.radius
-    entries = [e for e in entries_of(scene, (half, half)) if not e.is_long]
-    entries += diagram_entries()
-    foot = key_height(len(entries)) + _MARGIN
-    page = Page(3 * _MARGIN + 2 * _WINDOW, _MARGIN + foot + _WINDOW + _TITLE)
+    known = entries_of(scene, (half, half)) if entries is None else entries
+    key = [*(e for e in known if not e.is_long), *diagram_entries()]
+    foot = key_height(len(key)) + _MARGIN
+    size = (3 * _MARGIN + 2 * _WINDOW, _MARGIN + foot + _WINDOW + _TITLE)
+    page = Page(*size, dpi or DPI)
     bottom, middle = _MARGIN + foot, 2 * _MARGIN + _WINDOW
     stage = page.stage((_MARGIN, bottom, _MARGIN + _WINDOW, bottom + _WINDOW), scene.view)
     unnamed = paint_scene(stage, scene)
@@ -139,7 +154,7 @@ def _diagram_page(scene: Scene, title: str, relations: Relations) -> Page:
     box = (middle, bottom, middle + _WINDOW, bottom + _WINDOW)
     told = paint_diagram(page, box, scene, relations)
     _paint_title(page, "Its scene graph", f"{told}  ·  {_READ_DIAGRAM}", left=middle)
-    paint_key(page, entries, (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2))
+    paint_key(page, key, (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2))
     return page
 
 
@@ -192,12 +207,12 @@ def draw_sheet(
     """
     if not 1 <= len(frames) <= 100 or columns < 1:
         raise ValueError(f"a sheet has 1 to 100 frames in columns, not {len(frames)} in {columns}")
-    _check_installed()
+    check_installed()
     from sgstore.draw.page import Page, check_format, own_style
 
     check_format(to)
-    reach = _checked(radius) or max(
-        view_of(f.graph, None, _matched(f.highlight)).radius for f in frames
+    reach = checked(radius) or max(
+        view_of(f.graph, None, matched_nodes(f.highlight)).radius for f in frames
     )
     across = min(columns, len(frames))
     down = -(-len(frames) // across)
@@ -234,7 +249,7 @@ def draw_map(road_map: RoadMap, to: Path, *, title: str | None = None) -> None:
     MissingExtraError
         If the drawing packages are not installed.
     """
-    _check_installed()
+    check_installed()
     from sgstore.draw.atlas import paint_atlas
     from sgstore.draw.page import Page, check_format, own_style
 
@@ -256,7 +271,14 @@ def title_of(graph: SceneGraph) -> str:
     return f"{clean(graph.trace)}   frame {graph.seq}   {seconds}"
 
 
-def _check_installed() -> None:
+def check_installed() -> None:
+    """Refuse to go on without the drawing packages.
+
+    Raises
+    ------
+    MissingExtraError
+        They are not installed.
+    """
     try:
         import matplotlib as mpl
         import PIL
@@ -265,13 +287,14 @@ def _check_installed() -> None:
     del mpl, PIL
 
 
-def _checked(radius: float | None) -> float | None:
+def checked(radius: float | None) -> float | None:
+    """A radius that a user gave, if it is one; m."""
     if radius is not None and not 1.0 <= radius <= 10_000.0:
         raise ValueError(f"radius is {radius} m, expected 1 to 10,000 m")
     return radius
 
 
-def _matched(highlight: Mapping[str, int] | Sequence[int]) -> dict[int, str]:
+def matched_nodes(highlight: Mapping[str, int] | Sequence[int]) -> dict[int, str]:
     """Node id → variables that it is bound to."""
     if not isinstance(highlight, Mapping):
         return dict.fromkeys(map(int, highlight), "")
@@ -312,14 +335,18 @@ def _panel_box(page: Page) -> Rect:
 
 
 def _paint_panel(
-    page: Page, scene: Scene, half: tuple[float, float], picture: bytes | None
+    page: Page,
+    scene: Scene,
+    half: tuple[float, float],
+    picture: bytes | None,
+    entries: Sequence[Entry] | None,
 ) -> None:
     from sgstore.draw import panel as side
     from sgstore.draw.legend import entries_of
 
     left, bottom, right, top = _panel_box(page)
     panel = side.Panel(page, left, right, bottom, top)
-    entries = entries_of(scene, half)
+    entries = entries_of(scene, half) if entries is None else entries
     if picture is not None:
         side.paint_picture(panel, picture)
     if scene.matched:
@@ -332,7 +359,7 @@ def _paint_cell(page: Page, frame: SheetFrame, box: Rect, radius: float) -> None
     from sgstore.draw.scene import Scene, paint_scene
 
     view = view_of(frame.graph, radius)
-    matched = _matched(frame.highlight)
+    matched = matched_nodes(frame.highlight)
     scene = Scene.of(frame.graph, frame.road_map, matched, view, "ego")
     paint_scene(page.stage(box, view), scene, every_name=False)
     caption = clean(frame.caption) if frame.caption else title_of(frame.graph)

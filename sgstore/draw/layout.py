@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 GAP: Final = (26.0, 11.0)
 """Room between two nodes, to the sides and up and down, so that lines between them can be seen."""
-ROUNDS: Final = 400
+ROUNDS: Final = 200
 ROW: Final = 17.0
 """Height of a row of parts of the map."""
 _PULL: Final = 0.06
@@ -59,7 +59,7 @@ def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> F
     scale = np.divide(1.0, np.sqrt(share), out=np.zeros_like(share), where=share > 0)
     room = half - sizes.max(axis=0) / 2
     wanted = (low + high) / 2 + away * scale[:, None] * room
-    return _apart(wanted, sizes, box, pinned)
+    return _freed(_apart(wanted, sizes, box, pinned), sizes, box, pinned)
 
 
 def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
@@ -87,6 +87,26 @@ def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
         step = 0.3 * push.sum(axis=1) + calm * _PULL * (wanted - spots)
         spots[loose] += step[loose]
         spots = np.clip(spots, low, high)
+    return spots
+
+
+def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
+    """Put each node that still lies on an earlier one into the nearest free place, if there is any."""
+    low, high = np.array(box[:2]), np.array(box[2:])
+    spots = spots.copy()
+    for node in range(pinned, len(spots)):
+        needed = (sizes[:node] + sizes[node]) / 2 + 1.0
+        if not (np.abs(spots[:node] - spots[node]) < needed).all(axis=1).any():
+            continue
+        half = sizes[node] / 2
+        steps = (
+            np.arange(low[i] + half[i], high[i] - half[i] + 1e-6, half[i] / (2 - i)) for i in (0, 1)
+        )
+        places = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+        taken = (np.abs(places[:, None] - spots[:node]) < needed).all(axis=2).any(axis=1)
+        if not taken.all():
+            far = np.hypot(*(places - spots[node]).T)
+            spots[node] = places[np.argmin(np.where(taken, np.inf, far))]
     return spots
 
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from numpy.typing import NDArray
 
     from sgstore.draw.labels import Rect
     from sgstore.draw.view import View
@@ -175,12 +176,15 @@ class Page:
     ----------
     width, height : float
         In points.
+    dpi : float
+        Pixels of an inch, where it is drawn in pixels.
     """
 
-    def __init__(self, width: float, height: float) -> None:
+    def __init__(self, width: float, height: float, dpi: float = DPI) -> None:
         self.width = width
         self.height = height
-        self._figure = Figure(figsize=(width / 72, height / 72), dpi=DPI, facecolor=PAPER)
+        self._dpi = dpi
+        self._figure = Figure(figsize=(width / 72, height / 72), dpi=dpi, facecolor=PAPER)
         self._canvas = FigureCanvasAgg(self._figure)
         self.sheet = self._axes(0, 0, width, height)
         self.sheet.set_xlim(0, width)
@@ -228,7 +232,7 @@ class Page:
             font,
             False,  # noqa: FBT003  its only spelling that all releases know
         )
-        return width * 72 / DPI, height * 72 / DPI
+        return width * 72 / self._dpi, height * 72 / self._dpi
 
     def picture(
         self, picture: bytes, left: float, top: float, width: float, height: float
@@ -267,11 +271,14 @@ class Page:
         self._figure.savefig(written, format="svg", metadata={"Creator": "sgstore", "Date": None})
         return written.getvalue()
 
-    def _png(self) -> bytes:
+    def pixels(self) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8: the page as it is seen."""
         self._canvas.draw()
-        pixels = np.ascontiguousarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
+        return np.ascontiguousarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
+
+    def _png(self) -> bytes:
         written = io.BytesIO()
-        indexed(Image.fromarray(pixels)).save(written, "PNG")
+        indexed(Image.fromarray(self.pixels())).save(written, "PNG")
         return written.getvalue()
 
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:

@@ -1,0 +1,287 @@
+"""Animations of clips: every picture at its time, in memory that does not grow."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from drawing import Crossing, crowd, entity, graph_of, related
+from PIL import Image
+
+from sgstore.cli import run
+from sgstore.demo import RECORDING
+from sgstore.draw.film import Film, Shot
+from sgstore.draw.gif import Gif, changed
+from sgstore.draw.stored import FrameRange, draw_clip, draw_stored, range_of
+from sgstore.errors import ExportError, StoreError
+from sgstore.ingest import ingest
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+RED = (
+    "MATCH (light:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(:Lane)<-[:isIn]-(:Ego)"
+)
+
+
+def read(path: Path) -> tuple[list[NDArray[np.uint8]], list[int]]:
+    """Pictures of an animation as they are seen, and how long each is shown; ms."""
+    pictures: list[NDArray[np.uint8]] = []
+    durations: list[int] = []
+    with Image.open(path) as image:
+        for number in range(getattr(image, "n_frames", 1)):
+            image.seek(number)
+            pictures.append(np.asarray(image.convert("RGB")))
+            durations.append(image.info["duration"])
+    return pictures, durations
+
+
+def noise(seed: int, height: int = 40, width: int = 60) -> NDArray[np.uint8]:
+    """Areas of few colours."""
+    rng = np.random.default_rng(seed)
+    colours = rng.integers(0, 256, (30, 3)).astype(np.uint8)
+    return colours[rng.integers(0, 30, (height, width))]
+
+
+# The container ------------------------------------------------------------------------------------
+
+
+def test_pictures_come_back_as_they_were_at_their_times(tmp_path: Path) -> None:
+    pictures = [noise(seed) for seed in range(5)]
+    pictures[3] = pictures[2].copy()
+    pictures[3][10:20, 30:35] = 7
+    with Gif(tmp_path / "a.gif") as gif:
+        for picture, time in zip(pictures, (0.0, 0.104, 0.2, 0.25, 1.0), strict=True):
+            gif.add(picture, time)
+
+    shown, durations = read(tmp_path / "a.gif")
+
+    assert all((a == b).all() for a, b in zip(shown, pictures, strict=True))
+    assert durations == [100, 100, 50, 750, 750]
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.info["loop"] == 0
+
+
+def test_times_do_not_drift(tmp_path: Path) -> None:
+    with Gif(tmp_path / "a.gif") as gif:
+        for step in range(31):
+            gif.add(noise(step, 4, 4), step / 30)
+
+    durations = read(tmp_path / "a.gif")[1]
+
+    assert sum(durations[:-1]) == 1000
+    assert set(durations) == {30, 40}
+
+
+def test_a_picture_that_does_not_change_stays(tmp_path: Path) -> None:
+    with Gif(tmp_path / "a.gif") as gif:
+        for step in range(3):
+            gif.add(noise(1), step / 10)
+
+    shown, _ = read(tmp_path / "a.gif")
+    assert all((picture == noise(1)).all() for picture in shown)
+    assert changed(noise(1), noise(1)) == (0, 0, 1, 1)
+    assert changed(None, noise(1)) == (0, 0, 60, 40)
+
+
+@pytest.mark.parametrize("colours", [1, 2, 3, 16, 17, 256, 4000])
+def test_any_number_of_colours(tmp_path: Path, colours: int) -> None:
+    rng = np.random.default_rng(colours)
+    table = rng.integers(0, 256, (colours, 3)).astype(np.uint8)
+    picture = table[rng.integers(0, colours, (64, 64))]
+    with Gif(tmp_path / "a.gif") as gif:
+        gif.add(picture, 0.0)
+
+    ((shown,), _) = read(tmp_path / "a.gif")
+
+    apart = np.abs(shown.astype(int) - picture)
+    assert apart.max() <= (0 if colours <= 256 else 120)
+
+
+def test_what_is_broken_off_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "a.gif").write_bytes(b"precious")
+
+    def broken_off() -> None:
+        with Gif(tmp_path / "a.gif") as gif:
+            gif.add(noise(1), 0.0)
+            gif.add(noise(2), 0.1)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        broken_off()
+
+    assert [(f.name, f.read_bytes()) for f in tmp_path.iterdir()] == [("a.gif", b"precious")]
+
+
+def test_a_folder_that_is_missing_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="cannot write the animation"):
+        Gif(tmp_path / "missing" / "a.gif")
+
+
+def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
+    with Gif(tmp_path / "a.gif") as gif:
+        tracemalloc.start()
+        try:
+            sizes: list[int] = []
+            for step in range(120):
+                gif.add(noise(step, 200, 200), step / 10)
+                sizes.append(tracemalloc.get_traced_memory()[0])
+        finally:
+            tracemalloc.stop()
+    assert max(sizes[60:]) <= max(sizes[10:60]) + 20_000
+
+
+# Films --------------------------------------------------------------------------------------------
+
+
+def shots() -> list[Shot]:
+    """The ego at rest; a person walks by."""
+    made: list[Shot] = []
+    for step in range(3):
+        nodes = {
+            0: entity("car", 0.0, 0.0, 90.0, is_ego=True),
+            1: entity("person", -5.0 + 5 * step, 12.0),
+        }
+        graph = graph_of(nodes, related(nodes))
+        graph = type(graph)(**{name: getattr(graph, name) for name in graph.__slots__}
+                            | {"seq": step, "time_ns": step * 200_000_000})  # fmt: skip
+        made.append(Shot(graph, {"p": 1} if step == 1 else {}))
+    return made
+
+
+@pytest.mark.parametrize("diagram", [False, True])
+def test_a_film_is_of_one_size_and_runs_as_fast_as_the_trace(tmp_path: Path, diagram: bool) -> None:
+    with Film(tmp_path / "a.gif", None, shots(), diagram=diagram) as film:
+        for shot in shots():
+            film.add(shot)
+
+    pictures, durations = read(tmp_path / "a.gif")
+    assert durations == [200, 200, 200]
+    assert len({picture.shape for picture in pictures}) == 1
+    assert (pictures[0] != pictures[1]).any()
+
+
+def test_the_scale_is_that_of_the_whole_clip(tmp_path: Path) -> None:
+    road_map = Crossing()
+    near = Shot(graph_of({0: entity("car", 0.0, 0.0, 90.0, is_ego=True)}, []), {})
+    far = Shot(crowd(road_map), {})
+    film = Film(tmp_path / "a.gif", road_map, [near, far])
+    with film:
+        scales = {film._scene(shot).view.radius for shot in (near, far)}
+
+    assert len(scales) == 1
+    assert scales.pop() > 30.0
+
+
+def test_a_film_that_is_no_gif_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"end the name in \.gif"):
+        Film(tmp_path / "a.png", None, shots())
+    assert list(tmp_path.iterdir()) == []
+
+
+# Of a store ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("store") / "town.sgstore"
+    ingest(path, [RECORDING])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "ends"),
+    [
+        ("town@12s..18.5s", ("town@12s", "town@18.5s")),
+        ("town@12..18", ("town@12s", "town@18s")),
+        ("a#b#3..14", ("a#b#3", "a#b#14")),
+        ("town@12s", None),
+        ("town#12", None),
+        ("148", None),
+    ],
+)
+def test_a_clip_is_named_by_its_ends(text: str, ends: tuple[str, str] | None) -> None:
+    assert range_of(text) == (ends and FrameRange(*ends))
+
+
+def test_a_clip_of_a_store_is_drawn_with_what_matches(store: Path, tmp_path: Path) -> None:
+    done: list[tuple[int, int]] = []
+    opened = Store(store)
+
+    marked = draw_clip(
+        opened,
+        FrameRange("town#210", "town#218"),
+        tmp_path / "a.gif",
+        matches=opened.find(RED),
+        radius=30.0,
+        fps=4.0,
+        on_frame=lambda *counts: done.append(counts),
+    )
+
+    pictures, durations = read(tmp_path / "a.gif")
+    assert done == [(1, 3), (2, 3), (3, 3)]
+    assert marked == len(pictures) == 3
+    assert durations == [300, 300, 300]
+
+
+def test_a_clip_that_is_none_says_why(store: Path, tmp_path: Path) -> None:
+    opened, to = Store(store), tmp_path / "a.gif"
+
+    with pytest.raises(ExportError, match="ends before it begins"):
+        draw_clip(opened, FrameRange("town@20s", "town@10s"), to)
+    with pytest.raises(StoreError, match="town"):
+        draw_clip(opened, FrameRange("town@70s", "town@500s"), to)
+    with pytest.raises(ValueError, match="fps"):
+        draw_clip(opened, FrameRange("town@1s", "town@2s"), to, fps=0.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_of_a_stored_frame_has_the_camera_that_is_asked_for(
+    store: Path, tmp_path: Path
+) -> None:
+    opened = Store(store)
+    pictures: dict[str, Any] = {}
+    for name, camera in (("default", None), ("named", "/ego/camera/front/image"), ("none", "none")):
+        assert not draw_stored(opened, "town#217", tmp_path / f"{name}.svg", camera=camera)
+        pictures[name] = (tmp_path / f"{name}.svg").read_text(encoding="utf-8")
+
+    assert "<image" in pictures["default"]
+    assert pictures["default"] == pictures["named"]
+    assert "<image" not in pictures["none"]
+    with pytest.raises(StoreError, match="/nowhere"):
+        draw_stored(opened, "town#217", tmp_path / "a.svg", camera="/nowhere")
+    with pytest.raises(ExportError, match="no JPEG or PNG"):
+        draw_stored(opened, "town#217", tmp_path / "a.svg", camera="/ego/lidar/points")
+    assert not (tmp_path / "a.svg").exists()
+
+
+def test_what_a_query_matches_in_a_stored_frame_is_marked(store: Path, tmp_path: Path) -> None:
+    opened = Store(store)
+
+    assert draw_stored(
+        opened, "town#217", tmp_path / "a.svg", matches=opened.find(RED), camera="none"
+    )
+    assert "light = traffic_light" in (tmp_path / "a.svg").read_text(encoding="utf-8")
+    nothing = opened.find("MATCH (e:Ego)-[:isIn]->(l:Lane {name: 'nowhere'})")
+    assert not draw_stored(opened, "town#217", tmp_path / "b.svg", matches=nothing, camera="none")
+
+
+def test_the_verb_draws_frames_and_clips(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gif, png = tmp_path / "a.gif", tmp_path / "a.png"
+    options = ["--radius", "30", "--camera", "none"]
+
+    assert run(["show", str(store), "town@21s..21.2s", "-o", str(gif), *options]) == 0
+    assert run(["show", str(store), "town#210", "--graph", "-o", str(png), *options]) == 0
+    assert capsys.readouterr().out == f"{gif}\n{png}\n"
+    assert len(read(gif)[0]) == 3
+    assert run(["show", str(store), "town@21s..22s", "-o", str(png), *options]) == 1
+    assert "end the name in .gif" in capsys.readouterr().err
+    assert run(["show", str(store), "town#210", "-o", str(gif), *options]) == 1
+    assert ".png or .svg" in capsys.readouterr().err
