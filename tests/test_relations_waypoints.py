@@ -101,6 +101,20 @@ def test_waypoints_lead_on_from_lane_to_lane() -> None:
     assert {a.partition("@")[0] == b for a, b in names(town, "isIn") if "@" in a} == {True}
 
 
+def test_a_waypoint_has_the_curvature_of_its_lane() -> None:
+    town = map_of_graphs(road(), with_points(4))
+
+    assert town is not None
+    points = {
+        name: curvature
+        for name, curvature in zip(town.nodes.name, town.nodes.curvature, strict=True)
+        if not math.isnan(curvature)
+    }
+    assert points["7/0/-1@4"] == pytest.approx(0)
+    assert points["8/0/-1@8"] == pytest.approx(1 / (20 + 1.5), rel=0.02)  # on the outside
+    assert all("@" in name for name in points)
+
+
 def test_lanes_of_types_that_are_not_kept_have_no_waypoints() -> None:
     town = map_of_graphs(road(), with_points(4, types=("sidewalk",)))
 

@@ -57,13 +57,14 @@ def recording(data: Path, name: str) -> Path:
 
 def rows(graph: GraphBlock, frame: int) -> dict[str, set[tuple[object, ...]]]:
     """What is in the graph of a frame."""
-    of, lanes, there = graph.edges, graph.lanes, graph.presence
-    edge, lane = of.frame == frame, lanes.frame == frame
+    of, lanes, there, gaps = graph.edges, graph.lanes, graph.presence, graph.gaps
+    edge, lane, gap = of.frame == frame, lanes.frame == frame, gaps.frame == frame
     state = slice(graph.frames.offsets[frame], graph.frames.offsets[frame + 1])
     return {
         "states": set(graph.frames.states.node[state].tolist()),
         "presence": set(there.node[there.frame == frame].tolist()),
         "edges": set(zip(of.src[edge], of.relation[edge], of.dst[edge], strict=True)),
+        "gaps": set(zip(gaps.src[gap], gaps.dst[gap], gaps.gap[gap], strict=True)),
         "lanes": {
             tuple(map(float, row))
             for row in zip(
@@ -138,6 +139,30 @@ def test_lane_states_belong_to_edges_and_one_of_each_entity_is_primary(
         assert of_lanes <= of_edges
         assert len(primary) == len(set(primary))
         assert set(primary) == set(zip(lanes.frame, lanes.node, strict=True))
+
+
+@recordings
+def test_gaps_belong_to_edges_that_lead_and_follow(data: Path, name: str) -> None:
+    for graph in graphs(recording(data, name)):
+        of, gaps = graph.edges, graph.gaps
+        leads, follows = (
+            set(zip(of.frame[rows], of.src[rows], of.dst[rows], strict=True))
+            for rows in (of.relation == RELATION_CODE[r] for r in ("leads", "follows"))
+        )
+        assert set(zip(gaps.frame, gaps.src, gaps.dst, strict=True)) == follows
+        assert len(gaps) == len(follows)
+        assert {(frame, b, a) for frame, a, b in follows} == leads
+
+
+@recordings
+def test_the_ego_sees_what_is_there_and_never_itself(data: Path, name: str) -> None:
+    for graph in graphs(recording(data, name)):
+        of, frames = graph.edges, graph.frames
+        seen = of.relation == RELATION_CODE["sees"]
+        assert (of.src[seen] == frames.ego[of.frame[seen]]).all()
+        assert (of.src[seen] != of.dst[seen]).all()
+        ends = np.stack([of.frame[seen], of.dst[seen]])
+        assert len(np.unique(ends, axis=1).T) == seen.sum()
 
 
 def test_vehicles_of_the_swarm_drive_in_driving_lanes(data: Path) -> None:

@@ -28,9 +28,7 @@ _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _INPUTS: Final = ("steer", "throttle", "brake")
 _DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
 _MAP_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
-_MAP_NUMBERS: Final = (
-    *("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature"),
-)
+_MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
 
 
 class Known(NamedTuple):
