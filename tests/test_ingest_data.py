@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.data
 
-FLAVOURS = ("osi_converter/*.mcap", "omega_prime/*.mcap", "esmini/*.mcap", "sumo/*.mcap")
+FLAVOURS = ("osi_converter", "omega_prime", "esmini", "sumo", "carla")
 
 
 @pytest.fixture(scope="module")
 def ingested(data, tmp_path_factory) -> Iterator[tuple[StoreFile, list[TraceOutcome]]]:
-    paths = [path for flavour in FLAVOURS for path in sorted((data / "traces").glob(flavour))]
+    paths = [
+        path for flavour in FLAVOURS for path in sorted((data / "traces" / flavour).glob("*.mcap"))
+    ]
     place = tmp_path_factory.mktemp("data") / "s.db"
     outcomes = ingest(place, paths)
     store = StoreFile(place)
@@ -39,7 +41,7 @@ def said(path: Path, topic: str) -> dict[int, bytes]:
 def test_everything_comes_in_without_a_loss(ingested) -> None:
     _, outcomes = ingested
 
-    assert len(outcomes) == 11
+    assert len(outcomes) == 13
     assert {o.path.stem: (o.status, o.losses, o.error) for o in outcomes} == {
         o.path.stem: ("added", [], None) for o in outcomes
     }
