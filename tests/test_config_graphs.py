@@ -1,0 +1,114 @@
+"""Whatever the settings are, graphs are whole: every edge ends at nodes that are there, and is there once."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+from sgstore.config import Config, configured
+from sgstore.opendrive import read_map
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
+from sgstore.traces import open_trace
+from sgstore.vocabulary import RELATION_CODE, RELATIONS
+
+if TYPE_CHECKING:
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.world import FrameBlock
+
+CHOICES: dict[str, dict[str, list[Any]]] = {
+    "range": {
+        "shape": ["radius", "rectangle", "polygon", "corridor"],
+        "polygon": [[[40, 0], [-10, 18], [-10, -18]]],
+        "height": [[], [-1, 1]],
+        "by": ["footprint", "centre"],
+    },
+    "lanes": {
+        "granularity": ["none", "lane", "waypoint"],
+        "sections": [True, False],
+        "types": [[], ["driving"]],
+        "ahead": [0, 60],
+    },
+    "proximity": {"between": ["centres", "origins", "footprints"]},
+    "direction": {"ties": ["ahead", "both", "carlasgg"], "sides": ["open", "closed", "none"]},
+    "pairs": {
+        "ego": [True, False],
+        "within": [0, 25],
+        "static": [False, True],
+        "kinds": [[], [["Vehicle", "Person"], ["Ego", "Entity"]]],
+    },
+}
+KINDS: list[list[str]] = [[], ["Vehicle", "Lane", "Waypoint"], ["Entity"], ["Person", "Road"]]
+
+
+def any_config(seed: int) -> Config:
+    rng = np.random.default_rng(seed)
+
+    def one_of(choices: list[Any]) -> Any:
+        return choices[int(rng.integers(len(choices)))]
+
+    tables = {
+        name: {key: one_of(values) for key, values in table.items()}
+        for name, table in CHOICES.items()
+    }
+    without = [name for name in ("sees", "near", "isIn", "overlaps") if rng.random() < 0.2]
+    return configured(**tables, kinds=one_of(KINDS), without=without)
+
+
+@cache
+def sample() -> tuple[list[FrameBlock], RoadMap]:
+    with open_trace(REPOSITORY / "sgstore/sample/town.mcap") as trace:
+        return list(islice(trace.blocks(30), 2)), read_map(trace.info.map_text, "town")
+
+
+def nodes_of(graph: GraphBlock) -> set[tuple[int, int]]:
+    """Frames and nodes that are in a graph."""
+    moving = zip(graph.frames.frame_of.tolist(), graph.frames.states.node.tolist(), strict=True)
+    still = zip(graph.presence.frame.tolist(), graph.presence.node.tolist(), strict=True)
+    return {*moving, *still}
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_every_edge_ends_at_nodes_and_is_there_once(seed: int) -> None:
+    config, (blocks, road_map) = any_config(seed), sample()
+    generator, shown = SceneGraphGenerator(road_map, config), map_of_graphs(road_map, config)
+    assert shown is not None
+    for block in blocks:
+        graph = generator.block(block)
+        nodes, edges = nodes_of(graph), graph.edges
+        table = np.column_stack([edges.frame, edges.relation, edges.src, edges.dst])
+
+        assert len(np.unique(table, axis=0)) == len(table)
+        of = graph.lanes
+        ends = ((edges.frame, edges.src), (edges.frame, edges.dst), (of.frame, of.lane))
+        for frame, end in (*ends, (of.frame, of.node)):
+            assert set(zip(frame.tolist(), end.tolist(), strict=True)) <= nodes
+        assert min((node for _, node in nodes), default=0) >= -len(shown.nodes)
+        assert {RELATIONS[code] for code in edges.relation.tolist()} <= set(generator.answers)
+        in_lanes = table[edges.relation == RELATION_CODE["isIn"]][:, [0, 2, 3]].tolist()
+        states = zip(of.frame.tolist(), of.node.tolist(), of.lane.tolist(), strict=True)
+        assert {*states} <= set(map(tuple, in_lanes))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_frames_one_by_one_give_the_same_whatever_the_settings(seed: int) -> None:
+    config, (blocks, road_map) = any_config(100 + seed), sample()
+    with open_trace(REPOSITORY / "sgstore/sample/town.mcap") as trace:
+        few = list(islice(trace.blocks(7), 4))
+
+    def edges_of(parts: list[FrameBlock]) -> list[tuple[int, ...]]:
+        generator, found = SceneGraphGenerator(road_map, config), []
+        for part in parts:
+            of = generator.block(part).edges
+            seq = part.seq[of.frame]
+            columns = (column.tolist() for column in (seq, of.relation, of.src, of.dst))
+            found += list(zip(*columns, strict=True))
+        return sorted(found)
+
+    last = few[-1].seq[-1]
+    assert edges_of(few) == [edge for edge in edges_of(blocks[:1]) if edge[0] <= last]
