@@ -73,6 +73,17 @@ def test_the_parts_of_a_map_are_counted_and_measured(tmp_path: Path, call: Any) 
     assert "road 'bad'" in rows[10][1]
 
 
+def test_in_a_table_warnings_are_said_and_are_no_rows(tmp_path: Path, call: Any) -> None:
+    file = tmp_path / "small.xodr"
+    file.write_text(small(), encoding="utf-8")
+
+    code, out, err = call("map", file)
+
+    assert code == 0
+    assert "road 'bad'" in err
+    assert "warning" not in out
+
+
 def test_a_table_for_people_has_the_same_rows(call: Any) -> None:
     code, out, _ = call("map", TOWN)
     _, machine, _ = call("map", TOWN, "--format", "ndjson")

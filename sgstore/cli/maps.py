@@ -38,13 +38,18 @@ def map_(
 
         draw_map(road_map, picture)
         say(f"drawn: {picture}")
+    form = form_of(form, as_json=as_json)
     rows = [
         (one.part, one.kind, one.count, None if one.length is None else round(one.length, 1))
         for one in summary(road_map)
     ]
+    if form is Format.table:  # sentences have no room in a table
+        for _, text, _, _ in (row for row in rows if row[0] == "warning"):
+            say(text)
+        rows = [row for row in rows if row[0] != "warning"]
     columns = ("part", "kind", "count", "length_m")
     types = ("VARCHAR", "VARCHAR", "BIGINT", "DOUBLE")
-    write_rows(columns, rows, form_of(form, as_json=as_json), types=types)
+    write_rows(columns, rows, form, types=types)
     return 0
 
 

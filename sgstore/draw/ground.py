@@ -157,7 +157,7 @@ def paint_ground(stage: Stage, ground: Ground, *, arrows: bool = True) -> None:
         stage.fill_all(_stripes(ground, row), palette.CROSSWALK, z=layers.MARKS, edge=0.0)
     for row in ground.of_kind(*SCENERY, "unknown"):
         colour = palette.entity_tint(KINDS[nodes.kind[row]])
-        # Props of a map are mostly marked areas, parking spaces first of all: what stands there must show.
+        # Props of a map are mostly areas, traffic islands for example: what stands there must show.
         thin = 0.18 if KINDS[nodes.kind[row]] == "prop" else 1.0
         stage.fill_all(ground.outlines_of([row]), colour, z=layers.SCENERY, edge=0.8, alpha=thin)
         stage.lines(ground.open_lines([row]), colour, z=layers.SCENERY, width=1.2)
@@ -177,6 +177,11 @@ def _paint_lanes(
     sides = [side for row in marked if (side := ground.sides(row)) is not None]
     borders = [border for pair in sides for border in pair]
     z += 0.8 * layers.STOREY
+    # Parking spaces lie on lanes or beside them; they have no number among these.
+    spaces = [r for r in lanes if types[r] == "parking" and not ground.nodes.lane[r]]
+    outlines = ground.outlines_of(spaces)
+    stage.fill_all(outlines, palette.lane_tint("parking"), z=z - 0.4 * layers.STOREY)
+    borders += [np.asarray(outline.vertices) for outline in outlines]
     stage.lines(borders, palette.LANE_MARK, z=z, width=min(0.7, 0.16 * stage.points))
     if arrows:
         heads = [head for left, right in sides for head in _chevrons((left + right) / 2)]
