@@ -399,6 +399,20 @@ def test_a_message_that_cannot_be_read_is_a_loss_and_the_others_are_kept(path: P
     assert states(blocks)[0]["1"]["throttle"] == 0.5
 
 
+def test_what_cannot_be_read_is_counted_once(path: Path) -> None:
+    with Bridge(path) as bridge:
+        bridge.objects(0.0, [])
+        bridge.writer.add_message(bridge.channels["/carla/objects"], 5, b"\0\1\0\0\1", 5)
+        bridge.light_states({}, 0.0)
+        topic = "/carla/traffic_lights/status"
+        bridge.writer.add_message(bridge.channels[topic], 6, b"\0\1\0\0\1", 6)
+        bridge.objects(0.1, [vehicle(1)])
+
+    losses = read(path)[2].losses
+
+    assert [(loss.messages, loss.start_ns) for loss in losses] == [(1, 5), (1, 6)]
+
+
 @pytest.mark.parametrize("text", ["", "std_msgs/Header header\nObject[] objects", "int32 objects"])
 def test_objects_that_no_definition_explains_are_an_error(path: Path, text: str) -> None:
     with Bridge(path) as bridge:

@@ -6,6 +6,7 @@ the map. All of that is gathered when a recording is opened.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final
@@ -245,13 +246,15 @@ class Survey:
         channel = int(run.channel[row])
         content = self.contents[channel]
         if content == OBJECTS:
-            self._look_for_egos(run.data(row), channel)
+            with suppress(TraceError):  # reported when frames are read
+                self._look_for_egos(run.data(row), channel)
             return
         data = bytes(run.data(row))
         if content == ODOMETRY:
             self._take_odometry(channel, decode(self.structures[channel], data))
         elif self._last.get(channel) != data:  # the bridge says many things again and again
-            news = self._take[content](decode(self.structures[channel], data))
+            news = content == LIGHT_STATES  # which are read with the frames
+            news = news or self._take[content](decode(self.structures[channel], data))
             self._last[channel] = data
             if news and content in LASTING:
                 self._lasting.append(ref_of(run, row))
@@ -262,7 +265,6 @@ class Survey:
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
-            LIGHT_STATES: lambda _message: True,
             WORLD: lambda told: self._take_map(text(told, "opendrive"), text(told, "map_name")),
             TEXT: self._take_text,
             VEHICLE: self._take_vehicle,
