@@ -12,15 +12,18 @@ import time
 import tracemalloc
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+import sgstore
 from bench.measure import Measure
-from sgstore.config import Config
+from sgstore.config import Config, Lanes
 from sgstore.opendrive import read_map
 from sgstore.relations.bearing import BESIDE
 from sgstore.sgg import SceneGraphGenerator
+from sgstore.traces import open_trace
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
 from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
 SECOND = 1_000_000_000
+SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 NO_MESSAGES = MessageRefs(*(np.zeros(0, np.int64) for _ in range(5)))
 
 
@@ -159,9 +163,15 @@ def timed(work: Callable[[], object], seconds: float) -> float:
     return best
 
 
-def generated(blocks: list[FrameBlock], road_map: RoadMap | None, *, sees: bool = True) -> int:
+def generated(
+    blocks: list[FrameBlock],
+    road_map: RoadMap | None,
+    *,
+    sees: bool = True,
+    config: Config | None = None,
+) -> int:
     """Number of edges of a trace, as the generator makes them."""
-    generator = SceneGraphGenerator(road_map, Config(sees=sees))
+    generator = SceneGraphGenerator(road_map, config or Config(sees=sees))
     return sum(len(generator.block(block).edges) for block in blocks)
 
 
@@ -251,4 +261,61 @@ def run(quick: bool = False) -> list[Measure]:
             Measure(f"{name}, peak memory", peak_of(partial(generated, blocks, road_map)), "MB"),
         ]
     online = latency(list(traffic(60, 60 if quick else 300, 45)), road_map)
-    return [*table, Measure("sgg, 60 entities, one frame alone", online, "ms", "99th percentile")]
+    table.append(Measure("sgg, 60 entities, one frame alone", online, "ms", "99th percentile"))
+    return [
+        *table,
+        *of_sample(seconds),
+        *in_one_pass(road_map, seconds),
+        *over_time(road_map, quick),
+    ]
+
+
+def of_sample(seconds: float) -> list[Measure]:
+    """The bundled recording, which drives through the junctions of a town; with lanes and with waypoints."""
+    with open_trace(SAMPLE) as recording:
+        road_map = read_map(recording.info.map_text, recording.info.map_name)
+        blocks = list(recording.blocks(2 * BUCKET_FRAMES))
+    frames = sum(map(len, blocks))
+    entities = sum(len(block.states) for block in blocks) / frames
+    lanes = timed(partial(generated, blocks, road_map), seconds)
+    fine = Config(lanes=Lanes(granularity="waypoint", spacing=1.0))
+    points = timed(partial(generated, blocks, road_map, config=fine), seconds)
+    return [
+        Measure(f"sgg, the sample, {entities:.0f} entities", frames / lanes, "frames/s"),
+        Measure("sgg, the sample, waypoints every metre", frames / points, "frames/s"),
+    ]
+
+
+def in_one_pass(road_map: RoadMap, seconds: float) -> list[Measure]:
+    """Three egos in one pass, beside one after the other."""
+    blocks = list(traffic(40, 300, 45))
+    egos = [[np.full(len(block), node) for node in range(3)] for block in blocks]
+
+    def together() -> None:
+        generator = SceneGraphGenerator(road_map, Config())
+        for block, of in zip(blocks, egos, strict=True):
+            generator.blocks(block, of)
+
+    def one_by_one() -> None:
+        for number in range(3):
+            generator = SceneGraphGenerator(road_map, Config())
+            for block, of in zip(blocks, egos, strict=True):
+                generator.blocks(block, of[number : number + 1])
+
+    once, thrice = timed(together, seconds), timed(one_by_one, seconds)
+    note = f"{thrice / once:.2f} times as fast as one by one"
+    return [Measure("sgg, 40 entities, three egos in one pass", 300 / once, "frames/s", note)]
+
+
+def over_time(road_map: RoadMap, quick: bool) -> list[Measure]:
+    """Peak memory of a trace that is ten times as long, whose blocks are made as they are needed."""
+
+    def drive(frames: int) -> None:
+        generator = SceneGraphGenerator(road_map, Config())
+        for block in traffic(40, frames, 45):
+            generator.block(block)
+
+    frames = 120 if quick else 600
+    short, long = (peak_of(partial(drive, n)) for n in (frames, 10 * frames))
+    note = f"{long / short:.2f} times that of {frames} frames"
+    return [Measure(f"sgg, 40 entities, {10 * frames} frames, peak memory", long, "MB", note)]
