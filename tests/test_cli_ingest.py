@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from recordings import drive
+from recordings import Recorder, car, drive
 
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
@@ -88,3 +88,166 @@ def test_a_payload_that_cannot_be_had_is_told(store, arguments, reason) -> None:
 
     assert run.returncode == 1
     assert reason in run.stderr.decode()
+
+
+# ingest
+
+
+def statuses(run: subprocess.CompletedProcess[bytes]) -> dict[str, str]:
+    return {Path(row["file"]).name: row["status"] for row in json.loads(run.stdout)}
+
+
+def test_recordings_come_from_folders_patterns_and_a_list(tmp_path) -> None:
+    for name in ("a", "b", "c", "d"):
+        folder = tmp_path / f"in{name}"
+        folder.mkdir()
+        drive(folder / f"{name}.mcap", frames=3 + ord(name) % 7)
+    store = tmp_path / "s.db"
+    listed = f"{tmp_path / 'ind' / 'd.mcap'}\n\n{tmp_path / 'inc'}\n"
+
+    trial = sgstore("ingest", store, tmp_path / "in[ab]" / "*.mcap", "--dry-run", "--json")
+    first = sgstore("ingest", store, tmp_path / "in[ab]" / "*.mcap", "-j", 2, "--json")
+    second = sgstore("ingest", store, tmp_path / "ina", "-", "--json", stdin=listed)
+
+    assert statuses(trial) == {"a.mcap": "new", "b.mcap": "new"}
+    assert statuses(first) == {"a.mcap": "added", "b.mcap": "added"}
+    assert statuses(second) == {"a.mcap": "present", "d.mcap": "added", "c.mcap": "added"}
+    assert [run.returncode for run in (trial, first, second)] == [0, 0, 0]
+
+
+def test_a_part_and_egos_are_asked_for_by_options(tmp_path) -> None:
+    path = drive(tmp_path / "d.mcap", frames=60)
+    options = ("--since", "1s", "--until", "5000ms", "--rate", 2, "--ego", "7", "--ego", "3")
+
+    run = sgstore("ingest", tmp_path / "s.db", path, *options, "--json")
+
+    assert run.returncode == 0, run.stderr
+    rows = [(row["trace"], row["ego"], row["frames"]) for row in json.loads(run.stdout)]
+    assert rows == [("d", "Ego", 9), ("d~2", "3", 9)]
+    told = sgstore("info", tmp_path / "s.db", "--trace", "d~2").stdout.decode()
+    assert "part         from 1 s, to 5 s, 2 frames a second" in told
+
+
+def test_what_was_read_otherwise_is_refused_and_replaced_by_force(tmp_path) -> None:
+    path = drive(tmp_path / "d.mcap", frames=20)
+    sgstore("ingest", tmp_path / "s.db", path)
+
+    refused = sgstore("ingest", tmp_path / "s.db", path, "--rate", 1)
+    forced = sgstore("ingest", tmp_path / "s.db", path, "--rate", 1, "--force", "--json")
+
+    assert refused.returncode == 1
+    assert "read with other settings; to read it anew, remove it first or say --force" in (
+        refused.stderr.decode()
+    )
+    assert (forced.returncode, statuses(forced)) == (0, {"d.mcap": "replaced"})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "reason"),
+    [
+        (("nothing/*.mcap",), 1, "no file fits this pattern"),
+        (("d.mcap", "--since", "soon"), 2, "expected a time"),
+        (("d.mcap", "--jobs", "-1"), 2, "Invalid value"),
+        (("none.mcap",), 1, "no such file"),
+    ],
+)
+def test_wrong_use_of_ingest_is_told(tmp_path, arguments, code, reason) -> None:
+    run = sgstore("ingest", tmp_path / "s.db", *arguments)
+
+    assert run.returncode == code
+    assert reason in run.stderr.decode()
+    assert list(tmp_path.iterdir()) == []
+
+
+# info, doctor
+
+
+def damaged(folder: Path) -> Path:
+    """A recording with a chunk that is hurt, a jump of the clock and a gap."""
+    with Recorder(folder / "hurt.mcap", chunk_size=400, compression="") as recorder:
+        for i in range(40):
+            stamp = i / 10 - (2.0 if 20 <= i < 30 else 0.0) + (5.0 if i >= 35 else 0.0)
+            recorder.ground_truth(i / 10, [car(7, float(i))], host=7, stamp=stamp)
+    content = bytearray((folder / "hurt.mcap").read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    (folder / "hurt.mcap").write_bytes(content)
+    return folder / "hurt.mcap"
+
+
+def test_the_report_of_a_trace_is_kept_and_told(tmp_path) -> None:
+    path = damaged(tmp_path)
+
+    run = sgstore("ingest", tmp_path / "s.db", path, "--json")
+    told = sgstore("info", tmp_path / "s.db", "--trace", "hurt").stdout.decode()
+    kept = in_json("info", tmp_path / "s.db", "--trace", "hurt")
+
+    assert run.returncode == 3
+    report = kept["report"]
+    assert report["losses"][0]["reason"] == "the chunk does not match its checksum"
+    assert (report["entities"], report["clock_jumps"]) == ({"car": 1}, 1)
+    assert report["clock_jumps_at"][0]["seconds"] == pytest.approx(-1.9)
+    assert report["gaps"] >= 1
+    for line in ("entities     1 car", "clock jumps  1: -1.9 s before #", "losses:", "channels:"):
+        assert line in told, told
+    assert "the chunk does not match its checksum; " in told
+    assert [channel["topic"] for channel in kept["channels"]] == ["truth"]
+
+
+def test_doctor_says_what_would_be_read_and_what_is_wrong(tmp_path) -> None:
+    path = damaged(tmp_path)
+    ingest(tmp_path / "s.db", [path])
+    kept = StoreFile(tmp_path / "s.db").trace("hurt")
+
+    run = sgstore("doctor", path, "--json")
+    told = sgstore("doctor", path)
+
+    (found,) = json.loads(run.stdout)
+    assert (run.returncode, told.returncode) == (3, 3)
+    assert (found["frames"], found["digest"], found["ego"]) == (kept.frames, kept.digest, kept.ego)
+    assert json.loads(json.dumps(found["losses"])) == [
+        {name: str(v) if name.endswith("_ns") else v for name, v in loss.items()}
+        for loss in kept.report["losses"]
+    ]
+    assert found["channels"][0]["messages"] == kept.frames
+    assert "the chunk does not match its checksum" in told.stdout.decode()
+
+
+def test_doctor_is_well_with_what_is_well_and_fails_with_what_is_no_recording(tmp_path) -> None:
+    good = drive(tmp_path / "good.mcap", frames=5)
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(good.read_bytes()[:4])
+    with Recorder(tmp_path / "pictures.mcap") as recorder:
+        recorder.camera(0.0)
+
+    assert sgstore("doctor", good).returncode == 0
+    both = sgstore("doctor", bad, good, "--json")
+    assert both.returncode == 1
+    assert [bool(found["error"]) for found in json.loads(both.stdout)] == [True, False]
+    other = sgstore("doctor", tmp_path / "pictures.mcap")
+    assert other.returncode == 1
+    assert "cannot be read" in other.stdout.decode()
+    assert "pictures.Image" in other.stdout.decode()
+
+
+# verify, remove
+
+
+def test_a_store_is_verified_and_traces_are_removed(tmp_path) -> None:
+    paths = [drive(tmp_path / f"{name}.mcap", frames=n) for name, n in (("a", 4), ("b", 5))]
+    store = tmp_path / "s.db"
+    ingest(store, paths)
+
+    well = sgstore("verify", store, "--payloads")
+    paths[1].unlink()
+    gone = sgstore("verify", store, "--payloads", "--json")
+    removed = in_json("remove", store, "b", "--compact")
+    none = sgstore("remove", store, "b")
+
+    assert (well.returncode, well.stdout) == (0, b"")
+    assert "2 traces" in well.stderr.decode()
+    assert "2 recordings: no fault" in well.stderr.decode()
+    assert (gone.returncode, [f["check"] for f in json.loads(gone.stdout)]) == (1, ["payloads"])
+    assert [(row["trace"], row["frames"]) for row in removed] == [("b", 5)]
+    assert (none.returncode, "no trace 'b'" in none.stderr.decode()) == (1, True)
+    assert [trace.name for trace in StoreFile(store).traces()] == ["a"]
+    assert sgstore("verify", store).returncode == 0
