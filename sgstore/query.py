@@ -166,7 +166,8 @@ class Store:
         frame : int, str or FrameRef
             Its ``frame_id``, ``TRACE#SEQ``, ``TRACE@12.3s``, or what :meth:`Matches.frames` gives.
         abstraction : str, optional
-            ``E``, ``EL``, ``ER``, ``RSV``, ``junction``, ``SG``, ``roadscene2vec``, or a registered one.
+            ``E``, ``EL``, ``ER``, ``RSV``, ``junction``, ``SG``, ``roadscene2vec``, a registered one; or a set
+            of relations that was derived, which has all that is known of nodes and edges, too.
 
         Returns
         -------
@@ -185,6 +186,10 @@ class Store:
         """
         if abstraction is None:
             return self.file.graph(_ref(frame)).to_networkx()
+        derived = {one.name.lower() for one in self.file.deriving.sets()}
+        if abstraction.lower() in derived:
+            whole = self.file.graph(_ref(frame))
+            return self.file.deriving.graph(whole, abstraction).to_networkx()
         graph, about = self.file.abstracted.labelled(_ref(frame), abstraction)
         nodes, edges = graph.named(0)
         return named_graph(nodes, edges, **about)
@@ -197,8 +202,8 @@ class Store:
         Parameters
         ----------
         abstraction : str
-            As :meth:`graph` takes it. Classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction`` are in the store
-            from the start; others are computed when they are first asked for, and then kept.
+            As :meth:`graph` takes it, but for derived sets. Classes in ``E``, ``EL``, ``ER``, ``RSV`` and
+            ``junction`` are in the store from the start; others are computed when first asked for, then kept.
         trace : int or str, optional
             Only of this one.
 

@@ -112,6 +112,18 @@ CREATE TABLE frame_class (                                     -- ordered by all
 CREATE TABLE later_class (                                     -- the same of abstractions that were asked for later
   abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);
 
+-- Other relations from the same states: sets that were derived, each under its name
+
+CREATE TABLE derived (                                         -- one row for each set and trace
+  name VARCHAR, trace_id BIGINT, settings JSON, digest VARCHAR, answers VARCHAR[], derived_at TIMESTAMP, version VARCHAR);
+
+CREATE TABLE derived_node (                                    -- all nodes of its graphs, those that move too
+  set_name VARCHAR, moves BOOLEAN, kind kind, bucket BIGINT, node_id INTEGER, mask BIGINT);
+
+CREATE TABLE derived_edge (                                    -- as edge
+  set_name VARCHAR, relation relation, src_is_ego BOOLEAN, dst_is_ego BOOLEAN, src_kind kind, dst_kind kind,
+  bucket BIGINT, src INTEGER, dst INTEGER, mask BIGINT);
+
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
   bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
   chunk_offset BIGINT, "offset" BIGINT, length BIGINT);

@@ -7,7 +7,7 @@ An abstraction is a function from :class:`Seen`, what a scene graph holds of nod
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
@@ -97,8 +97,6 @@ class Grounds:
         """(K,): whether it is a lane that is driven on."""
         return (self.kind == _LANE) & np.isin(self.lane_type, DRIVEN)
 
-
-_NODE_COLUMNS: Final = ("node", "kind", "is_ego", "x", "y", "z", "heading")
 
 DRIVEN: Final = (
     *("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"),
@@ -224,20 +222,6 @@ class Seen:
         frame, edge = np.nonzero(present[:, src[wanted]] & present[:, dst[wanted]])
         edge = wanted[edge]
         return frame, grounds.relation[edge], grounds.src[edge], grounds.dst[edge]
-
-    def only(self, number: int) -> Seen:
-        """One of the frames, as the only one."""
-        nodes, edges = self.node_frame == number, self.frame == number
-        zero = np.zeros(1, np.int64)
-        return replace(
-            self,
-            frames=1,
-            node_frame=zero.repeat(int(nodes.sum())),
-            frame=zero.repeat(int(edges.sum())),
-            ego_lane=self.ego_lane[number : number + 1],
-            **{name: getattr(self, name)[nodes] for name in _NODE_COLUMNS},
-            **{name: getattr(self, name)[edges] for name in ("relation", "src", "dst")},
-        )
 
     def row_of(self, frame: Ints, node: Ints) -> Ints:
         """Rows of nodes in frames; -1 where they are not in the graph."""

@@ -13,6 +13,7 @@ import typer
 
 from sgstore.cli import (
     exports,
+    graphs,
     live,
     maps,
     payloads,
@@ -29,7 +30,7 @@ from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
 __all__ = ["app", "main"]
 
-VERBS = (traces, stores, maps, live, settings, queries, payloads, pictures, exports, tour)
+VERBS = (traces, stores, graphs, maps, live, settings, queries, payloads, pictures, exports, tour)
 """The modules of the verbs: importing them makes the verbs known; help lists them in this order."""
 
 app.registered_commands.sort(

@@ -180,9 +180,7 @@ class Abstracted:
         abstraction = abstraction_named(name)
         with self._access.reading() as connection:
             frame = frame_named(connection, ref)
-            bucket = frame.frame_id >> FRAME_BITS
-            seq, seen = self._graphs.of_buckets(connection, bucket, bucket + 1)
-        number = int(np.searchsorted(seq, frame.seq))
+            _, seen = self._graphs.of_frames(connection, frame.frame_id, frame.frame_id)
         about = {
             "frame_id": frame.frame_id,
             "trace": frame.trace,
@@ -190,7 +188,7 @@ class Abstracted:
             "time_ns": frame.time_ns,
             "abstraction": abstraction.name,
         }
-        return abstraction.function(seen.only(number)), about
+        return abstraction.function(seen), about
 
 
 def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> list[int]:

@@ -13,6 +13,7 @@ from sgstore.errors import StoreError, TraceError
 from sgstore.store import rows, schema
 from sgstore.store.access import Access, default_memory, spill_folder, translated
 from sgstore.store.classes import Abstracted
+from sgstore.store.deriving import Deriving
 from sgstore.store.folder import Folder
 from sgstore.store.packing import plain
 from sgstore.store.payloads import payload_place
@@ -474,6 +475,11 @@ class StoreFile:
         if self._abstracted is None:
             self._abstracted = Abstracted(self.path, self._access)
         return self._abstracted
+
+    @property
+    def deriving(self) -> Deriving:
+        """Sets of relations that were derived from the states."""
+        return Deriving(self.path, self._access)
 
     def verify(self, *, recordings: bool = False) -> Verification:
         """Look whether everything is as it was published.

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.abstractions import Grounds, Seen
-from sgstore.store.packing import BUCKET_BITS
-from sgstore.world import BUCKET_FRAMES
+from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,19 +33,21 @@ ORDER BY relation, src, dst
 """
 _FRAMES: Final = """
 SELECT frame_id, seq, coalesce(ego, -1) AS ego FROM frame
-WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id
+WHERE frame_id >= $first AND frame_id <= $last ORDER BY frame_id
 """
 _MOVING: Final = """
 SELECT frame_id, node_id, enum_code(kind) AS kind, is_ego, x, y, z, heading FROM state
-WHERE frame_id >= $low << 6 AND frame_id < $high << 6
+WHERE frame_id >= $first AND frame_id <= $last
 """
 _STANDING: Final = """
 SELECT (n.bucket << 6) + b.bit AS frame_id, n.node_id, enum_code(n.kind) AS kind
-FROM node n JOIN bits b ON (n.mask & b.m) <> 0 WHERE n.bucket >= $low AND n.bucket < $high
+FROM node n JOIN bits b ON (n.mask & b.m) <> 0 WHERE n.bucket BETWEEN $first >> 6 AND $last >> 6
+      AND (n.bucket << 6) + b.bit BETWEEN $first AND $last
 """
 _EDGES: Final = """
 SELECT (e.bucket << 6) + b.bit AS frame_id, enum_code(e.relation) AS relation, e.src, e.dst
-FROM edge e JOIN bits b ON (e.mask & b.m) <> 0 WHERE e.bucket >= $low AND e.bucket < $high
+FROM edge e JOIN bits b ON (e.mask & b.m) <> 0 WHERE e.bucket BETWEEN $first >> 6 AND $last >> 6
+      AND (e.bucket << 6) + b.bit BETWEEN $first AND $last
 """
 _EGO_LANES: Final = """
 SELECT l.frame_id, l.lane FROM lane_state l JOIN frame f ON f.frame_id = l.frame_id AND f.ego = l.node_id
@@ -70,13 +71,14 @@ class Graphs:
         if row is None or row[0] is None:
             return
         for low in range(row[0], row[1] + 1, WINDOW):
-            yield self.of_buckets(connection, low, min(low + WINDOW, row[1] + 1))
+            high = min(low + WINDOW, row[1] + 1)
+            yield self.of_frames(connection, low << FRAME_BITS, (high << FRAME_BITS) - 1)
 
-    def of_buckets(
-        self, connection: DuckDBPyConnection, low: int, high: int
+    def of_frames(
+        self, connection: DuckDBPyConnection, first: int, last: int
     ) -> tuple[NDArray[np.int64], Seen]:
-        """Frames of some buckets of one trace: their numbers, and their graphs."""
-        where = {"low": low, "high": high}
+        """Frames of one trace from one id to another: their numbers, and their graphs."""
+        where = {"first": first, "last": last}
 
         def columns(sql: str) -> dict[str, NDArray[Any]]:
             return connection.execute(sql, where).fetchnumpy()
@@ -89,7 +91,7 @@ class Graphs:
 
         moving, standing, edges, own = map(columns, (_MOVING, _STANDING, _EDGES, _EGO_LANES))
         still = len(standing["node_id"])
-        trace = self._trace(connection, low >> BUCKET_BITS)
+        trace = self._trace(connection, first >> (BUCKET_BITS + FRAME_BITS))
         places = {name: filled(moving[name]) for name in ("x", "y", "z", "heading")}
         for axis in "xyz":
             places[axis] = trace[f"origin_{axis}"] + places[axis]
@@ -151,8 +153,3 @@ class Graphs:
 def filled(values: NDArray[Any]) -> NDArray[np.float64]:
     """Numbers, NaN where there is none."""
     return np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
-
-
-def seq_of(frame_id: int) -> int:
-    """The number of a frame in its trace."""
-    return ((frame_id >> 6) % (1 << BUCKET_BITS)) * BUCKET_FRAMES + frame_id % 64

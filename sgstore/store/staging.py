@@ -46,6 +46,8 @@ _ENUMS: Final[dict[str, dict[str, str]]] = {
     "node": {"kind": "kind"},
     "edge": {"relation": "relation", "src_kind": "kind", "dst_kind": "kind"},
     "lane_state": {"kind": "kind"},
+    "derived_node": {"kind": "kind"},
+    "derived_edge": {"relation": "relation", "src_kind": "kind", "dst_kind": "kind"},
     "map_node": {"kind": "kind"},
     "map_edge": {"relation": "relation", "src_kind": "kind", "dst_kind": "kind"},
 }
@@ -63,6 +65,8 @@ ORDER BY s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask FROM edge ORDER BY ALL""",
     "frame_class": "SELECT * FROM frame_class ORDER BY ALL",
     "later_class": "SELECT * FROM later_class ORDER BY ALL",
+    "derived_node": "SELECT * FROM derived_node ORDER BY ALL",
+    "derived_edge": "SELECT * FROM derived_edge ORDER BY ALL",
     "message": "SELECT * FROM message",
 }
 """The tables that grow with a trace, sorted as they are published."""
