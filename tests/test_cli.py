@@ -405,3 +405,13 @@ def test_what_fails_in_a_frame_is_told(store: str, sgstore) -> None:
     ]
     assert json.loads(data[1])["failed"] == "e.speed > 20"
     assert (told[0], data[0]) == (0, 0)
+
+
+def test_properties_of_sgsm_are_translated(tmp_path: Path, sgstore) -> None:
+    (tmp_path / "p.py").write_text('x = P.gt(P.size(P.relSet("Ego", "near")), 0)')
+
+    told = sgstore("translate", tmp_path / "p.py")
+    written = sgstore("translate", tmp_path / "p.py", "-o", tmp_path / "p.sgql")
+
+    assert told[:2] == (0, "DEFINE PREDICATE x() AS EXISTS {(n2:Ego)-[:near]->(n1)};\n")
+    assert (written[1], (tmp_path / "p.sgql").read_text()) == ("", told[1])

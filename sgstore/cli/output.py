@@ -96,6 +96,23 @@ def say(message: str) -> None:
     sys.stderr.write(f"sgstore: {message}\n")
 
 
+def write_text(text: str, output: Path | None = None) -> None:
+    """Print a text as it is, on stdout or into a file.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    if output is None:
+        sys.stdout.write(text)
+        return
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ExportError(f"{output}: {error.strerror or error}") from error
+
+
 def _write_text(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], form: Format, stream: TextIO
 ) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,8 +26,9 @@ from sgstore.cli.arguments import (
     query_of,
     say_left_out,
     seconds_of,
+    text_of,
 )
-from sgstore.cli.output import Format, say, write_document, write_rows
+from sgstore.cli.output import Format, say, write_document, write_rows, write_text
 
 if TYPE_CHECKING:
     from sgstore.sandbox import Answer, Sandbox
@@ -113,6 +115,27 @@ def why_not(
     return 0
 
 
+class Language(StrEnum):
+    """Languages that are translated."""
+
+    sgl = "sgl"
+
+
+@app.command()
+def translate(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What to translate; - is stdin.")],
+    language: Annotated[
+        Language, typer.Option("--from", help="sgl: properties of SGSM, as Python.")
+    ] = Language.sgl,
+    output: Output = None,
+) -> int:
+    """Translate properties of other tools into the query language; nothing of the file is run."""
+    from sgstore.lang.sgl import translated
+
+    write_text(translated(text_of(file)), output)
+    return 0
+
+
 @app.command()
 def sql(
     store: StorePath,
@@ -129,7 +152,7 @@ def sql(
 ) -> int:
     """Ask a store in SQL, read only.
 
-    Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE tells columns.
+    Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     """
     if safe:
         with _sandbox(store, timeout, max_rows) as box:
