@@ -276,8 +276,8 @@ def test_an_ego_of_the_config_serves_frames_that_name_none() -> None:
 def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(stepping, "REMEMBERED", 100)
-    monkeypatch.setattr(stepping, "SPARE", 100)
+    monkeypatch.setattr(stepping, "REMEMBERED", 60)
+    monkeypatch.setattr(stepping, "SPARE", 60)
     online = generator(None, range=Range(30))
 
     def run(first: int, count: int) -> int:
@@ -287,10 +287,10 @@ def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
         gc.collect()
         return tracemalloc.get_traced_memory()[0]
 
-    run(0, 400)
+    run(0, 200)
     tracemalloc.start()
     try:
-        sizes = [run(200 * k, 200) for k in range(2, 9)]
+        sizes = [run(100 * k, 100) for k in range(2, 9)]
     finally:
         tracemalloc.stop()
     assert max(sizes[3:]) < 1.1 * max(sizes[:3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -94,11 +95,10 @@ class Records:
         frames = graph.frames
         ego = int(outer[frames.ego[0]]) if frames.ego[0] >= 0 else None
         nodes: dict[int, Attributes] = {}
-        moving = outer[frames.states.node]
-        for row in np.argsort(moving).tolist():
-            node = int(moving[row])
+        moving = zip(outer[frames.states.node].tolist(), _moving(frames.states), strict=True)
+        for node, told in sorted(moving, key=itemgetter(0)):
             about = known[node].attributes(is_ego=node == ego, is_static=False)
-            nodes[node] = about | _moving(frames.states, row)
+            nodes[node] = about | told
         present = graph.presence.node
         for node in np.sort(outer[present[present >= 0]]).tolist():
             nodes[node] = dict(self._standing[node])
@@ -141,20 +141,31 @@ class Records:
         return [(a, self._relation[row], b, {}) for a, b, row in ends]
 
 
-def _moving(states: States, row: int) -> Attributes:
-    """Attributes of a state, in outward units."""
-    numbers = {name: float(getattr(states, name)[row]) for name in (*_BOX, *_MOTION, *_INPUTS)}
-    heading = float(states.heading[row])
-    numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
-    for name in ("pitch", "roll", "yaw_rate"):
-        numbers[name] = math.degrees(getattr(states, name)[row])
-    vz = 0.0 if math.isnan(numbers["vz"]) else numbers["vz"]
-    numbers["speed"] = math.sqrt(numbers["vx"] ** 2 + numbers["vy"] ** 2 + vz**2)
-    numbers["accel"] = numbers["ax"] * math.cos(heading) + numbers["ay"] * math.sin(heading)
-    about = _numbers(numbers)
-    lights, light, derived = (
-        int(getattr(states, name)[row]) for name in ("lights", "light_state", "derived")
+def _moving(states: States) -> list[Attributes]:
+    """Attributes of states, in outward units: of whole columns first, then row by row."""
+    columns: dict[str, Floats] = {
+        name: getattr(states, name) for name in (*_BOX, *_MOTION, *_INPUTS)
+    }
+    columns["heading"] = np.degrees(wrapped(states.heading))
+    columns |= {name: np.degrees(getattr(states, name)) for name in ("pitch", "roll", "yaw_rate")}
+    columns["speed"] = np.sqrt(states.vx**2 + states.vy**2 + np.nan_to_num(states.vz) ** 2)
+    columns["accel"] = states.ax * np.cos(states.heading) + states.ay * np.sin(states.heading)
+    names = tuple(columns)
+    table = np.stack([columns[name] for name in names], axis=1)
+    known = np.isfinite(table).tolist()
+    codes = zip(
+        states.lights.tolist(), states.light_state.tolist(), states.derived.tolist(), strict=True
     )
+    return [
+        {name: value for name, value, told in zip(names, row, is_known, strict=True) if told}
+        | _coded(*whole)
+        for row, is_known, whole in zip(table.tolist(), known, codes, strict=True)
+    ]
+
+
+def _coded(lights: int, light: int, derived: int) -> Attributes:
+    """What codes say: lights of a vehicle, what a traffic light shows, what was derived."""
+    about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
     if light >= 0:
