@@ -210,8 +210,10 @@ class FrameDecoder:
                     frame.nodes.append(node)
                     frame.objects.append(content)
         frame.heads = self._lights.rows()
-        told = controls_of(getattr(message, "host_vehicle_data", None))
-        known = zip(frame.controls, told, self._controls, strict=True)
+        data = getattr(message, "host_vehicle_data", None)
+        if data is None and self._controls is _NO_VECTOR:
+            return
+        known = zip(frame.controls, controls_of(data), self._controls, strict=True)
         steer, throttle, brake = (
             next((value for value in three if not math.isnan(value)), NAN) for three in known
         )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.opendrive.objects import kind_of_object
@@ -113,6 +114,7 @@ def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
     return replace(meaning, subkind=" ".join(word for word in words if word))
 
 
+@lru_cache(maxsize=1)  # a recording is read twice and more
 def kinds_of_map(text: str) -> dict[str, str]:
     """Id of each object in an OpenDRIVE text → its kind."""
     kinds: dict[str, str] = {}
