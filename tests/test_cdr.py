@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from contextlib import suppress
 from typing import Any
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
 from sgstore.errors import TraceError
-from sgstore.traces.cdr import MAX_ROWS, MAX_VALUES, Table, decode, number, records, text
+from sgstore.traces.cdr import MAX_ROWS, MAX_VALUES, Fields, Table, decode, number, records, text
 from sgstore.traces.ros2msg import NUMBERS, Sequence, Struct, Text, parse_definition
 
 RULE = "=" * 80
@@ -115,6 +116,34 @@ def test_any_message_is_decoded_as_it_was_meant(case: tuple[str, dict[str, Any]]
 
     assert found == plain(message)
     assert found == plain(generate_dynamic("pkg/msg/Top", content)["pkg/msg/Top"](data))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(examples())
+def test_fields_are_those_of_the_whole_message(case: tuple[str, dict[str, Any]]) -> None:
+    content, message = case
+    kind = parse_definition("pkg/msg/Top", content.encode())
+    data = encoded(content, message)
+    paths = [*(f"f{i}" for i in range(6)), "f0.f0", "f1[0]", "f2[1].f0", "f3.f1.f2"]
+    reader = Fields(kind, tuple(paths))
+
+    def told(path: str) -> float:
+        value: Any = decode(kind, data)
+        for step in re.findall(r"\w+", path):
+            inside = isinstance(value, dict) and step in value
+            listed = (
+                isinstance(value, list | np.ndarray) and step.isdigit() and int(step) < len(value)
+            )
+            if not (inside or listed):
+                return math.nan
+            value = value[step if inside else int(step)]
+        return float(value) if isinstance(value, int | float | np.number) else math.nan
+
+    for _ in range(2):  # learned, then remembered
+        np.testing.assert_array_equal(reader.read(data), [told(path) for path in paths])
+    for length in range(0, len(data), 3):
+        with pytest.raises(TraceError):
+            reader.read(data[:length])
 
 
 @settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from sgstore.traces.recording import Recording
     from sgstore.traces.ros2msg import Struct
+    from sgstore.world import Floats
 
 OBJECTS: Final = "objects"
 ACTORS: Final = "actors"
@@ -110,6 +111,11 @@ def ident_of(message: dict[str, Any], path: str) -> int | None:
 
 def stamp_of(message: dict[str, Any]) -> int:
     """Time in a message's header; ns. :data:`NEVER` if it has none, or one beyond all clocks."""
-    seconds, nanos = (number(message, f"header.stamp.{part}") for part in ("sec", "nanosec"))
-    told = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
-    return int(seconds) * 1_000_000_000 + int(nanos) if told else NEVER
+    return stamp_from([number(message, f"header.stamp.{part}") for part in ("sec", "nanosec")])
+
+
+def stamp_from(told: Floats | list[float]) -> int:
+    """Time of seconds and nanoseconds, likewise."""
+    seconds, nanos = told
+    there = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
+    return int(seconds) * 1_000_000_000 + int(nanos) if there else NEVER

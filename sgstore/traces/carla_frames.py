@@ -18,9 +18,8 @@ ego_vehicle.py); carla.VehicleLightState.
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -34,12 +33,13 @@ from sgstore.traces.carla_channels import (
     ODOMETRY,
     STATUS,
     VEHICLE_LIGHTS,
+    stamp_from,
     stamp_of,
 )
 from sgstore.traces.carla_events import EVENTS, Events
 from sgstore.traces.carla_lights import Lights
 from sgstore.traces.carla_survey import SAME_TICK
-from sgstore.traces.cdr import Table, decode, number
+from sgstore.traces.cdr import Fields, Table, decode
 from sgstore.traces.frames import FAR, NAN, POSE, FrameRows, Roster
 from sgstore.traces.tally import Tally
 
@@ -62,6 +62,8 @@ COLUMNS: Final = (
     *(f"shape.dimensions[{i}]" for i in range(3)),
 )
 """Numbers that are read of every ``derived_object_msgs/Object``."""
+STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
+CONTROLS: Final = ("steer", "throttle", "brake")
 ODOMETRY_COLUMNS: Final = (
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
     *(f"pose.pose.orientation.{part}" for part in "xyzw"),
@@ -169,6 +171,8 @@ class FrameDecoder:
         self._controls = NEVER, _NO_CONTROLS
         self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
         self._odometry: tuple[int, Floats | None] = NEVER, None
+        self._fields: dict[int, Fields] = {}
+        self._driven = found.driven
         self._take = self._takers()
         self.channels = frozenset({leading, *self._take})
 
@@ -316,7 +320,7 @@ class FrameDecoder:
         takers: dict[int, Callable[[int, int, memoryview], None]] = {}
         own = {
             channel: found.contents[channel]
-            for channel, role in found.driven.items()
+            for channel, role in self._driven.items()
             if ego is not None and found.egos.id_of(role) == ego
         }
         statuses = STATUS in own.values()  # they tell what was applied, commands what was asked for
@@ -325,11 +329,14 @@ class FrameDecoder:
                 takers[channel] = self._take_light_states
             elif content == VEHICLE_LIGHTS:
                 takers[channel] = self._take_vehicle_lights
-            elif channel in own and content == STATUS:
-                takers[channel] = self._take_status
-            elif channel in own and content == COMMANDS and not statuses:
-                takers[channel] = self._take_command
+            elif channel in own and content == (STATUS if statuses else COMMANDS):
+                prefix = "control." if statuses else ""
+                columns = tuple(prefix + name for name in CONTROLS)
+                self._fields[channel] = Fields(found.structures[channel], (*STAMP, *columns))
+                takers[channel] = self._take_controls
             elif channel in own and content == ODOMETRY:
+                columns = (*STAMP, *ODOMETRY_COLUMNS)
+                self._fields[channel] = Fields(found.structures[channel], columns)
                 takers[channel] = self._take_odometry
             elif content in EVENTS:
                 takers[channel] = self._take_event
@@ -338,13 +345,11 @@ class FrameDecoder:
     def _take_light_states(self, channel: int, _log_time: int, data: memoryview) -> None:
         self._lights.update(decode(self._survey.structures[channel], data))
 
-    def _take_status(self, channel: int, _log_time: int, data: memoryview) -> None:
-        message = decode(self._survey.structures[channel], data)
-        self._set_controls(stamp_of(message), _controls_of(message, "control."))
-
-    def _take_command(self, channel: int, _log_time: int, data: memoryview) -> None:
-        message = decode(self._survey.structures[channel], data)
-        self._set_controls(stamp_of(message), _controls_of(message, ""))
+    def _take_controls(self, channel: int, _log_time: int, data: memoryview) -> None:
+        told = self._fields[channel].read(data)
+        stamp = stamp_from(told[:2])
+        steer, throttle, brake = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
+        self._set_controls(stamp, (0.0 - steer, throttle, brake))
 
     def _set_controls(self, stamp: int, controls: tuple[float, float, float]) -> None:
         self._controls = stamp, controls
@@ -356,7 +361,7 @@ class FrameDecoder:
             return
         found = self._survey
         message = decode(found.structures[channel], data)
-        ident = found.egos.id_of(found.driven[channel])
+        ident = found.egos.id_of(self._driven[channel])
         stamp = stamp_of(message)
         place = log_time if stamp == NEVER else stamp, log_time, self._seq
         named = "" if ident is None else str(ident)
@@ -371,9 +376,8 @@ class FrameDecoder:
     def _take_odometry(self, channel: int, _log_time: int, data: memoryview) -> None:
         if self._frame is not None and self._ego in self._nodes and self._odometry[1] is None:
             return  # it is among the objects
-        message = decode(self._survey.structures[channel], data)
-        numbers = np.array([number(message, path) for path in ODOMETRY_COLUMNS])
-        self._odometry = stamp_of(message), numbers
+        told = self._fields[channel].read(data)
+        self._odometry = stamp_from(told[:2]), told[2:]
         self._see_odometry()
 
     def _see_odometry(self) -> None:
@@ -462,12 +466,6 @@ def _rotated(quaternion: Floats, vector: Floats) -> Floats:
     axis, w = quaternion[:3], quaternion[3]
     across = 2 * np.cross(axis, vector)
     return vector + w * across + np.cross(axis, across)
-
-
-def _controls_of(message: dict[str, Any], prefix: str) -> tuple[float, float, float]:
-    told = (number(message, prefix + name) for name in ("steer", "throttle", "brake"))
-    steer, throttle, brake = (value if math.isfinite(value) else NAN for value in told)
-    return 0.0 - steer, throttle, brake
 
 
 def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:

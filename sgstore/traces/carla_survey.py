@@ -58,6 +58,7 @@ _PLACES: Final = ("id", "pose.position.x", "pose.position.y", "pose.position.z")
 _ODOMETRY: Final = tuple(f"pose.{path}" for path in _PLACES[1:])
 _MAP_BEGINS: Final = 4096
 _MOST_TRIES: Final = 200
+_MOST_NOTES: Final = 100
 
 
 @dataclass(slots=True)
@@ -122,7 +123,7 @@ class Survey:
     Raises
     ------
     TraceError
-        The file cannot be read, or the definition of the objects is malformed.
+        The file cannot be read.
     """
 
     def __init__(self, recording: Recording, ego: str) -> None:
@@ -208,7 +209,7 @@ class Survey:
                 if content:
                     self.lost.add(reason, 0)
                 else:
-                    self.notes.append(f"{reason}; its messages can only be handed on as they are")
+                    self._note(f"{reason}; its messages can only be handed on as they are")
         return self.contents[channel]
 
     def _learn(self, channel: int, content: str) -> None:
@@ -299,8 +300,7 @@ class Survey:
                     f"actor {ident} is called {before.type_name!r} and {actor.type_name!r};"
                     " the first name counts"
                 )
-                if note not in self.notes[-100:]:
-                    self.notes.append(note)
+                self._note(note)
         return len(actors) > known
 
     def _take_map(self, content: str, name: str) -> bool:
@@ -308,10 +308,14 @@ class Survey:
             self.map_text = content
             self.map_name = PurePosixPath(name).name
         elif content and content != self.map_text:
-            note = "the recording carries more than one road map; the first one counts"
-            if note not in self.notes:
-                self.notes.append(note)
+            self._note("the recording carries more than one road map; the first one counts")
         return True
+
+    def _note(self, note: str) -> None:
+        """Take note of something odd, once; of very much that is odd only the first."""
+        if note not in self.notes and len(self.notes) <= _MOST_NOTES:
+            more = "and more that is as odd"
+            self.notes.append(note if len(self.notes) < _MOST_NOTES else more)
 
     # Vehicles under test that no list names -----------------------------------------------------------
 

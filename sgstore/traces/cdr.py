@@ -224,6 +224,44 @@ class _Layout:
             to[:, column : column + count] = numbers
 
 
+class Fields:
+    """Reads some numbers of messages of one kind, and passes over the rest of them.
+
+    Parameters
+    ----------
+    kind : Struct
+        Of the messages.
+    columns : tuple of str
+        Paths of the numbers: ``header.stamp.sec``, ``pose.covariance[0]``.
+    """
+
+    def __init__(self, kind: Struct, columns: tuple[str, ...]) -> None:
+        self._kind = kind
+        self._columns = {path: column for column, path in enumerate(columns)}
+        self._layouts: dict[str, list[_Layout]] = {}
+
+    def read(self, data: Data) -> Floats:
+        """The numbers of a message, (columns,) float64; NaN where it lacks one.
+
+        Raises
+        ------
+        TraceError
+            As :func:`decode`.
+        """
+        reader = _Reader.of(data)
+        values, order = reader.values, reader.order
+        layouts = self._layouts.setdefault(order, [])
+        for layout in layouts:
+            if layout.size <= len(values) and layout.agreeing(values, order, 0, 1):
+                break
+        else:
+            layout = _learned(reader, self._kind, self._columns)
+            _remember(layouts, layout)
+        numbers = np.full((1, len(self._columns)), np.nan)
+        layout.copy(values, 0, numbers)
+        return numbers[0]
+
+
 class Table:
     """Reads a sequence of structures in messages of one kind as columns.
 
@@ -293,18 +331,25 @@ class Table:
             if alike:
                 break
         else:
-            layout, alike = self._learn(reader), 1
-            if len(layout.prefixes) <= _MAX_PREFIXES:
-                layouts.insert(0, layout)
-                del layouts[_MAX_LAYOUTS:]
+            layout, alike = _learned(reader, self._element, self._columns), 1
+            _remember(layouts, layout)
         layout.copy(values, place, to[:alike])
         reader.place = place + alike * layout.size
         return alike
 
-    def _learn(self, reader: _Reader) -> _Layout:
-        walk = _Walk(reader, self._columns, reader.place)
-        walk.step(self._element, "")
-        return _Layout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
+
+def _learned(reader: _Reader, kind: Struct, columns: dict[str, int]) -> _Layout:
+    """The layout of the value that a reader stands before; it stands behind it then."""
+    walk = _Walk(reader, columns, reader.place)
+    walk.step(kind, "")
+    return _Layout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
+
+
+def _remember(layouts: list[_Layout], layout: _Layout) -> None:
+    """Keep a layout, as the first that is tried, unless too much would have to agree."""
+    if len(layout.prefixes) <= _MAX_PREFIXES:
+        layouts.insert(0, layout)
+        del layouts[_MAX_LAYOUTS:]
 
 
 class _Walk:
