@@ -203,7 +203,7 @@ class SceneGraphGenerator:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
             shown = map_of_graphs(self._road_map, self._config)
             self._online = Online(fresh, shown, self._config.ego)
-        return self._online.step(frame)
+        return self._online.step(frame.meant(self._config.types))
 
     def _learn(self, frames: FrameBlock) -> None:
         entities, nodes = frames.entities, frames.states.node

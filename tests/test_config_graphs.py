@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -9,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from test_online import columns, shown
 
 from sgstore.config import Config, configured
+from sgstore.online import Replay
 from sgstore.opendrive import read_map
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.traces import open_trace
-from sgstore.vocabulary import RELATION_CODE, RELATIONS
+from sgstore.vocabulary import RELATION_CODE, RELATIONS, TypeMeaning
 
 if TYPE_CHECKING:
     from sgstore.graph import GraphBlock
@@ -112,3 +115,19 @@ def test_frames_one_by_one_give_the_same_whatever_the_settings(seed: int) -> Non
 
     last = few[-1].seq[-1]
     assert edges_of(few) == [edge for edge in edges_of(blocks[:1]) if edge[0] <= last]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_steps_give_what_blocks_give_whatever_the_settings(seed: int) -> None:
+    types = {"TYPE_PEDESTRIAN": TypeMeaning("animal", "service", "dog")}
+    config, (blocks, road_map) = replace(any_config(200 + seed), types=types), sample()
+    offline, online = (SceneGraphGenerator(road_map, config) for _ in range(2))
+    replay, idents = Replay(), list(blocks[0].entities.ident)
+
+    graph = offline.block(blocks[0])
+    steps = [online.step(frame) for frame in replay.frames(blocks[0])]
+
+    for row, step in enumerate(steps):
+        assert shown(step) == columns(graph, row, idents)
+    kinds = {attributes["kind"] for step in steps for attributes in step.nodes.values()}
+    assert "person" not in kinds

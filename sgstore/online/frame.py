@@ -19,8 +19,9 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
+    from sgstore.vocabulary import TypeMeaning
     from sgstore.world import FrameBlock, States
 
 _NAN: Final = math.nan
@@ -68,6 +69,13 @@ class Entity(NamedTuple):
         """What may not change while it is known."""
         return self.kind, self.special, self.subkind
 
+    def meant(self, told: TypeMeaning | None) -> Entity:
+        """The entity as its type is said to be meant, if anything is said."""
+        if told is None:
+            return self
+        kind = KIND_CODE[told.kind]
+        return self._replace(kind=kind, special=told.special, subkind=told.subkind)
+
 
 class Frame:
     """One instant, to be filled with what is there.
@@ -97,6 +105,16 @@ class Frame:
 
     def __len__(self) -> int:
         return len(self.entities)
+
+    def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
+        """The frame, its entities of the kinds that type names (in lower case) are said to mean."""
+        if not types:
+            return self
+        frame = Frame(self.time_ns, self.ego)
+        frame.entities = [
+            entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
+        ]
+        return frame
 
     def __repr__(self) -> str:
         return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
