@@ -20,7 +20,7 @@ from mcap.records import Schema
 from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
 
 from sgstore.errors import TraceError
-from sgstore.traces import open_trace
+from sgstore.traces import frames, open_trace
 from sgstore.traces.frames import POSE, derive
 from sgstore.traces.osi_lights import lit, shown
 from sgstore.traces.osi_objects import MovingObjects, light_bits
@@ -1235,3 +1235,31 @@ def test_numbers_that_nothing_on_earth_has_are_missing_and_counted(tmp_path: Pat
     assert of(blocks, "1").ay.tolist() == [3.0]
     assert np.isnan(blocks[0].scenery.length).all()
     assert "4 numbers of 1e+09 and more are taken as missing" in report.warnings
+
+
+@pytest.mark.parametrize("size", [1, 60])
+def test_of_messages_without_end_between_two_frames_those_near_them_are_referred_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    monkeypatch.setattr(frames, "NEAR_REFS", 20)
+    path = tmp_path / "a.mcap"
+    with Recorder(path, chunk_size=500) as recorder:
+        for i in range(300):
+            recorder.camera(i / 10)
+            if i in {100, 101, 290}:
+                recorder.ground_truth(i / 10 + 0.01, [car(1)], host=1)
+    with open_trace(path) as trace:
+        blocks = list(trace.blocks(size))
+        warnings = trace.report.warnings
+
+    times = np.concatenate([block.messages.log_time_ns for block in blocks])
+    assert len(times) < 200
+    assert (np.diff(times) > 0).all()
+    for near in (*range(85, 116), *range(275, 300)):
+        assert ns(near / 10) in times
+    assert ns(20.0) not in times
+    dropped = 303 - len(times)
+    assert (
+        f"{dropped} sensor messages stand far from any frame, and no frame refers to them"
+        in warnings
+    )

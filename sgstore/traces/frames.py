@@ -52,6 +52,9 @@ POSE: Final = (
 FAR: Final = 1e9
 """Greatest coordinate of anything on earth, in any projection; m. Beyond it a pose is not usable."""
 
+NEAR_REFS: Final = 250_000
+"""Messages behind a frame, and before the next one, that are referred to however many there are."""
+
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = 0, 3, 6, 9, 12
 
 
@@ -235,6 +238,7 @@ def assemble(
     done: list[FrameRows] = []  # the frame before the block, and those of it that are complete
     open_refs: list[MessageRefs] = []
     block_refs: list[MessageRefs] = []
+    between = _Between()
     first, known = 0, 0
     for run in runs:
         start = 0
@@ -250,11 +254,13 @@ def assemble(
                 first, done, raw = first + size, done[-2:], []
                 window = size + 1
             if len(done) + len(raw) == window:
-                open_refs.append(refs(run.span(start, row)))
+                between.add(refs(run.span(start, row)))
                 start, known = row, entered
-                block_refs, open_refs = open_refs, []
+                block_refs, open_refs = open_refs + between.take(), []
             raw.append(frame)
-        open_refs.append(refs(run.span(start, len(run))))
+            open_refs += between.take()
+        between.add(refs(run.span(start, len(run))))
+    open_refs += between.take()
     done += _on_earth(decoder.complete(raw), decoder.roster)
     if len(done) - (first > 0) > size:
         yield _block(first, done, size, block_refs, decoder.roster.take(known))
@@ -264,8 +270,53 @@ def assemble(
     if decoder.roster.absurd:
         words = f"{decoder.roster.absurd} numbers of {FAR:g} and more are taken as missing"
         decoder.roster.report.warnings.append(words)
+    if between.dropped:
+        words = f"{between.dropped} sensor messages stand far from any frame, and no frame refers to them"
+        decoder.roster.report.warnings.append(words)
     if left:
         yield _block(first, done, left, open_refs, entered)
+
+
+@dataclass(slots=True)
+class _Between:
+    """References of messages between two frames: if they are very many, the first and the last of them.
+
+    A recording may hold hours of pictures without any ground truth. What stands far from every frame is the
+    payload of none.
+    """
+
+    dropped: int = 0
+    _parts: list[MessageRefs] = field(default_factory=list[MessageRefs])
+    _total: int = 0
+
+    def add(self, refs: MessageRefs) -> None:
+        self._parts.append(refs)
+        self._total += len(refs)
+        if self._total > 3 * NEAR_REFS:
+            whole = _joined(self._parts)
+            first, last = slice(0, NEAR_REFS), slice(len(whole) - NEAR_REFS, None)
+            self.dropped += len(whole) - 2 * NEAR_REFS
+            self._parts = [_some(whole, first), _some(whole, last)]
+            self._total = 2 * NEAR_REFS
+
+    def take(self) -> list[MessageRefs]:
+        """All of them, in order; then there are none."""
+        parts, self._parts, self._total = self._parts, [], 0
+        return parts
+
+
+def _some(refs: MessageRefs, rows: slice) -> MessageRefs:
+    # Copied, so that the whole is not kept alive by a part of it.
+    return MessageRefs(*(getattr(refs, column.name)[rows].copy() for column in fields(MessageRefs)))
+
+
+def _joined(parts: list[MessageRefs]) -> MessageRefs:
+    return MessageRefs(
+        *(
+            np.concatenate([getattr(part, column.name) for part in parts])
+            for column in fields(MessageRefs)
+        )
+    )
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
@@ -328,12 +379,7 @@ def _block(
         ego=ego,
         entities=entities,
         scenery=scenery,
-        messages=MessageRefs(
-            *(
-                np.concatenate([getattr(part, column.name) for part in refs])
-                for column in fields(MessageRefs)
-            )
-        ),
+        messages=_joined(refs),
     )
 
 
