@@ -28,7 +28,7 @@ from sgstore.relations.extent import Extent, Places
 from sgstore.relations.following import gaps
 from sgstore.relations.keeping import Keeping, renamed
 from sgstore.relations.pairs import joined_pairs, near_pairs, of_kinds, related_pairs
-from sgstore.relations.scene import Bodies, Scene
+from sgstore.relations.scene import IS_SIGNAL, Bodies, Scene
 from sgstore.relations.still import StillPairs
 from sgstore.relations.survey import Survey
 from sgstore.relations.waypoints import waypoints_of
@@ -230,8 +230,10 @@ class SceneGraphGenerator:
         if not len(scenery):
             return np.zeros(0, np.int64), np.zeros(0, np.intp)
         frame, row = areas.near(scenery.x, scenery.y, np.hypot(scenery.length, scenery.width) / 2)
-        held = areas.hold(frame, _boxes(scenery)[row], _bottom(scenery)[row], static=True)
-        held &= self._keeping.entities(self._kinds[scenery.node])[row]
+        kind = self._kinds[scenery.node][row]
+        boxes, bottom = _boxes(scenery)[row], _bottom(scenery)[row]
+        held = areas.hold(frame, boxes, bottom, static=True, hung=IS_SIGNAL[kind])
+        held &= self._keeping.entities(kind)
         return frame[held], row[held]
 
     def _in_range(
@@ -239,8 +241,9 @@ class SceneGraphGenerator:
     ) -> tuple[FrameBlock, Rows, Rows]:
         """The frames with only the states in range, the rows of these, and those of the egos among them."""
         frame, states = frames.frame_of, frames.states
-        held = areas.hold(frame, _boxes(states), _bottom(states))
-        held &= self._keeping.entities(self._kinds[states.node])
+        kind = self._kinds[states.node]
+        held = areas.hold(frame, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
+        held &= self._keeping.entities(kind)
         named = states.node == np.repeat(frames.ego, np.diff(frames.offsets))
         kept = np.flatnonzero(held | named)
         here = np.where(ego < 0, -1, np.searchsorted(kept, ego))

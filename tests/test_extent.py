@@ -378,6 +378,20 @@ def test_other_storeys_are_out_of_range(of: Range, names: list[str], passed: set
     assert roads(graph, road_map) == passed
 
 
+def test_a_light_hangs_over_the_road_of_its_storey() -> None:
+    config = Config(range=Range(50, height=(-2.0, 2.0)))
+    lights = [
+        thing(f"{z}", 9, 3, z=z, kind="traffic_light", static=static, length=0.4, width=0.4)
+        for static in (False, True)
+        for z in (5.5 + static / 4, 9.5 + static / 4, -3.5 - static / 4)
+    ]
+    pole = thing("pole", 9, 3, z=5.5, kind="pole")
+
+    graph = graph_of(frames([thing("ego"), *lights, pole]), None, config)
+
+    assert entities(graph) == ["ego", "5.5", "5.75"]
+
+
 def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is() -> None:
     road_map, egos = read_map(BRIDGE, "bridge"), Places(*np.array([[0.0], [9.0], [0.0], [5.0]]))
     points, of = road_map.waypoints(STEP), Range(30.0, height=(-1.0, 1.0))

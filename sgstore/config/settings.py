@@ -91,7 +91,7 @@ class Range:
     height: tuple[float, ...] = setting(
         (),
         "[lowest, highest]: how far below or above the ground under the ego the ground under an entity, and "
-        "the road, may be (storeys); m. Empty: at any height",
+        "the road, may be (storeys); signals may hang up to 6 m above it; m. Empty: at any height",
     )
     grade: float = setting(
         0.0, "with height: what rises or falls by less than this for each metre away counts too"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import gap, gap_to_points
-from sgstore.relations.scene import joined, spread
+from sgstore.relations.scene import IS_SIGNAL, joined, spread
 from sgstore.roads.lanetypes import DRIVING
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE
 
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 TOUCH: Final = 1e-9
 """What is no farther from the edge of an area touches it: rounding; m."""
+
+HANG: Final = 6.0
+"""How high above the ground of their storey signals may hang; m. (Clearance over roads is 4.5 to 5.5 m.)"""
 
 STEP: Final = 2.0
 """From point to point of a lane whose height is looked at; m."""
@@ -204,7 +207,15 @@ class Areas:
         frame, row = np.nonzero(~(far > reach**2) | ~self.exist[:, None])
         return frame, row
 
-    def hold(self, frame: Ints, boxes: Floats, ground: Floats, *, static: bool = False) -> Bools:
+    def hold(
+        self,
+        frame: Ints,
+        boxes: Floats,
+        ground: Floats,
+        *,
+        static: bool = False,
+        hung: Bools | None = None,
+    ) -> Bools:
         """Whether footprints are in range.
 
         Parameters
@@ -217,6 +228,8 @@ class Areas:
             Height of the lower side of each box; m. NaN: any.
         static : bool
             Whether they are entities that never move.
+        hung : (N,) bool, optional
+            Which may hang above the ground (:data:`HANG`).
         """
         boxes = boxes.copy()
         by = self.settings.static_by if static else self.settings.by
@@ -228,7 +241,7 @@ class Areas:
         near = np.flatnonzero(~inside & (np.hypot(x, y) <= self.reach + extent + TOUCH))
         inside[near] = self._meet(np.asarray(frame)[near], boxes[near])
         if self.settings.height and self.settings.height_of_entities:
-            inside &= self._level(np.asarray(frame), np.hypot(x, y), ground)
+            inside &= self._level(np.asarray(frame), np.hypot(x, y), ground, hung)
         return inside
 
     def parts(self, road_map: RoadMap) -> Bools:
@@ -254,10 +267,12 @@ class Areas:
         """Frames, and nodes of the map that meet their areas."""
         raise NotImplementedError
 
-    def _level(self, frame: Ints, away: Floats, height: Floats) -> Bools:
+    def _level(self, frame: Ints, away: Floats, height: Floats, hung: Bools | None = None) -> Bools:
         """Whether heights, of things so far away, are on the storey of an ego."""
         rise = height - self.egos.ground[frame]
         lowest, highest = self.settings.height
+        if hung is not None:  # as low as it may have to be
+            rise = np.where(hung, np.clip(highest, rise - HANG, rise), rise)
         off = (rise < lowest) | (rise > highest)  # what is missing is not off
         return ~off | (np.abs(rise) < self.settings.grade * away) | ~self.exist[frame]
 
@@ -272,7 +287,7 @@ class Areas:
         other = np.flatnonzero(~is_lane)
         at, place = frame[other], column[other]
         away = np.hypot(nodes.x[place] - self.egos.x[at], nodes.y[place] - self.egos.y[at])
-        off = ~self._level(at, away, nodes.z[place])
+        off = ~self._level(at, away, nodes.z[place], IS_SIGNAL[nodes.kind[place]])
         inside[at[off], place[off]] = False
 
         frame, lane = frame[is_lane], column[is_lane] - 1
