@@ -90,18 +90,18 @@ def record(  # noqa: PLR0913  as many options as a recording has
     """
     live = LiveWorld(world, ego, scenery=scenery)
     blueprints = {sensor.name: sensor.type for sensor in sensors}
+    attached: Sensors | None = None
     with ExitStack() as stack:
+        if sensors:
+            attached = stack.enter_context(Sensors(world, live.find_ego(), list(sensors)))
         recorder = stack.enter_context(
             Recorder(to, map_text=live.map_text, map_name=live.map_name, sensors=blueprints)
         )
         run = _Run(live, recorder, on_frame)
         snapshots = stack.enter_context(closing(_snapshots(world, step_s)))
-        attached: Sensors | None = None
         try:
             for snapshot in snapshots:
                 run.take(snapshot)
-                if sensors and attached is None:
-                    attached = stack.enter_context(Sensors(world, live.ego, list(sensors)))
                 if attached is not None:
                     run.drain(attached, 0.0)
                 if duration_s is not None and run.seconds >= duration_s:

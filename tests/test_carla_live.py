@@ -222,6 +222,19 @@ def test_a_world_without_a_map_is_refused() -> None:
         LiveWorld(world)
 
 
+def test_a_server_that_goes_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = at_red()
+    live = LiveWorld(world)
+    live.frame()
+
+    def gone() -> None:
+        raise RuntimeError("time-out of 10000ms while waiting for the simulator")
+
+    monkeypatch.setattr(world, "get_vehicles_light_states", gone)
+    with pytest.raises(TraceError, match="the CARLA server does not answer: time-out"):
+        live.frame()
+
+
 def test_without_the_package_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "carla", None)
 

@@ -174,8 +174,6 @@ class LiveWorld:
     world : carla.World
     map_text, map_name : str
         The road map as OpenDRIVE, and what the simulator calls it.
-    ego : carla.Vehicle or None
-        The ego of the last frame.
 
     Raises
     ------
@@ -194,7 +192,6 @@ class LiveWorld:
         self._actors: dict[int, _Actor | None] = {}
         self._scenery = scenery
         self._told = False
-        self.ego: Any = None
 
     @cached_property
     def road_map(self) -> RoadMap:
@@ -219,13 +216,35 @@ class LiveWorld:
         -------
         Frame
             Actors and vehicles of the level; the first frame has the scenery, too.
+
+        Raises
+        ------
+        TraceError
+            The server does not answer any more.
         """
-        snapshot = self.world.get_snapshot() if snapshot is None else snapshot
-        states = {state.id: state for state in snapshot}
-        self._look(set(states))
-        here = {i: a for i in states if (a := self._actors[i]) is not None}
+        try:
+            return self._frame(self.world.get_snapshot() if snapshot is None else snapshot)
+        except RuntimeError as error:  # what the client raises, whatever went wrong
+            raise TraceError(f"the CARLA server does not answer: {error}") from error
+
+    def find_ego(self) -> Any:
+        """The ego as a ``carla.Vehicle``, without making a frame; ``None`` if there is none."""
+        try:
+            here = self._here({state.id for state in self.world.get_snapshot()})
+        except RuntimeError as error:
+            raise TraceError(f"the CARLA server does not answer: {error}") from error
         ego = self._ego_of(here)
-        self.ego = None if ego is None else here[ego].handle
+        return None if ego is None else here[ego].handle
+
+    def _here(self, present: set[int]) -> dict[int, _Actor]:
+        """The actors that are entities."""
+        self._look(present)
+        return {i: a for i in sorted(present) if (a := self._actors[i]) is not None}
+
+    def _frame(self, snapshot: Any) -> Frame:
+        states = {state.id: state for state in snapshot}
+        here = self._here(set(states))
+        ego = self._ego_of(here)
         frame = Frame(round(snapshot.timestamp.elapsed_seconds * 1e9), ego)
         lights = self.world.get_vehicles_light_states()
         for ident, actor in here.items():
