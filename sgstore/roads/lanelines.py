@@ -284,12 +284,15 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
     return cross_sections(line.centre, lefts, rights, half)
 
 
-def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
+def about_lanes(lanes: Sequence[str], what: str) -> str:
     """A warning that names lanes; the first few of many."""
+    more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
+    return f"{'lanes' if len(lanes) > 1 else 'lane'} {', '.join(lanes[:LISTED])}{more}: {what}"
+
+
+def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
     if lanes:
-        more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
-        many = "lanes" if len(lanes) > 1 else "lane"
-        network.warnings.append(f"{many} {', '.join(lanes[:LISTED])}{more}: {what}")
+        network.warnings.append(about_lanes(lanes, what))
 
 
 def _add_ways(network: _Network, areas: Iterable[Area]) -> None:

@@ -28,6 +28,7 @@ from sgstore.roads.lanelines import (
     Border,
     Joint,
     LaneLine,
+    about_lanes,
     plain_lanes,
 )
 from sgstore.roads.lanetext import OF_LANES, lane_text
@@ -173,6 +174,7 @@ class OsiLanes:
         self._told: dict[str, dict[int, Any]] = {name: {} for name in FIELDS}
         self._map = ""
         self._points = 0
+        self._broken: dict[str, list[str]] = {}
         self.warnings: list[str] = []
 
     def take(self, data: bytes) -> None:
@@ -221,6 +223,7 @@ class OsiLanes:
             else:
                 lines += self._guarded(_physical_line, ident, lane, borders)
         plain, warnings = plain_lanes(_sections_numbered(lines), areas)
+        self.warnings += [about_lanes(which, what) for what, which in self._broken.items()]
         if not plain:
             return "", ""
         return lane_text(plain, [*self.warnings, *warnings]), self._name()
@@ -230,8 +233,8 @@ class OsiLanes:
     ) -> list[Any]:
         try:
             return [read(lane, borders)]
-        except (*DECODE_ERRORS, FloatingPointError) as error:
-            self.warnings.append(f"lane {ident}: left out: {error}")
+        except DECODE_ERRORS as error:
+            self._broken.setdefault(f"left out: {error}", []).append(str(ident))
             return []
 
     def _name(self) -> str:
