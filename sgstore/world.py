@@ -311,12 +311,12 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a simulator says has happened to one of its vehicles.
+    """Something that a simulator says has happened: to one of its vehicles, or to weather and light.
 
     Attributes
     ----------
     kind : str
-        ``collision`` or ``lane_invasion``.
+        ``collision``, ``lane_invasion`` or ``environment``.
     time_ns, log_time_ns : int
         Simulation time and log time.
     seq : int
@@ -328,7 +328,8 @@ class Event:
     value : float or None
         Length of the impulse of a collision; N·s.
     detail : str
-        Markings that were crossed: ``broken``, ``solid``, ``other``, with commas.
+        Markings that were crossed: ``broken``, ``solid``, ``other``, with commas. Of an environment, what it
+        is from now on: ``precipitation=light, fog=mist``.
     """
 
     kind: str

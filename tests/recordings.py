@@ -58,10 +58,13 @@ TYPES = {
     "TrafficSign": "id=1:Identifier main_sign=2:MainSign source_reference=4:ExternalReference*",
     "LaneClassification": "centerline=3:Vector3d*",
     "Lane": "id=1:Identifier classification=2:LaneClassification",
+    "TimeOfDay": "seconds_since_midnight=1:uint32",
+    "EnvironmentalConditions": "ambient_illumination=1:Illumination time_of_day=2:TimeOfDay"
+    " temperature=4:double precipitation=6:Precipitation fog=7:Fog",
     "GroundTruth": "timestamp=2:Timestamp host_vehicle_id=3:Identifier"
     " stationary_object=4:StationaryObject* moving_object=5:MovingObject*"
     " traffic_sign=6:TrafficSign* traffic_light=7:TrafficLight* lane=10:Lane*"
-    " map_reference=15:string",
+    " environmental_conditions=12:EnvironmentalConditions map_reference=15:string",
     "VehiclePowertrain": "pedal_position_acceleration=1:double",
     "VehicleBrakeSystem": "pedal_position_brake=1:double",
     "HostVehicleData": "vehicle_powertrain=4:VehiclePowertrain"
@@ -81,6 +84,9 @@ ENUMS = {
     "StationaryType": "TYPE_UNKNOWN=0 TYPE_OTHER=1 TYPE_BUILDING=3 TYPE_POLE=4 TYPE_TREE=7",
     "Color": "COLOR_UNKNOWN=0 COLOR_OTHER=1 COLOR_RED=2 COLOR_YELLOW=3 COLOR_GREEN=4 COLOR_WHITE=6",
     "Icon": "ICON_UNKNOWN=0 ICON_OTHER=1 ICON_NONE=2 ICON_WALK=16 ICON_DONT_WALK=17",
+    "Precipitation": "PRECIPITATION_UNKNOWN=0 PRECIPITATION_NONE=2 PRECIPITATION_LIGHT=4",
+    "Fog": "FOG_UNKNOWN=0 FOG_EXCELLENT_VISIBILITY=2 FOG_MIST=6",
+    "Illumination": "AMBIENT_ILLUMINATION_UNKNOWN=0 AMBIENT_ILLUMINATION_LEVEL5=6",
     "Unit": "UNIT_UNKNOWN=0 UNIT_KILOMETER_PER_HOUR=3 UNIT_MILE_PER_HOUR=4",
     "Mode": "MODE_UNKNOWN=0 MODE_OTHER=1 MODE_OFF=2 MODE_CONSTANT=3 MODE_FLASHING=4",
     "SignType": "TYPE_UNKNOWN=0 TYPE_OTHER=1 TYPE_GIVE_WAY=16 TYPE_STOP=17"

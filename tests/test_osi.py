@@ -1263,3 +1263,40 @@ def test_of_messages_without_end_between_two_frames_those_near_them_are_referred
         f"{dropped} sensor messages stand far from any frame, and no frame refers to them"
         in warnings
     )
+
+
+def test_weather_and_light_are_events_when_they_begin_and_change(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i in range(8):
+            ground = ground_truth(i / 10, [car(1)], host=1)
+            told = ground.environmental_conditions
+            if i not in {2, 3}:  # what is not told goes on
+                told.precipitation, told.ambient_illumination = (2, 6) if i < 5 else (4, 6)
+                told.time_of_day.seconds_since_midnight = 46_700 + i
+                told.temperature = 290.15
+            if i == 7:
+                told.fog = 6
+            channel = recorder.channel("truth", "osi3.GroundTruth")
+            recorder.write(channel, i / 10, ground.SerializeToString())
+    _, _, report = read(path, 3)
+
+    assert [(event.kind, event.seq, event.time_ns, event.detail) for event in report.events] == [
+        ("environment", 0, 0,
+         "precipitation=none, illumination=level5, time_of_day=12:58:20, temperature=290.1 K"),
+        ("environment", 5, ns(0.5),
+         "precipitation=light, illumination=level5, time_of_day=12:58:25, temperature=290.1 K"),
+        ("environment", 7, ns(0.7),
+         "precipitation=light, fog=mist, illumination=level5, time_of_day=12:58:27, temperature=290.1 K"),
+    ]  # fmt: skip
+
+
+def test_conditions_that_are_malformed_cost_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        data = ground_truth(0.0, [car(1)], host=1).SerializeToString() + b"\x62\x02\x12\x7f"
+        recorder.write(recorder.channel("truth", "osi3.GroundTruth"), 0.0, data)
+    _, _, report = read(path)
+
+    assert (report.frames, report.events, report.losses) == (1, [], [])
+    assert report.warnings == ["weather and light cannot be read where they changed 1 times"]

@@ -84,6 +84,7 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
         "classification": dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
         **_REFERENCES,
     },
+    "environmental_conditions": OPAQUE,
     "road_marking": _ID,
     "lane_boundary": _ID,
     "lane": _ID,

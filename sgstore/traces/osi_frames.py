@@ -22,6 +22,7 @@ import numpy as np
 
 from sgstore.traces.frames import NAN, POSE, FrameRows, Roster
 from sgstore.traces.osi_cast import is_key, keys_of
+from sgstore.traces.osi_environment import Environment
 from sgstore.traces.osi_lights import TrafficLights
 from sgstore.traces.osi_objects import MovingObjects
 from sgstore.traces.osi_schema import DECODE_ERRORS, enum_name, ground_truth_of, has_field, parse
@@ -114,6 +115,8 @@ class FrameDecoder:
         ].objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
         self._lights = TrafficLights(self.roster)
+        self._environment = Environment(survey.leads[leading].message, report)
+        self._frames = 0
 
     def decode(self, run: Messages, row: int) -> RawFrame | None:
         """The frame that a message begins, if it begins one; what else it says is taken up."""
@@ -140,6 +143,7 @@ class FrameDecoder:
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
         losses, warn = self._report.losses, self._report.warnings.append
+        self._environment.settle()
         losses += self._unreadable.losses()
         for loss in self._unusable.losses():
             reason = f"{loss.reason}: {loss.messages} states were left out"
@@ -190,6 +194,8 @@ class FrameDecoder:
         self._lights.update(ground)
         frame = RawFrame(log_time if time_ns is None else time_ns, log_time, self._lights.rows())
         self._open = frame
+        self._environment.look(ground, frame.time_ns, log_time, self._frames)
+        self._frames += 1
         self._join(frame, message, nodes, objects)
         for ahead in [time for time in self._ahead if time <= frame.time_ns]:
             contents = self._ahead.pop(ahead)
