@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,7 +17,6 @@ from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = pytest.mark.data
 
@@ -101,3 +104,58 @@ def test_graphs_are_what_the_views_show(ingested) -> None:
             assert Counter((s, r, d) for s, r, d, _ in graph.edges) == Counter(edges)
             assert Counter((node,) for node in graph.nodes) == Counter(nodes)
             assert {end for s, _, d, _ in graph.edges for end in (s, d)} <= graph.nodes.keys()
+
+
+DAMAGED = {
+    "clock_jump": (200, False),
+    "cut_mid_chunk": (99, True),
+    "flipped_chunk": (167, True),
+    "flipped_chunk_nocrc": (167, True),
+    "flipped_silent_nocrc": (200, False),
+    "nan_poses": (200, True),
+    "no_footer": (200, False),
+    "unknown_channel": (200, False),
+    "zstd_bomb": (6, True),
+    "zstd_bomb_fcs": (6, True),
+}
+"""What the folder's README says can be saved of each file, in frames, and whether something is lost."""
+
+INGEST = """
+import json, re, sys
+from pathlib import Path
+from sgstore.ingest import ingest
+outcomes = ingest(sys.argv[1], sys.argv[2:])
+peak = re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1]
+print(json.dumps({"peak": int(peak), "outcomes": [outcome.as_dict() for outcome in outcomes]}))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peaks are told by Linux")
+def test_all_that_can_be_had_of_damaged_recordings_comes_in_and_the_rest_is_named(
+    data, tmp_path
+) -> None:
+    folder = data / "traces" / "carla" / "damaged"
+    paths = [folder / f"{name}.mcap" for name in DAMAGED]
+
+    run = subprocess.run(
+        [sys.executable, "-c", INGEST, tmp_path / "s.db", *paths],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    told = json.loads(run.stdout)
+    assert told["peak"] < 512_000
+    store = StoreFile(tmp_path / "s.db")
+    reports = {trace.path.stem: trace.report for trace in store.traces()}
+    for outcome in told["outcomes"]:
+        name = Path(outcome["path"]).stem
+        frames, lossy = DAMAGED[name]
+        assert outcome["status"] == "added", outcome["error"]
+        assert outcome["frames"] >= frames, name
+        assert bool(outcome["losses"]) == lossy, name
+        assert all(loss["reason"] for loss in outcome["losses"])
+        assert reports[name]["losses"] == outcome["losses"]
+    assert reports["clock_jump"]["clock_jumps"] == 1
+    assert reports["flipped_chunk"]["gaps"] == 1
+    assert store.verify(recordings=True).faults == []
