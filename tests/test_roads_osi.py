@@ -278,10 +278,12 @@ def test_lanes_that_came_from_opendrive_keep_the_names_they_had(source: tuple[st
     truth.lane(2, [(0, 0), (25, 0)], source=first)
     truth.lane(3, [(0, 9), (25, 9)], source=("x",))
     truth.lane(4, [(0, 19), (25, 19)], source=("1", "here", "there"))
+    truth.lane(5, [(0, 29), (25, 29)], source=("1" * 500, "0", "1"))
+    truth.lane(6, [(0, 39), (25, 39)], source=("1", "nan", "1"))
 
     nodes = made(truth).nodes
 
-    assert nodes.name[1:5] == ("7/1/-1", "7/0/-1", "3", "4")
+    assert nodes.name[1:7] == ("7/1/-1", "7/0/-1", "3", "4", "5", "6")
     assert nodes.road[1:3] == ("7", "7")
     assert (nodes.section[1], nodes.lane[1]) == (1, -1)
     assert nodes.length[nodes.name.index("7")] == pytest.approx(50)

@@ -132,6 +132,8 @@ _RULES: Final = {
 }
 """Rule → whether traffic may cross from right to left, and from left to right, along the reference line."""
 
+_LONGEST: Final = 100
+"""Greatest length of the name of a road."""
 _JUMP: Final = 1e-3
 """Least distance by which a border jumps; m."""
 _FAR: Final = 1e8
@@ -464,12 +466,14 @@ def _source(lane: Any) -> dict[str, Any]:
         for source, value in identifiers(lane)
         if source == "net.asam.opendrive"
     ]
-    if len(values) < 3:
+    if len(values) < 3 or len(values[0]) > _LONGEST:
         return {}
     try:
-        return {"road": values[0], "section": float(values[1]), "number": int(values[2])}
+        start, number = float(values[1]), int(values[2])
     except ValueError:
         return {}
+    usable = abs(start) < _FAR and abs(number) < _FAR
+    return {"road": values[0], "section": start, "number": number} if usable else {}
 
 
 def _sections_numbered(lines: Sequence[LaneLine]) -> list[LaneLine]:
