@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 from mcap_ros2._dynamic import serialize_dynamic
+from opendrive_maps import a_map, a_road, element, line
 
 from sgstore.traces import open_trace
 from sgstore.vocabulary import KINDS
@@ -101,8 +102,8 @@ def definition(name: str, other: Mapping[str, str] | None = None) -> str:
         package = part.split("/")[0]
         text += f"{RULE}\nMSG: {part}\n" if text else ""
         text += known[part] + "\n"
-        for line in known[part].splitlines():
-            word = line.split()[0].split("[")[0]
+        for told in known[part].splitlines():
+            word = told.split()[0].split("[")[0]
             full = word if "/" in word else f"{package}/{word}"
             if full in known and full not in wanted:
                 wanted.append(full)
@@ -367,6 +368,18 @@ def control(steer: float, throttle: float, brake: float) -> dict[str, Any]:
 
 
 HERO = {1: ("vehicle.tesla.model3", "hero")}
+SIGNAL = element(
+    "signal",
+    id="s80",
+    s=25,
+    t=-4,
+    orientation="+",
+    dynamic="yes",
+    type="1000001",
+    country="OpenDRIVE",
+)
+TOWN = a_map(a_road("1", line(100), signals=SIGNAL))
+"""A road along x with one lane, and a traffic light beside it."""
 ACTORS = {
     7: ("vehicle.tesla.model3", "hero"),
     3: ("vehicle.mitsubishi.fusorosa", "autopilot"),
@@ -381,7 +394,7 @@ def drive(
 ) -> Path:
     """A drive of a car and a bus, past a walker and a light. ``everything``: messages of every kind."""
     with Bridge(path, **how) as bridge:
-        bridge.world("<OpenDRIVE/>")
+        bridge.world(TOWN)
         bridge.actors(ACTORS)
         bridge.light_places([light(80, 25, -4)])
         if everything:
@@ -409,7 +422,7 @@ def drive(
                 bridge.odometry(t, 5, 5, role="stranger")
                 bridge.collision(t, 3, (1, 2, 3))
                 bridge.lane_invasion(t, [1, 10])
-                bridge.write("/carla/map", "std_msgs/String", {"data": "<OpenDRIVE/>"}, t)
+                bridge.write("/carla/map", "std_msgs/String", {"data": TOWN}, t)
     return path
 
 

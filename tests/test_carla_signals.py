@@ -295,9 +295,22 @@ def test_the_box_of_a_light_lies_in_the_light_s_own_axes(path: Path) -> None:
         bridge.light_places([light(80, 120, 10, math.pi / 2, centre=(-11.75, 23, -3))])
         bridge.objects(0.0, [vehicle(1)])
 
-    entities = read(path)[1][0].entities
+    _, blocks, report = read(path)
+    entities = blocks[0].entities
 
     assert dict(zip(entities.ident, entities.map_ref, strict=True)) == {"80": "forth", "1": ""}
+    assert not any("signal" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("text", ["", "<OpenDRIVE/>", "town"])
+def test_lights_that_no_signal_tells_the_lanes_of_are_counted(path: Path, text: str) -> None:
+    with Bridge(path) as bridge:
+        bridge.light_places([light(80, 120, 10), light(81, 500, 500)])
+        if text:
+            bridge.world(crossing().text if text == "town" else text)
+        bridge.objects(0.0, [vehicle(1)])
+
+    assert any(w.startswith("2 traffic lights are no signal") for w in read(path)[2].warnings)
 
 
 # What a clip needs --------------------------------------------------------------------------------

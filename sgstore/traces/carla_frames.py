@@ -205,6 +205,11 @@ class FrameDecoder:
                 f"of {self._lights.unplaced} traffic lights the recording does not say where they stand:"
                 " they are listed as entities, but are in no graph"
             )
+        if self._lights.aimless:
+            warn(
+                f"{self._lights.aimless} traffic lights are no signal of the recording's road map:"
+                " for which lanes they are is not known"
+            )
         if self._untimed:
             warn(f"{self._untimed} frames bear no time of their own: their log time is taken")
         if not self._survey.egos.actors:

@@ -182,6 +182,11 @@ class Lights:
         return len(self._unplaced)
 
     @property
+    def aimless(self) -> int:
+        """Lights of which it is not known for which lanes they are."""
+        return len(self._row.keys() - self._signals.keys())
+
+    @property
     def states(self) -> Ints:
         """What they show now: codes of :data:`sgstore.vocabulary.LIGHT_STATES`. Not to be written to."""
         return self._states
