@@ -73,7 +73,7 @@ CREATE TABLE context (                                         -- messages that 
 
 CREATE TABLE entity (                                          -- what does not change about an entity of a trace
   trace_id BIGINT, node_id INTEGER, kind kind, ident VARCHAR, special VARCHAR, subkind VARCHAR, type_name VARCHAR,
-  is_static BOOLEAN, map_ref VARCHAR,
+  is_static BOOLEAN, map_ref VARCHAR, parked BOOLEAN,          -- parked: of vehicles, NULL where it is not known
   x FLOAT, y FLOAT, z FLOAT, heading FLOAT, length FLOAT, width FLOAT, height FLOAT);   -- pose of the static ones, else NULL
 
 -- Frames ----------------------------------------------------------------------------------------------------------
@@ -273,10 +273,11 @@ COMMENT ON VIEW lanes IS 'One row a lane of a road map. name: road/section/lane;
 
 CREATE VIEW entities AS
 SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.ident, e.special, e.subkind, e.type_name, e.is_static, e.map_ref,
-       t.origin_x + e.x AS x, t.origin_y + e.y AS y, t.origin_z + e.z AS z, degrees(e.heading) AS heading, e.length, e.width, e.height
+       t.origin_x + e.x AS x, t.origin_y + e.y AS y, t.origin_z + e.z AS z, degrees(e.heading) AS heading, e.length, e.width, e.height,
+       e.parked
 FROM entity e JOIN trace t ON t.trace_id = e.trace_id;
 
-COMMENT ON VIEW entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is.';
+COMMENT ON VIEW entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
 
 CREATE VIEW payloads AS
 SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, t.uri AS file,

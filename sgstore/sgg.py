@@ -28,6 +28,7 @@ from sgstore.relations.extent import Extent, Places
 from sgstore.relations.following import gaps
 from sgstore.relations.keeping import Keeping, renamed
 from sgstore.relations.pairs import joined_pairs, near_pairs, of_kinds, related_pairs
+from sgstore.relations.parking import Parking
 from sgstore.relations.scene import IS_SIGNAL, Bodies, Scene
 from sgstore.relations.still import StillPairs
 from sgstore.relations.survey import Survey
@@ -88,6 +89,7 @@ class SceneGraphGenerator:
         self._kinds: Codes = np.zeros(0, np.int8)
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self._still = StillPairs(config)
+        self._parking = Parking()
         self.answers = self._answers(road_map)
 
     def _answers(self, road_map: RoadMap | None) -> tuple[str, ...]:
@@ -98,6 +100,11 @@ class SceneGraphGenerator:
             of_map = {*MAP_RELATIONS, *(VOCABULARY[code] for code in codes)}
         names = self._keeping.names(names, of_map)
         return tuple(name for name in VOCABULARY if name in names)
+
+    @property
+    def parked(self) -> Codes:
+        """(n,) int8: of each entity whether it is parked, as all blocks so far tell: 1 or 0; -1: not known."""
+        return self._parking.parked
 
     def block(self, frames: FrameBlock) -> GraphBlock:
         """The scene graphs of the next frames, as their ego has them.
@@ -150,12 +157,16 @@ class SceneGraphGenerator:
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
         still = self._still.among(keys, len(frames.states), len(self._scenery))
+        standing = None
+        if self._survey is not None:
+            standing = self._survey.standing(bodies)
+            self._parking.stand(bodies, standing, self._survey.driving)
         return _World(
             keys=keys,
             bodies=bodies,
             near=joined_pairs([near_pairs(bodies, self._config), still]),
             contacts=contacts(bodies),
-            standing=None if self._survey is None else self._survey.standing(bodies),
+            standing=standing,
         )
 
     def _graphs(self, view: _View, world: _World) -> GraphBlock:
@@ -211,6 +222,7 @@ class SceneGraphGenerator:
             if entities.first != len(self._kinds):
                 raise ValueError(f"new entities begin at {entities.first}, not {len(self._kinds)}")
             self._kinds = np.concatenate([self._kinds, entities.kind])
+            self._parking.learn(entities)
             if self._survey is not None:
                 self._survey.learn(entities, frames.scenery)
         if len(frames.scenery):
@@ -223,6 +235,7 @@ class SceneGraphGenerator:
             strange = of[(of < 0) | (of >= len(self._kinds))]
             if len(strange):
                 raise ValueError(f"a state of node {strange[0]}, which no block has introduced")
+        self._parking.see(frames.states)
 
     def _scenery_in_range(self, areas: Areas) -> tuple[Ints, Rows]:
         """Frames and rows of the scenery: all of it where there is no ego."""

@@ -367,6 +367,44 @@ def test_a_footprint_in_the_range_of_several_egos_is_looked_up_once() -> None:
     assert town.asked == 3
 
 
+# Parking ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("places", "other", "parked"),
+    [
+        pytest.param([(9, 9), (9.2, 9)], {}, 1, id="off the road, trembling"),
+        pytest.param([(9, 9), (9.4, 9)], {}, 0, id="off the road, moving"),
+        pytest.param([(9, 9), (20, 9), (9, 9)], {}, 0, id="there and back"),
+        pytest.param([(9, -2), (9, -2)], {}, 0, id="on a lane for driving"),
+        pytest.param([(9, -2), (9, -2)], {"static": True}, 1, id="static in the simulator"),
+        pytest.param([(9, 9), (9, 9)], {"kind": "person"}, -1, id="no vehicle"),
+        pytest.param([(90, 90), (90, 90)], {}, -1, id="never in range"),
+        pytest.param([(90, 90), (95, 90)], {}, 0, id="never in range, moving"),
+        pytest.param([(math.nan, 9), (9, 9)], {}, 1, id="at first nowhere"),
+    ],
+)
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_what_is_parked_is_known_in_the_end(
+    places: list[tuple[float, float]], other: dict[str, object], parked: int, blocks: int
+) -> None:
+    recording, generator = Recording(), SceneGraphGenerator(STREET, Config())
+    scenes = [[thing("ego", i, -2), thing("c", *place, **other)] for i, place in enumerate(places)]
+
+    for part in [scenes] if blocks == 1 else [[scene] for scene in scenes]:
+        generator.block(recording.block(*part))
+
+    assert generator.parked.tolist() == [0, parked]
+
+
+def test_without_a_map_only_what_is_static_is_known_to_be_parked() -> None:
+    generator = SceneGraphGenerator(None, Config())
+
+    generator.block(frames([thing("ego"), thing("a", 5), thing("b", 9, static=True)]))
+
+    assert generator.parked.tolist() == [-1, -1, 1]
+
+
 # What it can answer -----------------------------------------------------------------------------
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sgstore.ingest.jobs import Job
     from sgstore.roads import RoadMap
     from sgstore.traces import Trace
-    from sgstore.world import FrameBlock, Ints, TraceInfo
+    from sgstore.world import Codes, FrameBlock, Ints, TraceInfo
 
 EGOS_AT_ONCE: Final = 4
 """Egos whose graphs are built in one pass over a recording: each needs the memory of a segment."""
@@ -221,7 +221,7 @@ class Reading:
                 self._append(generator, block, group, segments)
                 tally.see(block)
                 self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
-            self._seal(trace, group, segments, tally)
+            self._seal(trace, group, segments, tally, generator.parked)
 
     def _append(
         self,
@@ -240,7 +240,12 @@ class Reading:
             segment.append(graph)
 
     def _seal(
-        self, trace: Trace, group: list[_Wanted], segments: list[Segment], tally: Tally
+        self,
+        trace: Trace,
+        group: list[_Wanted],
+        segments: list[Segment],
+        tally: Tally,
+        parked: Codes,
     ) -> None:
         report, told = trace.report, tally.as_dict()
         for one, segment in zip(group, segments, strict=True):
@@ -251,7 +256,7 @@ class Reading:
             outcome.unknown_types = self._job.config.unknown_of(report.unknown_types)
             outcome.warnings += report.warnings
             outcome.losses += report.losses
-            segment.seal(replace(report, warnings=outcome.warnings), told)
+            segment.seal(replace(report, warnings=outcome.warnings), told, parked)
             outcome.status = "sealed"
 
     def _meant(self, block: FrameBlock) -> FrameBlock:

@@ -188,6 +188,13 @@ NODE_ATTRIBUTES: Final = _named(
         ),
         _constant("ident", "ident", "the simulator's own id"),
         _constant("type_name", "type_name", "the simulator's type name"),
+        Attribute(
+            "parked",
+            Type.boolean,
+            {Home.entity: "parked"},
+            "whether a vehicle does not move in the whole trace, off the driving lanes",
+            kinds=frozenset(VEHICLES),
+        ),
         _repeated("special", "special kind", SPECIALS),
         _repeated("subkind", "what a prop or an unknown is"),
         Attribute(

@@ -51,6 +51,11 @@ class Survey:
     waypoints : Waypoints, optional
         Those of the map, where it has any.
 
+    Attributes
+    ----------
+    driving : (K,) bool
+        Which nodes of the map are lanes for motor traffic.
+
     Notes
     -----
     It remembers which entities stand for signals and objects of the map, and the last footprint of what was in
@@ -65,7 +70,7 @@ class Survey:
         self._net = LaneNet(road_map)
         self._reach = SignalReach(road_map, self._net, lines, ahead)
         self._footing = _Footing(road_map, lines)
-        self._driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
+        self.driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
         self._parent = _parents(road_map)
         self._columns: dict[tuple[bool, str], list[int]] = {}
         for column in np.flatnonzero(nodes.kind < len(ENTITY_KINDS)).tolist():
@@ -118,7 +123,7 @@ class Survey:
             order = np.argsort(rows, kind="stable")
             parts = rows[order], nodes[order]
         stands: Bools = np.zeros(len(bodies), np.bool_)
-        stands[hits.row[self._driving[-1 - hits.lane]]] = True
+        stands[hits.row[self.driving[-1 - hits.lane]]] = True
         placed = np.isfinite(bodies.x) & np.isfinite(bodies.y)
         off_road = np.flatnonzero(
             ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store.access import Access
     from sgstore.store.packing import Columns
-    from sgstore.world import FrameBlock, TraceInfo, TraceReport
+    from sgstore.world import Codes, FrameBlock, TraceInfo, TraceReport
 
 
 class Segment:
@@ -159,7 +159,12 @@ class Segment:
             raise ValueError("a segment without a store is sealed, and published by one")
         return publish_in(self._access, sealed)
 
-    def seal(self, report: TraceReport, more: Mapping[str, Any] | None = None) -> Sealed:
+    def seal(
+        self,
+        report: TraceReport,
+        more: Mapping[str, Any] | None = None,
+        parked: Codes | None = None,
+    ) -> Sealed:
         """Complete the files of the trace, so that any process can publish them; nothing can be added then.
 
         Parameters
@@ -167,6 +172,8 @@ class Segment:
         report : TraceReport
         more : mapping, optional
             What else the report in the store is to say, as plain values.
+        parked : (n,) int8, optional
+            Of each entity whether it is parked: 1 or 0; -1: not known.
 
         Raises
         ------
@@ -179,6 +186,8 @@ class Segment:
             raise ValueError("a trace without frames")
         staging, identity = self._staging, self._identity
         with translated(self._store):
+            if parked is not None:
+                staging.mark_parked(parked)
             payloads.join(
                 staging.connection,
                 staging.all_messages(),

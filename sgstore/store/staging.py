@@ -11,6 +11,7 @@ from glob import escape
 from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
+import numpy as np
 
 from sgstore.store.access import memory_setting, translated
 from sgstore.store.checksums import Checksum, expressions
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.store.packing import Columns
+    from sgstore.world import Codes
 
 MEMORY: Final = 48 << 20
 """Most memory of a database that publishes; bytes. Beyond it its tables spill to disk."""
@@ -149,6 +151,14 @@ class Staging:
         if self._bytes * _ROOM > self._memory:
             self._memory = self._bytes * _ROOM
             self.connection.execute(f"SET memory_limit = '{memory_setting(self._memory)}'")
+
+    def mark_parked(self, parked: Codes) -> None:
+        """Tell of the entities, by node id, whether they are parked: 1 or 0; -1: not known."""
+        for value in (0, 1):
+            self.connection.execute(
+                "UPDATE entity SET parked = $value WHERE list_contains($nodes, node_id)",
+                {"value": bool(value), "nodes": np.flatnonzero(parked == value).tolist()},
+            )
 
     def settle(self, *, whole: bool) -> None:
         """Make room if the tables have grown; called between blocks.
