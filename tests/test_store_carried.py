@@ -200,6 +200,37 @@ def test_the_run_is_found_in_files_of_any_make(tmp_path, how) -> None:
     assert carried.data == b"".join(packets[GROUP : 2 * GROUP - 1])
 
 
+@pytest.mark.parametrize("how", [{}, {"use_chunking": False}])
+def test_the_run_goes_over_the_files_of_a_bag(tmp_path, how) -> None:
+    packets = encoded("h264", 2 * GROUP)
+    bag, cut = tmp_path / "bag", GROUP + 3
+    bag.mkdir()
+    for name, numbers in (("a.mcap", range(cut)), ("b.mcap", range(cut, 2 * GROUP))):
+        with Recorder(bag / name, **how) as recorder:
+            wrapping = WRAPPINGS["ros"]
+            if name == "b.mcap":  # other ids in the second file
+                recorder.camera(0.0, topic="other")
+            schema = recorder.writer.register_schema(
+                wrapping.schema, wrapping.schema_encoding, wrapping.definition
+            )
+            channel = recorder.writer.register_channel("/cam", wrapping.encoding, schema)
+            for i in numbers:
+                if i % 2 == 0:
+                    recorder.ground_truth(i / 20, [car(7, i / 20)], host=7)
+                at = ns(i / 20)
+                recorder.writer.add_message(channel, at, wrapping.make(packets[i], "h264"), at, i)
+    (bag / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  storage_identifier: mcap\n"
+        "  relative_file_paths:\n    - a.mcap\n    - b.mcap\n"
+    )
+    (outcome,) = ingest(tmp_path / "s.db", [bag], config=Config(payloads=Payloads(join="latest")))
+    assert outcome.status == "added", outcome
+
+    carried = StoreFile(tmp_path / "s.db").carried(f"bag#{GROUP - 1}", "/cam")
+
+    assert carried.data == b"".join(packets[GROUP : 2 * GROUP - 1])
+
+
 def without_sets(packet: bytes) -> bytes:
     """A packet of H.264 without its parameter sets."""
     starts = [i for i in range(len(packet)) if packet[i : i + 3] == b"\0\0\1"]

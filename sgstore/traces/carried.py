@@ -18,7 +18,7 @@ import base64
 import json
 import re
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -32,6 +32,7 @@ from sgstore.traces.fetch import open_regular, read_message
 from sgstore.traces.mcap_file import McapFile
 from sgstore.traces.osi_camera import camera_of
 from sgstore.traces.osi_schema import DECODE_ERRORS, SENSOR_VIEW, message_class
+from sgstore.traces.parts import bag_folder, parts_of
 from sgstore.traces.ros2msg import parse_definition
 from sgstore.traces.summary import read_summary
 from sgstore.world import TraceReport
@@ -79,6 +80,9 @@ _CODECS: Final = (
     ),
 )
 """Key frames: IDR of H.264; BLA, IDR and CRA of H.265. Parameter sets: SPS and PPS, and VPS of H.265."""
+
+_END: Final = 1 << 62
+"""A place behind all messages of a file."""
 
 _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """A start code of annex B and the first byte of the unit behind it; no unit has one inside."""
@@ -134,7 +138,8 @@ def read_carried(
     codec = next((codec for codec in _CODECS if codec.named.search(form.lower())), None)
     if codec is None or not data:
         return Carried("message", message)
-    before = map(unwrap, _before(_Place(path, channel, chunk_offset, offset)))
+    places = _places(_Place(path, channel, chunk_offset, offset))
+    before = map(unwrap, chain.from_iterable(map(_before, places)))
     try:
         run, sets = _decodable(codec, data, before)
     except TraceError as error:
@@ -246,6 +251,29 @@ def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
     return found
 
 
+def _places(place: _Place) -> Iterator[_Place]:
+    """The place of a message in its file; of a bag then the ends of the files before it, the latest first."""
+    folder = bag_folder(place.path)
+    if folder is None:
+        yield place
+        return
+    chunked = place.chunk_offset >= 0
+    at = place.chunk_offset if chunked else place.offset
+    with McapFile(folder) as bag:
+        wanted = bag.channels[place.channel]
+    for part in reversed(parts_of(folder)):
+        if part.base > at or part.size < 0:
+            continue
+        with McapFile(part.path) as file:
+            own = [n for n, c in file.channels.items() if c.topic == wanted.topic]
+        here = at < part.base + part.size
+        offsets = (at - part.base, place.offset) if chunked else (-1, at - part.base)
+        if not here:
+            offsets = (_END, _END) if chunked else (-1, _END)
+        for number in own:
+            yield _Place(part.path, number, *offsets)
+
+
 def _before(place: _Place) -> Iterator[bytes]:
     """The messages of a channel before one of them, the latest first, as they stand in the file."""
     if place.chunk_offset < 0:
@@ -267,7 +295,7 @@ def _chunks(place: _Place) -> list[int]:
     with open_regular(place.path) as file:
         size = file.seek(0, 2)
         found: list[int] = read_summary(file, size).chunk_offsets.tolist()
-    if place.chunk_offset not in found:
+    if place.chunk_offset not in found and not (found and place.chunk_offset == _END):
 
         def note(start: int) -> bool:
             found.append(start)
