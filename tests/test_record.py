@@ -93,6 +93,8 @@ def test_a_recorded_run_has_the_graphs_of_the_online_mode(tmp_path: Path) -> Non
         online = generator.step(live.frame(world.wait_for_tick()))
         agree(online, store.file.graph(f"run#{seq}"), names)
     assert done.written.frames == 31
+    kinds = dict(store.sql("SELECT ident, kind FROM entities").values)
+    assert {kinds[ident] for ident in ("41", "50", "70")} == {"stop_sign", "prop", "bus"}
 
 
 LOST = {"steer", "subkind", "name", "ident"}

@@ -170,6 +170,7 @@ MEANINGS: Final[Mapping[str, str]] = {
     "leads": "next one ahead along the lane",
     "follows": "next one behind along the lane",
     "overlaps": "footprints touch",
+    "mayAffect": "a signal that lies ahead on that lane",
 }
 """What the relations mean that do not say so themselves, seen from the other end."""
 
