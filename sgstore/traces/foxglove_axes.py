@@ -117,8 +117,11 @@ class Axes:
 
 def normed(turn: Floats) -> Floats:
     """A quaternion of length 1; the one that turns nothing for one of no length."""
-    length = float(np.sqrt(turn @ turn))
-    return turn / length if length > 0 and np.isfinite(length) else STILL
+    largest = float(np.abs(turn).max())
+    if not 0 < largest < np.inf:
+        return STILL
+    scaled = turn / largest  # the squares of very small numbers are 0
+    return scaled / np.sqrt(scaled @ scaled)
 
 
 def product(a: Floats, b: Floats) -> Floats:

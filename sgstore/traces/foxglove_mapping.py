@@ -141,9 +141,11 @@ class Mapping:
 _ALIASES: Final = {
     "pedestrian": "person",
     "walker": "person",
-    "cyclist": "bicycle",
     "human": "person",
+    "cyclist": "bicycle",
+    "ego": "car",
 }
+"""Words that producers use for kinds; what is called nothing but the ego is a car."""
 _GENERAL: Final = Mapping(entity=Entity(type="metadata.type"))
 _TYPE_KEYS: Final = ("type", "class", "category", "label", "kind", "classification")
 _SECTIONS: Final[dict[str, type[Any]]] = {
