@@ -87,15 +87,20 @@ def test_commands_stand_in_for_controls_that_were_not_recorded(path: Path) -> No
     assert (frame["1"]["steer"], frame["1"]["throttle"]) == (0.5, 0.75)
 
 
-def test_controls_of_another_vehicle_are_not_the_ego_s(path: Path) -> None:
+def test_every_vehicle_has_its_own_controls(path: Path) -> None:
     with Bridge(path) as bridge:
-        bridge.actors(HERO | {2: ("vehicle.audi.tt", "hero2")})
-        bridge.objects(0.0, [vehicle(1), vehicle(2)])
-        bridge.status(0.0, throttle=0.25)
-        bridge.status(0.0, throttle=0.75, role="hero2")
+        bridge.actors(HERO | {2: ("vehicle.audi.tt", "hero2"), 3: ("vehicle.audi.tt", "")})
+        for i in range(3):
+            bridge.status(i * 0.1, throttle=0.75, role="hero2")
+            bridge.objects(i * 0.1, [vehicle(3), vehicle(2), vehicle(1)])
+            bridge.status(i * 0.1, throttle=0.25)
+            bridge.command(i * 0.1, steer=1, throttle=1, brake=1)
+            bridge.status(i * 0.1, throttle=1, role="stranger")
 
-    assert states(read(path)[1])[0]["1"]["throttle"] == 0.25
-    assert states(read(path, ego="hero2")[1])[0]["2"]["throttle"] == 0.75
+    for ego in ("hero", "hero2", "3"):
+        for frame in states(read(path, 2, ego=ego)[1]):
+            throttles = [frame[i]["throttle"] for i in "123"]
+            np.testing.assert_equal(throttles, [0.25, 0.75, math.nan])
 
 
 def test_lights_of_vehicles_have_our_order(path: Path) -> None:

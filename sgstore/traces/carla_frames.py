@@ -84,6 +84,9 @@ _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
 low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
 _NO_CONTROLS: Final = (NAN, NAN, NAN)
 
+Controls = tuple[float, float, float]
+"""Steer, throttle, brake, as :class:`sgstore.world.States` has them; NaN: not told."""
+
 
 @dataclass(slots=True)
 class RawFrame:
@@ -98,8 +101,8 @@ class RawFrame:
         Node id of each object.
     light_states : (m,) int64
         Of the traffic lights.
-    controls : tuple of float
-        As :class:`~sgstore.traces.frames.FrameRows` has them.
+    controls : dict
+        Actor id → steer, throttle, brake.
     vehicle_lights : mapping
         Actor id → mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`.
     odometry : (11,) float64 or None
@@ -111,7 +114,7 @@ class RawFrame:
     objects: Floats
     nodes: Ints
     light_states: Ints
-    controls: tuple[float, float, float] = _NO_CONTROLS
+    controls: dict[int, Controls] = field(default_factory=dict[int, "Controls"])
     vehicle_lights: Mapping[int, int] = field(default_factory=dict[int, int])
     odometry: Floats | None = None
 
@@ -168,11 +171,12 @@ class FrameDecoder:
         self._unusable = Tally()
         self._unreadable = Tally()
         self._frame: RawFrame | None = None
-        self._controls = NEVER, _NO_CONTROLS
+        self._controls: dict[int, tuple[int, Controls]] = {}
         self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
         self._odometry: tuple[int, Floats | None] = NEVER, None
         self._fields: dict[int, Fields] = {}
         self._driven = found.driven
+        self._drivers: dict[int, int] = {}
         self._take = self._takers()
         self.channels = frozenset({leading, *self._take})
 
@@ -241,9 +245,9 @@ class FrameDecoder:
             np.array([nodes[ident] for ident in idents], np.int64),
             self._lights.states,
         )
-        stamp, controls = self._controls
-        if -SAME_TICK <= time_ns - stamp <= HOLDS:
-            frame.controls = controls
+        for ident, (stamp, controls) in self._controls.items():
+            if -SAME_TICK <= time_ns - stamp <= HOLDS:
+                frame.controls[ident] = controls
         stamp, lights = self._vehicle_lights
         if abs(time_ns - stamp) <= SAME_TICK:
             frame.vehicle_lights = lights
@@ -297,6 +301,7 @@ class FrameDecoder:
             values = np.vstack([values, _pose_of(frame.odometry)])
         ego = self._nodes.get(-1 if self._ego is None else self._ego, -1)
         heads = self._lights
+        driven = {self._nodes.get(one, -1): told for one, told in frame.controls.items()}
         return FrameRows(
             time_ns=frame.time_ns,
             log_time_ns=frame.log_time_ns,
@@ -305,7 +310,8 @@ class FrameDecoder:
             values=np.concatenate([values, heads.values]),
             lights=np.append(self._lights_of(frame, node), np.full(len(heads.nodes), -1)),
             light_state=np.concatenate([np.full(len(node), -1), frame.light_states]),
-            controls=frame.controls,
+            controls=driven.pop(ego, _NO_CONTROLS),
+            driven=driven,
         )
 
     def _lights_of(self, frame: RawFrame, node: Ints) -> Ints:
@@ -321,28 +327,30 @@ class FrameDecoder:
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
         """Channel → what takes up its messages."""
-        found, ego = self._survey, self._ego
+        found = self._survey
         takers: dict[int, Callable[[int, int, memoryview], None]] = {}
         own = {
-            channel: found.contents[channel]
+            channel: (found.contents[channel], ident)
             for channel, role in self._driven.items()
-            if ego is not None and found.egos.id_of(role) == ego
+            if (ident := found.egos.id_of(role)) is not None
         }
-        statuses = STATUS in own.values()  # they tell what was applied, commands what was asked for
+        for channel, (content, ident) in own.items():
+            # A status tells what was applied, a command only what was asked for.
+            applied = (STATUS, ident) in own.values()
+            if content == (STATUS if applied else COMMANDS):
+                columns = tuple(("control." if applied else "") + name for name in CONTROLS)
+                self._fields[channel] = Fields(found.structures[channel], (*STAMP, *columns))
+                self._drivers[channel] = ident
+                takers[channel] = self._take_controls
+            elif (content, ident) == (ODOMETRY, self._ego):
+                columns = (*STAMP, *ODOMETRY_COLUMNS)
+                self._fields[channel] = Fields(found.structures[channel], columns)
+                takers[channel] = self._take_odometry
         for channel, content in found.contents.items():
             if content == LIGHT_STATES:
                 takers[channel] = self._take_light_states
             elif content == VEHICLE_LIGHTS:
                 takers[channel] = self._take_vehicle_lights
-            elif channel in own and content == (STATUS if statuses else COMMANDS):
-                prefix = "control." if statuses else ""
-                columns = tuple(prefix + name for name in CONTROLS)
-                self._fields[channel] = Fields(found.structures[channel], (*STAMP, *columns))
-                takers[channel] = self._take_controls
-            elif channel in own and content == ODOMETRY:
-                columns = (*STAMP, *ODOMETRY_COLUMNS)
-                self._fields[channel] = Fields(found.structures[channel], columns)
-                takers[channel] = self._take_odometry
             elif content in EVENTS:
                 takers[channel] = self._take_event
         return takers
@@ -352,14 +360,11 @@ class FrameDecoder:
 
     def _take_controls(self, channel: int, _log_time: int, data: memoryview) -> None:
         told = self._fields[channel].read(data)
-        stamp = stamp_from(told[:2])
+        stamp, ident = stamp_from(told[:2]), self._drivers[channel]
         steer, throttle, brake = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
-        self._set_controls(stamp, (0.0 - steer, throttle, brake))
-
-    def _set_controls(self, stamp: int, controls: tuple[float, float, float]) -> None:
-        self._controls = stamp, controls
+        self._controls[ident] = stamp, (0.0 - steer, throttle, brake)
         if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
-            self._frame.controls = controls
+            self._frame.controls[ident] = self._controls[ident][1]
 
     def _take_event(self, channel: int, log_time: int, data: memoryview) -> None:
         if not self._window[0] <= log_time <= self._window[1]:

@@ -18,7 +18,7 @@ from sgstore.vocabulary import KIND_CODE
 from sgstore.world import Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -74,6 +74,8 @@ class FrameRows:
         Columns :data:`POSE`.
     controls : tuple of float
         Steer, throttle, brake of the ego; NaN where the recording has none.
+    driven : mapping
+        Node id → the same, of other vehicles than the ego.
     """
 
     time_ns: int
@@ -84,6 +86,9 @@ class FrameRows:
     lights: Ints
     light_state: Ints
     controls: tuple[float, float, float] = (NAN, NAN, NAN)
+    driven: Mapping[int, tuple[float, float, float]] = field(
+        default_factory=dict[int, tuple[float, float, float]]
+    )
 
     def __len__(self) -> int:
         return len(self.node)
@@ -394,12 +399,18 @@ def _on_earth(frames: list[FrameRows], roster: Roster) -> list[FrameRows]:
 
 
 def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> dict[str, Floats]:
-    """Control inputs in the rows of the ego; nothing where no frame has any."""
+    """Control inputs in the rows of the ego and of others that have any; nothing where no frame tells any."""
     inputs = np.array([frame.controls for frame in frames], np.float64)
-    if np.isnan(inputs).all():
+    others = [frame.driven for frame in frames]
+    if np.isnan(inputs).all() and not any(others):
         return {}
     columns = np.repeat(inputs, counts, axis=0)
     columns[nodes != np.repeat(ego, counts)] = np.nan
+    start = 0
+    for count, driven in zip(counts.tolist(), others, strict=True):
+        for node, told in driven.items():
+            columns[start + np.flatnonzero(nodes[start : start + count] == node)] = told
+        start += count
     return {"steer": columns[:, 0], "throttle": columns[:, 1], "brake": columns[:, 2]}
 
 
