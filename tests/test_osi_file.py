@@ -373,3 +373,11 @@ def test_the_real_files_are_what_protobuf_reads(data: Path, name: str, frames: i
         assert column(blocks, axis)[moving].tolist() == expected
     assert column(blocks, "vx")[moving].tolist() == [base.velocity.x for base in things]
     assert payloads(path, blocks) == parts
+
+
+def test_a_world_that_is_empty_at_first_is_known_by_what_comes_later(tmp_path: Path) -> None:
+    told = [VERSION + ground_truth(i / 10).SerializeToString() for i in range(40)]
+    _, blocks, report = read(write(tmp_path / "a.osi", packed([*told, *messages(2)])))
+
+    assert report.frames == 42
+    assert "1" in [ident for block in blocks for ident in block.entities.ident]

@@ -53,8 +53,8 @@ CHANNEL: Final = 1
 RUN_BYTES: Final = 4 << 20
 """Messages that are handed on together have about this size at most; bytes."""
 
-_TRIED: Final = 8
-"""Messages that are read to find out what they are."""
+_ENOUGH, _TRIED = 8, 1000
+"""Messages that are read to find out what they are: enough if they hold anything, and at most."""
 _VERSION, _TIMESTAMP = 1, 2
 _LATEST: Final = 1 << 62
 
@@ -154,17 +154,23 @@ class OsiFile:
     def _recognise(self) -> str:
         """What the messages are; learns how they begin."""
         report = TraceReport()
-        first = [data for _, _, data in islice(self._messages(report), _TRIED)]
-        if not first:
-            reason = report.losses[0].reason if report.losses else "the file is empty"
-            raise TraceError(f"no message of ASAM OSI: {reason}", path=self.path)
-        self._mark = _beginning(first[0])
-        named = {name: _likeness(name, first) for name in (GROUND_TRUTH, SENSOR_VIEW)}
-        best = max(named, key=lambda name: named[name])
-        if named[best] <= 0:
-            reason = f"its messages are neither {GROUND_TRUTH} nor {SENSOR_VIEW}"
-            raise TraceError(reason, path=self.path)
-        return best
+        likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
+        tried = 0
+        for _, _, data in islice(self._messages(report), _TRIED):
+            tried += 1
+            self._mark = self._mark or _beginning(data)
+            for name in likeness:
+                likeness[name] += _likeness(name, data)
+            if tried >= _ENOUGH and max(likeness.values()) > 0:
+                break
+        best = max(likeness, key=lambda name: likeness[name])
+        if likeness[best] > 0:
+            return best
+        reason = f"its messages are neither {GROUND_TRUTH} nor {SENSOR_VIEW} with anything in them"
+        if not tried:
+            told = report.losses[0].reason if report.losses else "the file is empty"
+            reason = f"no message of ASAM OSI: {told}"
+        raise TraceError(reason, path=self.path)
 
     def _messages(self, report: TraceReport) -> Iterator[tuple[int, int, bytes]]:
         """Place of the zstd frame, offset in it, and data of every message."""
@@ -319,19 +325,16 @@ def _beginning(data: bytes) -> bytes:
     return data[: stop + 1] if (number, wire) == (_VERSION, 2) and 4 <= stop <= 32 else b""
 
 
-def _likeness(name: str, messages: list[bytes]) -> int:
-    """How much messages look like being of a type: the things with a place or an id in them; -1: not at all.
+def _likeness(name: str, data: bytes) -> int:
+    """How much a message looks like being of a type: the things with a place or an id in it; -1: not at all.
 
     A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
     """
     message, objects = _classes_of(name)
-    total = 0
-    for data in messages:
-        try:
-            total += _things(ground_truth_of(parse(message, data)), objects)
-        except DECODE_ERRORS:
-            total -= 1
-    return total
+    try:
+        return _things(ground_truth_of(parse(message, data)), objects)
+    except DECODE_ERRORS:
+        return -1
 
 
 @cache
