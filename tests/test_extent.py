@@ -392,19 +392,24 @@ def test_a_light_hangs_over_the_road_of_its_storey() -> None:
     assert entities(graph) == ["ego", "5.5", "5.75"]
 
 
-def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is() -> None:
-    road_map, egos = read_map(BRIDGE, "bridge"), Places(*np.array([[0.0], [9.0], [0.0], [5.0]]))
+@pytest.mark.parametrize(
+    ("ground", "ramp"), [(0.0, False), (5.0, True), (10.0, False), (2.0, False), (3.0, True)]
+)
+def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is(ground: float, ramp: bool) -> None:
+    road_map = read_map(BRIDGE, "bridge")
+    egos = Places(*np.array([[0.0], [9.0], [0.0], [ground]]))
     points, of = road_map.waypoints(STEP), Range(30.0, height=(-1.0, 1.0))
-    expected = []
+    expected: list[bool] = []
     for i in range(3):
         mine = points.lane == i
         away = np.hypot(points.x[mine], points.y[mine] - 9)
-        level = np.abs(points.z[mine] - 5) <= 1
+        level = np.abs(points.z[mine] - ground) <= 1
         expected.append(bool((level & ((away <= 30) | (away == away.min()))).any()))
 
     parts = Extent(of, road_map).areas(egos).parts(road_map)
 
-    assert parts[0, 1:4].tolist() == expected == [False, True, True]
+    assert parts[0, 1:4].tolist() == expected
+    assert expected[2] == ramp
 
 
 # What is kept ------------------------------------------------------------------------------------
