@@ -320,7 +320,7 @@ def test_entities_must_be_introduced_one_after_another() -> None:
 
 def contents(graph: GraphBlock) -> list[object]:
     """All that is in a graph, to be compared."""
-    of, there, lanes = graph.edges, graph.presence, graph.lanes
+    of, there, lanes, gaps = graph.edges, graph.presence, graph.lanes, graph.gaps
     return [
         graph.frames.offsets.tolist(),
         graph.frames.ego.tolist(),
@@ -330,6 +330,7 @@ def contents(graph: GraphBlock) -> list[object]:
         sorted(
             zip(*(lanes.frame, lanes.node, lanes.lane, lanes.overlap, lanes.primary), strict=True)
         ),
+        sorted(zip(gaps.frame, gaps.src, gaps.dst, gaps.gap, strict=True)),
     ]
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sgstore.world import FrameBlock
 
 RECORDINGS = [
+    "carla/Town01.carla",
     "esmini/cut-in",
     "esmini/highway_merge",
     "esmini/pedestrian",
