@@ -1300,3 +1300,19 @@ def test_conditions_that_are_malformed_cost_nothing_else(tmp_path: Path) -> None
 
     assert (report.frames, report.events, report.losses) == (1, [], [])
     assert report.warnings == ["weather and light cannot be read where they changed 1 times"]
+
+
+def test_an_id_with_much_behind_it_is_an_id(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i in range(3):
+            rest = car(7, float(i)).SerializeToString()[4:]
+            ident = b"\x08\x07\x7a\xc8\x01" + b"n" * 200  # field 15 of the identifier: 200 bytes
+            thing = b"\x0a" + bytes([len(ident) & 0x7F | 0x80, len(ident) >> 7]) + ident + rest
+            size = bytes([len(thing) & 0x7F | 0x80, len(thing) >> 7])
+            data = ground_truth(i / 10, host=7).SerializeToString() + b"\x2a" + size + thing
+            recorder.write(recorder.channel("truth", "osi3.GroundTruth"), i / 10, data)
+    _, blocks, report = read(path)
+
+    assert of(blocks, "7").x.tolist() == [0.0, 1.0, 2.0]
+    assert report.losses == []

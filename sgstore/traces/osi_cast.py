@@ -62,7 +62,7 @@ def keys_of(objects: Sequence[bytes]) -> list[bytes]:
 def is_key(key: bytes, thing: Any) -> bool:
     """Whether the beginning of a serialised object is its id and nothing else."""
     ident = thing.id.SerializeToString()
-    return key == b"\x0a" + bytes([len(ident)]) + ident
+    return len(ident) < 0x80 and key == b"\x0a" + bytes([len(ident)]) + ident
 
 
 @dataclass(slots=True)
