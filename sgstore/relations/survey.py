@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.opendrive.nodes import DRIVING
 from sgstore.relations.along import Centrelines
 from sgstore.relations.following import next_ahead
 from sgstore.relations.lanenet import LaneNet
 from sgstore.relations.scene import IS_SIGNAL, Bodies, Ground, Standing, joined, kinds_mask
 from sgstore.relations.upstream import SignalReach
 from sgstore.roads import OFF_ROAD, LaneHits
+from sgstore.roads.lanetypes import DRIVING
 from sgstore.vocabulary import ENTITY_KINDS, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:

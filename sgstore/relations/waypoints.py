@@ -18,9 +18,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sgstore.errors import ConfigError
-from sgstore.opendrive.nodes import DRIVING
 from sgstore.relations.scene import spread
 from sgstore.roads import MapEdges, MapNodes, RoadMap
+from sgstore.roads.lanetypes import DRIVING
 from sgstore.roads.points import point_shapes
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE
 
