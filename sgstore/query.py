@@ -25,6 +25,7 @@ from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.lang.phases import Window
 from sgstore.lang.results import EXTENTS
 from sgstore.store import FrameRef, StoreFile
+from sgstore.vocabulary import folded
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
@@ -186,8 +187,8 @@ class Store:
         """
         if abstraction is None:
             return self.file.graph(_ref(frame)).to_networkx()
-        derived = {one.name.lower() for one in self.file.deriving.sets()}
-        if abstraction.lower() in derived:
+        derived = {folded(one.name) for one in self.file.deriving.sets()}
+        if folded(abstraction) in derived:
             whole = self.file.graph(_ref(frame))
             return self.file.deriving.graph(whole, abstraction).to_networkx()
         graph, about = self.file.abstracted.labelled(_ref(frame), abstraction)
@@ -324,7 +325,7 @@ class Matches:
         """
         with self._file.snapshot():
             catalog = self._store.catalog()
-            if self._ready is None or self._ready.catalog is not catalog:
+            if self._ready is None or self._ready.stored is not catalog:
                 self._ready = compile_query(self._text, catalog, self._parameters)
             yield self._ready
 

@@ -53,7 +53,7 @@ def bind_query(
     QueryError
         Types do not fit, or a part belongs to the temporal layer.
     """
-    session = Session(text, parameters)
+    session = Session(text, parameters, classed=catalog.classed)
     match = _only_match(statements, session)
     ego, unknown_is_false = _settings(match.settings, session, catalog)
     names = Names(session, ScopeBuilder(session))
@@ -61,6 +61,7 @@ def bind_query(
     distinct = names.scope.distinct()  # before RETURN, which must not change what matches
     result = _result(match.returns, names)
     _refuse_unused(session)
+    _refuse_strange(session, catalog)
     return b.Query(
         replace(names.scope.finished(), distinct=distinct),
         result,
@@ -107,8 +108,13 @@ def _settings(
             if value not in egos:
                 session.unknown("ego", value, setting.span, egos)
             ego = value
+        elif name == "abstraction":
+            if folded(value) not in catalog.sets:
+                known = [one.name for one in catalog.sets.values()]
+                session.unknown("abstraction", value, setting.span, known)
         else:
-            session.unknown("setting", setting.name, setting.span, ("NODES", "EGO", "UNKNOWN"))
+            known = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION")
+            session.unknown("setting", setting.name, setting.span, known)
     return ego, unknown_is_false
 
 
@@ -130,6 +136,18 @@ def _refuse_unused(session: Session) -> None:
         raise QueryError(
             f"the query has no parameter '{unused[0]}'",
             hint=f"it would be written ${unused[0]}",
+        )
+
+
+def _refuse_strange(session: Session, catalog: Catalog) -> None:
+    """Refuse relations that the abstraction that is asked does not have."""
+    if catalog.relations is None:
+        return
+    strange = sorted(session.relations - catalog.relations)
+    if strange:
+        raise QueryError(
+            f"the abstraction {catalog.name!r} has no relation '{strange[0]}'",
+            hint=f"it has: {', '.join(sorted(catalog.relations)) or 'none'}",
         )
 
 

@@ -87,6 +87,14 @@ def _attribute(span: Span, children: Children) -> s.AttributeOf:
     return s.AttributeOf(owner, name.text, span)
 
 
+def _attribute_in(span: Span, children: Children) -> s.AttributeOf:
+    """``frame.class('E')``: another way to write ``frame.class_E``."""
+    owner, name, value = children
+    if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
+        raise BuildError(f"'.{name.text}' takes nothing in parentheses; only frame.class does")
+    return s.AttributeOf(owner, f"class_{_unquoted(value.text)}", span)
+
+
 def _arguments(_: Span, children: Children) -> tuple[s.Expression, ...]:
     return tuple(children)
 
@@ -474,6 +482,7 @@ BUILDERS: Final[dict[str, Callable[[Span, Children], Any]]] = {
     "times": _times,
     "sign": _sign,
     "attribute": _attribute,
+    "attribute_in": _attribute_in,
     "timespan": _duration,
     "parameter": _parameter,
     "variable": _variable,

@@ -76,6 +76,8 @@ class Unit(StrEnum):
     """What people call the node: of a part of the map its name, of an entity its kind and id."""
     seconds = "seconds"
     """A time in nanoseconds; seen as seconds since the trace began."""
+    classed = "classed"
+    """The class of a frame's graph in an abstraction; the column is the name of that."""
     span = "span"
     """A length of time in nanoseconds; seen in seconds."""
 
@@ -351,6 +353,17 @@ EDGE_ALIASES: Final = {"offset": "laneoffset", "primary": "isprimary"}
 """Shorter words for them, folded."""
 
 
+def class_attribute(abstraction: str, name: str = "") -> Attribute:
+    """The class of a frame in an abstraction; NULL where it is not in the store."""
+    return Attribute(
+        name or f"class_{abstraction}",
+        Type.text,
+        {Home.state: abstraction},
+        "class of the frame's graph in RSV; frame.class('E'): in another abstraction",
+        Unit.classed,
+    )
+
+
 def _plain(name: str, kind: Type, column: str, meaning: str) -> Attribute:
     return Attribute(name, kind, {Home.state: column}, meaning)
 
@@ -364,6 +377,7 @@ FRAME_ATTRIBUTES: Final = _named(
         Attribute(
             "t", Type.number, {Home.state: "time_ns"}, "since the trace began; s", Unit.seconds
         ),
+        class_attribute("RSV", "class"),
     )
 )
 """Attributes of ``frame`` by folded name (table ``frame``)."""
@@ -424,6 +438,16 @@ class Catalog:
         Kinds that occur in table ``state``, among the static ones of table ``entity``, and in table
         ``map_node``.
     traces : tuple of TraceFacts
+    classed : tuple of str
+        Abstractions in which the classes of frames are in the store.
+    name : str
+        Of the abstraction that this is the catalog of; empty: of the store.
+    relations : frozenset of str or None
+        Those that the abstraction has; ``None``: all.
+    shadows : tuple of (str, str)
+        Tables that are others under the abstraction, and what they are there.
+    sets : mapping of str to Catalog
+        The catalogs of the abstractions that a query can name, by folded name.
     """
 
     edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
@@ -432,3 +456,8 @@ class Catalog:
     fixed: frozenset[str] = frozenset()
     mapped: frozenset[str] = frozenset(MAP_KINDS)
     traces: tuple[TraceFacts, ...] = ()
+    classed: tuple[str, ...] = ()
+    name: str = ""
+    relations: frozenset[str] | None = None
+    shadows: tuple[tuple[str, str], ...] = ()
+    sets: Mapping[str, Catalog] = field(default_factory=dict[str, "Catalog"])

@@ -13,9 +13,11 @@ from sgstore.lang.parser import parse
 from sgstore.lang.phases import traces_of
 from sgstore.lang.printing import query_text, statements_text
 from sgstore.lang.rewrite import rewritten
+from sgstore.lang.syntax import Match
+from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from sgstore.lang.bound import Query
     from sgstore.lang.catalog import Catalog
@@ -36,13 +38,16 @@ class Compiled:
     query : Query
         Rewritten.
     catalog : Catalog
-        What it was compiled against.
+        What it was compiled against: that of the abstraction which it names, or of the store.
+    stored : Catalog, optional
+        Of the store.
     """
 
     text: str
     bound: Query
     query: Query
     catalog: Catalog
+    stored: Catalog | None = None
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -155,5 +160,25 @@ def compile_query(
     QueryError
         Its types do not fit together.
     """
-    bound = bind_query(text, parse(text), catalog, parameters or {})
-    return Compiled(text, bound, rewritten(bound, catalog), catalog)
+    statements = parse(text)
+    seen = _seen(statements, catalog, parameters or {})
+    bound = bind_query(text, statements, seen, parameters or {})
+    return Compiled(text, bound, rewritten(bound, seen), seen, catalog)
+
+
+def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
+    """The catalog of the abstraction that a query names, if it is known; else that of the store."""
+    settings = (
+        setting
+        for statement in statements
+        if isinstance(statement, Match)
+        for setting in statement.settings
+        if folded(setting.name) == "abstraction"
+    )
+    found = next(settings, None)
+    if found is None:
+        return catalog
+    value = found.value
+    name = value if isinstance(value, str) else str(parameters.get(value.name, ""))
+    seen = catalog.sets.get(folded(name), catalog)
+    return replace(seen, sets=catalog.sets)

@@ -17,6 +17,7 @@ from sgstore.lang.catalog import (
     TRACE_ATTRIBUTES,
     Attribute,
     Type,
+    class_attribute,
 )
 from sgstore.lang.names import RESERVED, Names, hint_at
 from sgstore.vocabulary import KINDS, folded, kinds_labelled
@@ -131,14 +132,25 @@ def _attribute(e: s.AttributeOf, names: Names) -> b.Bound:
     if owner in RESERVED and names.meaning(owner) is None:
         known, make = _OF_RESERVED[owner]
         found = known.get(folded(e.name))
+        if found is None and owner == "frame":
+            found = _class_attribute(e.name, names)
         if found is None:
             known_names = [attribute.name for attribute in known.values()]
+            if owner == "frame":
+                known_names += [f"class_{name}" for name in names.session.classed]
             names.session.unknown(f"attribute of {owner}", e.name, _tail(e), known_names)
         return make(found, found.type)
     meaning = names.meaning(owner)
     if meaning is not None and meaning.edge is not None:
         return edge_attribute(meaning.edge, e.name, _tail(e), names)
     return node_attribute(names.node(owner, e.owner.span), e.name, _tail(e), names)
+
+
+def _class_attribute(name: str, names: Names) -> Attribute | None:
+    """``class_NAME``, which is also written ``class('NAME')``."""
+    of = (one for one in names.session.classed if folded(f"class_{one}") == folded(name))
+    found = next(of, None)
+    return None if found is None else class_attribute(found)
 
 
 _OF_RESERVED: Final[dict[str, tuple[Mapping[str, Attribute], Callable[..., b.Bound]]]] = {

@@ -196,6 +196,10 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
             return f"(CAST({value} - {trace}.{quoted('start_ns')} AS DOUBLE) / 1e9)"
         case Unit.span:
             return f"(CAST({value} AS DOUBLE) / 1e9)"
+        case Unit.classed:
+            on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {word(column)}']
+            classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
+            return f"({classes.text()})"
         case _:
             return value
 

@@ -72,6 +72,8 @@ class Session:
         Keys taken, without regard to case: the database sees no difference.
     calls : list of str
         Predicates whose bodies are being bound.
+    classed : tuple of str
+        Abstractions in which the store has the classes of frames.
     numbers, blocks : int
         Unnamed nodes and edges, and blocks, so far.
     """
@@ -84,6 +86,7 @@ class Session:
     relations: set[str] = field(default_factory=set[str])
     keys: set[str] = field(default_factory=set[str])
     calls: list[str] = field(default_factory=list[str])
+    classed: tuple[str, ...] = ()
     numbers: int = 0
     blocks: int = 0
 

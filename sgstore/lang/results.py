@@ -349,9 +349,13 @@ def _aggregates(column: Column) -> bool:
 
 def _finished(writer: Frames, text: str, columns: Iterable[str]) -> Statement:
     """A statement with the shared relations before it."""
+    before = [
+        (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
+    ]
+    before += [(f"{quoted(name)} AS", body) for name, body in writer.shared]
     shared = ",\n".join(
-        f"{quoted(name)} AS (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
-        for name, body in writer.shared
+        f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
+        for head, body in before
     )
     sql = f"WITH {shared}\n{text}" if shared else text
     return Statement(sql, tuple(writer.values.items), tuple(columns))

@@ -22,6 +22,7 @@ from sgstore.store.rows import run
 from sgstore.store.seen import filled
 from sgstore.store.staging import Staging
 from sgstore.store.traces import trace_named
+from sgstore.vocabulary import folded
 from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ class Deriving:
         AbstractionError
             There is no such set.
         """
-        gone = [one for one in self.sets() if one.name.lower() == name.lower()]
+        gone = [one for one in self.sets() if folded(one.name) == folded(name)]
         if not gone:
             raise AbstractionError(f"no derived set {name!r}")
         with writing(self._access) as connection:
@@ -161,7 +162,7 @@ class Deriving:
         with self._access.reading() as connection:
             trace_id, _ = trace_named(connection, whole.trace)
             known = [s.name for s in sets_of(connection) if s.trace_id == trace_id]
-            found = next((n for n in known if n.lower() == name.lower()), None)
+            found = next((n for n in known if folded(n) == folded(name)), None)
             if found is None:
                 raise AbstractionError(f"{whole.trace!r} has no derived set {name!r}")
             where = {

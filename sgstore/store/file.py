@@ -180,29 +180,12 @@ class StoreFile:
 
     def catalog(self) -> Catalog:
         """What the store holds, as the compiler of queries wants to know it."""
-        from sgstore.lang import Catalog, TraceFacts  # the whole compiler: only for who wants one
+        from sgstore.store.cataloguing import (
+            catalog_of,  # the whole compiler: only for who wants one
+        )
 
         with self._reading() as connection:
-
-            def counted(table: str) -> dict[tuple[str, str, str], int]:
-                sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM {table} GROUP BY ALL"
-                return {(r, a, b): n for r, a, b, n in connection.execute(sql).fetchall()}
-
-            def kinds(of: str) -> frozenset[str]:
-                found = connection.execute(f"SELECT DISTINCT kind FROM {of}").fetchall()
-                return frozenset(kind for (kind,) in found)
-
-            return Catalog(
-                edges=counted("edge"),
-                map_edges=counted("map_edge"),
-                moving=kinds("entity WHERE NOT is_static"),
-                fixed=kinds("entity WHERE is_static"),
-                mapped=kinds("map_node"),
-                traces=tuple(
-                    TraceFacts(t.trace_id, t.name, t.ego, frozenset(t.answers))
-                    for t in stored_traces(connection)
-                ),
-            )
+            return catalog_of(connection)
 
     def traces(self) -> tuple[StoredTrace, ...]:
         """All traces, in the order in which they came."""

@@ -1,0 +1,133 @@
+"""``USING ABSTRACTION`` and ``frame.class``: a derived set answers as a store made with its settings does."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import pytest
+
+import sgstore
+from sgstore.abstractions.literature import SUBSETS
+from sgstore.config import configured
+from sgstore.errors import QueryError, QueryNameError
+from sgstore.graphs import derive
+from sgstore.ingest import ingest
+
+SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"
+OTHER = configured(
+    range={"radius": 28.0, "by": "centre"},
+    proximity={"upper": [3.0, 5.0, 9.0, 12.0, 18.0, 28.0]},
+    direction={"upper": [30.0, 60.0, 120.0]},
+    without=["overlaps"],
+)
+QUERIES = [
+    "MATCH (v:Vehicle)",
+    "MATCH (p:Person) WHERE p.speed > 1",
+    "MATCH (e:Ego)",
+    "MATCH (e:Ego)-[d:near_coll|very_near]->(v)",
+    "MATCH (a)-[:inDFrontOf]->(b:Ego), (a)-[:isIn]->(l:Lane) WHERE dist(a, b) < 20",
+    "MATCH (l:Lane)-[:opposes]->(m:Lane) RETURN l.name, m.name, COUNT(*) AS n",
+    "MATCH (e:Ego)-[:isIn*2]->(r:Road) RETURN r.id, COUNT(*) AS n",
+    "MATCH (e:Ego) WHERE COUNT {(v:Vehicle)} > 2 RETURN frame.seq",
+    "MATCH (e:Ego) WHERE NOT EXISTS {(e)-[:visible]-(:Person)} RETURN INTERVALS",
+    "MATCH (s:Vegetation) RETURN s.id, COUNT(*) AS n",
+    "MATCH (a:Car), (b:Car) WHERE gap(a, b) < 3 RETURN a.id, b.id, COUNT(*) AS n",
+    "MATCH (a)-[r]->(b) RETURN type(r) AS r, a.kind AS a, b.kind AS b, COUNT(*) AS n",
+    "MATCH (v:Vehicle) RETURN CLIPS(-1s, +1s)",
+]
+
+
+def made(path, config=None):
+    (outcome,) = ingest(path, [str(SAMPLE)], config=config, until=20.0)
+    assert outcome.error is None
+    return sgstore.open(path)
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("using")
+    first = made(folder / "a.sgstore")
+    derive(first.file.path, OTHER, "other")
+    return first, made(folder / "b.sgstore", OTHER)
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_a_derived_set_answers_as_a_store_made_with_its_settings(stores, query) -> None:
+    derived, ingested = stores
+    ours = derived.find(f"USING ABSTRACTION other {query}")
+    theirs = ingested.find(query)
+
+    assert sorted(map(repr, ours.rows())) == sorted(map(repr, theirs.rows()))
+    assert ours.count() == theirs.count() > 0
+    assert list(ours.frames()) == list(theirs.frames())
+    assert list(ours.clips(1, 1)) == list(theirs.clips(1, 1))
+
+
+def test_a_relation_that_a_set_does_not_answer_leaves_its_traces_out(stores) -> None:
+    derived, ingested = stores
+
+    for found in (
+        derived.find("USING ABSTRACTION 'other' MATCH (a)-[:overlaps]->(b)"),
+        ingested.find("MATCH (a)-[:overlaps]->(b)"),
+    ):
+        assert found.left_out == ("town",)
+
+
+def test_the_name_may_be_a_parameter_and_case_does_not_matter(stores) -> None:
+    store, _ = stores
+    query = "USING ABSTRACTION {0} MATCH (e:Ego)-[:near]->(v)"
+    wanted = store.find(query.format("other")).rows()
+
+    assert store.find(query.format("Other")).rows() == wanted
+    assert store.find(query.format("$set"), set="other").rows() == wanted
+    assert store.find("MATCH (e:Ego)-[:near]->(v)").rows() != wanted
+
+
+@pytest.mark.parametrize("name", SUBSETS)
+def test_abstractions_of_the_literature_show_their_own_nodes_and_relations(stores, name) -> None:
+    store, _ = stores
+    rows = store.find(
+        f"USING ABSTRACTION {name} MATCH (a)-[r]->(b) RETURN type(r) AS r, a.kind AS a, b.kind AS b"
+    ).rows()
+    nodes = store.find(f"USING ABSTRACTION {name} MATCH (a) RETURN DISTINCT a.kind").rows()
+    of = SUBSETS[name]
+
+    if of.kinds is None:
+        return
+    assert {r for r, *_ in rows} <= of.moving | of.lasting
+    assert bool(rows) == bool(of.moving)
+    assert {kind for (kind,) in nodes} <= of.kinds
+    assert ("lane",) in nodes or name in {"E", "ER"}
+
+
+def test_a_relation_that_an_abstraction_has_not_is_an_error(stores) -> None:
+    store, _ = stores
+
+    with pytest.raises(QueryError, match="'E' has no relation 'near'"):
+        store.find("USING ABSTRACTION E MATCH (a)-[:near]->(b)")
+    with pytest.raises(QueryNameError, match="unknown abstraction 'othr'"):
+        store.find("USING ABSTRACTION othr MATCH (a:Ego)")
+
+
+def test_frames_are_found_by_their_class(stores) -> None:
+    store, _ = stores
+    classes = store.classes("E")
+    wanted = classes["class"][40]
+    same = [int(f) for f, c in zip(*classes.values(), strict=True) if c == wanted]
+    query = "MATCH (e:Ego) WHERE frame.class('E') = $c RETURN frame.id, frame.class"
+    found = store.find(query, c=wanted).rows()
+    rsv = dict(zip(*(column.tolist() for column in store.classes("RSV").values()), strict=True))
+
+    assert [frame for frame, _ in found] == same
+    assert all(rsv[frame] == cls for frame, cls in found)
+    assert store.find("MATCH (e:Ego) WHERE frame.class_E = $c", c=wanted).count() == len(same)
+    rows = store.sql(f"SELECT count(*) FROM classes WHERE abstraction = 'E' AND class = '{wanted}'")
+    assert rows.values == [(len(same),)]
+
+
+@pytest.mark.parametrize(
+    "query", ["MATCH (e:Ego) RETURN frame.class('none')", "MATCH (e:Ego) RETURN e.class('E')"]
+)
+def test_a_class_that_is_not_known_is_an_error(stores, query) -> None:
+    with pytest.raises(QueryError):
+        stores[0].find(query)
