@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -477,3 +478,21 @@ def test_the_shipped_mappings_name_kinds_of_everything_they_know() -> None:
         assert mapping.recognise.topics
         assert "unknown" not in {meaning.kind for meaning in mapping.types.values()}
     assert json.dumps(sorted(shipped())) == '["nuscenes2mcap"]'
+
+
+def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path: Path) -> None:
+    def peak(frames: int) -> int:
+        path = tmp_path / f"{frames}.mcap"
+        with SceneRecorder.of(path, "json", chunk_size=1 << 15) as recorder:
+            for i in range(frames):
+                recorder.transform(i / 10, "map", "base_link", (i, 0, 0))
+                recorder.scene(i / 10, [cube("a", (i, 0, 0)), cube("b")])
+        with open_trace(path) as trace:
+            tracemalloc.start()
+            for _ in trace.blocks():
+                pass
+            highest = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+        return highest
+
+    assert peak(2000) < 1.3 * peak(500)
