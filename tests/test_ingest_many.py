@@ -314,6 +314,13 @@ def test_an_ego_that_is_not_in_the_recording_costs_no_other(crowd, tmp_path) -> 
     assert "nobody" in str(outcomes[1].error)
 
 
+def test_an_ego_that_comes_only_after_the_part_is_told(crowd, tmp_path) -> None:
+    outcomes = ingest(tmp_path / "s.db", [crowd], egos=["1", "5"], until=2.0)
+
+    assert [(o.status, o.frames) for o in outcomes] == [("added", 21), ("failed", 0)]
+    assert "the ego '5' is in none of the frames that were read" in str(outcomes[1].error)
+
+
 # Which files
 
 

@@ -52,11 +52,15 @@ class View:
 
 @dataclass(slots=True)
 class _Wanted:
-    """A view that is to be read: what is known of the recording, with its ego; its node id once it is met."""
+    """A view that is to be read.
+
+    What is known of the recording, with its ego; the ego's node id, once that is known; whether a frame had it.
+    """
 
     view: View
     info: TraceInfo
     node: int = -1
+    met: bool = False
 
 
 class Reading:
@@ -125,23 +129,20 @@ class Reading:
             views.append(View(TraceOutcome(info.path, ego=info.ego)))
             yield _Wanted(views[0], info)
             return
-        idents = self._vehicles(trace) if egos == (ALL_EGOS,) else [None] * len(egos)
-        names = list(egos) if idents and idents[0] is None else idents
-        seen: set[str] = set()
-        for name, ident in zip(names, idents, strict=True):
-            view = View(TraceOutcome(info.path, ego=name or ""))
+        everyone, seen = egos == (ALL_EGOS,), set[str]()
+        for name in self._vehicles(trace) if everyone else egos:
+            view = View(TraceOutcome(info.path, ego=name))
             views.append(view)
             try:
-                mapping = self._job.config.mapping
-                found = ident if ident is not None else _ident(info, name or "", mapping)
+                found = name if everyone else _ident(info, name, self._job.config.mapping)
             except SgstoreError as error:
                 view.outcome.error = error
                 continue
-            view.outcome.ego = found
-            if found in seen:
+            if found in seen:  # two names of one
                 views.pop()
                 continue
             seen.add(found)
+            view.outcome.ego = found
             yield _Wanted(view, replace(info, ego=found))
 
     def _vehicles(self, trace: Trace) -> list[str]:
@@ -250,6 +251,10 @@ class Reading:
         report, told = trace.report, tally.as_dict()
         for one, segment in zip(group, segments, strict=True):
             outcome = one.view.outcome
+            if self._job.config.egos and not one.met:
+                reason = f"the ego {one.info.ego!r} is in none of the frames that were read"
+                outcome.error = TraceError(reason, path=one.info.path)
+                continue
             outcome.frames = tally.frames
             outcome.entities = tally.entities
             outcome.clock_jumps, outcome.gaps = told["clock_jumps"], told["gaps"]
@@ -276,6 +281,7 @@ def _ego_of(block: FrameBlock, one: _Wanted) -> Ints:
         one.node = block.entities.first + block.entities.ident.index(one.info.ego)
     here = np.zeros(len(block), np.bool_)
     here[block.frame_of[block.states.node == one.node]] = True
+    one.met = one.met or bool(here.any())
     return np.where(here, one.node, -1)
 
 
