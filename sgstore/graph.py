@@ -104,6 +104,9 @@ class LaneStates:
         Heading of the entity less the lane's direction, in (-π, π]; rad.
     primary : bool
         Whether it is the one lane that the entity is in above all: centre inside, then heading, then overlap.
+    along : float64
+        Place of the box's centre along the lane's centre line, from the lane's start in its direction, beyond
+        its ends too; m.
     """
 
     frame: Ints
@@ -113,6 +116,7 @@ class LaneStates:
     offset: Floats
     heading_error: Floats
     primary: np.ndarray[Any, np.dtype[np.bool_]]
+    along: Floats
 
     def __len__(self) -> int:
         return len(self.frame)

@@ -101,7 +101,8 @@ CREATE TABLE edge (                                            -- ordered by all
 
 CREATE TABLE lane_state (                                      -- attributes of isIn edges from entities to lanes
   kind kind, frame_id BIGINT, node_id INTEGER, lane INTEGER,
-  overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN);   -- offset to the left, m; rad
+  overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN,    -- offset to the left, m; rad
+  along FLOAT);                                                -- of the centre, from the start of the lane, m
 
 CREATE TABLE lane_gap (                                        -- attribute of the edges src follows dst and dst leads src
   frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);       -- from bumper to bumper along the lanes, m
@@ -208,10 +209,10 @@ FROM frame f JOIN (
 COMMENT ON VIEW edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
 
 CREATE VIEW lane_states AS
-SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary
+SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary, along
 FROM lane_state;
 
-COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all.';
+COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m.';
 
 CREATE VIEW lane_gaps AS
 SELECT frame_id, src, dst, gap FROM lane_gap;

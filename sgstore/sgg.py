@@ -401,7 +401,7 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
     if ground is None:
         none = np.zeros(0, np.int64)
         empty = np.zeros(0)
-        return LaneStates(none, none, none, empty, empty, empty, np.zeros(0, np.bool_))
+        return LaneStates(none, none, none, empty, empty, empty, np.zeros(0, np.bool_), empty)
     hits = ground.standing.hits
     return LaneStates(
         frame=bodies.frame[hits.row],
@@ -411,6 +411,7 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
         offset=hits.offset,
         heading_error=hits.heading_error,
         primary=hits.primary,
+        along=ground.standing.along,
     )
 
 

@@ -228,6 +228,7 @@ class RandomTrace:
             offset=rng.uniform(-2, 2, count),
             heading_error=rng.uniform(-1, 1, count),
             primary=rng.random(count) < 0.5,
+            along=rng.uniform(-5, 80, count),
         )
 
 

@@ -336,6 +336,13 @@ EDGE_ATTRIBUTES: Final = _named(
             Unit.plain,
         ),
         _of_lane(
+            "along",
+            Type.number,
+            "along",
+            "of the centre along the lane, from its start; m",
+            Unit.plain,
+        ),
+        _of_lane(
             "gap",
             Type.number,
             "gap",

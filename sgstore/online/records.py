@@ -189,6 +189,7 @@ def _edges(graph: GraphBlock, outer: Ints) -> list[Edge]:
                 "overlap": float(lanes.overlap[row]),
                 "lane_offset": float(lanes.offset[row]),
                 "heading_error": math.degrees(lanes.heading_error[row]),
+                "along": float(lanes.along[row]),
             }
         )
         | {"is_primary": bool(lanes.primary[row])}

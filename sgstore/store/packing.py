@@ -208,6 +208,7 @@ def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
         "lane_offset": number(lanes.offset),
         "heading_error": number(lanes.heading_error),
         "is_primary": lanes.primary,
+        "along": number(lanes.along),
     }
 
 
