@@ -134,6 +134,8 @@ class _Run:
         self._frames = 0
         self._start_ns = 0
         self._without_ego = 0
+        self._missed = 0
+        self._tick: int | None = None
 
     def take(self, snapshot: Any) -> None:
         frame = self._live.frame(snapshot)
@@ -141,6 +143,9 @@ class _Run:
         if not self._frames:
             self._start_ns = frame.time_ns
         self._frames += 1
+        if self._tick is not None:
+            self._missed += max(int(snapshot.frame) - self._tick - 1, 0)
+        self._tick = int(snapshot.frame)
         self._without_ego += not frame.ego
         self.ego = frame.ego or self.ego
         self.seconds = (frame.time_ns - self._start_ns) / 1e9
@@ -157,6 +162,9 @@ class _Run:
         found: list[str] = []
         if self._without_ego:
             found.append(f"{self._without_ego} of {self._frames} frames have no ego")
+        if self._missed:
+            reason = "the world ran faster than it could be recorded (--step drives it)"
+            found.append(f"{self._missed} ticks between the frames are missing: {reason}")
         if sensors is not None and sensors.dropped:
             reason = sensors.reason or "they came faster than they could be written"
             found.append(f"{sensors.dropped} measurements were lost: {reason}")

@@ -334,6 +334,23 @@ def test_frames_without_an_ego_are_told(tmp_path: Path) -> None:
     assert done.warnings == ["5 of 5 frames have no ego"]
 
 
+def test_ticks_that_were_missed_are_told(tmp_path: Path) -> None:
+    world = busy()
+    script = world.script
+
+    def hurry(world: StandInWorld) -> None:
+        script(world)
+        if world.clock.frame == 103:
+            clock = world.clock
+            world.clock = carla.Timestamp(clock.frame + 2, clock.elapsed_seconds + 0.1, 0.05, 0.0)
+
+    world.script = hurry
+    done = record(world, tmp_path / "run.mcap", duration_s=0.5)
+
+    assert len(done.warnings) == 1
+    assert done.warnings[0].startswith("2 ticks between the frames are missing")
+
+
 # Settings and the command line --------------------------------------------------------------------
 
 
