@@ -84,7 +84,7 @@ class States:
     light_state : int8
         What a traffic light shows: code of :data:`sgstore.vocabulary.LIGHT_STATES`; -1: no light.
     steer, throttle, brake : float64
-        Control inputs, for the ego where the trace has them; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+        Control inputs, where the trace tells them; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
     derived : int64
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
     """
@@ -257,7 +257,8 @@ class TraceInfo:
     path : Path
         The file.
     size, mtime_ns : int
-        Its size in bytes and time of change; what later tells that it was replaced.
+        Its size in bytes and time of change, of a bag those of its files together; what later tells that it
+        was replaced.
     digest : str
         SHA-256 of the whole file, in hexadecimal digits.
     flavour : str

@@ -17,6 +17,7 @@ from sgstore.cli import run
 from sgstore.errors import TraceError
 from sgstore.exporters import Source
 from sgstore.exporters.mcap import write_clips
+from sgstore.ingest import ingest
 from sgstore.ingest.files import recordings
 from sgstore.traces import digest_of, open_trace, read_message
 from sgstore.traces.mcap_file import McapFile
@@ -327,3 +328,24 @@ def test_a_real_recording_in_two_files_is_what_it_was(data: Path, tmp_path: Path
                 getattr(ours.states, column), getattr(theirs.states, column)
             )
     assert one[2].losses == []
+
+
+def test_a_bag_whose_file_was_replaced_gives_no_message_of_it(tmp_path: Path, path: Path) -> None:
+    bag, store = split(path, tmp_path / "bag", 2), tmp_path / "s.db"
+    topic = "/carla/objects"
+    ingest(store, [bag])
+    (bag / "notes.txt").write_text("what lies beside its files is of no concern")
+    before = sgstore.open(store).payload("bag#0", topic)
+    (bag / "drive_1.mcap").write_bytes((bag / "drive_1.mcap").read_bytes() + b"\0")
+
+    assert read(bag)[0].size == sum(file.stat().st_size for file in bag.glob("*.mcap"))
+    assert before in [data for _, _, data in messages(path, topic)]
+    with pytest.raises(TraceError, match="not the file that was ingested"):
+        sgstore.open(store).payload("bag#0", topic)
+
+
+def messages(path: Path, topic: str) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        return [
+            (c.topic, m.log_time, m.data) for _, c, m in make_reader(stream).iter_messages([topic])
+        ]

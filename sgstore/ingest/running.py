@@ -21,6 +21,7 @@ from sgstore.ingest.parts import Part
 from sgstore.ingest.reading import Reading
 from sgstore.ingest.workers import Workers
 from sgstore.store import Folder, Sealed, StoreFile
+from sgstore.traces import mark_of
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
@@ -205,6 +206,6 @@ class _Meter:
 
 def _size(path: Path) -> int:
     try:
-        return path.stat().st_size
-    except OSError:  # told when it is opened
+        return mark_of(path)[0]
+    except (OSError, SgstoreError):  # told when it is opened
         return 0

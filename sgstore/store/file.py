@@ -325,16 +325,15 @@ class StoreFile:
 
     def _unchanged(self, uri: str, size: int, mtime_ns: int, digest: str) -> Path:
         """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
-        from sgstore.traces import digest_of
+        from sgstore.traces import digest_of, mark_of
 
         path = Path(uri)
         try:
-            now = path.stat()
+            mark = (uri, *mark_of(path))
         except OSError as error:
             raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
-        mark = (uri, now.st_size, now.st_mtime_ns)
         if mark != (uri, size, mtime_ns) and mark not in self._seen:
-            if now.st_size != size or digest_of(path) != digest:
+            if mark[1] != size or digest_of(path) != digest:
                 raise TraceError("not the file that was ingested; ingest it anew", path=path)
             self._seen.add(mark)
         return path
@@ -427,14 +426,15 @@ class StoreFile:
 
     def known_digest(self, path: Path) -> str:
         """The digest of a recording that has been ingested from a path and looks the same since; else empty."""
+        from sgstore.traces import mark_of
+
         try:
-            now = path.stat()
-        except OSError:
+            mark = mark_of(path)
+        except (OSError, TraceError):
             return ""
         sql = "SELECT any_value(digest) FROM trace WHERE uri = ? AND size = ? AND mtime_ns = ?"
         with self._reading() as connection:
-            marks = [plain(str(path.resolve())), now.st_size, now.st_mtime_ns]
-            found = connection.execute(sql, marks).fetchone()
+            found = connection.execute(sql, [plain(str(path.resolve())), *mark]).fetchone()
         return str(found[0]) if found and found[0] else ""
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Protocol, Self
 
 from sgstore.errors import TraceError
 from sgstore.traces.carla import CarlaTrace
-from sgstore.traces.fetch import digest_of
+from sgstore.traces.fetch import digest_of, mark_of
 from sgstore.traces.fetch import read_message as _read_message
 from sgstore.traces.foxglove import FoxgloveTrace
 from sgstore.traces.mcap_file import McapFile
@@ -37,6 +37,7 @@ __all__ = [
     "Reader",
     "Trace",
     "digest_of",
+    "mark_of",
     "open_recording",
     "open_trace",
     "read_message",

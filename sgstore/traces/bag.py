@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.traces.fetch import mark_of
 from sgstore.traces.mcap_file import MAX_LOSSES, McapFile, Place
 from sgstore.traces.parts import METADATA, Part, part_at, parts_of
 from sgstore.world import Loss, TraceReport
@@ -35,7 +36,7 @@ class McapBag(McapFile):
     Attributes
     ----------
     path, size, mtime_ns
-        The folder, with its own size and time of change.
+        The folder; the size of all files together, and the latest time of change among them.
     others
         As :class:`~sgstore.traces.mcap_file.McapFile` has them, of all files together. A channel is the same
         in two files if its topic, its encodings and its definition are; ids are those of the first file that
@@ -49,8 +50,7 @@ class McapBag(McapFile):
 
     def __init__(self, path: Path) -> None:
         self.path = path.parent if path.name == METADATA else path
-        status = self.path.stat()
-        self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+        self.size, self.mtime_ns = mark_of(self.path)
         self.schemas = {}
         self.channels = {}
         self.metadata = {}

@@ -84,6 +84,26 @@ def digest_of(path: Path) -> str:
     return digest.hexdigest()
 
 
+def mark_of(path: Path) -> tuple[int, int]:
+    """Size and time of change of a recording, which tell whether it was replaced; bytes, ns.
+
+    Of a bag: the size of its files together, and the latest time of change among them.
+
+    Raises
+    ------
+    OSError
+        There is no such file.
+    TraceError
+        The metadata of the bag cannot be read, or none of its files is there.
+    """
+    folder = bag_folder(path)
+    if folder is None:
+        status = path.stat()
+        return status.st_size, status.st_mtime_ns
+    files = [part for part in parts_of(folder) if part.size >= 0]
+    return sum(part.size for part in files), max(part.path.stat().st_mtime_ns for part in files)
+
+
 def _file_at(path: Path, place: int) -> tuple[Path, int]:
     """The file in which a place of a recording lies, and the place at which that file begins."""
     folder = bag_folder(path)
