@@ -107,7 +107,9 @@ def test_a_process_that_dies_costs_the_recording_that_it_read(tmp_path, monkeypa
 
     failed = [o.path for o in outcomes if o.error]
     assert failed == victims
-    assert "ended unexpectedly (code -9)" in str(next(o.error for o in outcomes if o.error))
+    assert "the process that read it was killed by signal 9" in str(
+        next(o.error for o in outcomes if o.error)
+    )
     assert [o.path for o in outcomes] == paths
     assert [o.status for o in ingest(tmp_path / "s.db", paths)].count("present") == 4
 

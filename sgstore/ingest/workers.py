@@ -162,8 +162,9 @@ class Workers:
         code = worker.end()
         if worker.tasks:
             index = worker.tasks.popleft()
-            reason = f"the process that read it ended unexpectedly (code {code}); is there too little memory?"
-            error = TraceError(reason, path=paths[index])
+            how = f"was killed by signal {-code}; is there too little memory?"
+            how = how if code < 0 else f"ended with code {code}; what it said of that is on stderr"
+            error = TraceError(f"the process that read it {how}", path=paths[index])
             done[index] = [View(TraceOutcome(paths[index], error=error))]
         waiting.extendleft(reversed(worker.tasks))
 
