@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 GRAZE: Final = 1e-6
 """What is no deeper within a footprint passes it by; m."""
 
+AT_ONCE: Final = 4096
+"""Pairs of a body and another before it that are looked at together."""
+
 POINTS: Final = 5
 """Points of a body that are looked at: its centre and the four corners."""
 
@@ -58,9 +61,14 @@ def seen(bodies: Bodies, ego: Rows) -> Rows:
     views = _views(bodies, rows, mine[rows])
     hidden = np.zeros((len(rows), POINTS), np.bool_)
     for target, cover in _in_one_direction(views, bodies.frame[rows]):
-        for point in range(POINTS):
-            blocked = _blocked(views, target, cover, point)
-            hidden[target[blocked], point] = True
+        # Near ones first: they hide the most, and what is hidden is not looked at again.
+        order = np.argsort(views.near[cover], kind="stable")
+        for first in range(0, len(order), AT_ONCE):
+            part = order[first : first + AT_ONCE]
+            for point in range(POINTS):
+                pairs = part[~hidden[target[part], point]]
+                blocked = pairs[_blocked(views, target[pairs], cover[pairs], point)]
+                hidden[target[blocked], point] = True
     return rows[~hidden.all(axis=1)]
 
 
