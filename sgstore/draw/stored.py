@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.draw import check_installed, draw_frame
 from sgstore.errors import ExportError, StoreError
@@ -157,32 +157,29 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
 
     if not 0 < fps <= MOST_FPS:
         raise ValueError(f"fps is {fps}, expected a number up to {MOST_FPS:g}")
-    with store.file.snapshot():
-        chosen = _chosen(store, frames, fps)
 
-        def shot(number: int, *, seen: bool) -> Shot:
-            ref = chosen[number]
+    def shot(ref: FrameRef, *, seen: bool) -> Shot:
+        # The store is kept open for one frame at a time, so that others can write while this one draws.
+        with store.file.snapshot():
             bindings = matches.bindings(ref) if matches is not None else []
             picture = _picture(store, ref, camera) if seen and not diagram else None
             return Shot(store.file.graph(ref.frame_id), bindings[0] if bindings else {}, picture)
 
-        spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
-        marked = 0
-        with Film(
-            to,
-            map_of(store, chosen[0].trace),
-            [shot(number, seen=False) for number in spread],
-            relations=relations,
-            radius=radius,
-            north_up=north_up,
-            diagram=diagram,
-        ) as film:
-            for number in range(len(chosen)):
-                now = shot(number, seen=True)
-                film.add(now)
-                marked += bool(now.highlight)
-                if on_frame is not None:
-                    on_frame(number + 1, len(chosen))
+    with store.file.snapshot():
+        chosen = _chosen(store, frames, fps)
+        road_map = map_of(store, chosen[0].trace)
+    spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
+    samples = [shot(chosen[number], seen=False) for number in spread]
+    look: dict[str, Any] = {"relations": relations, "radius": radius}
+    look |= {"north_up": north_up, "diagram": diagram}
+    marked = 0
+    with Film(to, road_map, samples, **look) as film:
+        for number, ref in enumerate(chosen, start=1):
+            now = shot(ref, seen=True)
+            film.add(now)
+            marked += bool(now.highlight)
+            if on_frame is not None:
+                on_frame(number, len(chosen))
     return marked
 
 
