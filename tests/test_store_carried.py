@@ -19,7 +19,7 @@ from recordings import Recorder, car, ns
 
 from sgstore.config import Config, Payloads
 from sgstore.errors import TraceError
-from sgstore.ingest import ingest
+from sgstore.ingest import Progress, ingest
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
@@ -223,8 +223,13 @@ def test_the_run_goes_over_the_files_of_a_bag(tmp_path, how) -> None:
         "rosbag2_bagfile_information:\n  storage_identifier: mcap\n"
         "  relative_file_paths:\n    - a.mcap\n    - b.mcap\n"
     )
-    (outcome,) = ingest(tmp_path / "s.db", [bag], config=Config(payloads=Payloads(join="latest")))
+    seen: list[Progress] = []
+    config = Config(payloads=Payloads(join="latest"))
+    (outcome,) = ingest(tmp_path / "s.db", [bag], config=config, on_progress=seen.append)
     assert outcome.status == "added", outcome
+    sizes = [(bag / name).stat().st_size for name in ("a.mcap", "b.mcap")]
+    assert seen[-1].size == seen[-1].all_size == sum(sizes)
+    assert sizes[0] < seen[-1].bytes_done <= sum(sizes)
 
     carried = StoreFile(tmp_path / "s.db").carried(f"bag#{GROUP - 1}", "/cam")
 
