@@ -254,7 +254,7 @@ def hurt_protobuf(data: bytes, draw: random.Random) -> bytes:  # noqa: C901, PLR
 def hurt_json(data: bytes, draw: random.Random) -> bytes:
     try:
         told = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return hurt_bytes(data, draw)
     if draw.random() < 0.1:
         return draw.choice(

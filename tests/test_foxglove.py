@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tracemalloc
+from time import process_time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -496,3 +497,30 @@ def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path: Path) -> 
         return highest
 
     assert peak(2000) < 1.3 * peak(500)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("protobuf", b"\x12\x82\x80\x80\x04" + b"\x42\x00" * (4 << 20) + b"\x42\x00"),
+        ("protobuf", b"\x12\x00" * (4 << 20)),
+        ("protobuf", b"\x0a\x00" * (1 << 24)),
+        ("json", b'{"entities":[' + b"{}," * (5 << 20) + b"{}]}"),
+        ("json", b'{"entities":[{"cubes":[' + b"{}," * (1 << 20) + b"{}]}]}"),
+        ("json", b'{"entities":[{"id":"' + b"x" * (1 << 25) + b'"}]}'),
+    ],
+    ids=["cubes", "entities", "deletions", "JSON entities", "JSON cubes", "a JSON id"],
+)
+def test_a_message_of_countless_parts_is_a_loss_and_costs_little(
+    file: Path, encoding: str, data: bytes
+) -> None:
+    with SceneRecorder.of(file, encoding) as recorder:
+        recorder.scene(1.0, [cube("a")])
+        recorder.write(recorder.channels["scene"], 1.1, data)
+    start = process_time()
+    _, blocks, report = read(file)
+
+    assert len(of(blocks, "a")) == 1
+    (loss,) = report.losses
+    assert "at most" in loss.reason or "more than" in loss.reason
+    assert process_time() - start < 10

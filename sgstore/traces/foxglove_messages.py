@@ -30,10 +30,24 @@ TRANSFORM: Final = "foxglove.FrameTransform"
 TRANSFORMS: Final = "foxglove.FrameTransforms"
 READ: Final = frozenset({SCENE, TRANSFORM, TRANSFORMS})
 
-MAX_BYTES: Final = 32 << 20
-"""Greatest size of a message that is read."""
+MAX_BYTES: Final = 16 << 20
+"""Greatest size of a message that is read; one of JSON becomes up to thirty times as large."""
 MAX_ENTITIES: Final = 100_000
 """Greatest number of entities of a message."""
+MAX_PARTS: Final = 10_000
+"""Greatest number of cubes, or of anything else, of an entity."""
+_PLACE: Final = dict.fromkeys(("x", "y", "z"))
+_TURN: Final = dict.fromkeys(("x", "y", "z", "w"))
+_SOLID: Final = {"pose": {"position": _PLACE, "orientation": _TURN}, "size": _PLACE}
+_SCENE_FIELDS: Final[dict[str, Any]] = {
+    "deletions": dict.fromkeys(("type", "id")),
+    "entities": {
+        **dict.fromkeys(("timestamp", "frame_id", "id", "lifetime", "frame_locked")),
+        "metadata": dict.fromkeys(("key", "value")),
+        **dict.fromkeys(("cubes", "cylinders", "spheres", "models"), _SOLID),
+    },
+}
+"""Fields that are read of a scene; lines, triangles and texts stay bytes."""
 ERRORS: Final = (*DECODE_ERRORS, RecursionError)
 """What reading a message raises if it is not what it seems."""
 _LATEST: Final = 1 << 62
@@ -119,7 +133,8 @@ class Reader:
 
     def __init__(self, schema: Schema, encoding: str) -> None:
         self.name = schema.name
-        self._class = message_class(schema) if encoding == "protobuf" else None
+        fields = _SCENE_FIELDS if schema.name == SCENE else None
+        self._class = message_class(schema, fields) if encoding == "protobuf" else None
 
     def scene(self, data: bytes) -> Scene:
         """A ``SceneUpdate``.
@@ -130,9 +145,8 @@ class Reader:
             One of :data:`ERRORS`.
         """
         told = self._parsed(data)
-        entities, deletions = _list(told, "entities"), _list(told, "deletions")
-        if len(entities) + len(deletions) > MAX_ENTITIES:
-            raise ValueError(f"{len(entities)} entities; at most {MAX_ENTITIES} are read")
+        entities = _list(told, "entities", MAX_ENTITIES)
+        deletions = _list(told, "deletions", MAX_ENTITIES)
         kinds = [(int(_get(gone, "type", 0)), str(_get(gone, "id", ""))) for gone in deletions]
         found = [_box(entity) for entity in entities]
         boxes = [box for box in found if box is not None]
@@ -152,9 +166,8 @@ class Reader:
             One of :data:`ERRORS`.
         """
         told = self._parsed(data)
-        several = _list(told, "transforms") if self.name == TRANSFORMS else [told]
-        if len(several) > MAX_ENTITIES:
-            raise ValueError(f"{len(several)} transforms; at most {MAX_ENTITIES} are read")
+        one_of_many = self.name == TRANSFORMS
+        several = _list(told, "transforms", MAX_ENTITIES) if one_of_many else [told]
         return [
             Transform(
                 parent=str(_get(one, "parent_frame_id", "")),
@@ -189,12 +202,14 @@ def _get(part: Any, name: str, otherwise: Any) -> Any:
     return getattr(part, name)
 
 
-def _list(part: Any, name: str) -> list[Any]:
+def _list(part: Any, name: str, most: int = MAX_PARTS) -> list[Any]:
     told = _get(part, name, None)
     if told is None:
         return []
     if isinstance(told, (str, bytes, dict)):
         raise TypeError(f"{name} is no list")
+    if len(told) > most:
+        raise ValueError(f"{len(told)} {name}; at most {most} are read")
     return list(told)
 
 
