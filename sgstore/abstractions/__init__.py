@@ -76,6 +76,7 @@ ABSTRACTIONS: Final = (
 AT_INGEST: Final = ("E", "EL", "ER", "RSV", "junction")
 """Those whose classes every store has from the start."""
 
+_OWN: Final = {folded(one.name): one for one in ABSTRACTIONS}
 _REGISTERED: dict[str, Abstraction] = {}
 
 
@@ -120,7 +121,7 @@ _LONGEST: Final = 64
 
 def abstractions() -> dict[str, Abstraction]:
     """All that are known, by folded name: shipped, registered, and entry points of other packages."""
-    known = {folded(one.name): one for one in ABSTRACTIONS} | _REGISTERED
+    known = _OWN | _REGISTERED
     for point in entry_points(group=GROUP):
         if folded(point.name) not in known:
             known[folded(point.name)] = Abstraction(point.name, point.load())
@@ -135,6 +136,9 @@ def abstraction_named(name: str) -> Abstraction:
     AbstractionError
         There is none.
     """
+    known = _OWN | _REGISTERED  # looking for entry points takes a while
+    if folded(name) in known:
+        return known[folded(name)]
     known = abstractions()
     if folded(name) in known:
         return known[folded(name)]

@@ -108,12 +108,13 @@ class _Block:
     @classmethod
     def of(cls, graphs: Labelled) -> _Block:
         words = _digests(graphs.labels)
+        on_edges = _on_edges(words, graphs.bundles)
         src = found(graphs.node_frame, graphs.node, graphs.frame, graphs.src)
         dst = found(graphs.node_frame, graphs.node, graphs.frame, graphs.dst)
         if len(src) and min(int(src.min()), int(dst.min())) < 0:
             raise ValueError("an edge of an abstraction ends at what is no node of its frame")
         order = np.argsort(_narrow(graphs.frame, graphs.frames), kind="stable")
-        label = words[graphs.label[order]]
+        label = on_edges[graphs.label[order]]
         of_node = words[graphs.node_label]
         return cls(
             graphs.frames,
@@ -172,13 +173,12 @@ class _Block:
         """Parallel edges as one: the words of its label are the sums of theirs, which tell any two apart."""
         if not len(self.src):
             return self
-        key = self.src * len(self.graph) + self.dst
-        order = np.argsort(key)
-        key = key[order]
-        starts = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+        order = _by(self.src, self.dst, len(self.graph))
+        src, dst = self.src[order], self.dst[order]
+        starts = np.flatnonzero(np.append(True, (src[1:] != src[:-1]) | (dst[1:] != dst[:-1])))
         first = order[starts]
-        low = np.add.reduceat(_mixed(self.low[order]), starts)
-        high = np.add.reduceat(_mixed(self.high[order]), starts)
+        low = np.add.reduceat(self.low[order], starts)
+        high = np.add.reduceat(self.high[order], starts)
         return _Block(
             self.graphs,
             self.graph,
@@ -208,6 +208,13 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
     return np.frombuffer(raw, "<u8").astype(np.uint64).reshape(-1, 2)
 
 
+def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
+    """The words of labels as edges add them up: for each label, and from the end for each bundle."""
+    words = _mixed(words)
+    sums = [words[list(bundle)].sum(axis=0, dtype=np.uint64) for bundle in reversed(bundles)]
+    return np.concatenate([words, np.array(sums, np.uint64).reshape(-1, 2)])
+
+
 def _mixed(words: Words) -> Words:
     words = (words ^ (words >> _SHIFT)) * _B
     words = (words ^ (words >> _SHIFT)) * _C
@@ -217,6 +224,12 @@ def _mixed(words: Words) -> Words:
 def _narrow(values: Ints, bound: int) -> NDArray[Any]:
     """Small numbers in a type that sorts by radix."""
     return values.astype(np.uint16) if bound <= 1 << 16 else values
+
+
+def _by(first: Ints, second: Ints, bound: int) -> NDArray[np.intp]:
+    """The order of pairs of numbers below a bound."""
+    order = np.argsort(_narrow(second, bound), kind="stable")
+    return order[np.argsort(_narrow(first, bound)[order], kind="stable")]
 
 
 def _sums(owner: Ints, values: Words, count: int) -> Words:
@@ -240,7 +253,7 @@ def _refined(block: _Block) -> Words:
     np.add.at(colour, block.src[loops], _mixed(block.low[loops] + _D))
     rows = np.flatnonzero(~loops)
     src, dst = block.src[rows], block.dst[rows]
-    out_label, back = block.low[rows], np.argsort(dst, kind="stable")
+    out_label, back = block.low[rows], np.argsort(_narrow(dst, nodes), kind="stable")
     src_back, dst_back, in_label = src[back], dst[back], out_label[back] * _D
     size = np.bincount(block.graph, minlength=block.graphs)
     cells = _cells(block, colour)
@@ -346,7 +359,7 @@ def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")
-    sorted_edges = np.argsort(place[block.src] * max(len(order), 1) + place[block.dst])
+    sorted_edges = _by(place[block.src], place[block.dst], len(order))
     node_ends = np.searchsorted(block.graph, np.arange(block.graphs + 1))
     edge_ends = np.searchsorted(block.edge_graph[sorted_edges], np.arange(block.graphs + 1))
     start = node_ends[block.edge_graph[sorted_edges]]

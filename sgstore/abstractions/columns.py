@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.abstractions.roles import Strands
-from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE
+from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, KIND_CODE, KINDS, PROXIMITY, RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -35,6 +35,14 @@ EGO: Final = "ego"
 EGOS: Final = (EGO, "ego_car")
 """Labels that one node of a frame has, which is called by it."""
 
+SCENERY: Final = ("building", "pole", "barrier", "vegetation")
+"""Kinds of entities that only ``SG`` has."""
+
+BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
+"""Relations among entities that the literature has."""
+
+_SMALL: Final = np.array([kind in SCENERY for kind in KINDS])
+_BETWEEN: Final = np.array([name in BETWEEN_ENTITIES for name in RELATIONS])
 _ENTITY_KINDS: Final = len(ENTITY_KINDS)
 _LANE: Final = KIND_CODE["lane"]
 
@@ -105,7 +113,7 @@ DRIVEN: Final = (
 """Types of lanes that traffic drives on."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Seen:
     """Nodes and edges of the scene graphs of many frames.
 
@@ -223,21 +231,70 @@ class Seen:
         edge = wanted[edge]
         return frame, grounds.relation[edge], grounds.src[edge], grounds.dst[edge]
 
+    @cached_property
+    def is_traffic(self) -> Bools:
+        """(N,): whether a node is an entity that the literature has, which scenery is not."""
+        return self.is_entity & ~_SMALL[self.kind]
+
+    @cached_property
+    def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Ordered pairs of such entities, each once in a frame, with all that the literature has between them.
+
+        Returns
+        -------
+        frame, src, dst : (K,)
+        relations : (K,)
+            Bit i stands for the relation with code i.
+        """
+        kept = self.is_traffic
+        rows = np.flatnonzero(_BETWEEN[self.relation])
+        frame, bit = self.frame[rows], self.relation[rows].astype(np.int64)
+        a, b = self.row_of(frame, self.src[rows]), self.row_of(frame, self.dst[rows])
+        both = np.flatnonzero((a >= 0) & (b >= 0) & kept[a] & kept[b])
+        frame, bit, a, b = frame[both], bit[both], a[both], b[both]
+        starts = np.searchsorted(self.node_frame, np.arange(self.frames + 1))
+        most = int(np.diff(starts).max(initial=0))
+        cell = (frame * most + (a - starts[frame])) * most + (b - starts[frame])
+        if self.frames * most * most <= _CELLS:
+            # A relation holds once between two nodes, so that sums are unions.
+            sums = np.bincount(cell, weights=np.exp2(bit))
+            cells = np.flatnonzero(sums)
+            bits = sums[cells].astype(np.int64)
+        else:
+            cells, pair = np.unique(cell, return_inverse=True)
+            bits = np.bincount(pair, weights=np.exp2(bit)).astype(np.int64)
+        frame, pair = np.divmod(cells, max(most * most, 1))
+        a, b = np.divmod(pair, max(most, 1))
+        return frame, self.node[starts[frame] + a], self.node[starts[frame] + b], bits
+
     def row_of(self, frame: Ints, node: Ints) -> Ints:
         """Rows of nodes in frames; -1 where they are not in the graph."""
         return found(self.node_frame, self.node, frame, node)
 
 
 def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
-    """Rows of (frame, node) in columns that are sorted by both; -1 where there is none."""
+    """Rows of (frame, node) in columns that name each once; -1 where there is none."""
     if not len(nodes):
         return np.full(len(node), -1)
-    low = min(int(nodes.min()), int(node.min(initial=0)))
-    span = max(int(nodes.max()), int(node.max(initial=0))) - low + 1
-    keys = frames * span + (nodes - low)
-    wanted = frame * span + (node - low)
-    row = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[row] == wanted, row, -1)
+    ids, column = np.unique(nodes, return_inverse=True)
+    place = np.full((int(frames.max()) + 1, len(ids)), -1)
+    place[frames, column] = np.arange(len(nodes))
+    low, span = int(ids[0]), int(ids[-1]) - int(ids[0]) + 1
+    if span <= _TABLE:
+        table = np.zeros(span, np.int64)
+        table[ids - low] = np.arange(len(ids))
+        at = table[np.clip(node - low, 0, span - 1)]
+    else:
+        at = np.minimum(np.searchsorted(ids, node), len(ids) - 1)
+    row = place[np.minimum(frame, len(place) - 1), at]
+    return np.where((ids[at] == node) & (frame < len(place)), row, -1)
+
+
+_TABLE: Final = 1 << 18
+"""Up to so many numbers are looked up in a table, which is faster than searching."""
+
+_CELLS: Final = 1 << 23
+"""Up to so many ordered pairs are counted in a table."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +315,9 @@ class Labelled:
     frame, src, dst : (E,) int64
         Edges; both ends are nodes of the same frame. An edge may be there more than once.
     label : (E,) int32
-        Index into ``labels``.
+        Index into ``labels``; -1 less an index into ``bundles`` for several edges with the same ends.
+    bundles : tuple of tuple of int
+        Indices into ``labels``.
     names : mapping of int to str
         What nodes are called that are not called by their label: parts of the map.
     """
@@ -273,6 +332,7 @@ class Labelled:
     label: Labels
     dst: Ints
     names: Mapping[int, str] = field(default_factory=dict[int, str])
+    bundles: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
     def assembled(
@@ -282,10 +342,12 @@ class Labelled:
         edges: Sequence[Part],
         labels: Sequence[str],
         names: Mapping[int, str] | None = None,
+        bundles: Sequence[Sequence[int]] = (),
     ) -> Labelled:
         """From parts: nodes ``(frame, node, label)`` in any order, edges ``(frame, src, label, dst)``.
 
-        Labels are indices into ``labels``, which may repeat texts. A node that comes twice in a frame is one.
+        Labels are indices into ``labels``, which may repeat texts; one below zero stands for a bundle. A node
+        that comes twice in a frame is one.
         """
         table = tuple(dict.fromkeys(labels))
         index = {text: i for i, text in enumerate(table)}
@@ -304,9 +366,12 @@ class Labelled:
             renumbered[label[fresh]],
             edge_frame,
             src,
-            renumbered[edge_label],
+            np.where(edge_label < 0, edge_label, renumbered[np.maximum(edge_label, 0)]).astype(
+                np.int32
+            ),
             dst,
             names or {},
+            tuple(tuple(int(renumbered[label]) for label in bundle) for bundle in bundles),
         )
 
     def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
@@ -329,7 +394,11 @@ class Labelled:
         columns = (self.src[edges].tolist(), self.label[edges].tolist(), self.dst[edges].tolist())
         return (
             dict(zip(called.values(), labels, strict=True)),
-            [(called[a], self.labels[r], called[b]) for a, r, b in zip(*columns, strict=True)],
+            [
+                (called[a], self.labels[label], called[b])
+                for a, r, b in zip(*columns, strict=True)
+                for label in ((r,) if r >= 0 else self.bundles[-1 - r])
+            ],
         )
 
 

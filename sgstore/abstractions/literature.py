@@ -21,40 +21,73 @@ Where our graphs have what theirs lack, this is how it is:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.abstractions.columns import EGO, Labelled
+from sgstore.abstractions.columns import BETWEEN_ENTITIES, EGO, SCENERY, Labelled
 from sgstore.abstractions.roles import OPPOSING, role_name
 from sgstore.vocabulary import (
-    DIRECTIONS,
+    ENTITY_KINDS,
     KIND_CODE,
     KINDS,
-    PROXIMITY,
     RELATION_CODE,
     RELATIONS,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from sgstore.abstractions.columns import Grounds, Part, Seen
     from sgstore.abstractions.roles import Strands
     from sgstore.world import Bools, Ints
 
-SCENERY: Final = ("building", "pole", "barrier", "vegetation")
-"""Kinds of entities that only ``SG`` has."""
-
 ROOT_ROAD: Final = -(1 << 40)
 """Node number of ``Root Road``."""
 
-BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
 OF_JUNCTION: Final = (
     *BETWEEN_ENTITIES,
     *("isIn", "travelsTo", "laneChange", "opposes", "controlsTrafficOf", "mayAffect"),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Subset:
+    """What queries see under an abstraction, whose nodes and edges are some of those of the scene graph.
+
+    Attributes
+    ----------
+    kinds : frozenset of str or None
+        Kinds of its nodes; ``None``: all, and all relations.
+    moving : frozenset of str
+        Relations of entities, to one another and to parts of the map.
+    lasting : frozenset of str
+        Relations among parts of the map.
+    """
+
+    kinds: frozenset[str] | None
+    moving: frozenset[str] = frozenset()
+    lasting: frozenset[str] = frozenset()
+
+
+_TRAFFIC: Final = frozenset(ENTITY_KINDS) - frozenset(SCENERY)
+_LANES: Final = frozenset({"lane", "off_road"})
+_RELATED: Final = frozenset(BETWEEN_ENTITIES)
+_PARTS: Final = frozenset({*_LANES, "road", "junction"})
+
+SUBSETS: Final[Mapping[str, Subset]] = {
+    "E": Subset(_TRAFFIC),
+    "EL": Subset(_TRAFFIC | _LANES, frozenset({"isIn"})),
+    "ER": Subset(_TRAFFIC, _RELATED),
+    "RSV": Subset(_TRAFFIC | _LANES, _RELATED | {"isIn"}),
+    "junction": Subset(_TRAFFIC | _PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
+    "SG": Subset(None),
+}
+"""In queries lanes keep the names and the sections that they have in the map."""
 
 _MAPS: Final = 4
 """Maps of which what follows from them is remembered."""
@@ -63,7 +96,7 @@ _EGO_LABEL: Final = len(KINDS)
 _KIND_LABELS: Final = (*KINDS, EGO)
 _IS_IN: Final = RELATION_CODE["isIn"]
 _OFF_ROAD: Final = -1
-_SMALL: Final = np.array([kind in SCENERY for kind in KINDS])
+_ON_ROADS: Final = np.array([r in OF_JUNCTION and r not in BETWEEN_ENTITIES for r in RELATIONS])
 
 
 def entities(seen: Seen) -> Labelled:
@@ -74,7 +107,8 @@ def entities(seen: Seen) -> Labelled:
 def related(seen: Seen) -> Labelled:
     """``ER``: the entities and their relations."""
     labels = (*_KIND_LABELS, *RELATIONS)
-    return Labelled.assembled(seen.frames, [_entities(seen)], [_relations(seen)], labels)
+    edges, bundles = _relations(seen)
+    return Labelled.assembled(seen.frames, [_entities(seen)], [edges], labels, bundles=bundles)
 
 
 def in_lanes(seen: Seen) -> Labelled:
@@ -106,7 +140,7 @@ def junction(seen: Seen) -> Labelled:
     grounds = seen.grounds
     first = len(_KIND_LABELS)
     wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
-    nodes, kept = [_entities(seen)], _kept(seen)
+    nodes, kept = [_entities(seen)], seen.is_traffic
     labels = [*_KIND_LABELS, *RELATIONS]
     edges: list[Part] = []
     if grounds is not None:
@@ -125,11 +159,13 @@ def junction(seen: Seen) -> Labelled:
         kept = kept.copy()
         kept[rows] = True
         edges.append(_drawn(seen, kept, seen.lasting(wanted), whose))
-    moving = np.flatnonzero(np.isin(seen.relation, wanted))
+    moving = np.flatnonzero(_ON_ROADS[seen.relation])
     columns = (seen.frame[moving], seen.relation[moving], seen.src[moving], seen.dst[moving])
     edges.append(_drawn(seen, kept, columns, None if grounds is None else _merged(grounds)))
-    parts = [(frame, src, first + relation, dst) for frame, relation, src, dst in edges]
-    return Labelled.assembled(seen.frames, nodes, parts, labels, _names(grounds))
+    parts: list[Part] = [(frame, src, first + relation, dst) for frame, relation, src, dst in edges]
+    between, bundles = _relations(seen)
+    parts.append(between)
+    return Labelled.assembled(seen.frames, nodes, parts, labels, _names(grounds), bundles)
 
 
 def _drawn(seen: Seen, kept: Bools, columns: Part, whose: Ints | None) -> Part:
@@ -219,35 +255,34 @@ def _names(grounds: Grounds | None) -> dict[int, str]:
     return names
 
 
-def _kept(seen: Seen) -> Bools:
-    """Which nodes are entities that the literature has."""
-    return seen.is_entity & ~_SMALL[seen.kind]
-
-
 def _entities(seen: Seen) -> Part:
-    rows = np.flatnonzero(_kept(seen))
+    rows = np.flatnonzero(seen.is_traffic)
     label = np.where(seen.is_ego[rows], _EGO_LABEL, seen.kind[rows])
     return seen.node_frame[rows], seen.node[rows], label
 
 
-def _relations(seen: Seen) -> Part:
-    """Edges between entities; labels follow those of the kinds."""
-    wanted = np.isin(seen.relation, [RELATION_CODE[name] for name in BETWEEN_ENTITIES])
-    rows = np.flatnonzero(wanted)
-    columns = (seen.frame[rows], seen.relation[rows], seen.src[rows], seen.dst[rows])
-    frame, relation, src, dst = _drawn(seen, _kept(seen), columns, None)
-    return frame, src, len(_KIND_LABELS) + relation, dst
+def _relations(seen: Seen) -> tuple[Part, list[list[int]]]:
+    """Edges between entities, and the bundles of labels, which follow those of the kinds, that they bear."""
+    frame, src, dst, bits = seen.pairs
+    distinct, number = np.unique(bits, return_inverse=True)
+    first = len(_KIND_LABELS)
+    bundles = [
+        [first + code for code in range(len(RELATIONS)) if one >> code & 1]
+        for one in distinct.tolist()
+    ]
+    return (frame, src, -1 - number, dst), bundles
 
 
 def _with_lanes(seen: Seen, *, related: bool) -> Labelled:
     labels = [*_KIND_LABELS, *RELATIONS]
-    nodes, edges = [_entities(seen)], [_relations(seen)] if related else []
+    between, bundles = _relations(seen) if related else (None, [])
+    nodes, edges = [_entities(seen)], [between] if between else []
     if seen.grounds is not None:
         lanes, inside, names = _lanes(seen, len(labels))
         labels += names
         nodes += lanes
         edges += inside
-    return Labelled.assembled(seen.frames, nodes, edges, labels)
+    return Labelled.assembled(seen.frames, nodes, edges, labels, bundles=bundles)
 
 
 def _lanes(seen: Seen, first: int) -> tuple[list[Part], list[Part], list[str]]:
@@ -257,7 +292,7 @@ def _lanes(seen: Seen, first: int) -> tuple[list[Part], list[Part], list[str]]:
     strands = seen.grounds.strands
     rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
     entity = seen.row_of(seen.frame[rows], seen.src[rows])
-    rows = rows[(entity >= 0) & _kept(seen)[entity]]
+    rows = rows[(entity >= 0) & seen.is_traffic[entity]]
     frame, src, dst = seen.frame[rows], seen.src[rows], seen.dst[rows]
     off = dst == _OFF_ROAD
     strand = strands.of[-1 - dst]

@@ -51,7 +51,7 @@ FROM edge e JOIN bits b ON (e.mask & b.m) <> 0 WHERE e.bucket BETWEEN $first >> 
 """
 _EGO_LANES: Final = """
 SELECT l.frame_id, l.lane FROM lane_state l JOIN frame f ON f.frame_id = l.frame_id AND f.ego = l.node_id
-WHERE l.is_primary AND l.frame_id >= $low << 6 AND l.frame_id < $high << 6
+WHERE l.is_primary AND l.frame_id >= $first AND l.frame_id <= $last
 """
 
 
