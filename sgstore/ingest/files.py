@@ -70,16 +70,6 @@ def _parts(bag: Path) -> tuple[Part, ...]:
         return ()
 
 
-def size_of(path: Path) -> int:
-    """Bytes of a recording, those of all files of a bag; 0 if it cannot be read."""
-    try:
-        if path.is_dir():
-            return sum(max(part.size, 0) for part in _parts(path))
-        return path.stat().st_size
-    except OSError:
-        return 0
-
-
 def is_recording(path: Path) -> bool:
     """Whether a file is named as a recording is."""
     return path.name.lower().endswith(ENDINGS) and path.is_file()

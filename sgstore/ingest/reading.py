@@ -11,7 +11,6 @@ import numpy as np
 
 from sgstore.config import ALL_EGOS
 from sgstore.errors import SgstoreError, TraceError
-from sgstore.ingest.files import size_of
 from sgstore.ingest.maps import Maps
 from sgstore.ingest.outcomes import TraceOutcome
 from sgstore.ingest.tally import Tally
@@ -196,7 +195,7 @@ class Reading:
         """Build the segments of some views in one pass over the recording."""
         job, size = self._job, self._job.block_frames
         generator = SceneGraphGenerator(road_map, job.config)
-        tally, whole = Tally(), size_of(trace.info.path)
+        tally = Tally()
         blocks = job.part.blocks(map(self._meant, trace.blocks(size)), size)
         first = next(blocks, None)
         if first is None:
@@ -222,7 +221,7 @@ class Reading:
                 first = None
                 self._append(generator, block, group, segments)
                 tally.see(block)
-                self._on_block(tally.frames, _reached(block, whole), whole)
+                self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
             self._seal(trace, group, segments, tally, generator.parked)
 
     def _append(

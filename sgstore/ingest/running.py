@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.config import Config
 from sgstore.errors import SgstoreError
-from sgstore.ingest.files import size_of
 from sgstore.ingest.jobs import Job
 from sgstore.ingest.maps import Maps
 from sgstore.ingest.outcomes import Progress, TraceOutcome
@@ -174,9 +173,7 @@ class _Meter:
     def __init__(self, paths: list[Path], on_progress: Callable[[Progress], None] | None) -> None:
         self._paths = paths
         self._on_progress = on_progress
-        self._sizes = [
-            size_of(path) for path in paths
-        ]  # what cannot be read is told when it is opened
+        self._sizes = [_size(path) for path in paths]
         self._frames = [0] * len(paths)
         self._bytes = [0] * len(paths)
         self._done = 0
@@ -205,3 +202,10 @@ class _Meter:
                 files=len(self._paths),
             )
             self._on_progress(progress)
+
+
+def _size(path: Path) -> int:
+    try:
+        return mark_of(path)[0]
+    except (OSError, SgstoreError):  # told when it is opened
+        return 0
