@@ -177,10 +177,7 @@ class Reading:
     def _known_digest(self, path: Path) -> str:
         """The digest of a file that the store knows by path, size and time of change: it need not be hashed."""
         store = self._store()
-        # What is in the files of a folder can change, and the folder looks the same.
-        if store is None or self._job.force or not path.is_file():
-            return ""
-        return store.known_digest(path)
+        return "" if store is None or self._job.force else store.known_digest(path)
 
     def _store(self) -> StoreFile | None:
         if self._file is None and self._job.store.exists():
