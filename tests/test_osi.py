@@ -1316,3 +1316,42 @@ def test_an_id_with_much_behind_it_is_an_id(tmp_path: Path) -> None:
 
     assert of(blocks, "7").x.tolist() == [0.0, 1.0, 2.0]
     assert report.losses == []
+
+
+def lengthy(number: int, content: bytes) -> bytes:
+    """A field of protobuf with a content of some megabytes."""
+    size, n = bytearray(), len(content)
+    while n > 0x7F:
+        size.append(n & 0x7F | 0x80)
+        n >>= 7
+    return bytes([number << 3 | 2, *size, n]) + content
+
+
+@pytest.mark.parametrize(
+    ("field", "reference", "count"),
+    [
+        (4, 5, 9 << 20),
+        (6, 4, 9 << 20),
+        (7, 5, 9 << 20),
+        (5, 10, 3 << 20),
+        (4, 5, 2 << 20),
+        (5, 10, 1 << 20),
+    ],
+)
+def test_countless_references_are_a_loss_and_cost_little(
+    tmp_path: Path, field: int, reference: int, count: int
+) -> None:
+    path = tmp_path / "a.mcap"
+    ident = b"\x0a\x02\x08\x09\x12\x02\x12\x00"  # id 9, a base with a position
+    with Recorder(path) as recorder:
+        recorder.ground_truth(0.0, [car(1)], host=1)
+        hostile = lengthy(field, ident + bytes([reference << 3 | 2, 0]) * count)
+        ground = ground_truth(0.1, [car(1)]).SerializeToString()
+        recorder.write(recorder.channels["truth"], 0.1, ground + hostile)
+        recorder.ground_truth(0.2, [car(1)], host=1)
+    start = process_time()
+    _, blocks, report = read(path)
+
+    assert len(of(blocks, "1")) >= 2
+    assert len(report.losses) == (field != 5 or count > 2 << 20)  # else known by its number
+    assert process_time() - start < 10

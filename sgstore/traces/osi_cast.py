@@ -38,6 +38,13 @@ def names_of(moving_object: Any) -> list[str]:
     return [*named, *bare]
 
 
+def _names_or_none(moving_object: Any) -> list[str]:
+    try:
+        return names_of(moving_object)
+    except ValueError:  # references without end: then it is known by its number
+        return []
+
+
 def hosts_of(message: Any) -> list[int]:
     """Ids that a message gives to the host vehicle, the most telling first; 0 is one too."""
     told = [message, ground_truth_of(message), getattr(message, "host_vehicle_data", None)]
@@ -93,7 +100,8 @@ class Cast:
                 thing = objects.FromString(content)
             except DECODE_ERRORS:  # counted as a loss when the frames are read
                 continue
-            self.names.setdefault(thing.id.value, names_of(thing))
+            if thing.id.value not in self.names:
+                self.names[thing.id.value] = _names_or_none(thing)
             if is_key(key, thing):
                 self._keys.add(key)
 

@@ -19,6 +19,13 @@ MAX_GROUND_TRUTH: Final = 32 << 20
 """Greatest size of a ground truth; bytes. One with all lanes of a town takes 1.4 MB."""
 MAX_OBJECTS: Final = 100_000
 """Greatest number of objects (vehicles, lights, lanes, …) of a ground truth."""
+MAX_STATICS: Final = 16 << 20
+"""Greatest size of the stationary objects, signs and lights of a ground truth together; bytes. What is read of
+them is parsed to the last part, and a part may be two bytes long."""
+MAX_OBJECT: Final = 4 << 20
+"""Greatest size of a moving object; bytes."""
+MAX_REFERENCES: Final = 1000
+"""Greatest number of source references of an object, and of identifiers in one."""
 SMALL: Final = 64 << 10
 """A message up to this size cannot hold so many that it mattered; bytes."""
 
@@ -179,10 +186,26 @@ def check_size(data: bytes, truth: int) -> None:
     size = sum(stop - start for start, stop in spans)
     if size > MAX_GROUND_TRUTH:
         raise ValueError(f"a ground truth of {size} bytes; at most {MAX_GROUND_TRUTH} are read")
-    for start, stop in spans:
-        for count, _ in enumerate(fields_of(data, start, stop)):
-            if count > MAX_OBJECTS:
-                raise ValueError(f"more than {MAX_OBJECTS} objects in a ground truth")
+    _check_objects(field for start, stop in spans for field in fields_of(data, start, stop))
+
+
+def _check_objects(fields: Iterator[tuple[int, int, int, int]]) -> None:
+    statics = 0
+    for count, (number, _, start, stop) in enumerate(fields):
+        if count > MAX_OBJECTS:
+            raise ValueError(f"more than {MAX_OBJECTS} objects in a ground truth")
+        if number == _MOVING and stop - start > MAX_OBJECT:
+            raise ValueError(
+                f"a moving object of {stop - start} bytes; at most {MAX_OBJECT} are read"
+            )
+        statics += (stop - start) * (number in _STATICS)
+    if statics > MAX_STATICS:
+        raise ValueError(f"{statics} bytes of static things; at most {MAX_STATICS} are read")
+
+
+_MOVING: Final = 5
+_STATICS: Final = frozenset({4, 6, 7})
+"""Numbers of ``stationary_object``, ``traffic_sign``, ``traffic_light``, in every version of OSI."""
 
 
 def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int, int, int]]:

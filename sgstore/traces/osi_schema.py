@@ -21,6 +21,7 @@ from sgstore.traces.osi_fields import (
     GROUND_TRUTH_FIELDS,
     HOST_DATA_FIELDS,
     MAX_OBJECTS,
+    MAX_REFERENCES,
     MOVING_OBJECT_FIELDS,
     SENSOR_VIEW_FIELDS,
     check_size,
@@ -207,10 +208,20 @@ def enum_name(message: Any, field: str) -> str:
 
 
 def identifiers(thing: Any) -> list[tuple[str, str]]:
-    """Source references of an object: (type of the source, identifier), in the order they stand."""
+    """Source references of an object: (type of the source, identifier), in the order they stand.
+
+    Raises
+    ------
+    ValueError
+        There are more than any object has.
+    """
+    references = getattr(thing, "source_reference", ())
+    most = max([len(references), *(len(one.identifier) for one in references[:MAX_REFERENCES])])
+    if most > MAX_REFERENCES:
+        raise ValueError(f"an object with {most} references; at most {MAX_REFERENCES} are read")
     return [
         (reference.type, identifier)
-        for reference in getattr(thing, "source_reference", ())
+        for reference in references
         for identifier in reference.identifier
     ]
 

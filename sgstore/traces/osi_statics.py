@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.opendrive.objects import kind_of_object
-from sgstore.traces.osi_schema import enum_name, has_field, map_ref, static_pose
+from sgstore.traces.osi_schema import DECODE_ERRORS, enum_name, has_field, map_ref, static_pose
 from sgstore.vocabulary import ENTITY_KINDS, TypeMeaning, type_meanings
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Statics:
     Attributes
     ----------
     unplaced : dict
-        What has no usable pose, in words → log time at which it was told.
+        What has no usable pose or cannot be read, in words → log time at which it was told.
     """
 
     unplaced: dict[str, int] = field(default_factory=dict[str, int])
@@ -62,8 +62,13 @@ class Statics:
                 continue
             for thing in getattr(ground, name):
                 key = (name, thing.id.value)
-                if key not in self._found:
+                if key in self._found:
+                    continue
+                try:
                     self._take(key, thing, log_time_ns)
+                except DECODE_ERRORS as error:
+                    words = f"{name.replace('_', ' ')} {key[1]} cannot be read ({error})"
+                    self.unplaced.setdefault(words, log_time_ns)
 
     def enter(self, roster: Roster, map_text: str) -> None:
         """Enter them all. Objects of the map whose kind is not told are what the map says that they are."""
