@@ -40,7 +40,8 @@ SELECT DISTINCT src, relation, dst FROM edge
 WHERE bucket = $bucket AND mask & $bit <> 0 ORDER BY src, relation, dst
 """
 _LANES: Final = """
-SELECT src, dst, overlap, lane_offset, heading_error, is_primary, along FROM lane_states WHERE frame_id = $frame_id
+SELECT src, dst, overlap, lane_offset, heading_error, is_primary, along
+FROM lane_states WHERE frame_id = $frame_id
 """
 _GAPS: Final = "SELECT src, dst, gap FROM lane_gaps WHERE frame_id = $frame_id"
 _MAP_NODES: Final = """
