@@ -165,6 +165,14 @@ def test_relations_are_those_of_the_literature() -> None:
     assert {"leads", "sees", "isIn", "toLeftOf", "opposes"} <= {label for _, label, _ in all_of_it}
 
 
+def test_an_edge_that_comes_twice_counts_once() -> None:
+    once = scene((CAR, "near", EGO), (EGO, "near", CAR))
+    twice = scene(*[(CAR, "near", EGO)] * 2, (EGO, "near", CAR))
+    related = abstraction_named("ER").function
+
+    assert classes_of(related(once)) == classes_of(related(twice))
+
+
 def test_junction_has_the_lanes_of_the_map_and_sections_are_one() -> None:
     seen = scene(
         (EGO, "isIn", OWN), (BUS, "isIn", AHEAD), present=(OWN, LEFT, AHEAD, AGAINST, ROAD)

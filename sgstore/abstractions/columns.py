@@ -246,30 +246,39 @@ class Seen:
         relations : (K,)
             Bit i stands for the relation with code i.
         """
-        kept = self.is_traffic
+        kept = np.flatnonzero(self.is_traffic)
+        node_frame, node = self.node_frame[kept], self.node[kept]
         rows = np.flatnonzero(_BETWEEN[self.relation])
         frame, bit = self.frame[rows], self.relation[rows].astype(np.int64)
-        a, b = self.row_of(frame, self.src[rows]), self.row_of(frame, self.dst[rows])
-        both = np.flatnonzero((a >= 0) & (b >= 0) & kept[a] & kept[b])
+        a, b = (found(node_frame, node, frame, end[rows]) for end in (self.src, self.dst))
+        both = np.flatnonzero((a >= 0) & (b >= 0))
         frame, bit, a, b = frame[both], bit[both], a[both], b[both]
-        starts = np.searchsorted(self.node_frame, np.arange(self.frames + 1))
+        starts = np.searchsorted(node_frame, np.arange(self.frames + 1))
         most = int(np.diff(starts).max(initial=0))
         cell = (frame * most + (a - starts[frame])) * most + (b - starts[frame])
-        if self.frames * most * most <= _CELLS:
-            # A relation holds once between two nodes, so that sums are unions.
-            sums = np.bincount(cell, weights=np.exp2(bit))
-            cells = np.flatnonzero(sums)
-            bits = sums[cells].astype(np.int64)
-        else:
-            cells, pair = np.unique(cell, return_inverse=True)
-            bits = np.bincount(pair, weights=np.exp2(bit)).astype(np.int64)
+        cells, bits = _united(cell, bit, self.frames * most * most)
         frame, pair = np.divmod(cells, max(most * most, 1))
         a, b = np.divmod(pair, max(most, 1))
-        return frame, self.node[starts[frame] + a], self.node[starts[frame] + b], bits
+        return frame, node[starts[frame] + a], node[starts[frame] + b], bits
 
     def row_of(self, frame: Ints, node: Ints) -> Ints:
         """Rows of nodes in frames; -1 where they are not in the graph."""
         return found(self.node_frame, self.node, frame, node)
+
+
+def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
+    """Cells below a bound that have bits, ascending, and all bits of each."""
+    if bound <= _CELLS:
+        sums = np.bincount(cell, weights=np.exp2(bit))
+        cells = np.flatnonzero(sums)
+        bits = sums[cells].astype(np.int64)
+    else:
+        cells, number = np.unique(cell, return_inverse=True)
+        bits = np.bincount(number, weights=np.exp2(bit)).astype(np.int64)
+    if int(np.bitwise_count(bits).sum()) == len(cell):
+        return cells, bits
+    once = np.unique(np.stack([cell, bit]), axis=1)  # sums are unions of what is there once
+    return _united(once[0], once[1], bound)
 
 
 def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
