@@ -14,7 +14,7 @@ help:
 	@echo "make fuzz    read 100,000 recordings that were hurt on purpose (about half an hour)"
 	@echo "make kill    kill ingest 200 times at random and look whether the stores are whole and equal"
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
-	@echo "make oracle  100,000 random patterns and formulas against exhaustive search (hours)"
+	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -65,6 +65,7 @@ oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle.py 100000
 	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py
+	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
 
 sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py

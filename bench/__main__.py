@@ -11,6 +11,7 @@ TITLES = {
     "ingest": "Ingest: a recording into a store",
     "traces": "Recordings: objects decoded, large files skimmed",
     "sgg": "The scene graph generator",
+    "classes": "Classes: isomorphic or not, beside networkx",
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
     "patterns": "Patterns over a million frames",

@@ -17,7 +17,7 @@ from sgstore.abstractions import Classes, Labelled, classes_of
 from sgstore.abstractions.symmetry import Search
 
 PAIRS = int(os.environ.get("SGSTORE_CLASS_PAIRS", "1500"))
-"""Random pairs; ``make classes-oracle`` takes 12,000."""
+"""Random pairs; ``make oracle`` takes 12,000."""
 
 
 def labelled(graphs) -> Labelled:
