@@ -31,7 +31,9 @@ TRANSFORMS: Final = "foxglove.FrameTransforms"
 READ: Final = frozenset({SCENE, TRANSFORM, TRANSFORMS})
 
 MAX_BYTES: Final = 16 << 20
-"""Greatest size of a message that is read; one of JSON becomes up to thirty times as large."""
+"""Greatest size of a protobuf message that is read."""
+MAX_JSON: Final = 8 << 20
+"""Greatest size of a JSON message that is read; in memory it becomes up to thirty times as large."""
 MAX_ENTITIES: Final = 100_000
 """Greatest number of entities of a message."""
 MAX_PARTS: Final = 10_000
@@ -179,8 +181,9 @@ class Reader:
         ]
 
     def _parsed(self, data: bytes) -> Any:
-        if len(data) > MAX_BYTES:
-            raise ValueError(f"a message of {len(data)} bytes; at most {MAX_BYTES} are read")
+        most = MAX_JSON if self._class is None else MAX_BYTES
+        if len(data) > most:
+            raise ValueError(f"a message of {len(data)} bytes; at most {most} are read")
         if self._class is not None:
             check_size(data, 0)
             return self._class.FromString(data)
