@@ -6,14 +6,15 @@ import hashlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.abstractions import abstractions, check_name
+from sgstore.abstractions import abstraction_named, abstractions, check_name
+from sgstore.abstractions.literature import SUBSETS
 from sgstore.config import Config, from_dict
 from sgstore.errors import AbstractionError, ConfigError
 from sgstore.opendrive import read_map
 from sgstore.roads.lanetext import is_lane_text, read_lane_text
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KINDS, folded, kinds_labelled
+from sgstore.vocabulary import KINDS, RELATION_CODE, RELATIONS, folded, kinds_labelled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,6 +113,61 @@ def derive(
                 " say --force to replace it, or choose another name"
             )
         results.append(_derived(file, trace, settings, of_name))
+    return results
+
+
+def keep_abstraction(
+    store: str | Path, name: str, traces: Sequence[int | str] = ()
+) -> list[Derivation]:
+    """Keep what an abstraction makes of the stored graphs, so that queries can name it.
+
+    That of ``roadscene2vec``, or of a client's own function: nodes of the scene graph, and edges labelled
+    with relations. Nodes that it makes up, and other labels, are in ``graph(frame, abstraction=…)`` only.
+
+    Parameters
+    ----------
+    store, traces
+        As :func:`derive` takes them.
+    name : str
+        Of the abstraction, and of the set.
+
+    Returns
+    -------
+    list of Derivation
+        One for each trace.
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction, or queries can name it without this.
+    StoreError
+        There is no such store or trace, or others keep the store for too long.
+    """
+    abstraction = abstraction_named(name)
+    if abstraction.name in SUBSETS:
+        raise AbstractionError(f"queries can name {abstraction.name!r} as it is: USING ABSTRACTION")
+    file = StoreFile(store)
+    chosen = [file.trace(ref) for ref in traces] if traces else list(file.traces())
+    known = {(one.name, one.trace_id) for one in file.deriving.sets()}
+    results: list[Derivation] = []
+    for trace in chosen:
+        if (abstraction.name, trace.trace_id) in known:
+            results.append(Derivation(trace.name, "present"))
+            continue
+        frames = edges = 0
+        relations: set[int] = set()
+        with file.deriving.building(abstraction.name, trace.trace_id) as building:
+            for seq, seen in file.deriving.seen(trace.trace_id):
+                graphs = abstraction.function(seen)
+                building.append_labelled(seq, seen, graphs)
+                relations |= {
+                    RELATION_CODE[text] for text in graphs.labels if text in RELATION_CODE
+                }
+                frames, edges = frames + graphs.frames, edges + len(graphs.related()[0])
+            answers = tuple(RELATIONS[code] for code in sorted(relations))
+            settings = {"abstraction": abstraction.name}
+            building.publish(settings, hashlib.sha256(repr(settings).encode()).hexdigest(), answers)
+        results.append(Derivation(trace.name, "derived", frames, edges))
     return results
 
 

@@ -18,6 +18,7 @@ from importlib import import_module
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, overload
 
+from sgstore.abstractions import abstractions
 from sgstore.errors import MissingExtraError
 from sgstore.graph import named_graph
 from sgstore.lang import Compiled, compile_query
@@ -188,7 +189,7 @@ class Store:
         if abstraction is None:
             return self.file.graph(_ref(frame)).to_networkx()
         derived = {folded(one.name) for one in self.file.deriving.sets()}
-        if folded(abstraction) in derived:
+        if folded(abstraction) in derived and folded(abstraction) not in abstractions():
             whole = self.file.graph(_ref(frame))
             return self.file.deriving.graph(whole, abstraction).to_networkx()
         graph, about = self.file.abstracted.labelled(_ref(frame), abstraction)

@@ -8,9 +8,10 @@ import pytest
 
 import sgstore
 from sgstore.abstractions.literature import SUBSETS
+from sgstore.cli import run
 from sgstore.config import configured
-from sgstore.errors import QueryError, QueryNameError
-from sgstore.graphs import derive
+from sgstore.errors import AbstractionError, QueryError, QueryNameError
+from sgstore.graphs import derive, keep_abstraction
 from sgstore.ingest import ingest
 
 SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"
@@ -131,3 +132,47 @@ def test_frames_are_found_by_their_class(stores) -> None:
 def test_a_class_that_is_not_known_is_an_error(stores, query) -> None:
     with pytest.raises(QueryError):
         stores[0].find(query)
+
+
+def test_roadscene2vec_can_be_kept_and_asked(stores) -> None:
+    store, _ = stores
+    with pytest.raises(QueryNameError):
+        store.find("USING ABSTRACTION roadscene2vec MATCH (e:Ego)")
+    (first,) = keep_abstraction(store.file.path, "RoadScene2Vec")
+    (again,) = keep_abstraction(store.file.path, "roadscene2vec")
+    found = store.find(
+        "USING ABSTRACTION roadscene2vec MATCH (a)-[r]->(b:Ego) RETURN frame.seq, a.id, type(r)"
+    ).rows()
+    wanted = {
+        (seq, int(a.rsplit("_", 1)[1]), label)
+        for seq in range(0, 200, 40)
+        for a, b, label in store.graph(f"town#{seq}", abstraction="roadscene2vec").edges(
+            data="label"
+        )
+        if b == "ego_car"
+    }
+
+    assert (first.status, again.status) == ("derived", "present")
+    assert {row for row in found if row[0] in range(0, 200, 40)} == wanted
+    assert wanted
+    assert not store.file.verify().faults
+    with pytest.raises(AbstractionError, match="as it is"):
+        keep_abstraction(store.file.path, "RSV")
+
+
+def test_the_verb_derives_lists_and_removes(stores, tmp_path, capsys) -> None:
+    store, _ = stores
+    config = tmp_path / "near.toml"
+    config.write_text("[pairs]\nwithin = 5\n", encoding="utf-8")
+    path = str(store.file.path)
+
+    assert run(["derive", path, "--config", str(config), "--as", "near5"]) == 0
+    assert run(["derive", path, "--json"]) == 0
+    assert '"near5"' in capsys.readouterr().out
+    assert run(["derive", path, "--config", str(config), "--as", "RSV"]) == 1
+    assert run(["derive", path, "--config", str(config)]) == 2
+    config.write_text("[range]\nradius = 500\n", encoding="utf-8")
+    assert run(["derive", path, "--config", str(config), "--as", "far"]) == 2
+    assert "ingest the recording anew" in capsys.readouterr().err
+    assert run(["derive", path, "--remove", "near5"]) == 0
+    assert run(["derive", path, "--remove", "near5"]) == 1

@@ -383,6 +383,24 @@ class Labelled:
             tuple(tuple(int(renumbered[label]) for label in bundle) for bundle in bundles),
         )
 
+    def related(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Edges whose label is a relation, one row each: frame, source, code of the relation, destination."""
+        code = {name: i for i, name in enumerate(RELATIONS)}
+        parts = [(code.get(text, -1),) for text in self.labels]
+        bundles = [tuple(parts[label][0] for label in bundle) for bundle in self.bundles]
+        several = parts + bundles[::-1]  # a label below zero counts from the end
+        many = np.array([len(of) for of in several] or [0])
+        starts = np.cumsum(many) - many
+        flat = np.array([one for of in several for one in of] or [-1], np.int64)
+        index = np.where(self.label < 0, len(several) + self.label, self.label)
+        count = many[index]
+        edge = np.repeat(np.arange(len(index)), count)
+        within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+        relation = flat[starts[index[edge]] + within] if len(edge) else edge
+        known = relation >= 0
+        edge = edge[known]
+        return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
+
     def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
         """One of the frames by names: nodes ``name → label``, and edges ``(name, label, name)``.
 

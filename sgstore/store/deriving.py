@@ -19,7 +19,7 @@ from sgstore.store import packing
 from sgstore.store.adding import add_files, note, writing
 from sgstore.store.packing import FRAME_BITS, NodeKinds, Origin, as_json, texts
 from sgstore.store.rows import run
-from sgstore.store.seen import filled
+from sgstore.store.seen import Graphs, filled
 from sgstore.store.staging import Staging
 from sgstore.store.traces import trace_named
 from sgstore.vocabulary import folded
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
+    from sgstore.abstractions import Labelled, Seen
     from sgstore.graph import GraphBlock
     from sgstore.store.access import Access
     from sgstore.store.packing import Columns
@@ -123,6 +124,11 @@ class Deriving:
         with self._access.reading() as connection:
             reader = _Reader(connection, trace_id)
             yield from reader.blocks()
+
+    def seen(self, trace_id: int) -> Iterator[tuple[Ints, Seen]]:
+        """The graphs of a trace as they were ingested: numbers of frames, and what abstractions see of them."""
+        with self._access.reading() as connection:
+            yield from Graphs().of_trace(connection, trace_id)
 
     def building(self, name: str, trace_id: int) -> Building:
         """A place for a new set of a trace; a context manager."""
@@ -217,6 +223,10 @@ class Building:
                 " WHERE t.trace_id = ? ORDER BY n.node_id DESC",
                 [trace_id],
             ).fetchnumpy()
+            static = connection.execute(
+                "SELECT node_id FROM entity WHERE trace_id = ? AND is_static", [trace_id]
+            ).fetchnumpy()
+        self._static = static["node_id"].astype(np.int64)
         self._kinds.map = kinds["kind"].astype(np.int8)
 
     def __enter__(self) -> Building:
@@ -244,6 +254,50 @@ class Building:
         }
         self._insert("derived_node", moving)
         self._insert("derived_edge", packing.edge_columns(graph, self._trace_id, self._kinds))
+
+    def append_labelled(self, seq: Ints, seen: Seen, graphs: Labelled) -> None:
+        """Add the next frames as an abstraction has them: those of its nodes and edges that a store can hold.
+
+        These are nodes of the scene graph, and edges between them that are labelled with a relation.
+        """
+        self._staging.settle(whole=True)
+        rows = seen.row_of(graphs.node_frame, graphs.node)
+        rows = rows[rows >= 0]
+        bucket = packing.trace_bucket(self._trace_id, seq)
+        at, node, kind = seen.node_frame[rows], seen.node[rows], seen.kind[rows]
+        first, mask = packing.masks_of((bucket[at], node), seq[at] % BUCKET_FRAMES)
+        self._insert(
+            "derived_node",
+            {
+                "kind": kind[first],
+                "bucket": bucket[at][first],
+                "node_id": node[first],
+                "mask": mask,
+                "moves": (node[first] >= 0) & ~np.isin(node[first], self._static),
+            },
+        )
+        frame, src, relation, dst = graphs.related()
+        a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
+        both = np.flatnonzero((a >= 0) & (b >= 0))
+        frame, relation, a, b = frame[both], relation[both], a[both], b[both]
+        of_ego = seen.is_ego[a] * 2 + seen.is_ego[b]
+        keys = (relation, of_ego, bucket[frame], seen.node[a], seen.node[b])
+        first, mask = packing.masks_of(keys, seq[frame] % BUCKET_FRAMES)
+        a, b = a[first], b[first]
+        self._insert(
+            "derived_edge",
+            {
+                "relation": relation[first],
+                "src_is_ego": seen.is_ego[a],
+                "dst_is_ego": seen.is_ego[b],
+                "src_kind": seen.kind[a],
+                "dst_kind": seen.kind[b],
+                "bucket": bucket[frame][first],
+                "src": seen.node[a],
+                "dst": seen.node[b],
+                "mask": mask,
+            },
+        )
 
     def _insert(self, table: str, columns: Columns) -> None:
         named = texts([self._name])
