@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import lzma
 import os
 import random
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -296,3 +299,30 @@ def test_an_edge_to_nowhere_is_a_defect_that_is_told() -> None:
 
     with pytest.raises(ValueError, match="no node of its frame"):
         classes_of(graph)
+
+
+@pytest.mark.parametrize(
+    ("name", "different"),
+    [
+        ("carla_max_vehicle_v3_Town02", 1254),
+        ("carla_zero_vehicle_v3_Town02", 3),
+        ("carla_zero_vehicle_v3_Town04", 6),
+        ("carla_zero_vehicle_v3", 8),
+    ],
+)
+def test_published_representatives_of_classes_have_classes_of_their_own(
+    data, name, different
+) -> None:
+    """S3C (Woodlief et al., 2024) published one graph for each class of isomorphic ones."""
+    graphs: dict[str, nx.MultiDiGraph] = {}
+    with lzma.open(data / "s3c" / f"{name}.csv.xz", "rt", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            graph = graphs.setdefault(row["sg"], nx.MultiDiGraph())
+            for node in (row["node1"], row["node2"]):
+                graph.add_node(node, label=re.sub(r"_\d+$", "", node))
+            graph.add_edge(row["node1"], row["node2"], label=row["edge"])
+    found = classes_of(
+        labelled([nx.convert_node_labels_to_integers(graph) for graph in graphs.values()])
+    )
+
+    assert len(graphs) == len(set(found)) == different
