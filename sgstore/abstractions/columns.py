@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.abstractions.roles import Strands
+from sgstore.roads.lanetypes import DRIVING
 from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, KIND_CODE, KINDS, PROXIMITY, RELATIONS
 
 if TYPE_CHECKING:
@@ -103,14 +104,7 @@ class Grounds:
     @cached_property
     def driving(self) -> Bools:
         """(K,): whether it is a lane that is driven on."""
-        return (self.kind == _LANE) & np.isin(self.lane_type, DRIVEN)
-
-
-DRIVEN: Final = (
-    *("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"),
-    *("bidirectional", "bus", "taxi", "HOV"),
-)
-"""Types of lanes that traffic drives on."""
+        return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
