@@ -130,7 +130,8 @@ def killed_and_resumed(
         others = [table for table in expected if found[table] != expected[table]]
         assert others == [], f"round {done['rounds']}: other rows in {others}"
         assert StoreFile(place / "s.db").verify().faults == []
-        assert [path.name for path in place.iterdir()] == ["s.db"]
+        beside = sorted(path.name for path in place.rglob("*"))
+        assert beside == ["s.db"], f"round {done['rounds']}, {jobs} jobs: {beside}"
         done["rounds"] += 1
     return done
 

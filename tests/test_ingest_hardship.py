@@ -19,7 +19,7 @@ from sgstore.store import StoreFile
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_store(tmp_path) -> None:
-    done = killed_and_resumed(tmp_path, kills=5, seed=int(time.time()), frames=70)
+    done = killed_and_resumed(tmp_path, kills=5, seed=5, frames=70)
 
     assert done["kills"] >= 5
 
@@ -125,3 +125,24 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_read(tmp_path
         ingest(tmp_path / place, [path])
 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d.mcap", "file"]
+
+
+def test_what_a_killed_writer_left_is_worked_in_by_the_next_run(tmp_path: Path) -> None:
+    recording = drive(tmp_path / "a.mcap", frames=20)
+    store = tmp_path / "s.db"
+    assert ingest(store, [recording])[0].status == "added"
+    code = (
+        "import duckdb, os, sys\n"
+        "c = duckdb.connect(sys.argv[1], config={'wal_autocheckpoint': '1TB'})\n"
+        "c.execute('PRAGMA disable_checkpoint_on_shutdown')\n"
+        "c.execute(\"INSERT INTO store_info VALUES ('test', 'kept')\")\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(store)], check=False)
+    (tmp_path / "s.db.gate").touch()
+    assert (tmp_path / "s.db.wal").exists()
+
+    assert ingest(store, [recording])[0].status == "present"
+
+    assert sorted(path.name for path in tmp_path.glob("s.db*")) == ["s.db"]
+    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values

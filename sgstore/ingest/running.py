@@ -114,6 +114,8 @@ class _Run:
         self._job = job
         self._paths = paths
         self._store = StoreFile(job.store) if job.store.exists() else None
+        if self._store is not None and not job.dry_run:
+            self._store.settle()
         self._meter = _Meter(paths, on_progress)
 
     def outcomes(self, jobs: int) -> list[TraceOutcome]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,7 +11,13 @@ import numpy as np
 
 from sgstore.errors import StoreError, TraceError
 from sgstore.store import rows, schema
-from sgstore.store.access import Access, default_memory, spill_folder, translated
+from sgstore.store.access import (
+    Access,
+    BusyError,
+    default_memory,
+    spill_folder,
+    translated,
+)
 from sgstore.store.classes import Abstracted
 from sgstore.store.deriving import Deriving
 from sgstore.store.folder import Folder
@@ -489,6 +495,21 @@ class StoreFile:
                 found.recordings = again.recordings
                 found.faults += again.faults
         return found
+
+    def settle(self) -> None:
+        """Work in what a writer that was killed left beside the store: it is safe, but no longer at rest.
+
+        Nothing is done if there is nothing, or if others keep the store for too long.
+        """
+        left = [self.path.with_name(f"{self.path.name}{ending}") for ending in (".wal", ".gate")]
+        if any(path.exists() for path in left):
+            database = scratch(spill_folder(), memory=self._memory)
+            with (
+                suppress(BusyError),
+                database as connection,
+                self._access.attached(connection),
+            ):
+                connection.execute("CHECKPOINT store")
 
     def compact(self) -> None:
         """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.

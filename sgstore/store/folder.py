@@ -44,6 +44,7 @@ class Folder:
     """
 
     def __init__(self, store: Path) -> None:
+        self._store = store
         _remove_dead(store)
         name = f"{store.name}{_NAME}{os.getpid()}"
         try:
@@ -81,6 +82,8 @@ class Folder:
         shutil.rmtree(self.path, ignore_errors=True)
         with suppress(OSError):
             os.close(self._lock)
+        # A worker may outlive its killed parent for a moment, and write into the folder while it is removed.
+        _remove_dead(self._store)
 
 
 def _remove_dead(store: Path) -> None:
