@@ -131,6 +131,15 @@ LANE_TYPES: Final = (
 )
 """Types of lanes. (ASAM OpenDRIVE 1.4 to 1.8, ``e_laneType``.)"""
 
+DRIVING: Final = frozenset(
+    {"driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"}
+    | {"bus", "taxi", "HOV", "mwyEntry", "mwyExit"}
+)
+"""Types of lanes that are made for motor traffic. (ASAM OpenDRIVE 1.4 to 1.8, lane types.)"""
+
+TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
+"""Types of lanes that have a direction of travel which matters to their neighbours."""
+
 LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
 """What a traffic light shows. ``flashing``: a bulb that flashes, whatever its colour."""
 

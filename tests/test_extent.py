@@ -17,9 +17,8 @@ from opendrive_maps import a_map, a_road, cubic, lane, line, link, section
 from sgstore.config import Config, Lanes, Pairs, Range, configured
 from sgstore.opendrive import read_map
 from sgstore.relations.extent import STEP, Extent, Places
-from sgstore.roads.lanetypes import DRIVING
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.vocabulary import KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
+from sgstore.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
 
 if TYPE_CHECKING:
     from sgstore.graph import GraphBlock

@@ -15,8 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.abstractions.roles import Strands
-from sgstore.roads.lanetypes import DRIVING
-from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, KIND_CODE, KINDS, PROXIMITY, RELATIONS
+from sgstore.vocabulary import (
+    DIRECTIONS,
+    DRIVING,
+    ENTITY_KINDS,
+    KIND_CODE,
+    KINDS,
+    PROXIMITY,
+    RELATIONS,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -14,7 +14,7 @@ import numpy as np
 
 from sgstore.opendrive.nodes import wide_pairs
 from sgstore.roads import LaneChanges
-from sgstore.roads.lanetypes import DRIVING
+from sgstore.vocabulary import DRIVING
 
 if TYPE_CHECKING:
     from sgstore.opendrive.document import Document

@@ -9,8 +9,9 @@ import numpy as np
 from sgstore.opendrive.grouped import last_before
 from sgstore.roads import STOREY, MapNodes
 from sgstore.roads.conflicts import conflicts
-from sgstore.roads.lanetypes import DRIVING, TRAFFIC, turn_words
 from sgstore.roads.ribbons import mean_widths, turned
+from sgstore.roads.turns import turn_words
+from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
     from sgstore.opendrive.document import Document

@@ -19,7 +19,7 @@ import numpy as np
 from sgstore.opendrive.nodes import FIRST_LANE, speed
 from sgstore.opendrive.places import node_columns, standing
 from sgstore.roads import MapNodes
-from sgstore.roads.lanetypes import DRIVING
+from sgstore.vocabulary import DRIVING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

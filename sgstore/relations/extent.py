@@ -15,8 +15,7 @@ import numpy as np
 
 from sgstore.geometry import gap, gap_to_points
 from sgstore.relations.scene import IS_SIGNAL, joined, spread
-from sgstore.roads.lanetypes import DRIVING
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE
+from sgstore.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

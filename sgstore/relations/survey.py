@@ -17,8 +17,7 @@ from sgstore.relations.lanenet import LaneNet
 from sgstore.relations.scene import IS_SIGNAL, Bodies, Ground, Standing, joined, kinds_mask
 from sgstore.relations.upstream import SignalReach
 from sgstore.roads import OFF_ROAD, LaneHits
-from sgstore.roads.lanetypes import DRIVING
-from sgstore.vocabulary import ENTITY_KINDS, RELATION_CODE, VEHICLES
+from sgstore.vocabulary import DRIVING, ENTITY_KINDS, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

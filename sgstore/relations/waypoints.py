@@ -20,9 +20,8 @@ import numpy as np
 from sgstore.errors import ConfigError
 from sgstore.relations.scene import spread
 from sgstore.roads import MapEdges, MapNodes, RoadMap
-from sgstore.roads.lanetypes import DRIVING
 from sgstore.roads.points import point_shapes
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE
+from sgstore.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
     from sgstore.config import Lanes

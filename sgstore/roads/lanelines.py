@@ -17,7 +17,6 @@ import shapely
 
 from sgstore.errors import MapError
 from sgstore.roads.lanes import PlainLane
-from sgstore.roads.lanetypes import DRIVING, TRAFFIC
 from sgstore.roads.sections import (
     APART,
     WIDE,
@@ -29,6 +28,7 @@ from sgstore.roads.sections import (
     thinned,
     way_between,
 )
+from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

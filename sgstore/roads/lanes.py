@@ -14,9 +14,9 @@ import numpy as np
 
 from sgstore.roads import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap
 from sgstore.roads.conflicts import conflicts
-from sgstore.roads.lanetypes import DRIVING, turn_words
 from sgstore.roads.ribbons import Ribbons, mean_widths, turned, wrapped
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.roads.turns import turn_words
+from sgstore.vocabulary import DRIVING, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -1,4 +1,4 @@
-"""Types of lanes and the words for their turns: what they mean, whatever a map was read from."""
+"""The words for the turns of lanes, whatever a map was read from."""
 
 from __future__ import annotations
 
@@ -8,14 +8,6 @@ import numpy as np
 
 if TYPE_CHECKING:
     from sgstore.world import Floats
-
-DRIVING: Final = frozenset(
-    {"driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"}
-    | {"bus", "taxi", "HOV", "mwyEntry", "mwyExit"}
-)
-"""Types of lanes that are made for motor traffic. (ASAM OpenDRIVE 1.4 to 1.8, lane types.)"""
-TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
-"""Types of lanes that have a direction of travel which matters to their neighbours."""
 
 STRAIGHT: Final = np.radians(30.0)
 """A lane through a junction that turns by less goes straight on; rad."""
