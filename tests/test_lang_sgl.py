@@ -148,3 +148,16 @@ def test_carla_steers_to_the_other_side() -> None:
 def test_what_is_not_sgl_is_refused_with_its_place(text: str, reason: str) -> None:
     with pytest.raises(QueryError, match=reason.replace("\\\\", "\\")):
         translated(text)
+
+
+def test_what_stands_in_one_another_without_end_is_refused() -> None:
+    chain = "\n".join(f'a{i + 1} = P.relSet(a{i}, "near")' for i in range(2000))
+    doubled = "\n".join(f"a{i + 1} = P.union(a{i}, a{i})" for i in range(40))
+    asked = "x = P.gt(P.size(a{}), 0)"
+
+    with pytest.raises(QueryError, match="too much stands in one another"):
+        translated(f'a0 = "Ego"\n{chain}\n{asked.format(2000)}')
+    with pytest.raises(QueryError, match="more than 100000 calls"):
+        translated(f'a0 = "Ego"\n{doubled}\n{asked.format(40)}')
+    with pytest.raises(QueryError, match="too much stands in one another"):
+        translated(f"Property('p', '{'(' * 20000}q', [('q', P.gt(1, 0))])")

@@ -33,6 +33,10 @@ _NAMED_ROADS: Final = 150
 _SIGNAL: Final = 3.4
 
 
+_TOLD: Final = 11
+"""Kinds of parts of a map that have room in one line."""
+
+
 def paint_atlas(page: Page, road_map: RoadMap, window: Rect, side: Rect) -> str:
     """Draw a map in a window, and its figures and legend beside it; returns a line that sums it up.
 
@@ -158,4 +162,5 @@ def _summary(ground: Ground) -> str:
     extent = np.ptp(np.concatenate(low_high), axis=0) if low_high else np.zeros(2)
     order = [kind for kind in (*MAP_KINDS, *ENTITY_KINDS) if kinds[kind] and kind != "off_road"]
     told = [counted(kinds[kind], kind.replace("_", " ")) for kind in order]
-    return "  ·  ".join([f"{extent[0]:.0f} m by {extent[1]:.0f} m", *told[:11]])
+    more = [f"and {len(told) - _TOLD} kinds more"] if len(told) > _TOLD else []
+    return "  ·  ".join([f"{extent[0]:.0f} m by {extent[1]:.0f} m", *told[:_TOLD], *more])

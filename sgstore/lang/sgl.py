@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 MAX_TEXT: Final = 1 << 20
 """Longest text that is translated; characters."""
 
-MAX_DEPTH: Final = 100
-"""Deepest nesting of calls."""
+MAX_NAMES: Final = 100
+"""Longest chain of names that stand for one another."""
+
+MAX_CALLS: Final = 100_000
+"""Most calls that are translated: a name stands for all that it means, each time."""
 
 MAX_TIMES: Final = 10_000
 """Most frames that ``$[N][…]`` may count."""
@@ -84,7 +87,10 @@ def translated(text: str) -> str:
         tree = ast.parse(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise QueryError(f"this is no Python: {error}") from None
-    return _Translation(text).all(tree)
+    try:
+        return _Translation(text).all(tree)
+    except RecursionError:
+        raise QueryError("too much stands in one another, perhaps by way of names") from None
 
 
 @dataclass
@@ -107,7 +113,7 @@ class _Translation:
         self._text = text
         self._names: dict[str, ast.expr] = {}
         self._numbers = 0
-        self._depth = 0
+        self._calls = 0
         self._defined: dict[str, str] = {}
 
     def all(self, tree: ast.Module) -> str:
@@ -330,7 +336,7 @@ class _Translation:
 
     def _resolved(self, value: ast.expr) -> ast.expr:
         """What a name stands for."""
-        for _ in range(MAX_DEPTH):
+        for _ in range(MAX_NAMES):
             if not isinstance(value, ast.Name) or value.id not in self._names:
                 return value
             value = self._names[value.id]
@@ -341,9 +347,9 @@ class _Translation:
         value = self._resolved(value)
         if not isinstance(value, ast.Call):
             raise self._refused("expected a call", value)
-        self._depth += 1
-        if self._depth > MAX_TEXT // 10:
-            raise self._refused("too much is nested", value)
+        self._calls += 1
+        if self._calls > MAX_CALLS:
+            raise self._refused(f"more than {MAX_CALLS} calls, by way of names", value)
         name, arguments = _function(value), [*value.args, *(k.value for k in value.keywords)]
         if name == "partial" and arguments:
             return _last_name(arguments[0]), arguments[1:]
@@ -407,7 +413,6 @@ class _Ltl:
         self._defined = {folded(name): name for name in defined}
         self._tokens = self._read(text)
         self._at = 0
-        self._deep = 0
 
     def text(self) -> str:
         found = self._binary(0)
@@ -449,9 +454,6 @@ class _Ltl:
         return left
 
     def _unary(self) -> str:
-        self._deep += 1
-        if self._deep > MAX_DEPTH * MAX_DEPTH:
-            raise self._refused("the formula is too long")
         word = self._take()
         if word in _UNARY:
             return f"{_UNARY[word]} ({self._unary()})"
