@@ -11,7 +11,7 @@ belong to the road map (:mod:`sgstore.roads`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,27 @@ Bools = NDArray[np.bool_]
 
 BUCKET_FRAMES = 60
 """Frames that one mask of the store covers; blocks that start at multiples of it are stored best."""
+
+
+POSE: Final = (
+    "x",
+    "y",
+    "z",
+    "heading",
+    "pitch",
+    "roll",
+    "vx",
+    "vy",
+    "vz",
+    "ax",
+    "ay",
+    "az",
+    "yaw_rate",
+    "length",
+    "width",
+    "height",
+)
+"""Columns of :class:`States` that say where a body is, how it moves and how large it is, in order."""
 
 
 @dataclass(frozen=True, slots=True)

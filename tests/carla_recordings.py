@@ -16,10 +16,10 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
-from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 from mcap_ros2._dynamic import serialize_dynamic
 from opendrive_maps import a_map, a_road, element, line
+from recordings import COMPRESSIONS
 
 from sgstore.traces import open_trace
 from sgstore.vocabulary import KINDS
@@ -29,12 +29,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.world import FrameBlock, TraceInfo, TraceReport
-
-COMPRESSIONS = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "": CompressionType.NONE,
-}
 
 DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",

@@ -21,12 +21,12 @@ from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house
 
 from sgstore.errors import TraceError
 from sgstore.traces import frames, open_trace
-from sgstore.traces.frames import POSE, derive
+from sgstore.traces.frames import derive
 from sgstore.traces.osi_lights import lit, shown
 from sgstore.traces.osi_objects import MovingObjects, light_bits
 from sgstore.traces.osi_schema import message_class
 from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
-from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
+from sgstore.world import POSE, FrameBlock, States, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,6 +17,7 @@ from sgstore.vocabulary import (
     kinds_labelled,
     suggestion,
 )
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -25,27 +26,7 @@ if TYPE_CHECKING:
     from sgstore.world import FrameBlock, States
 
 _NAN: Final = math.nan
-NUMBERS: Final = (
-    "x",
-    "y",
-    "z",
-    "heading",
-    "pitch",
-    "roll",
-    "vx",
-    "vy",
-    "vz",
-    "ax",
-    "ay",
-    "az",
-    "yaw_rate",
-    "length",
-    "width",
-    "height",
-    "steer",
-    "throttle",
-    "brake",
-)
+NUMBERS: Final = (*POSE, "steer", "throttle", "brake")
 WHOLE: Final = ("lights", "light_state", "derived")
 """Columns of :attr:`Entity.numbers` and of :attr:`Entity.whole`, as :class:`sgstore.world.States` has them."""
 _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}

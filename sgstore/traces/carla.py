@@ -11,7 +11,7 @@ list of actors without a place, and are left out; signs come from the road map.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar
 
 from sgstore.errors import MapError, TraceError
 from sgstore.opendrive import read_map
@@ -20,8 +20,8 @@ from sgstore.traces.carla_frames import FrameDecoder
 from sgstore.traces.carla_lights import signals_of
 from sgstore.traces.carla_survey import Survey
 from sgstore.traces.fetch import digest_of
-from sgstore.traces.frames import assemble, counted
-from sgstore.traces.references import FrameRefs, channels_of, refs_of
+from sgstore.traces.opened import Opened
+from sgstore.traces.references import channels_of, refs_of
 from sgstore.world import TraceInfo, TraceReport
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sgstore.world import FrameBlock
 
 
-class CarlaTrace:
+class CarlaTrace(Opened):
     """A recording of CARLA's ROS bridge.
 
     Parameters
@@ -94,16 +94,6 @@ class CarlaTrace:
         """Whether one of the channels carries lists of objects."""
         return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._recording.close()
-
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
         """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
 
@@ -124,14 +114,8 @@ class CarlaTrace:
             window=window,
             report=report,
         )
-        runs = self._recording.walk(report)
-        refs = FrameRefs(self.info.channels, window)
-        yield from counted(assemble(runs, size, decoder.channels, decoder, refs), report)
-        decoder.settle()
-        if not report.frames:
-            reason = report.losses[0].reason if report.losses else "it has no messages"
-            topic = self._survey.topic(self._leading)
-            raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
+        topic = self._survey.topic(self._leading)
+        yield from self._told(decoder, size, report, topic)
 
     def _find_signals(self) -> dict[int, str]:
         """Which signals of the recording's own map its traffic lights are."""

@@ -40,8 +40,9 @@ from sgstore.traces.carla_events import EVENTS, Events
 from sgstore.traces.carla_lights import Lights
 from sgstore.traces.carla_survey import SAME_TICK
 from sgstore.traces.cdr import Fields, Table, decode
-from sgstore.traces.frames import FAR, NAN, POSE, FrameRows, Roster
+from sgstore.traces.frames import FAR, NAN, FrameRows, Roster
 from sgstore.traces.tally import Tally
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -416,7 +417,7 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
     Returns
     -------
     values : (n, 16) float64
-        Columns :data:`sgstore.traces.frames.POSE`.
+        Columns :data:`sgstore.world.POSE`.
     usable : (n,) bool
         Whether there is a position on earth, and a quaternion that is one.
     """
@@ -462,7 +463,7 @@ def _boxes(shape: Floats, size: Floats) -> Floats:
 
 
 def _pose_of(odometry: Floats) -> Floats:
-    """Columns :data:`sgstore.traces.frames.POSE` of an odometry: without a box, so at the vehicle's origin."""
+    """Columns :data:`sgstore.world.POSE` of an odometry: without a box, so at the vehicle's origin."""
     values = np.full(len(POSE), np.nan)
     angles, _ = _turned(odometry[None, 3:7])
     values[:3], values[3:6] = odometry[:3], angles[0]

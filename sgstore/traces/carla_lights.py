@@ -15,8 +15,9 @@ import numpy as np
 
 from sgstore.traces.carla_channels import ident_of
 from sgstore.traces.cdr import number, records
-from sgstore.traces.frames import FAR, NAN, POSE
+from sgstore.traces.frames import FAR, NAN
 from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

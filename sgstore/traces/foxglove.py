@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
@@ -22,8 +22,8 @@ from sgstore.traces.foxglove_axes import ORIGIN, STILL, Axes
 from sgstore.traces.foxglove_frames import FrameDecoder, Names
 from sgstore.traces.foxglove_mapping import Mapping, mapping_for
 from sgstore.traces.foxglove_messages import ERRORS, SCENE, Reader, encoding_of
-from sgstore.traces.frames import assemble, counted
-from sgstore.traces.references import FrameRefs, Ref, channels_of, ref_of, refs_of
+from sgstore.traces.opened import Opened
+from sgstore.traces.references import Ref, channels_of, ref_of, refs_of
 from sgstore.world import TraceInfo, TraceReport
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ EGO_AXES: Final = ("base_link", "ego_vehicle", "ego", "hero")
 """Axes that move with the ego where no mapping says which do."""
 
 
-class FoxgloveTrace:
+class FoxgloveTrace(Opened):
     """A recording of Foxglove scenes.
 
     Parameters
@@ -115,16 +115,6 @@ class FoxgloveTrace:
                 return True
         return False
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._recording.close()
-
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
         """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
 
@@ -144,14 +134,8 @@ class FoxgloveTrace:
             self._recording.window,
             report,
         )
-        refs = FrameRefs(self.info.channels, self._recording.window)
-        runs = self._recording.walk(report)
-        yield from counted(assemble(runs, size, decoder.channels, decoder, refs), report)
-        decoder.settle()
-        if not report.frames:
-            reason = report.losses[0].reason if report.losses else "it has no messages"
-            topic = self._recording.channels[self._leading].topic
-            raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
+        topic = self._recording.channels[self._leading].topic
+        yield from self._told(decoder, size, report, topic)
 
     def _role(self, channel: int) -> str:
         return "ground_truth" if channel == self._leading else "payload"

@@ -19,9 +19,10 @@ import numpy as np
 from sgstore.traces.foxglove_axes import Axes, angles, product, rotated
 from sgstore.traces.foxglove_mapping import METADATA, type_keys
 from sgstore.traces.foxglove_messages import ERRORS, SCENE
-from sgstore.traces.frames import FAR, NAN, POSE, FrameRows, Roster
+from sgstore.traces.frames import FAR, NAN, FrameRows, Roster
 from sgstore.traces.tally import Tally
 from sgstore.vocabulary import LIGHT_STATE_CODE, folded
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from sgstore.traces.chunks import Messages

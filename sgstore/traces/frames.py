@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 import numpy as np
 
 from sgstore.vocabulary import KIND_CODE
-from sgstore.world import Entities, FrameBlock, MessageRefs, States
+from sgstore.world import POSE, Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -29,26 +29,6 @@ if TYPE_CHECKING:
 Raw = TypeVar("Raw")
 
 NAN: Final = float("nan")
-POSE: Final = (
-    "x",
-    "y",
-    "z",
-    "heading",
-    "pitch",
-    "roll",
-    "vx",
-    "vy",
-    "vz",
-    "ax",
-    "ay",
-    "az",
-    "yaw_rate",
-    "length",
-    "width",
-    "height",
-)
-"""Columns of :attr:`FrameRows.values`, in order; units as in :class:`sgstore.world.States`."""
-
 FAR: Final = 1e9
 """Greatest coordinate of anything on earth, in any projection; m. Beyond it a pose is not usable."""
 
@@ -194,9 +174,16 @@ class Decoder(Protocol[Raw]):
     ----------
     roster : Roster
         Takes up entities while messages are decoded.
+    channels : collection of int
+        Ids of the channels whose messages it asks for.
     """
 
     roster: Roster
+
+    @property
+    def channels(self) -> Collection[int]:
+        """Those channels."""
+        ...
 
     def decode(self, run: Messages, row: int) -> Raw | None:
         """The frame that a message is, or ``None`` if it is none."""
@@ -208,6 +195,10 @@ class Decoder(Protocol[Raw]):
         Each has been followed by another, or by the end of the recording: what belongs to the same instant
         may stand behind the message that leads.
         """
+        ...
+
+    def settle(self) -> None:
+        """Report what could not be used, once all frames are read."""
         ...
 
 

@@ -11,15 +11,15 @@ Source: open-simulation-interface 3.8.0; omega-prime specification.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar
 
 from sgstore.errors import TraceError
 from sgstore.traces.fetch import digest_of
-from sgstore.traces.frames import assemble, counted
+from sgstore.traces.opened import Opened
 from sgstore.traces.osi_frames import FrameDecoder
 from sgstore.traces.osi_schema import GROUND_TRUTH, ROAD_MAP, SENSOR_VIEW
 from sgstore.traces.osi_survey import Survey, schema_name, survey
-from sgstore.traces.references import FrameRefs, channels_of, refs_of
+from sgstore.traces.references import channels_of, refs_of
 from sgstore.world import TraceInfo, TraceReport
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sgstore.world import FrameBlock
 
 
-class OsiTrace:
+class OsiTrace(Opened):
     """A recording of OSI ground truth.
 
     Parameters
@@ -80,16 +80,6 @@ class OsiTrace:
         names = {schema_name(recording, channel) for channel in recording.channels}
         return bool(names & {GROUND_TRUTH, SENSOR_VIEW})
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._recording.close()
-
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
         """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
 
@@ -101,15 +91,8 @@ class OsiTrace:
         report = self.report = TraceReport()
         report.warnings += self._survey.notes
         decoder = FrameDecoder(self._survey, self._leading, self._ego, report)
-        runs = self._recording.walk(report)
-        refs = FrameRefs(self.info.channels, self._recording.window)
-        blocks = assemble(runs, size, decoder.channels, decoder, refs)
-        yield from counted(blocks, report)
-        decoder.settle()
-        if not report.frames:
-            reason = report.losses[0].reason if report.losses else "it has no messages"
-            topic = self._recording.channels[self._leading].topic
-            raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
+        topic = self._recording.channels[self._leading].topic
+        yield from self._told(decoder, size, report, topic)
 
     def _info(self, found: Survey, digest: str) -> TraceInfo:
         recording = self._recording

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.traces.frames import NAN, POSE, FrameRows, Roster
+from sgstore.traces.frames import NAN, FrameRows, Roster
 from sgstore.traces.osi_cast import is_key, keys_of
 from sgstore.traces.osi_environment import Environment
 from sgstore.traces.osi_lights import TrafficLights
@@ -29,7 +29,7 @@ from sgstore.traces.osi_schema import DECODE_ERRORS, enum_name, ground_truth_of,
 from sgstore.traces.osi_statics import UNTOLD
 from sgstore.traces.tally import Tally
 from sgstore.vocabulary import TypeMeaning, type_meanings
-from sgstore.world import Loss
+from sgstore.world import POSE, Loss
 
 if TYPE_CHECKING:
     from sgstore.traces.chunks import Messages

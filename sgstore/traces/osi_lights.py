@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.traces.frames import FAR, NAN, POSE
+from sgstore.traces.frames import FAR, NAN
 from sgstore.traces.osi_schema import enum_name, has_field, map_ref, static_pose
 from sgstore.vocabulary import LIGHT_STATE_CODE, TypeMeaning
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

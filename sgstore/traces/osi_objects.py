@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.traces.frames import FAR, POSE
+from sgstore.traces.frames import FAR
 from sgstore.traces.osi_fields import fields_of
 from sgstore.traces.osi_schema import DECODE_ERRORS
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -128,7 +129,7 @@ class MovingObjects:
         Returns
         -------
         values : (n, 16) float64
-            Columns :data:`sgstore.traces.frames.POSE`; NaN where the sub-message is missing, 0 where only
+            Columns :data:`sgstore.world.POSE`; NaN where the sub-message is missing, 0 where only
             the number is.
         usable : (n,) bool
             Whether there is a position on earth, and an orientation that is a number if there is one. What is

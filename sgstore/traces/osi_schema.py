@@ -240,7 +240,7 @@ def map_ref(thing: Any) -> str:
 
 
 def static_pose(base: Any) -> tuple[float, ...] | None:
-    """Pose and size of what does not move: the columns of :data:`sgstore.traces.frames.POSE`.
+    """Pose and size of what does not move: the columns of :data:`sgstore.world.POSE`.
 
     Without an orientation or dimension those are NaN. ``None`` if there is no usable position.
     """
