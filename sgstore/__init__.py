@@ -33,7 +33,8 @@ if TYPE_CHECKING:
         StoreError,
         TraceError,
     )
-    from sgstore.query import Matches, Store
+    from sgstore.matches import Matches
+    from sgstore.query import Store
     from sgstore.world import Clip
 
 _HOMES: Final = {
@@ -42,7 +43,7 @@ _HOMES: Final = {
     "ConfigError": "errors",
     "ExportError": "errors",
     "MapError": "errors",
-    "Matches": "query",
+    "Matches": "matches",
     "QueryError": "errors",
     "SgstoreError": "errors",
     "Store": "query",

@@ -16,7 +16,7 @@ from sgstore.query import Store
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sgstore.query import Interval
+    from sgstore.matches import Interval
 
     Say = Callable[[str], object]
 

@@ -5,32 +5,21 @@
     store = sgstore.open("drives.sgstore")
     for frame_id, trace, seq, time_ns, t, e, *rest in store.find("MATCH (e:Ego)-[:near_coll]->(:Person)"):
         ...
-
-Results are streams: they come window by window over the buckets of the store, in windows that grow, so that the
-first rows come at once and memory does not grow with their number.
 """
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from importlib import import_module
-from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, overload
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, overload
 
 from sgstore.abstractions import abstractions
-from sgstore.errors import MissingExtraError
 from sgstore.graph import named_graph
-from sgstore.lang import Compiled, compile_query
-from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
-from sgstore.lang.phases import Window
-from sgstore.lang.results import EXTENTS
+from sgstore.lang import compile_query
+from sgstore.matches import Matches
 from sgstore.store import FrameRef, StoreFile
 from sgstore.vocabulary import folded
-from sgstore.world import Clip
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
     from pathlib import Path
 
     import networkx as nx
@@ -40,52 +29,8 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog
     from sgstore.lang.evaluation import FrameView
     from sgstore.lang.pattern import Pattern
-    from sgstore.lang.results import Statement
     from sgstore.lang.whynot import WhyNot
     from sgstore.store import Rows, StoredTrace
-
-FIRST_WINDOW: Final = 64
-"""Buckets of the first window: 3,840 frames."""
-
-BUCKET_SHIFT: Final = 6
-"""``frame_id >> 6`` is the bucket of a frame."""
-
-LAST_WINDOW: Final = 16_384
-"""Buckets of the largest window: a million frames."""
-
-ROWS: Final = 200_000
-"""Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Consecutive frames of a trace in which something holds.
-
-    Attributes
-    ----------
-    trace : str
-        Name of the trace.
-    start_seq, end_seq : int
-        First and last frame.
-    start_ns, end_ns : int
-        Their simulation times.
-    start, end : float
-        The same since the trace began; s.
-    frames : int
-        How many there are.
-    values : dict
-        What stays the same: bindings, or the values after ``RETURN``.
-    """
-
-    trace: str
-    start_seq: int
-    end_seq: int
-    start_ns: int
-    end_ns: int
-    start: float
-    end: float
-    frames: int
-    values: dict[str, Any]
 
 
 class Store:
@@ -136,11 +81,12 @@ class Store:
             The text is no query, or names what the store does not know; it says where, and what would be right.
         """
         if isinstance(query, str):
-            return Matches(self, query, parameters)
+            return Matches(self.file, self.catalog, query, parameters)
         from sgstore.lang.pattern import Pattern
 
         pattern = query if isinstance(query, Pattern) else Pattern.of(query)
-        return Matches(self, str(pattern), {**pattern.parameters, **parameters})
+        given = {**pattern.parameters, **parameters}
+        return Matches(self.file, self.catalog, str(pattern), given)
 
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None
@@ -290,286 +236,6 @@ class Store:
         whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}
         whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
         return FrameView(self.file.graph(frame.frame_id), about, whole)
-
-
-class Matches:
-    """What matches a query. Iterating gives rows; each way of asking searches anew.
-
-    ``count``, ``frames`` and ``clips`` speak of the frames in which the pattern holds, whatever ``RETURN``
-    says; of a query that lists a limited number of rows, of the frames of these rows.
-
-    Attributes
-    ----------
-    columns : tuple of str
-        Names of the columns of the rows. Without ``RETURN``: ``frame_id``, ``trace``, ``seq``, ``time_ns``,
-        ``t`` (seconds since the trace began), then for each variable its node id, and its name under
-        ``….name``.
-    left_out : tuple of str
-        Traces that cannot answer the query, because a relation that it names is not known of them.
-    """
-
-    def __init__(self, store: Store, text: str, parameters: Mapping[str, object]) -> None:
-        self._store = store
-        self._file = store.file
-        self._text = text
-        self._parameters = parameters
-        self._ready: Compiled | None = None
-        with self._compiled() as compiled:
-            self.columns = compiled.columns
-            self.left_out = compiled.left_out
-
-    @contextmanager
-    def _compiled(self) -> Generator[Compiled]:
-        """The query compiled for the store as it is; the store stays so until this is left.
-
-        What a store holds decides which SQL is right, so a query is compiled anew when the file has changed.
-        """
-        with self._file.snapshot():
-            catalog = self._store.catalog()
-            if self._ready is None or self._ready.stored is not catalog:
-                self._ready = compile_query(self._text, catalog, self._parameters)
-            yield self._ready
-
-    def __iter__(self) -> Iterator[tuple[Any, ...]]:
-        return self._stream(Compiled.rows)
-
-    def rows(self) -> list[tuple[Any, ...]]:
-        """All rows at once."""
-        return list(self)
-
-    def count(self) -> int:
-        """The number of distinct frames."""
-        with self._compiled() as compiled:
-            if compiled.limited_to_frames is not None:
-                return len({row[0] for row in self._frames()})
-            statement = compiled.count()
-            return self._file.rows(statement.sql, statement.values).values[0][0]
-
-    def frames(self) -> Iterator[FrameRef]:
-        """The distinct frames, in order of trace and number; of limited rows, in the order of the rows."""
-        for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
-            yield FrameRef(frame_id, frame_id >> 24, trace, seq, time_ns, log_time_ns, t)
-
-    def _frames(self) -> Iterator[tuple[Any, ...]]:
-        with self._compiled() as compiled:
-            limited = compiled.limited_to_frames
-            if limited is None:
-                yield from self._stream(Compiled.frames, "frames")
-                return
-            rows = self._stream(lambda _, window: limited.rows(window))
-            found = ((*row[: len(FRAME_COLUMNS)], row[-1]) for row in rows)
-            yield from dict.fromkeys(found)
-
-    def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """What the variables of nodes are bound to in one frame, whatever ``RETURN`` says: node ids by name."""
-        bucket = frame.frame_id >> BUCKET_SHIFT
-        with self._compiled() as compiled:
-            statement = compiled.bindings(Window(bucket, bucket + 1))
-            rows = self._file.rows(statement.sql, statement.values).values
-        # A variable that is called like a column of frames, such as t, has ".id" behind it there.
-        names = {
-            i - 1: name.removesuffix(".name")
-            for i, name in enumerate(statement.columns)
-            if name.endswith(".name")
-        }
-        found = [row for row in rows if row[0] == frame.frame_id]
-        return [{name: row[i] for i, name in names.items()} for row in found]
-
-    def intervals(self) -> Iterator[Interval]:
-        """Maximal runs of consecutive frames of a trace in which the same binding holds.
-
-        With ``RETURN``, in which the same values are returned. A gap longer than 2.5 median periods ends a run.
-        """
-        with self._compiled() as compiled:
-            width = len(INTERVAL_COLUMNS)
-            names = compiled.intervals().columns[width:]
-            for row in self._stream(Compiled.intervals, "intervals"):
-                yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
-
-    def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
-        """Clips around the frames that match, in log time; those that overlap are one.
-
-        Parameters
-        ----------
-        before, after : float
-            What is added at both ends; s. The offsets of ``RETURN CLIPS(-3s, +5s)`` win over them.
-        """
-        start, end = round(before * 1e9), round(after * 1e9)
-        with self._compiled() as compiled:
-            if compiled.limited_to_frames is not None:
-                frames = ((row[1], row[-1]) for row in self._frames())
-                around = (Clip(trace, time - start, time + end) for trace, time in frames)
-                yield from merged(sorted(around, key=lambda clip: (clip.trace, clip.start_ns)))
-                return
-
-            def statement(compiled: Compiled, window: Window | None) -> Statement:
-                return compiled.clips(start, end, window)
-
-            yield from merged(Clip(*row[:3]) for row in self._stream(statement, "clips"))
-
-    def numpy(self) -> dict[str, NDArray[np.generic]]:
-        """All columns as arrays, masked where something is NULL."""
-        with self._compiled() as compiled:
-            statement = compiled.rows()
-            return self._file.arrays(statement.sql, statement.values)
-
-    def arrow(self) -> Any:
-        """All rows as a ``pyarrow.Table``.
-
-        Raises
-        ------
-        MissingExtraError
-            pyarrow is not installed.
-        """
-        try:
-            arrow = import_module("pyarrow")
-        except ImportError as error:
-            raise MissingExtraError("tables of Arrow", "arrow") from error
-        columns = list(zip(*self, strict=True)) or [() for _ in self.columns]
-        return arrow.table(dict(zip(self.columns, map(list, columns), strict=True)))
-
-    def df(self) -> Any:
-        """All rows as a ``pandas.DataFrame``.
-
-        Raises
-        ------
-        MissingExtraError
-            pandas is not installed.
-        """
-        try:
-            pandas = import_module("pandas")
-        except ImportError as error:
-            raise MissingExtraError("data frames", "pandas") from error
-        return pandas.DataFrame.from_records(self.rows(), columns=list(self.columns))
-
-    def explain(self) -> str:
-        """What became of the query, stage by stage: parse, bind, rewrite, emit."""
-        with self._compiled() as compiled:
-            return compiled.stages()
-
-    def for_people(self) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
-        """Columns and rows as a person wants to read them.
-
-        A frame, and the first one of an interval, comes as ``trace#seq``, which every command takes; a
-        variable as the name of its node.
-        """
-        width = len(INTERVAL_COLUMNS)
-        if self.columns[:width] == INTERVAL_COLUMNS:
-            columns = ("from", "start", "end", "frames", *self.columns[width:])
-            return columns, (
-                (
-                    f"{i.trace}#{i.start_seq}",
-                    round(i.start, 3),
-                    round(i.end, 3),
-                    i.frames,
-                    *i.values.values(),
-                )
-                for i in self.intervals()
-            )
-        if self.columns[: len(FRAME_COLUMNS)] != FRAME_COLUMNS:
-            return self.columns, iter(self)
-        width = len(FRAME_COLUMNS)
-        rest = self.columns[width:]
-        named = {name.removesuffix(".name") for name in rest if name.endswith(".name")}
-        keep = [i for i, name in enumerate(rest) if name.removesuffix(".id") not in named]
-        columns = ("frame", "t", *(rest[i].removesuffix(".name") for i in keep))
-
-        def shown() -> Iterator[tuple[Any, ...]]:
-            for row in self:
-                _, trace, seq, _, t = row[:width]
-                yield (f"{trace}#{seq}", round(t, 3), *(row[width + i] for i in keep))
-
-        return columns, shown()
-
-    def _stream(
-        self,
-        statement: Callable[[Compiled, Window | None], Statement],
-        form: str | None = None,
-    ) -> Iterator[tuple[Any, ...]]:
-        """Rows of a statement, window by window; all windows see the same state of the store.
-
-        ``form`` is that of the statement: rows, intervals, clips or frames; ``None``: what the query asks
-        for. Only for that do its order and its limit hold.
-        """
-        with self._compiled() as compiled:
-            asked = form in {None, compiled.query.result.form}
-            form = form or compiled.query.result.form
-            rows = self._windows(
-                lambda window: statement(compiled, window),
-                at_once=asked and not compiled.in_windows,
-                whole_traces=form in {"intervals", "clips"},
-            )
-            yield from islice(rows, compiled.query.result.limit if asked else None)
-
-    def _windows(
-        self,
-        statement: Callable[[Window | None], Statement],
-        *,
-        at_once: bool,
-        whole_traces: bool,
-    ) -> Iterator[tuple[Any, ...]]:
-        extents = [] if at_once else self._file.rows(EXTENTS).values
-        steps = windows(extents, whole_traces=whole_traces)
-        window, more = next(steps), True
-        while more:
-            ready, rows = statement(window), 0
-            with self._file.batches(ready.sql, ready.values) as batches:
-                for batch in batches:
-                    rows += len(batch)
-                    yield from batch.values
-            try:
-                window = steps.send(rows)
-            except StopIteration:
-                more = False
-
-
-def windows(
-    extents: Iterable[tuple[int, int]], *, whole_traces: bool = False
-) -> Generator[Window | None, int, None]:
-    """Ranges of buckets in order; ``None`` (all) for a small store.
-
-    Each is twice as long as the one before, unless that had so many rows (which are sent) that it would
-    have too many.
-
-    Parameters
-    ----------
-    extents : iterable of (int, int)
-        First bucket and number of buckets of each trace, in order.
-    whole_traces : bool
-        Whether no range may end within a trace.
-    """
-    extents = list(extents)
-    if sum(buckets for _, buckets in extents) <= FIRST_WINDOW:
-        yield None
-        return
-    size, used, low, high = FIRST_WINDOW, 0, None, 0
-    for first, buckets in extents:
-        start, left = first, buckets
-        while left:
-            taken = left if whole_traces else min(left, size - used)
-            low = start if low is None else low
-            start, left, used = start + taken, left - taken, used + taken
-            high = start
-            if used >= size:
-                rows = yield Window(low, high)
-                size = max(min(2 * used, used * ROWS // max(rows, 1), LAST_WINDOW), 1)
-                used, low = 0, None
-    if low is not None:
-        yield Window(low, high)
-
-
-def merged(clips: Iterable[Clip]) -> Iterator[Clip]:
-    """Clips, ordered by trace and start, with those that overlap or touch made one."""
-    last: Clip | None = None
-    for clip in clips:
-        if last is not None and clip.trace == last.trace and clip.start_ns <= last.end_ns:
-            last = replace(last, end_ns=max(last.end_ns, clip.end_ns))
-            continue
-        if last is not None:
-            yield last
-        last = clip
-    if last is not None:
-        yield last
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

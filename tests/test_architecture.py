@@ -19,6 +19,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"opendrive", "online"}),
     frozenset({"traces", "relations", "abstractions", "lang"}),
     frozenset({"sgg", "store", "temporal"}),
+    frozenset({"matches"}),
     frozenset({"ingest", "query", "graphs"}),
     frozenset({"monitor", "coverage", "selection", "exporters", "draw", "cluster", "sandbox"}),
     frozenset({"demo", "recording"}),

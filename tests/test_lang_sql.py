@@ -22,7 +22,7 @@ from sgstore.lang.functions import PAIR_FUNCTIONS
 from sgstore.lang.parser import parse
 from sgstore.lang.phases import Window
 from sgstore.lang.results import EXTENTS, Statement
-from sgstore.query import FIRST_WINDOW, windows
+from sgstore.matches import FIRST_WINDOW, windows
 
 NUMBERS = {
     "dist": "distance",

@@ -15,14 +15,16 @@ from oracle import answer
 from oracle_worlds import World, random_world
 
 import sgstore
-from sgstore import query
+from sgstore import matches as streams
 from sgstore.errors import QueryError, SqlError, StoreError
-from sgstore.query import Interval, Matches, Store, merged
+from sgstore.matches import Interval, Matches, merged
 from sgstore.store import FrameRef, StoreFile
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from sgstore.query import Store
 
 PATTERN = "MATCH (e:Ego)-[:near|visible]->(v:Vehicle)"
 
@@ -160,7 +162,7 @@ def test_small_windows_give_the_same(store: Store, monkeypatch: pytest.MonkeyPat
     texts = [PATTERN, f"{PATTERN} RETURN v.id, INTERVALS", f"{PATTERN} RETURN FRAMES LIMIT 7"]
     whole = [(store.find(text).rows(), list(store.find(text).intervals())) for text in texts]
 
-    monkeypatch.setattr(query, "FIRST_WINDOW", 1)
+    monkeypatch.setattr(streams, "FIRST_WINDOW", 1)
 
     assert [
         (store.find(text).rows(), list(store.find(text).intervals())) for text in texts
@@ -170,7 +172,7 @@ def test_small_windows_give_the_same(store: Store, monkeypatch: pytest.MonkeyPat
 def test_a_limit_looks_at_the_first_windows_only(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "FIRST_WINDOW", 1)
+    monkeypatch.setattr(streams, "FIRST_WINDOW", 1)
     asked: list[Any] = []
     batches = StoreFile.batches
 

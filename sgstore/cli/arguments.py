@@ -13,7 +13,8 @@ from sgstore.cli.output import Format, say
 from sgstore.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sgstore.query import Matches, Store
+    from sgstore.matches import Matches
+    from sgstore.query import Store
     from sgstore.sandbox import Answer
 
 app = typer.Typer(

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.draw import Relations
-    from sgstore.query import Matches, Store
+    from sgstore.matches import Matches
+    from sgstore.query import Store
     from sgstore.roads import RoadMap
     from sgstore.store import FrameRef
 

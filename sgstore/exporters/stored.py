@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sgstore.exporters import Source, exporter_named
-from sgstore.query import merged
+from sgstore.matches import merged
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
