@@ -169,6 +169,11 @@ class PairNumbers:
         coincide the bearing is 0.
     lon, lat : float64
         b's centre in a's axes: ahead, and to the left; m.
+    lon_gap, lat_gap : float64
+        How far the footprints are apart along a's axis, and across it; 0 where they overlap in that axis; m.
+    apparent_heading : float64
+        b's heading less the direction from a to b, in (-π, π]; rad: 0 is a tail, π a front. NaN where
+        the centres coincide. (Scenic's apparent heading of b from a: Fremont et al., PLDI 2019, table 2.)
     closing_speed : float64
         How fast the centres approach one another in the plane; m/s. NaN where they coincide.
     ttc : float64
@@ -186,6 +191,9 @@ class PairNumbers:
     rel_heading: Floats
     lon: Floats
     lat: Floats
+    lon_gap: Floats
+    lat_gap: Floats
+    apparent_heading: Floats
     closing_speed: Floats
     ttc: Floats
     headway: Floats
@@ -203,6 +211,8 @@ def pair_numbers(a: Floats, b: Floats) -> PairNumbers:
     dx, dy, dz, _, _, _, dvx, dvy = (b - a).T
     planar = np.sqrt(dx * dx + dy * dy)
     lon, lat = offsets(dx, dy, a[:, 3])
+    along, across = _reach(b, b[:, 3] - a[:, 3])
+    sight = wrapped(b[:, 3] - np.arctan2(dy, dx))
     footprint = [0, 1, 3, 4, 5]
     between = gap(a[:, footprint], b[:, footprint])
     closing = _quotient(-(dx * dvx + dy * dvy), planar, np.not_equal, 0)
@@ -216,11 +226,21 @@ def pair_numbers(a: Floats, b: Floats) -> PairNumbers:
         rel_heading=wrapped(b[:, 3] - a[:, 3]),
         lon=lon,
         lat=lat,
+        lon_gap=np.maximum(np.abs(lon) - a[:, 4] / 2 - along, 0),
+        lat_gap=np.maximum(np.abs(lat) - a[:, 5] / 2 - across, 0),
+        apparent_heading=np.where(planar > 0, sight, np.nan),
         closing_speed=closing,
         ttc=_quotient(between, closing, np.greater, 0),
         headway=np.where(lon > 0, headway, np.nan),
         rel_speed=np.sqrt(dvx * dvx + dvy * dvy),
     )
+
+
+def _reach(boxes: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """How far boxes that are turned reach from their centres, along two axes; m."""
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    length, width = boxes[:, 4] / 2, boxes[:, 5] / 2
+    return length * cos + width * sin, length * sin + width * cos
 
 
 def _quotient(

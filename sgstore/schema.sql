@@ -1,4 +1,4 @@
--- sgstore: what is in a store, version 1.
+-- sgstore: what is in a store, version 2.
 --
 -- Users' SQL sees the VIEWS at the end of this file: frames, nodes, edges, pairs, lanes, entities, payloads.
 -- They are public and keep their columns. The TABLES are inside and may change with the version.
@@ -13,6 +13,7 @@
 -- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
 --
 -- Changes
+--   * Version 2: pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
 --     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
 --   * map_id, channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
@@ -228,7 +229,9 @@ SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * 
        turned - 360 * ceil((turned - 180) / 360) AS rel_heading, px AS lon, py AS lat, closing_speed,
        CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS ttc,
        CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
-       src_kind, dst_kind, src_is_ego, dst_is_ego
+       src_kind, dst_kind, src_is_ego, dst_is_ego,
+       CASE WHEN s1 < 0 THEN 0 ELSE s1 END AS lon_gap, CASE WHEN s2 < 0 THEN 0 ELSE s2 END AS lat_gap,
+       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading
 FROM (
   SELECT *, CASE WHEN la + wa + lb + wb IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
       CASE WHEN s1 > 0 THEN s1 * s1 + greatest(t1, 0) * greatest(t1, 0) END, CASE WHEN s2 > 0 THEN s2 * s2 + greatest(t2, 0) * greatest(t2, 0) END,
@@ -245,7 +248,7 @@ FROM (
           -(dx * dvx + dy * dvy) / nullif(sqrt(dd), 0) AS closing_speed
       FROM (
         SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd,
-            CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned
+            CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned, degrees(hb - atan2(dy, dx)) AS sighted
         FROM (
           SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
               b.x::DOUBLE - a.x AS dx, b.y::DOUBLE - a.y AS dy, b.z::DOUBLE - a.z AS dz, b.vx::DOUBLE - a.vx AS dvx, b.vy::DOUBLE - a.vy AS dvy,
@@ -255,7 +258,7 @@ FROM (
               sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
           FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))));
 
-COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s.';
+COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees.';
 
 CREATE VIEW classes AS
 SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class

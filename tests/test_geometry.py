@@ -193,6 +193,43 @@ def test_pair_numbers_that_do_not_exist_are_missing() -> None:
     assert same_place.gap[0] == 0
 
 
+def test_gaps_along_and_across_are_those_of_the_shadows_on_the_axes() -> None:
+    rng = np.random.default_rng(8)
+    a, b = rng.uniform(-12, 12, (2, 500, 8))
+    a[:, 4:6], b[:, 4:6] = rng.uniform(0.5, 6, (2, 500, 2))
+
+    numbers = pair_numbers(a, b)
+
+    for i in range(500):
+        shadows = []
+        for x, y, _, heading, length, width, _, _ in (a[i], b[i]):
+            box = [
+                complex(x, y) + np.exp(1j * heading) * complex(u * length / 2, v * width / 2)
+                for u in (1, -1)
+                for v in (1, -1)
+            ]
+            shadows.append([corner * np.exp(-1j * a[i, 3]) for corner in box])
+        for axis, found in (("real", numbers.lon_gap[i]), ("imag", numbers.lat_gap[i])):
+            one, other = ([getattr(corner, axis) for corner in box] for box in shadows)
+            assert found == pytest.approx(max(min(other) - max(one), min(one) - max(other), 0))
+        assert max(numbers.lon_gap[i], numbers.lat_gap[i]) <= numbers.gap[i] + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("heading", "expected"),
+    [
+        pytest.param(PI / 2, 0, id="its tail"),
+        pytest.param(-PI / 2, PI, id="its front"),
+        pytest.param(PI, PI / 2, id="its right side"),
+    ],
+)
+def test_apparent_heading_is_what_is_seen_of_a_car(heading: float, expected: float) -> None:
+    numbers = pair_numbers(moving(0, 0, 0.3), moving(0, 20, heading))
+
+    assert abs(numbers.apparent_heading[0]) == pytest.approx(expected)
+    assert np.isnan(pair_numbers(moving(0, 0), moving(0, 0)).apparent_heading[0])
+
+
 def test_closing_speed_is_how_fast_the_distance_shrinks() -> None:
     rng = np.random.default_rng(5)
     a, b = rng.uniform(-20, 20, (2, 2000, 8))
@@ -229,7 +266,9 @@ def test_pair_numbers_equal_the_measured_view_in_sql(data: Path) -> None:
     numbers = pair_numbers(state[rows["src"]], state[rows["dst"]])
 
     assert len(rows["src"]) == 120 * 11
-    for name in numbers.__slots__:
+    measured = [name for name in numbers.__slots__ if name in rows]
+    assert len(measured) == 10
+    for name in measured:
         missing = np.ma.getmaskarray(rows[name])
         assert np.array_equal(np.isnan(getattr(numbers, name)), missing), name
         found, expected = getattr(numbers, name)[~missing], np.ma.getdata(rows[name])[~missing]

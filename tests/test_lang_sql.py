@@ -31,6 +31,9 @@ NUMBERS = {
     "lat": "lat",
     "bearing": "bearing",
     "rel_heading": "rel_heading",
+    "lon_gap": "lon_gap",
+    "lat_gap": "lat_gap",
+    "apparent_heading": "apparent_heading",
     "closing_speed": "closing_speed",
     "ttc": "ttc",
     "headway": "headway",
@@ -78,7 +81,7 @@ def test_numbers_of_pairs_are_those_of_geometry(world: World) -> None:
     assert len(rows) > 300
     for column, name in enumerate(NUMBERS.values(), start=3):
         expected = getattr(numbers, name)
-        if name in {"bearing", "rel_heading"}:
+        if name in {"bearing", "rel_heading", "apparent_heading"}:
             expected = np.degrees(expected)
         ours = np.array([np.nan if row[column] is None else row[column] for row in rows])
         np.testing.assert_allclose(ours, expected, atol=1e-9, err_msg=name)

@@ -17,7 +17,7 @@ VIEWS = {
     "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary",
     "lane_gaps": "frame_id src dst gap",
     "pairs": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
-    " rel_speed src_kind dst_kind src_is_ego dst_is_ego",
+    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading",
     "classes": "frame_id abstraction class",
     "lanes": "map node_id name lane_type road section lane junction turn x y z heading length width",
     "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",

@@ -226,8 +226,16 @@ def test_two_edges_joined_in_plain_sql_are_two_edges_of_one_frame(store) -> None
 
 
 NUMBERS = ("distance", "gap", "bearing", "rel_heading", "lon", "lat")
-NUMBERS += ("closing_speed", "ttc", "headway", "rel_speed")
-ANGLES = {"bearing", "rel_heading"}
+NUMBERS += (
+    "closing_speed",
+    "ttc",
+    "headway",
+    "rel_speed",
+    "lon_gap",
+    "lat_gap",
+    "apparent_heading",
+)
+ANGLES = {"bearing", "rel_heading", "apparent_heading"}
 
 
 def boxes(store: StoreFile, frame: int) -> tuple[list[int], Any]:

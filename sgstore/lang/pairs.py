@@ -38,6 +38,12 @@ _PAIR: Final = {
     "turned": "degrees({turn})",
     "bearing": "{course} - 360 * ceil(({course} - 180) / 360)",
     "rel_heading": "{turned} - 360 * ceil(({turned} - 180) / 360)",
+    # What is not known stays so: greatest() would pass over it.
+    "lon_gap": "CASE WHEN {out1} < 0 THEN 0 ELSE {out1} END",
+    "lat_gap": "CASE WHEN {out2} < 0 THEN 0 ELSE {out2} END",
+    "sighted": "degrees({bheading} - atan2({dy}, {dx}))",
+    "apparent_heading": "CASE WHEN {planar} > 0"
+    " THEN {sighted} - 360 * ceil(({sighted} - 180) / 360) END",
     "rel_speed": "sqrt({dvx} * {dvx} + {dvy} * {dvy})",
     "closing_speed": "-({dx} * {dvx} + {dy} * {dvy}) / nullif({planar}, 0)",
     "pace": "sqrt({avx} * {avx} + {avy} * {avy})",
