@@ -9,8 +9,10 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.traces.fetch import mark_of
-from sgstore.traces.mcap_file import MAX_LOSSES, McapFile, Place
+from sgstore.traces.losses import MAX_LOSSES, Place
+from sgstore.traces.mcap_file import McapFile
 from sgstore.traces.parts import METADATA, Part, part_at, parts_of
+from sgstore.traces.spool import Spool
 from sgstore.world import Loss, TraceReport
 
 if TYPE_CHECKING:
@@ -48,7 +50,8 @@ class McapBag(McapFile):
         The metadata cannot be read, or no file is there and is an MCAP file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, spool: Spool | None = None) -> None:
+        self._spool, self._own_spool = spool or Spool(), spool is None
         self.path = path.parent if path.name == METADATA else path
         self.size, self.mtime_ns = mark_of(self.path)
         self.schemas = {}
@@ -76,7 +79,7 @@ class McapBag(McapFile):
             self._faults.append(Loss(f"{name}: {METADATA} lists it, but there is no such file"))
             return
         try:
-            file = McapFile(part.path)
+            file = McapFile(part.path, self._spool)
         except TraceError as error:
             self._faults.append(Loss(f"{name}: {error.reason}", bytes=part.size, offset=part.base))
             return
@@ -94,6 +97,8 @@ class McapBag(McapFile):
         """Close all files."""
         for file in self._files.values():
             file.close()
+        if self._own_spool:
+            self._spool.close()
 
     @property
     def compression(self) -> str:
@@ -101,16 +106,20 @@ class McapBag(McapFile):
         return next(iter(self._files.values())).compression
 
     def walk(
-        self, report: TraceReport, wanted: Callable[[int], bool] | None = None
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
         """All messages, file by file; what cannot be read goes to ``report``."""
         report.losses += self._faults
         for base, file in self._files.items():
             found = TraceReport()
             here = None if wanted is None else _moved(wanted, base)
+            kept = None if keep is None else self._meant(keep, file)
             file.reopen()
             try:
-                for run in file.walk(found, here):
+                for run in file.walk(found, here, kept):
                     self._learn(file)
                     yield self._placed(file, run, base)
                 self._learn(file)
@@ -168,6 +177,10 @@ class McapBag(McapFile):
         if free >= MAX_IDS:
             raise TraceError(f"more than {MAX_IDS} channels or schemas", path=self.path)
         return free
+
+    def _meant(self, keep: Callable[[int], bool], file: McapFile) -> Callable[[int], bool]:
+        """The same question about the ids that a file has."""
+        return lambda number: keep(self._own[file.path, number])
 
     def _placed(self, file: McapFile, run: Messages, base: int) -> Messages:
         """The messages of a file under the ids and the places of the bag."""

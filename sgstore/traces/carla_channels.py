@@ -53,6 +53,20 @@ CONTENTS: Final = {
 LASTING: Final = frozenset({ACTORS, LIGHT_PLACES, LIGHT_STATES, WORLD, VEHICLE})
 """What holds until it is told anew, so that no single frame owns the message."""
 
+FOR_FRAMES: Final = frozenset(
+    {
+        OBJECTS,
+        LIGHT_STATES,
+        STATUS,
+        COMMANDS,
+        ODOMETRY,
+        COLLISION,
+        LANE_INVASION,
+        VEHICLE_LIGHTS,
+    }
+)
+"""What is read with the frames, after what lasts is known."""
+
 OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISION, LANE_INVASION})
 """What the bridge publishes under the role name of a vehicle."""
 

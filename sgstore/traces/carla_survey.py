@@ -17,6 +17,7 @@ from sgstore.errors import TraceError
 from sgstore.traces.carla_actors import Actor, Egos
 from sgstore.traces.carla_channels import (
     ACTORS,
+    FOR_FRAMES,
     LASTING,
     LIGHT_PLACES,
     LIGHT_STATES,
@@ -142,7 +143,8 @@ class Survey:
         self._last: dict[int, bytes] = {}
         self._lasting: list[Ref] = []
         self._others: dict[int, tuple[int, Ref]] = {}
-        for run in recording.walk(TraceReport()):  # what it loses is reported when frames are read
+        walk = recording.walk(TraceReport(), keep=lambda channel: self._meet(channel) in FOR_FRAMES)
+        for run in walk:  # what it loses is reported when frames are read
             self._look_at(run)
 
     @property

@@ -179,7 +179,7 @@ class _Survey:
         self._entity_axes: Counter[str] = Counter()
         self._transforms: dict[str, _Told] = {}
         self._axes = Axes()
-        for run in recording.walk(TraceReport()):
+        for run in recording.walk(TraceReport(), keep=self.readers.__contains__):
             self._look(run)
 
     def leading(self) -> int:

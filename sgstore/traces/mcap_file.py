@@ -49,7 +49,9 @@ from sgstore.traces.chunks import (
     read_records,
 )
 from sgstore.traces.fetch import open_regular
+from sgstore.traces.losses import Place, lose, loss_of_chunk, name_of
 from sgstore.traces.parts import bag_folder
+from sgstore.traces.spool import Spool
 from sgstore.traces.summary import MAGIC, Summary, read_summary
 from sgstore.world import Loss, TraceReport
 
@@ -63,8 +65,6 @@ MAX_DEFINITION: Final = 16 << 20
 """Greatest size of a schema, channel or metadata record; bytes."""
 MAX_DEFINITIONS: Final = 64 << 20
 """Greatest size of all schemas, channels and metadata of a file together; bytes."""
-MAX_LOSSES: Final = 1000
-"""Losses that are listed one by one; the last of them stands for all that follow."""
 RUN_MESSAGES: Final = 1024
 """Messages outside chunks that are handed on together."""
 
@@ -83,14 +83,6 @@ _HOLDS_CONTENT: Final = frozenset(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """A record of the file: where it begins, and its length with its head; bytes."""
-
-    offset: int
-    length: int
-
-
 @dataclass(slots=True)
 class _Walk:
     """Where a walk is, and what it has found.
@@ -100,6 +92,7 @@ class _Walk:
 
     report: TraceReport
     wanted: Callable[[int], bool] | None = None
+    keep: Callable[[int], bool] | None = None
     position: int = len(MAGIC)
     run: array[int] = field(default_factory=lambda: array("q"))
     pending: Loss | None = None
@@ -117,6 +110,8 @@ class McapFile:
     path : Path
         The file. The folder of a bag, or its ``metadata.yaml``, opens all files of it as one
         (:class:`~sgstore.traces.bag.McapBag`).
+    spool : Spool, optional
+        Where messages are kept between readings; of several files one, which somebody else closes.
 
     Attributes
     ----------
@@ -143,16 +138,18 @@ class McapFile:
         The file cannot be opened or is no MCAP file.
     """
 
-    def __new__(cls, path: Path) -> Self:
+    def __new__(cls, path: Path, spool: Spool | None = None) -> Self:
         """A file, or all files of a bag."""
+        del spool
         if cls is McapFile and bag_folder(path) is not None:
             from sgstore.traces.bag import McapBag
 
             return object.__new__(cast("type[Self]", McapBag))
         return object.__new__(cls)
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, spool: Spool | None = None) -> None:
         self.path = path
+        self._spool, self._own_spool = spool or Spool(), spool is None
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[Place, Metadata] = {}
@@ -180,6 +177,8 @@ class McapFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+        if self._own_spool:
+            self._spool.close()
 
     def reopen(self) -> None:
         """Open the file again after it was closed.
@@ -207,7 +206,10 @@ class McapFile:
         return window
 
     def walk(
-        self, report: TraceReport, wanted: Callable[[int], bool] | None = None
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
         """All messages in file order, chunk by chunk; what cannot be read goes to ``report``.
 
@@ -216,13 +218,16 @@ class McapFile:
         report : TraceReport
         wanted : callable, optional
             Whether the chunk at an offset is wanted; others are passed over.
+        keep : callable, optional
+            Whether the messages of the channel with an id will be asked for again: then a later walk need not
+            decompress them. It is asked after the messages were handed out.
 
         Raises
         ------
         TraceError
             The definitions of channels exceed all measure, or the file cannot be read any more.
         """
-        walk = _Walk(report, wanted)
+        walk = _Walk(report, wanted, keep)
         try:
             while not walk.closed:
                 head = self._head(walk.position)
@@ -306,7 +311,7 @@ class McapFile:
     def _single(self, walk: _Walk, start: int, length: int) -> Iterator[Messages]:
         if length < MESSAGE_HEAD.itemsize - HEAD.size or length > MAX_CHUNK:
             reason = f"a message of {length} bytes"
-            _lose(walk.report, Loss(reason, 1, length + HEAD.size, offset=start))
+            lose(walk.report, Loss(reason, 1, length + HEAD.size, offset=start))
             return
         walk.run.append(start)
         if len(walk.run) >= RUN_MESSAGES:
@@ -324,7 +329,7 @@ class McapFile:
             messages = message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
         except TraceError as error:
             loss = Loss(error.reason, len(offsets), offset=int(offsets[0]))
-            _lose(walk.report, loss)
+            lose(walk.report, loss)
             return
         yield from self._known(walk, messages)
 
@@ -335,7 +340,7 @@ class McapFile:
         walk.closed = resume is None
         if resume is not None:
             reason = "damage: the data seem to end here, but the summary names chunks behind"
-            _lose(walk.report, Loss(reason, bytes=resume - start, offset=start))
+            lose(walk.report, Loss(reason, bytes=resume - start, offset=start))
             walk.position = resume
 
     def _chunk(self, walk: _Walk, place: Place, astray: int | None) -> Iterator[Messages]:
@@ -349,19 +354,35 @@ class McapFile:
             if walk.chunks == 1:
                 self.compression = head.compression
             walk.unverified += head.crc == 0
-            records = read_records(self._file, head, verify=place.offset not in self._verified)
-            messages, definitions = parse_records(records, place.offset)
-            self._verified.add(place.offset)
+            messages, definitions = self._records(head)
         except TraceError as error:
             if astray is not None:
                 walk.position = astray
                 place = Place(place.offset, astray - place.offset)
-            walk.pending = _loss_of_chunk(error.reason, place, head)
+            walk.pending = loss_of_chunk(error.reason, place, head)
             return
         walk.messages += len(messages)
         for opcode, content in definitions:
             self._define(walk, opcode, content, place.offset)
         yield from self._known(walk, messages)
+        if walk.keep is not None and head.compression and not definitions:
+            ids, index = np.unique(messages.channel, return_inverse=True)
+            keep = [number in self.channels and walk.keep(number) for number in ids.tolist()]
+            self._spool.put(self.path, messages, np.array(keep, np.bool_)[index])
+
+    def _records(self, head: ChunkHead) -> tuple[Messages, list[tuple[int, memoryview]]]:
+        """Messages and definitions of a chunk, kept ones or from the file."""
+
+        def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
+            records = read_records(self._file, head, verify=head.offset not in self._verified)
+            return parse_records(records, head.offset)
+
+        kept = self._spool.get(self.path, head.offset, lambda: read()[0].read)
+        if kept is not None:
+            return kept, []
+        found = read()
+        self._verified.add(head.offset)
+        return found
 
     def _known(self, walk: _Walk, messages: Messages) -> Iterator[Messages]:
         """The messages, without those of channels that were never defined."""
@@ -378,7 +399,7 @@ class McapFile:
                 end_ns=int(times.max()),
                 offset=max(messages.chunk_offset, -1),
             )
-            _lose(walk.report, loss)
+            lose(walk.report, loss)
             messages = messages.take(~lost)
         if len(messages):
             yield messages
@@ -404,21 +425,21 @@ class McapFile:
         start = walk.position
         stop = self.size if resume is None else resume
         walk.position = stop
-        name = _name(opcode)
+        name = name_of(opcode)
         if resume is not None:
             reason = (
                 f"damage: a record ({name}) of {length} bytes where at most {stop - start} are left"
             )
-            _lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+            lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
         elif opcode == Opcode.CHUNK:
             yield from self._cut_chunk(walk, start)
         elif opcode in _HOLDS_CONTENT:
             reason = f"the file ends inside a record ({name}): {stop - start} of {length + HEAD.size} bytes"
             messages = 1 if opcode == Opcode.MESSAGE else 0
-            _lose(walk.report, Loss(reason, messages, stop - start, offset=start))
+            lose(walk.report, Loss(reason, messages, stop - start, offset=start))
         elif opcode == 0 or opcode > Opcode.DATA_END:
             reason = f"the bytes from here to the end are no MCAP records (opcode {opcode})"
-            _lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+            lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
 
     def _cut_chunk(self, walk: _Walk, start: int) -> Iterator[Messages]:
         """The whole messages of a chunk whose end is missing."""
@@ -435,7 +456,7 @@ class McapFile:
         count = 0 if kept is None else len(kept)
         walk.messages += count
         reason = f"the file ends inside a chunk; its first {count} messages were kept"
-        _lose(walk.report, _loss_of_chunk(reason, Place(start, self.size - start), head))
+        lose(walk.report, loss_of_chunk(reason, Place(start, self.size - start), head))
         if kept is not None:
             yield from self._known(walk, kept)
 
@@ -461,7 +482,7 @@ class McapFile:
     def _settle(self, walk: _Walk) -> None:
         """Report a chunk that was lost, now that its message indexes are read."""
         if walk.pending is not None:
-            _lose(walk.report, walk.pending)
+            lose(walk.report, walk.pending)
             walk.pending = None
 
     def _closing_words(self, walk: _Walk) -> None:
@@ -470,14 +491,14 @@ class McapFile:
         left = self.size - walk.position
         if not walk.closed:
             if 0 < left < HEAD.size:
-                _lose(walk.report, Loss("the file ends inside the head of a record", bytes=left))
+                lose(walk.report, Loss("the file ends inside the head of a record", bytes=left))
             warn("the recording was not closed: it has no end of data")
         elif self._summary_fault:
             warn(self._summary_fault)
         told = sum(self.counts.values()) if self.counts else 0
         if told > walk.messages and not walk.report.losses and walk.wanted is None:
             reason = f"the file's statistics tell of {told} messages, {walk.messages} were found"
-            _lose(walk.report, Loss(reason, told - walk.messages))
+            lose(walk.report, Loss(reason, told - walk.messages))
         if walk.chunks and walk.unverified == walk.chunks:
             warn("no chunk has a checksum: damage that leaves a chunk readable cannot be noticed")
 
@@ -489,8 +510,8 @@ class McapFile:
                 self.attachments.append(place)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
             if place.length > MAX_DEFINITION:
-                reason = f"a definition ({_name(opcode)}) of {place.length} bytes"
-                _lose(walk.report, Loss(reason, 0, place.length, offset=place.offset))
+                reason = f"a definition ({name_of(opcode)}) of {place.length} bytes"
+                lose(walk.report, Loss(reason, 0, place.length, offset=place.offset))
                 return
             content = self._at(place.offset + HEAD.size, place.length - HEAD.size)
             self._define(walk, opcode, content, place.offset, place)
@@ -507,8 +528,8 @@ class McapFile:
         try:
             odd = self._take_up(opcode, content, place)
         except READ_ERRORS as error:
-            reason = f"a definition ({_name(opcode)}) is malformed: {error!r}"
-            _lose(walk.report, Loss(reason, 0, len(content), offset=offset))
+            reason = f"a definition ({name_of(opcode)}) is malformed: {error!r}"
+            lose(walk.report, Loss(reason, 0, len(content), offset=offset))
             return
         if odd and odd not in walk.report.warnings:
             walk.report.warnings.append(odd)
@@ -528,7 +549,7 @@ class McapFile:
             known[record.id] = record
         elif known[record.id] != record:
             return (
-                f"{_name(opcode)} {record.id} is defined twice, differently; the first one counts"
+                f"{name_of(opcode)} {record.id} is defined twice, differently; the first one counts"
             )
         return ""
 
@@ -551,38 +572,3 @@ class McapFile:
         if len(data) != length:
             raise TraceError("the file became shorter while it was read", path=self.path)
         return memoryview(data)
-
-
-def _lose(report: TraceReport, loss: Loss) -> None:
-    """Report a loss; when there are very many, the last one stands for the rest."""
-    if len(report.losses) < MAX_LOSSES:
-        report.losses.append(loss)
-        return
-    last = report.losses[-1]
-    many = last.messages >= 0 and loss.messages >= 0
-    report.losses[-1] = Loss(
-        "further damage of the same kinds",
-        messages=last.messages + loss.messages if many else -1,
-        bytes=max(last.bytes, 0) + max(loss.bytes, 0),
-        start_ns=last.start_ns,
-        end_ns=max(last.end_ns, loss.end_ns),
-        offset=last.offset,
-    )
-
-
-def _loss_of_chunk(reason: str, place: Place, head: ChunkHead | None) -> Loss:
-    known = head is not None and head.start_ns <= head.end_ns <= _LAST_NS
-    return Loss(
-        reason,
-        bytes=place.length,
-        start_ns=head.start_ns if head and known else -1,
-        end_ns=head.end_ns if head and known else -1,
-        offset=place.offset,
-    )
-
-
-def _name(opcode: int) -> str:
-    try:
-        return Opcode(opcode).name.lower().replace("_", " ")
-    except ValueError:
-        return f"opcode {opcode}"

@@ -23,7 +23,8 @@ from mcap.records import Channel, Schema
 from sgstore.errors import TraceError
 from sgstore.traces.chunks import MESSAGE_HEAD, Messages
 from sgstore.traces.fetch import open_regular
-from sgstore.traces.mcap_file import MAX_LOSSES, RUN_MESSAGES
+from sgstore.traces.losses import MAX_LOSSES
+from sgstore.traces.mcap_file import RUN_MESSAGES
 from sgstore.traces.osi_fields import fields_of
 from sgstore.traces.osi_schema import (
     DECODE_ERRORS,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Metadata
 
-    from sgstore.traces.mcap_file import Place
+    from sgstore.traces.losses import Place
 
 ENDINGS: Final = (".osi", ".osi.zst")
 """How the names of such files end; nothing in them tells what they are."""
@@ -127,10 +128,14 @@ class OsiFile:
         return iter(())
 
     def walk(
-        self, report: TraceReport, wanted: Callable[[int], bool] | None = None
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
         """All messages in file order; what cannot be read goes to ``report``.
 
+        Nothing is kept: all messages are ground truth, which takes longer to decode than to decompress.
         ``chunk_offset`` of a message is the place of the zstd frame that it begins in.
 
         Raises
@@ -138,6 +143,7 @@ class OsiFile:
         TraceError
             The file cannot be read any more.
         """
+        del keep
         run = _Run()
         try:
             for place, offset, data in self._messages(report):

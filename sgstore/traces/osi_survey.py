@@ -183,7 +183,9 @@ def survey(recording: Recording) -> Survey:
     """
     result = Survey()
     maps: dict[int, type[Any]] = {}
-    for run in recording.walk(TraceReport()):
+    for run in recording.walk(
+        TraceReport(), keep=lambda channel: channel in result.leads or channel in result.hosts
+    ):
         for channel, row, count in zip(
             *np.unique(run.channel, return_index=True, return_counts=True), strict=True
         ):

@@ -53,9 +53,16 @@ class Recording(Protocol):
         ...
 
     def walk(
-        self, report: TraceReport, wanted: Callable[[int], bool] | None = None
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
-        """All messages in file order; what cannot be read goes to ``report``."""
+        """All messages in file order; what cannot be read goes to ``report``.
+
+        ``wanted``: whether the chunk at an offset is wanted. ``keep``: whether the messages of a channel will
+        be asked for again, so that a later walk finds them sooner.
+        """
         ...
 
     def close(self) -> None:
