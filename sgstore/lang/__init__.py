@@ -7,5 +7,14 @@ printed.
 
 from sgstore.lang.catalog import Catalog, TraceFacts
 from sgstore.lang.compiler import Compiled, compile_query
+from sgstore.lang.standard import NamedPattern, pattern, patterns
 
-__all__ = ["Catalog", "Compiled", "TraceFacts", "compile_query"]
+__all__ = [
+    "Catalog",
+    "Compiled",
+    "NamedPattern",
+    "TraceFacts",
+    "compile_query",
+    "pattern",
+    "patterns",
+]
