@@ -57,7 +57,7 @@ def bind_query(
     match = _only_match(statements, session)
     ego, unknown_is_false = _settings(match.settings, session, catalog)
     names = Names(session, ScopeBuilder(session))
-    bind_block(match.block, names)
+    bind_block(match.sequence.steps[0].block, names)
     distinct = names.scope.distinct()  # before RETURN, which must not change what matches
     result = _result(match.returns, names)
     _refuse_unused(session)
@@ -85,8 +85,9 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.Match:
             found = statement
     if found is None:
         session.refuse("nothing is asked", Span(0, len(session.text)), "add MATCH …")
-    if found.temporal:
-        session.temporal(*found.temporal)
+    step = found.sequence.steps[0]
+    if len(found.sequence.steps) > 1 or not isinstance(step, s.Step) or step.hold:
+        session.temporal("a sequence of steps", found.sequence.span)
     return found
 
 

@@ -303,46 +303,87 @@ def _block_body(span: Span, children: Children) -> s.Block:
 # Statements ---------------------------------------------------------------------------------------
 
 
-def _match_step(span: Span, children: Children) -> tuple[Any, ...]:
+def _match_step(span: Span, children: Children) -> s.Step:
     paths, where, hold, name = children
-    late = hold or name
-    return s.Block(paths, where, span), late
+    end = where.span.end if where else span.end
+    return s.Step(s.Block(paths, where, Span(span.start, end)), False, hold, name, span)
 
 
-def _temporal_part(word: str) -> Callable[[Span, Children], tuple[str, Span]]:
-    return lambda span, _: (word, span)
+def _holds_step(span: Span, children: Children) -> s.Step:
+    condition, hold, name = children
+    return s.Step(s.Block((), condition, condition.span), False, hold, name, span)
 
 
-def _holds_step(span: Span, _: Children) -> tuple[Any, ...]:
-    return s.Block((), None, span), ("HOLDS", Span(span.start, span.start + 5))
+def _absent_step(span: Span, children: Children) -> s.Step:
+    (step,) = children
+    if step.hold or step.name:
+        raise BuildError("what must not happen has no duration and no name", step.span)
+    return s.Step(step.block, True, None, None, span)
 
 
-def _absent_step(span: Span, children: Children) -> tuple[Any, ...]:
-    block, _ = children[0]
-    return block, ("NOT MATCH", Span(span.start, block.span.start + 5))
+def _scenario_step(span: Span, children: Children) -> s.ScenarioStep:
+    name, *given = children
+    values = tuple(value for value in given if value is not None)
+    return s.ScenarioStep(name.text, values, name.span, span)
 
 
-def _link(span: Span, _: Children) -> tuple[str, Span]:
-    return "a sequence of steps", span
+def _given(span: Span, children: Children) -> s.Given:
+    name, value = children
+    if not isinstance(value, s.Constant | s.Duration):
+        value = s.Parameter(value.text[1:], value.span)
+    return s.Given(name.text, value, span)
 
 
-def _sequence(_: Span, children: Children) -> tuple[Any, ...]:
-    """The first block, and the first temporal part of any."""
-    block, late = children[0]
-    return block, late or (children[1] if len(children) > 1 else None)
+def _hold(span: Span, children: Children) -> s.Hold:
+    *comparison, duration, inclusive = children
+    word = comparison[0].text if comparison else "="
+    if word in {"<>", "!="}:
+        raise BuildError("a step lasts for >=, >, =, < or <= a time", span)
+    return s.Hold(word, duration, inclusive is not None, span)
+
+
+def _step_name(_: Span, children: Children) -> str:
+    return children[0].text
+
+
+def _link(span: Span, children: Children) -> s.Link:
+    kind, after, within = children[0] or ("then", None, None)
+    return s.Link(kind, after, within, span)
+
+
+def _other_link(kind: Literal["until", "while"]) -> Callable[[Span, Children], s.Link]:
+    return lambda span, _: s.Link(kind, None, None, span)
+
+
+def _sequence(span: Span, children: Children) -> s.Sequence:
+    return s.Sequence(tuple(children[::2]), tuple(children[1::2]), span)
 
 
 def _match(span: Span, children: Children) -> s.Match:
-    settings, (block, late), returns, order, sample, limit = children
+    settings, sequence, returns, order, sample, limit = children
     if returns or order or sample or limit is not None:
         distinct, items, at = returns or (False, (s.Item("all", None, None, 0, 0, span),), span)
         returns = s.Returns(distinct, items, order or (), sample, limit, at)
-    return s.Match(settings or (), block, late, returns, span)
+    return s.Match(settings or (), sequence, returns, span)
 
 
 def _check(span: Span, children: Children) -> s.Check:
-    _, name, *_, formula, _ = children
-    return s.Check(name and name.text, formula, Span(span.start, span.start + 5))
+    settings, name, *quantifiers, formula, reset = children
+    return s.Check(settings or (), name and name.text, tuple(quantifiers), formula, reset, span)
+
+
+def _quantifier(span: Span, children: Children) -> s.Quantifier:
+    word, *nodes, where, absent = children
+    return s.Quantifier(word.text.upper(), tuple(nodes), where, bool(absent), span)
+
+
+def _quantified(span: Span, children: Children) -> s.QuantifiedNode:
+    name, label = children
+    return s.QuantifiedNode(name.text, label, span)
+
+
+def _absent(_: Span, children: Children) -> bool:
+    return children[0].text.upper() == "TRUE"
 
 
 def _using(_: Span, children: Children) -> tuple[s.Setting, ...]:
@@ -359,15 +400,17 @@ def _setting(span: Span, children: Children) -> s.Setting:
 
 def _define(span: Span, children: Children) -> s.Define:
     _, name, parameters, body = children
-    scenario = isinstance(body, tuple)
-    return s.Define(name.text, parameters or (), None if scenario else body, name.span, span)
+    formals: tuple[s.Formal, ...] = parameters or ()
+    if not isinstance(body, s.Sequence) and any(formal.default for formal in formals):
+        raise BuildError("the parameters of a predicate are names, without a value", span)
+    return s.Define(name.text, formals, body, name.span, span)
 
 
-def _param(_: Span, children: Children) -> s.Formal:
+def _param(span: Span, children: Children) -> s.Formal:
     name, label, default = children
-    if label or default:
-        raise BuildError("the parameters of a predicate are names, without label or default")
-    return s.Formal(name.text, name.span)
+    if label:
+        raise BuildError("the parameters of a definition are names, without a label")
+    return s.Formal(name.text, default, span)
 
 
 def _statements(_: Span, children: Children) -> tuple[Any, ...]:
@@ -424,8 +467,9 @@ BUILDERS: Final[dict[str, Callable[[Span, Children], Any]]] = {
     "param": _param,
     "match": _match,
     "check": _check,
-    "quantifier": _only,
-    "qvar": _only,
+    "quantifier": _quantifier,
+    "qvar": _quantified,
+    "absent": _absent,
     "reset": _only,
     "using": _using,
     "setting": _setting,
@@ -433,10 +477,16 @@ BUILDERS: Final[dict[str, Callable[[Span, Children], Any]]] = {
     "absent_step": _absent_step,
     "match_step": _match_step,
     "holds_step": _holds_step,
-    "hold": _temporal_part("FOR"),
-    "step_name": _temporal_part("a name for a step"),
+    "scenario_step": _scenario_step,
+    "given": _given,
+    "hold": _hold,
+    "step_name": _step_name,
     "link": _link,
-    "gap": _temporal_part("a bound"),
+    "until_link": _other_link("until"),
+    "while_link": _other_link("while"),
+    "within": lambda _, children: ("then", None, children[0]),
+    "after": lambda _, children: ("then", *children),
+    "immediately": lambda *_: ("immediately", None, None),
     "where": _only,
     "patterns": _patterns,
     "path": _path,

@@ -171,7 +171,7 @@ def _aggregate(name: str, e: s.Call, names: Names) -> b.Aggregate:
 def _predicate(e: s.Call, names: Names) -> b.Bound:
     session = names.session
     definition = session.predicates[folded(e.name)]
-    if definition.body is None:
+    if isinstance(definition.body, s.Sequence):
         session.temporal("a scenario", e.name_span)
     if definition.name in session.calls or len(session.calls) > MAX_CALLS:
         session.refuse(f"{definition.name}() is defined by itself", e.name_span)

@@ -319,44 +319,144 @@ class Returns:
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
-    """``USING … MATCH … WHERE … RETURN …``.
+class Hold:
+    """``FOR >= duration INCLUSIVE``: how long a step must last."""
 
-    ``temporal`` is the first part of it that belongs to the temporal layer: a word and its place.
+    comparison: str
+    duration: Duration | Parameter
+    inclusive: bool
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of a sequence.
+
+    Attributes
+    ----------
+    block : Block
+        What stands after ``MATCH``; of ``HOLDS (condition)`` a block without paths.
+    absent : bool
+        Whether it is ``NOT MATCH``.
+    hold : Hold or None
+    name : str or None
+        What ``AS`` calls it.
+    span : Span
     """
 
-    settings: tuple[Setting, ...]
     block: Block
-    temporal: tuple[str, Span] | None
+    absent: bool
+    hold: Hold | None
+    name: str | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioStep:
+    """``MATCH name(parameter = value, …)``: the steps of a scenario that has a name."""
+
+    name: str
+    given: tuple[Given, ...]
+    name_span: Span
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """``name = value``: the value of a parameter of a scenario."""
+
+    name: str
+    value: Constant | Duration | Parameter
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """What stands between two steps: when the second one comes after the first.
+
+    Attributes
+    ----------
+    kind : str
+        ``then``, ``immediately``, ``until`` or ``while``.
+    after, within : Duration, Parameter or None
+        Least and greatest time of ``then``.
+    span : Span
+    """
+
+    kind: Literal["then", "immediately", "until", "while"]
+    after: Duration | Parameter | None
+    within: Duration | Parameter | None
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """Steps with links between them; there is one step more than links."""
+
+    steps: tuple[Step | ScenarioStep, ...]
+    links: tuple[Link, ...]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """``USING … MATCH … WHERE … THEN … RETURN …``."""
+
+    settings: tuple[Setting, ...]
+    sequence: Sequence
     returns: Returns | None
     span: Span
 
 
 @dataclass(frozen=True, slots=True)
 class Formal:
-    """A parameter of a definition."""
+    """A parameter of a definition; that of a scenario may have a value that it takes if none is given."""
 
     name: str
+    default: Constant | Duration | None
     span: Span
 
 
 @dataclass(frozen=True, slots=True)
 class Define:
-    """``DEFINE PREDICATE name(parameters) AS body``; a scenario's body is ``None``, it is temporal."""
+    """``DEFINE PREDICATE name(parameters) AS condition``, ``DEFINE SCENARIO name(parameters) AS sequence``."""
 
     name: str
     parameters: tuple[Formal, ...]
-    body: Expression | None
+    body: Expression | Sequence
     name_span: Span
     span: Span
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
-    """``CHECK name: formula``, which belongs to the temporal layer."""
+class QuantifiedNode:
+    """``name:label`` after ``FORALL`` or ``FORSOME``."""
 
+    name: str
+    label: LabelExpression
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Quantifier:
+    """``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
+
+    word: str
+    nodes: tuple[QuantifiedNode, ...]
+    where: Expression | None
+    absent: bool
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """``USING … CHECK name: quantifiers formula RESET WHEN condition``."""
+
+    settings: tuple[Setting, ...]
     name: str | None
+    quantifiers: tuple[Quantifier, ...]
     formula: Expression
+    reset: Expression | None
     span: Span
 
 
