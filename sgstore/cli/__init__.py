@@ -14,6 +14,7 @@ import typer
 from sgstore.cli import (
     exports,
     graphs,
+    library,
     live,
     maps,
     payloads,
@@ -30,7 +31,20 @@ from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
 __all__ = ["app", "main"]
 
-VERBS = (traces, stores, graphs, maps, live, settings, queries, payloads, pictures, exports, tour)
+VERBS = (
+    traces,
+    stores,
+    graphs,
+    maps,
+    live,
+    settings,
+    queries,
+    library,
+    payloads,
+    pictures,
+    exports,
+    tour,
+)
 """The modules of the verbs: importing them makes the verbs known; help lists them in this order."""
 
 app.registered_commands.sort(
