@@ -130,6 +130,9 @@ CREATE TABLE payload (                                         -- the message of
   bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
   chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
 
+CREATE TABLE imported (                                        -- frames that came as graphs: what their file calls them
+  bucket BIGINT, bit TINYINT, trace_id BIGINT, graph VARCHAR, place BIGINT, images BIGINT);   -- place: row or line
+
 -- Maps: once each, whatever the number of traces on them ----------------------------------------------------------
 
 CREATE TABLE map (map_id INTEGER, digest VARCHAR, name VARCHAR, text VARCHAR);
@@ -290,3 +293,9 @@ FROM frame f JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
      JOIN channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN trace t ON t.trace_id = f.trace_id;
 
 COMMENT ON VIEW payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';
+
+CREATE VIEW imports AS
+SELECT f.frame_id, i.graph, i.place, i.images
+FROM frame f JOIN imported i ON i.bucket = f.bucket AND i.bit = f.bit;
+
+COMMENT ON VIEW imports IS 'One row a frame that was imported as a graph. graph: what its file calls it; place: row or line of the file where it begins; images: how many frames of the source it stands for (S3C keeps one for each class), else 1.';

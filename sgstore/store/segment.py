@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store.access import Access
     from sgstore.store.packing import Columns
-    from sgstore.world import Codes, FrameBlock, TraceInfo, TraceReport
+    from sgstore.world import Codes, FrameBlock, Ints, TraceInfo, TraceReport
 
 
 class Segment:
@@ -138,6 +138,25 @@ class Segment:
         self._origin = self._origin or packing.origin_of(frames)
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
         self._see_messages(graph)
+
+    def name_frames(self, seq: Ints, graphs: list[str], places: Ints, images: Ints) -> None:
+        """Take down what the file of an import calls the graphs that became frames: table ``imported``.
+
+        Parameters
+        ----------
+        seq : (F,) int64
+        graphs : list of str
+        places, images : (F,) int64
+            Row or line where each begins, and how many frames of the source it stands for.
+        """
+        columns = {
+            "bucket": packing.trace_bucket(self._identity.trace_id, seq),
+            "bit": seq % BUCKET_FRAMES,
+            "graph": texts(graphs),
+            "place": places,
+            "images": images,
+        }
+        self._staging.insert("imported", self._owned(columns))
 
     def publish(self, report: TraceReport) -> str:
         """Bring the trace into the store, in one transaction.
