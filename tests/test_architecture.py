@@ -20,7 +20,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"traces", "relations", "abstractions", "lang"}),
     frozenset({"sgg", "store", "temporal"}),
     frozenset({"matches"}),
-    frozenset({"ingest", "query", "graphs"}),
+    frozenset({"ingest", "importing", "query", "graphs"}),
     frozenset({"monitor", "coverage", "selection", "exporters", "draw", "cluster", "sandbox"}),
     frozenset({"demo", "recording"}),
     frozenset({"cli", "web", "pytest_plugin"}),
@@ -40,7 +40,7 @@ OWNERS = {
     "PIL": {"draw"},
     "carla": {"traces"},
 }
-MASKS_ARE_KNOWN_TO = {"store", "lang/sql"}
+MASKS_ARE_KNOWN_TO = {"store", "lang/sql", "lang/presence", "lang/counting"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill"}
 FORBIDDEN_CALLS = {"eval", "exec", "__import__"}

@@ -25,24 +25,20 @@ from sgstore.lang.bound import (
     Bound,
     Edge,
     Node,
-    NodeAttribute,
     Operation,
     Scope,
     blocks_of,
 )
-from sgstore.lang.catalog import Home
 from sgstore.lang.formulas import (
     Aliases,
     Leaf,
     Select,
-    Values,
     among,
     bound_text,
     columns_of,
     edge_table,
     expression_text,
     is_constant,
-    is_position,
     lane_text,
     leaves,
     nested,
@@ -50,8 +46,9 @@ from sgstore.lang.formulas import (
     quoted,
     trace_text,
 )
-from sgstore.lang.kinds import Profile, alias_of, edge_conditions, homes_of, kind_conditions
-from sgstore.lang.phases import Given, Phases, Window, apart, phases_of, traces_of
+from sgstore.lang.kinds import Profile, alias_of, edge_conditions, kind_conditions
+from sgstore.lang.phases import Given, Phases, apart, phases_of, traces_of
+from sgstore.lang.presence import Presence, bit_of
 from sgstore.lang.rewrite import (
     FALSE,
     chain,
@@ -61,17 +58,16 @@ from sgstore.lang.rewrite import (
     ordered,
     possible,
 )
-from sgstore.vocabulary import ENTITY_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.lang.bound import Kinds, Query
     from sgstore.lang.catalog import Catalog
+    from sgstore.lang.phases import Window
 
 OUTSIDE: Final = '":outside"'
 BUCKET: Final = '":bucket"'
-_ENTITIES: Final = frozenset(ENTITY_KINDS)
 _MANY: Final = 5
 """Up to so many masks are compared in pairs, so that each join sheds what it can."""
 
@@ -139,7 +135,7 @@ class Base:
             self.bucket = self.bucket or f'{BUCKET}."bucket"'
 
 
-class Masks(ABC):
+class Masks(Presence, ABC):
     """Writes relations of the first phase for one query.
 
     Parameters
@@ -152,10 +148,8 @@ class Masks(ABC):
     """
 
     def __init__(self, query: Query, catalog: Catalog, window: Window | None = None) -> None:
+        super().__init__(catalog, window)
         self.query = query
-        self.catalog = catalog
-        self.window = window
-        self.values = Values()
         self.shared: list[tuple[str, str]] = []
         self._numbers = count(1)
 
@@ -231,13 +225,6 @@ class Masks(ABC):
         select.join(nested(text, ":block"), [])
         select.group = ['"bucket"', *columns_of(keys)]
         return select.text()
-
-    def within(self, column: str, per: int = 1) -> list[str]:
-        """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window."""
-        if self.window is None:
-            return []
-        low, high = self.window.low * per, self.window.high * per
-        return [f"{column} >= {low}", f"{column} < {high}"]
 
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
         """Conditions on a trace id that keep the traces that are asked, in the outermost scope."""
@@ -389,10 +376,10 @@ class Masks(ABC):
         alias = quoted(f"{key}:")
         profile = Profile.of(kinds, self.catalog)
         if profile.moving or conditions:
-            rows = self._present(kinds, profile, conditions)
+            rows = self.present(kinds, profile, conditions)
             base.join(nested(rows, f"{key}:"), alias, {key: f'{alias}."node_id"'})
         else:
-            on = kind_conditions(kinds, f'{alias}."kind"', None, self._standing)
+            on = kind_conditions(kinds, f'{alias}."kind"', None, self.standing)
             base.join(f'"node" AS {alias}', alias, {key: f'{alias}."node_id"'}, on)
 
     def _join_conditions(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
@@ -412,83 +399,6 @@ class Masks(ABC):
         node = f'{alias}."node_id"'
         base.tie(f'"{table}" AS {alias}', {key: node}, on)
         base.select.where += [node_text(c, node, at, self.values) for c in conditions]
-
-    @property
-    def _standing(self) -> frozenset[str]:
-        return self.catalog.fixed | self.catalog.mapped
-
-    def _present(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-        """Frames in which nodes are present and meet conditions, for each place where they may live."""
-        branches: list[str] = []
-        if (
-            profile.moving
-            and not conditions
-            and not kinds.other
-            and profile.moving >= (self.catalog.moving & _ENTITIES)
-        ):
-            branches.append(self._present_ego())
-        elif profile.moving:
-            branches.append(self._present_moving(kinds, profile, conditions))
-        if profile.fixed:
-            branches.append(self._present_standing(kinds.only(profile.fixed), conditions, "fixed"))
-        if profile.mapped:
-            branches.append(
-                self._present_standing(kinds.only(profile.mapped), conditions, "mapped")
-            )
-        return "\nUNION ALL\n".join(branches)
-
-    def _present_ego(self) -> str:
-        select = Select(['"bucket"', '"ego" AS "node_id"', f'bit_or({bit_of(_BIT)}) AS "mask"'])
-        select.join('"frame"', ['"ego" IS NOT NULL', *self.within('"bucket"')])
-        select.group = ['"bucket"', '"ego"']
-        return select.text()
-
-    def _present_moving(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-        frame, node = '"s"."frame_id"', '"s"."node_id"'
-        select = Select(
-            [f'{frame} >> 6 AS "bucket"', node, f'bit_or({bit_of(frame)}) AS "mask"'],
-            group=[f"{frame} >> 6", node],
-        )
-        select.join(
-            '"state" AS "s"',
-            kind_conditions(kinds, '"s"."kind"', '"s"."is_ego"', self.catalog.moving),
-        )
-        select.where += self.within(frame, 64)
-        found = [leaf for c in conditions for leaf in leaves(c) if isinstance(leaf, NodeAttribute)]
-        homes = {home for leaf in found for home in homes_of(leaf.attribute, profile)}
-        entity = '"n"' if Home.entity in homes else None
-        if entity:
-            on = [f'"n"."trace_id" = {frame} >> 24', f'"n"."node_id" = {node}']
-            select.join('"entity" AS "n"', on)
-        at = Aliases('"s"', entity, None, self._join_trace(select, f"{frame} >> 24", conditions))
-        select.where += [node_text(c, node, at, self.values) for c in conditions]
-        return select.text()
-
-    def _present_standing(self, kinds: Kinds, conditions: list[Bound], place: str) -> str:
-        bucket, node = '"p"."bucket"', '"p"."node_id"'
-        select = Select([bucket, node, '"p"."mask"'])
-        select.join('"node" AS "p"', kind_conditions(kinds, '"p"."kind"', None, self._standing))
-        select.where += [f"{node} {'>=' if place == 'fixed' else '<'} 0", *self.within(bucket)]
-        at = Aliases()
-        if conditions and place == "fixed":
-            on = [f'"n"."trace_id" = {bucket} >> 18', f'"n"."node_id" = {node}']
-            select.join('"entity" AS "n"', on)
-            trace = self._join_trace(select, f"{bucket} >> 18", conditions)
-            at = Aliases(entity='"n"', trace=trace)
-        elif conditions:
-            select.join('"bucket" AS "b"', [f'"b"."bucket" = {bucket}'])
-            on = ['"n"."map_id" = "b"."map_id"', f'"n"."node_id" = {node}']
-            select.join('"map_node" AS "n"', on)
-            at = Aliases(map='"n"')
-        select.where += [node_text(c, node, at, self.values) for c in conditions]
-        return select.text()
-
-    def _join_trace(self, select: Select, trace: str, conditions: list[Bound]) -> str | None:
-        """The row of the trace, if a condition is on a position, which is stored about the trace's origin."""
-        if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
-            return None
-        select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
-        return '"t"'
 
     def _join_lane(self, base: Base, edge: Edge, conditions: list[Bound]) -> None:
         """The frames in which an edge meets conditions on its attributes."""
@@ -562,15 +472,6 @@ class Masks(ABC):
         edges = frozenset(edge.key for edge in block.scope.edges if edge.named)
         keys = frozenset(nodes) | frozenset(block.scope.outer)
         return self.frames(block.scope, given, keys, edges, columns)
-
-
-_BIT: Final = '"bit"'
-
-
-def bit_of(frame: str) -> str:
-    """The mask of a single frame, given its id or its number in the bucket."""
-    number = frame if frame == _BIT else f"{frame} & 63"
-    return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
 
 
 def _masked(base: Base, nodes: frozenset[str], edges: frozenset[str]) -> str:
