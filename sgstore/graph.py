@@ -150,6 +150,31 @@ class GraphBlock:
         return len(self.frames)
 
 
+def graph_of_records(
+    nodes: Iterable[Mapping[str, Any]], edges: Iterable[Mapping[str, Any]], **about: Any
+) -> nx.MultiDiGraph[Any]:
+    """A graph in node-link form as a ``networkx.MultiDiGraph``.
+
+    Parameters
+    ----------
+    nodes : iterable of mappings
+        ``id`` and attributes.
+    edges : iterable of mappings
+        ``source``, ``target``, ``relation``, which is the key too, and attributes.
+    **about
+        Attributes of the graph.
+    """
+    import networkx as nx  # half a second to import: only when asked for
+
+    graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph(**about)
+    for node in nodes:
+        graph.add_node(node["id"], **{k: v for k, v in node.items() if k != "id"})
+    for edge in edges:
+        known = {k: v for k, v in edge.items() if k not in {"source", "target"}}
+        graph.add_edge(edge["source"], edge["target"], key=edge["relation"], **known)
+    return graph
+
+
 def named_graph(
     nodes: Mapping[str, str], edges: Iterable[tuple[str, str, str]], **about: Any
 ) -> nx.MultiDiGraph[str]:

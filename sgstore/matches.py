@@ -13,16 +13,20 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import MissingExtraError
+from sgstore.graph import graph_of_records
 from sgstore.lang import Compiled, compile_query
 from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.lang.phases import Window
 from sgstore.lang.results import EXTENTS
+from sgstore.lang.rewrite import rewritten
+from sgstore.lang.subgraphs import Layout, shown
 from sgstore.store import FrameRef
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 
+    import networkx as nx
     import numpy as np
     from numpy.typing import NDArray
 
@@ -88,6 +92,9 @@ class Matches:
         ``….name``.
     left_out : tuple of str
         Traces that cannot answer the query, because a relation that it names is not known of them.
+    graphs : bool
+        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks: its ``nodes`` and its ``edges``, lists
+        of dicts in node-link form.
     """
 
     def __init__(
@@ -103,6 +110,7 @@ class Matches:
         self._parameters = parameters
         self._ready: Compiled | None = None
         with self._compiled() as compiled:
+            self.graphs = compiled.layout is not None
             self.columns = compiled.columns
             self.left_out = compiled.left_out
 
@@ -119,7 +127,9 @@ class Matches:
             yield self._ready
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
-        return self._stream(Compiled.rows)
+        with self._compiled() as compiled:
+            layout, rows = compiled.layout, self._stream(Compiled.rows)
+            yield from rows if layout is None else map(layout.row, rows)
 
     def rows(self) -> list[tuple[Any, ...]]:
         """All rows at once."""
@@ -162,6 +172,26 @@ class Matches:
         }
         found = [row for row in rows if row[0] == frame.frame_id]
         return [{name: row[i] for i, name in names.items()} for row in found]
+
+    def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
+        """Each match as a graph of the nodes and edges that it binds, whatever ``RETURN`` says.
+
+        Nodes are node ids with all that is known of them, and ``variables``: their names in the pattern. Edges
+        have their relation as key and as attribute, beside what else is known of them; see
+        :mod:`sgstore.lang.subgraphs`. The graph has the attributes ``frame_id``, ``trace``, ``seq``,
+        ``time_ns`` and ``t``, and what stands beside ``RETURN SUBGRAPHS``.
+        """
+        with self._compiled() as compiled:
+            layout = Layout.of(compiled.bound)
+            ready = replace(compiled, query=rewritten(layout.query, compiled.catalog))
+            asked = self.graphs or compiled.query.result.whole
+            rows = self._stream(
+                lambda _, window: ready.rows(window), None if asked else "subgraphs"
+            )
+            for row in rows:
+                *values, nodes, edges = layout.row(row)
+                about = dict(zip(layout.columns, values, strict=False))
+                yield graph_of_records(nodes, edges, **about)
 
     def intervals(self) -> Iterator[Interval]:
         """Maximal runs of consecutive frames of a trace in which the same binding holds.
@@ -262,12 +292,14 @@ class Matches:
         keep = [i for i, name in enumerate(rest) if name.removesuffix(".id") not in named]
         columns = ("frame", "t", *(rest[i].removesuffix(".name") for i in keep))
 
-        def shown() -> Iterator[tuple[Any, ...]]:
+        def lines() -> Iterator[tuple[Any, ...]]:
             for row in self:
                 _, trace, seq, _, t = row[:width]
-                yield (f"{trace}#{seq}", round(t, 3), *(row[width + i] for i in keep))
+                values = [row[width + i] for i in keep]
+                values[-2:] = shown(*values[-2:]) if self.graphs else values[-2:]
+                yield (f"{trace}#{seq}", round(t, 3), *values)
 
-        return columns, shown()
+        return columns, lines()
 
     def _stream(
         self,

@@ -69,6 +69,8 @@ def write_rows(
     ExportError
         The file cannot be written, or Parquet would go to a terminal.
     """
+    if form in {Format.csv, Format.parquet} and not types:
+        rows = ([_flat(value) for value in row] for row in rows)
     if form is Format.parquet:
         return _write_parquet(columns, rows, output, types)
     if output is None:
@@ -145,6 +147,15 @@ def _write_json(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: T
 
 def _dumps(columns: Sequence[str], row: Sequence[Any]) -> str:
     return json.dumps(_json_object(dict(zip(columns, row, strict=True))), ensure_ascii=False)
+
+
+def _flat(value: Any) -> Any:
+    """Lists and objects as JSON, for forms that have none."""
+    return json.dumps(_json_value(value), ensure_ascii=False) if _is_nested(value) else value
+
+
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, list | tuple | dict)
 
 
 def _json_object(values: dict[str, Any]) -> dict[str, Any]:

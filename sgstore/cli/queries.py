@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,6 +31,9 @@ from sgstore.cli.arguments import (
 from sgstore.cli.output import Format, say, write_document, write_rows, write_text
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.matches import Matches
     from sgstore.sandbox import Answer, Sandbox
 
 Safe = Annotated[
@@ -90,11 +93,24 @@ def find(
         typer.echo(number)
     else:
         form = form_of(form, as_json=as_json)
-        columns, rows = matches.for_people() if form is Format.table else (matches.columns, matches)
+        columns, rows = _as_shown(matches, form)
         number = write_rows(columns, rows, form, output)
         if not number and form is Format.table:
             say("nothing matches")
     return NO_MATCH if require and not number else 0
+
+
+def _as_shown(matches: Matches, form: Format) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
+    if form is Format.table:
+        return matches.for_people()
+    if not matches.graphs or form not in {Format.json, Format.ndjson}:
+        return matches.columns, matches
+    columns = ("directed", "multigraph", *matches.columns)
+    return columns, (
+        (True, True, *row[:-1], [{**edge, "key": edge["relation"]} for edge in row[-1]])
+        for row in matches
+    )
 
 
 @app.command("why-not")

@@ -325,7 +325,11 @@ def _related(label: s.Label, session: Session) -> frozenset[str]:
 # Results ------------------------------------------------------------------------------------------
 
 
-_FORMS: Final[dict[str, b.Form]] = {"intervals": "intervals", "clips": "clips"}
+_FORMS: Final[dict[str, b.Form]] = {
+    "intervals": "intervals",
+    "clips": "clips",
+    "subgraphs": "subgraphs",
+}
 
 
 def _result(returns: s.Returns | None, names: Names) -> b.Result:
@@ -350,13 +354,10 @@ def _result(returns: s.Returns | None, names: Names) -> b.Result:
 
 
 def _special(returns: s.Returns, session: Session) -> s.Item | None:
-    """The one result that is no value: ``FRAMES``, ``INTERVALS`` or ``CLIPS``."""
+    """The one result that is no value: ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``."""
     special = [item for item in returns.items if item.form not in {"value", "all"}]
-    for item in special:
-        if item.form == "subgraphs":
-            session.unknown("result", "SUBGRAPHS", item.span, ("FRAMES", "INTERVALS", "CLIPS"))
     if len(special) > 1:
-        session.refuse("one of FRAMES, INTERVALS and CLIPS at a time", special[1].span)
+        session.refuse("one of FRAMES, INTERVALS, SUBGRAPHS and CLIPS at a time", special[1].span)
     return special[0] if special else None
 
 
@@ -382,7 +383,8 @@ def _key(value: s.Expression, result: b.Result, names: Names) -> b.Bound | str:
         return same
     counted = any(isinstance(part, b.Aggregate) for part in b.walk(found))
     one_each = not (result.distinct or result.framed or result.aggregated)
-    if result.form != "rows" or not (result.aggregated if counted else one_each):
+    listed = result.form in {"rows", "subgraphs"}
+    if not listed or not (result.aggregated if counted else one_each):
         names.session.refuse(
             "only by what is returned can these results be ordered or sampled",
             value.span,

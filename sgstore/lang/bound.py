@@ -287,7 +287,7 @@ INTERVAL_COLUMNS: Final = (
 CLIP_COLUMNS: Final = ("trace", "start_ns", "end_ns")
 """Columns of a clip: log times, offsets included."""
 
-Form = Literal["rows", "intervals", "clips"]
+Form = Literal["rows", "intervals", "clips", "subgraphs"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +321,7 @@ class Result:
     Attributes
     ----------
     form : str
-        ``rows``, ``intervals`` or ``clips``.
+        ``rows``, ``intervals``, ``clips`` or ``subgraphs``.
     columns : tuple of Column
         Values returned; empty without ``RETURN``.
     whole : bool
@@ -350,6 +350,8 @@ class Result:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the columns that are not values: those of frames, intervals or clips."""
+        if self.form == "subgraphs":
+            return FRAME_COLUMNS
         if self.form != "rows":
             return INTERVAL_COLUMNS if self.form == "intervals" else CLIP_COLUMNS
         return FRAME_COLUMNS if self.whole or self.framed else ()

@@ -13,6 +13,7 @@ from sgstore.lang.parser import parse
 from sgstore.lang.phases import traces_of
 from sgstore.lang.printing import query_text, statements_text
 from sgstore.lang.rewrite import rewritten
+from sgstore.lang.subgraphs import Layout
 from sgstore.lang.syntax import Match
 from sgstore.vocabulary import folded
 
@@ -50,9 +51,14 @@ class Compiled:
     stored: Catalog | None = None
 
     @property
+    def layout(self) -> Layout | None:
+        """If it returns graphs: how they are made of its rows."""
+        return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Names of what it returns."""
-        return self.rows().columns
+        return self.rows().columns if self.layout is None else self.layout.columns
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -79,7 +85,7 @@ class Compiled:
         Of a query that returns rows these are all intervals, whatever its order and its limit.
         """
         query, result = self.query, self.query.result
-        if result.whole or result.aggregated:
+        if result.whole or result.aggregated or self.layout is not None:
             query = results.with_bindings(query)
         elif result.form == "rows":
             result = Result(form="intervals", columns=result.columns, whole=False)
@@ -163,7 +169,8 @@ def compile_query(
     statements = parse(text)
     seen = _seen(statements, catalog, parameters or {})
     bound = bind_query(text, statements, seen, parameters or {})
-    return Compiled(text, bound, rewritten(bound, seen), seen, catalog)
+    whole = Layout.of(bound).query if bound.result.form == "subgraphs" else bound
+    return Compiled(text, bound, rewritten(whole, seen), seen, catalog)
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:

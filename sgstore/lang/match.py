@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from sgstore.lang import bound as b
 from sgstore.lang.evaluation import Attributes, Binding, Evaluate, FrameView, evaluator
+from sgstore.lang.subgraphs import Layout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.lang.bound import BlockValue, Edge, Query, Scope
+    from sgstore.lang.subgraphs import Record
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Matcher:
     """
 
     def __init__(self, query: Query) -> None:
-        scope = query.scope
+        self._query, scope = query, query.scope
         self._search = Search(scope, injective=query.injective)
         self._names = [key for key, node in scope.nodes.items() if node.role == "named"]
         self._edges = [edge.key for edge in scope.edges if edge.named]
@@ -60,6 +62,18 @@ class Matcher:
             if key not in seen:  # unnamed nodes make no new match
                 seen.add(key)
                 yield Match(nodes, edges)
+
+    def graphs(self, view: FrameView) -> Iterator[tuple[list[Record], list[Record]]]:
+        """Each match as the nodes and edges that it binds; see :func:`sgstore.lang.subgraphs.graph_of`."""
+        layout = Layout.of(self._query)
+        scope, at = layout.query.scope, Binding(view)
+        seen: set[tuple[object, ...]] = set()
+        for _ in Search(scope, injective=self._query.injective).run(at):
+            single = [edge for edge in scope.edges if edge.high == 1]
+            key = (*(at.nodes[n] for n in scope.nodes), *(at.edges[e.key][0] for e in single))
+            if key not in seen:
+                seen.add(key)
+                yield layout.graph(at.nodes, at.edges, view.nodes)
 
     def holds(self, view: FrameView) -> bool:
         """Whether there is a match in a graph."""
