@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.abstractions.columns import BETWEEN_ENTITIES, EGO, SCENERY, Labelled
-from sgstore.abstractions.roles import OPPOSING, role_name
+from sgstore.abstractions.roles import OPPOSING, UNNAMED, role_name
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     KIND_CODE,
@@ -130,9 +130,25 @@ def whole(seen: Seen) -> Labelled:
         (seen.frame, seen.src, first + seen.relation.astype(np.int64), seen.dst),
         (frame, src, first + relation.astype(np.int64), dst),
     ]
-    labels = (*_KIND_LABELS, *RELATIONS)
+    labels = [*_KIND_LABELS, *RELATIONS]
+    if seen.grounds is not None:
+        label, more = _with_roles(seen, seen.grounds, label, len(labels))
+        labels += more
     nodes = [(seen.node_frame, seen.node, label)]
     return Labelled.assembled(seen.frames, nodes, edges, labels, _names(seen.grounds))
+
+
+def _with_roles(seen: Seen, grounds: Grounds, label: Ints, first: int) -> tuple[Ints, list[str]]:
+    """Labels of nodes, in which lanes whose names say their role are labelled with it; and these labels."""
+    named = grounds.strands.named
+    roles = np.unique(named[named != UNNAMED])
+    if not len(roles):
+        return label, []
+    part = np.clip(-1 - seen.node, 0, len(named) - 1)
+    role = np.where(seen.node < 0, named[part], UNNAMED)
+    at = np.minimum(np.searchsorted(roles, role), len(roles) - 1)
+    named_label = np.where(role == UNNAMED, label, first + at)
+    return named_label, [role_name(one) for one in roles.tolist()]
 
 
 def junction(seen: Seen) -> Labelled:
@@ -187,7 +203,7 @@ def _drawn(seen: Seen, kept: Bools, columns: Part, whose: Ints | None) -> Part:
 
 
 def _standing_for(whose: Ints, node: Ints) -> Ints:
-    return np.where(node < 0, whose[np.minimum(-1 - node, len(whose) - 1)], node)
+    return np.where(node < 0, whose[np.clip(-1 - node, 0, len(whose) - 1)], node)
 
 
 def _repeated(columns: Part) -> Bools:
@@ -210,6 +226,8 @@ def _merged(grounds: Grounds) -> Ints:
     first: dict[tuple[str, int, str], int] = {}
     keys = zip(grounds.road[lanes], grounds.lane[lanes].tolist(), strict=True)
     for row, (road, lane) in zip(lanes.tolist(), keys, strict=True):
+        if not road:  # it has a name and nothing else: a graph that came from elsewhere
+            continue
         key = (road, lane, "Lane" if grounds.driving[row] else grounds.lane_type[row])
         found[row] = first.setdefault(key, -1 - row)
     return found
@@ -227,6 +245,9 @@ def _ground_labels(grounds: Grounds, first: int) -> tuple[Ints, list[str]]:
             grounds.kind.tolist(), grounds.lane_type, grounds.driving.tolist(), strict=True
         )
     ]
+    named = grounds.strands.named
+    for row in np.flatnonzero(named != UNNAMED).tolist():
+        text[row] = role_name(int(named[row]))
     table = {label: first + i for i, label in enumerate(dict.fromkeys(text))}
     return np.array([table[label] for label in text], np.int64), list(table)
 
@@ -243,7 +264,7 @@ def _names(grounds: Grounds | None) -> dict[int, str]:
     for row, (kind, name, road, lane) in enumerate(columns):
         match KINDS[kind]:
             case "lane":
-                names[-1 - row] = f"Lane {road}_{lane:+d}"
+                names[-1 - row] = f"Lane {road}_{lane:+d}" if road else str(name)
             case "road":
                 names[-1 - row] = f"Road {name}"
             case "junction":
@@ -341,11 +362,13 @@ def _roles(seen: Seen, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints
         of = np.flatnonzero(own == one)
         at = np.minimum(np.searchsorted(known, here[of]), len(known) - 1)
         role[of] = np.where(known[at] == here[of], values[at], OPPOSING)
-    keep = (here != 0) & (reached | (role != OPPOSING))
+    named = strands.named[-1 - here]
+    keep = (here != 0) & (reached | (role != OPPOSING) | (named != UNNAMED))
     fresh = np.flatnonzero(keep)
     fresh = fresh[~_repeated((here_frame[fresh], here[fresh]))]
-    here_frame, here, role = here_frame[fresh], here[fresh], role[fresh]
-    return here_frame, here, _numbered(seen, (frame, src, strand), (here_frame, here, role))
+    here_frame, here, role, named = here_frame[fresh], here[fresh], role[fresh], named[fresh]
+    role = _numbered(seen, (frame, src, strand), (here_frame, here, role))
+    return here_frame, here, np.where(named != UNNAMED, named, role)
 
 
 def _numbered(seen: Seen, inside: Part, lanes: Part) -> Ints:

@@ -6,6 +6,7 @@ Outside of junctions and inside of them strands are apart. It is a matter of the
 
 from __future__ import annotations
 
+import re
 from collections import OrderedDict, defaultdict
 from typing import TYPE_CHECKING, Final
 
@@ -23,6 +24,9 @@ OPPOSING: Final = 1 << 16
 _MOST: Final = 1000
 """Lanes to one side of the ego's that have a name."""
 
+UNNAMED: Final = -(1 << 21)
+"""What stands for no role among those that names say."""
+
 
 class Strands:
     """The strands of a map, and how they lie beside one another.
@@ -32,10 +36,14 @@ class Strands:
     of : (K,) int64
         For each part of the map a node id: of the lane that stands for its strand, the one with the greatest
         node id; 0 for what is no lane that is driven on.
+    named : (K,) int64
+        For each part of the map the role that its name says, as in graphs that came from elsewhere;
+        :data:`UNNAMED` where it says none.
     """
 
     def __init__(self, grounds: Grounds) -> None:
         self.of = _strands(grounds)
+        self.named = np.array([_role_named(name) for name in grounds.name], np.int64)
         self._left = self._beside(grounds, "toLeftOf")
         self._right = self._beside(grounds, "toRightOf")
         self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
@@ -98,3 +106,27 @@ def role_name(role: int) -> str:
     if role >= OPPOSING:
         return f"Opposing Lane {role - OPPOSING}"
     return f"{'Left' if role > 0 else 'Right'} {abs(role)} of Ego Lane"
+
+
+_BESIDE: Final = re.compile(r"(left|right) (\d{1,4}) of ego lane")
+_OPPOSING: Final = re.compile(r"opposing lane (\d{1,4})")
+_ROLES: Final = {
+    "ego lane": 0,
+    "middle lane": 0,
+    "left lane": 1,
+    "right lane": -1,
+    "lane_middle": 0,
+    "lane_left": 1,
+    "lane_right": -1,
+}
+"""Names of lanes with S3C and CARLASGG, and with RoadScene2Vec, whose ego is always in the middle one."""
+
+
+def _role_named(name: str) -> int:
+    """The role that a name says; the inverse of :func:`role_name`."""
+    text = name.lower()
+    if beside := _BESIDE.fullmatch(text):
+        return int(beside[2]) * (1 if beside[1] == "left" else -1)
+    if opposing := _OPPOSING.fullmatch(text):
+        return OPPOSING + int(opposing[1])
+    return _ROLES.get(text, UNNAMED)
