@@ -13,7 +13,7 @@
 -- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
 --
 -- Changes
---   * Version 2: pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading.
+--   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
 --     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
 --   * map_id, channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
@@ -129,6 +129,10 @@ CREATE TABLE derived_edge (                                    -- as edge
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
   bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
   chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
+
+CREATE TABLE event (                                           -- what the simulator says has happened
+  trace_id BIGINT, frame_id BIGINT,                            -- of the frame that is nearest in time
+  time_ns BIGINT, log_time_ns BIGINT, kind VARCHAR, ident VARCHAR, other VARCHAR, value DOUBLE, detail VARCHAR);
 
 CREATE TABLE imported (                                        -- frames that came as graphs: what their file calls them
   bucket BIGINT, bit TINYINT, trace_id BIGINT, graph VARCHAR, place BIGINT, images BIGINT);   -- place: row or line
@@ -293,6 +297,15 @@ FROM frame f JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
      JOIN channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN trace t ON t.trace_id = f.trace_id;
 
 COMMENT ON VIEW payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';
+
+CREATE VIEW events AS
+SELECT v.frame_id, v.trace_id, t.name AS trace, v.kind, v.time_ns, (v.time_ns - t.start_ns) / 1e9 AS t, v.log_time_ns,
+       e.node_id, o.node_id AS other, v.value, v.detail, v.ident, v.other AS other_ident
+FROM event v JOIN trace t ON t.trace_id = v.trace_id
+     LEFT JOIN entity e ON e.trace_id = v.trace_id AND e.ident = v.ident
+     LEFT JOIN entity o ON o.trace_id = v.trace_id AND o.ident = v.other;
+
+COMMENT ON VIEW events IS 'What the simulator says has happened. frame_id: of the frame that is nearest in time; kind: collision, lane_invasion, environment; t: seconds since the trace began; node_id, ident: the vehicle, as an entity and as the simulator calls it; other, other_ident: what it collided with, NULL where that is no entity of the trace or nothing; value: length of the impulse of a collision, N·s; detail: markings that were crossed (broken, solid, other), or weather and light from then on. What is not known is NULL.';
 
 CREATE VIEW imports AS
 SELECT f.frame_id, i.graph, i.place, i.images

@@ -216,6 +216,9 @@ class FrameBlock:
         Poses of the static ones among them; they stay for the rest of the trace.
     messages : MessageRefs
         The messages read with this block, of all channels that are not latched.
+    events : tuple of Event
+        What the simulator says has happened, as far as it was read with this block: of its frames, and perhaps
+        of the next ones.
     """
 
     seq: Ints
@@ -227,6 +230,7 @@ class FrameBlock:
     entities: Entities
     scenery: States
     messages: MessageRefs
+    events: tuple[Event, ...] = ()
 
     def __post_init__(self) -> None:
         frames = len(self.seq)
@@ -379,7 +383,7 @@ class TraceReport:
     losses : list of Loss
         What could not be used.
     events : list of Event
-        What the simulator says has happened, in the order of the file.
+        What the simulator says has happened, in the order of the file: the first of very many.
     """
 
     frames: int = 0

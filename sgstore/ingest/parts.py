@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -60,7 +61,9 @@ class Part:
         clock = _Clock(self)
         waiting, given = _Waiting(), 0
         for block in blocks:
-            waiting.add(block, clock.kept(block.time_ns))
+            kept = clock.kept(block.time_ns)
+            happened = tuple(event for event in block.events if clock.within(event.time_ns))
+            waiting.add(replace(block, events=happened), kept)
             full = len(waiting) if waiting.messages > MAX_MESSAGES else len(waiting) // size * size
             if full:
                 yield waiting.take(full, given)
@@ -83,6 +86,14 @@ class _Clock:
         self._begun = part.since is None
         self.last = 0.0
         self.over = False
+
+    def within(self, time_ns: int) -> bool:
+        """Whether something that happened at a time happened in the part, once frames up to it were seen."""
+        since = (time_ns - (self._zero or 0)) / 1e9
+        part = self._part
+        return (
+            (part.since or -math.inf) <= since <= (math.inf if part.until is None else part.until)
+        )
 
     def kept(self, time_ns: Ints) -> Bools:
         """Whether each frame is kept."""
@@ -131,11 +142,11 @@ class _Waiting:
         self.messages += len(block.messages)
 
     def take(self, count: int, first: int) -> FrameBlock:
-        """The first frames as one block, with all messages and all entities that came so far."""
+        """The first frames as one block, with all messages, entities and events that came so far."""
         whole = _joined(self._blocks)
         now = _sliced(whole, 0, count)
         rest = _sliced(whole, count, len(whole))
-        self._blocks = [_without_entities(_without_messages(rest))]
+        self._blocks = [_only_frames(_without_messages(rest))]
         self._frames -= count
         self.messages = 0
         return replace(now, seq=first + np.arange(count))
@@ -179,6 +190,7 @@ def _joined(blocks: list[FrameBlock]) -> FrameBlock:
         entities=_entities([block.entities for block in blocks]),
         scenery=_stacked(States, [block.scenery for block in blocks]),
         messages=_stacked(MessageRefs, [block.messages for block in blocks]),
+        events=tuple(event for block in blocks for event in block.events),
     )
 
 
@@ -208,9 +220,9 @@ def _without_messages(block: FrameBlock) -> FrameBlock:
     return replace(block, messages=MessageRefs(**none))
 
 
-def _without_entities(block: FrameBlock) -> FrameBlock:
+def _only_frames(block: FrameBlock) -> FrameBlock:
     entities = block.entities
     none: dict[str, Any] = {f.name: getattr(entities, f.name)[:0] for f in fields(Entities)[1:]}
     nowhere = block.scenery.take(np.zeros(0, np.intp))
     first = entities.first + len(entities)
-    return replace(block, entities=Entities(first=first, **none), scenery=nowhere)
+    return replace(block, entities=Entities(first=first, **none), scenery=nowhere, events=())

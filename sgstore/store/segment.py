@@ -15,6 +15,7 @@ from sgstore.errors import StoreError
 from sgstore.store import packing, payloads
 from sgstore.store.access import translated
 from sgstore.store.classes import IngestedClasses
+from sgstore.store.happenings import Happenings
 from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
 from sgstore.store.publishing import MAP_TABLES, fill_trace, publish_in
 from sgstore.store.sealed import Sealed
@@ -82,6 +83,7 @@ class Segment:
         self._origin: Origin | None = None
         self._periods = payloads.Periods()
         self._classes = IngestedClasses(road_map)
+        self._happenings = Happenings(identity.trace_id)
         self._next_seq = 0
         self._staging = Staging(store, folder)
         try:
@@ -205,6 +207,7 @@ class Segment:
             raise ValueError("a trace without frames")
         staging, identity = self._staging, self._identity
         with translated(self._store):
+            staging.insert("event", self._owned(self._happenings.rest()))
             if parked is not None:
                 staging.mark_parked(parked)
             payloads.join(
@@ -252,6 +255,7 @@ class Segment:
         insert("edge", packing.edge_columns(graph, trace_id, kinds))
         insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
         insert("lane_gap", packing.gap_columns(graph, trace_id))
+        insert("event", self._owned(self._happenings.of(graph.frames)))
         insert("frame_class", self._classes.columns(graph, trace_id, kinds.entities))
 
     def _owned(self, columns: Columns) -> Columns:

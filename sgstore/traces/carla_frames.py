@@ -36,7 +36,7 @@ from sgstore.traces.carla_channels import (
     stamp_from,
     stamp_of,
 )
-from sgstore.traces.carla_events import EVENTS, Events
+from sgstore.traces.carla_events import EVENTS, event_of
 from sgstore.traces.carla_lights import Lights
 from sgstore.traces.carla_survey import SAME_TICK
 from sgstore.traces.cdr import Fields, Table, decode
@@ -166,7 +166,6 @@ class FrameDecoder:
         self._idents: dict[int, int] = {}
         self._people: set[int] = set()
         self._lights = Lights(found.lights, signals, self.roster)
-        self._events = Events(report)
         self._seq = -1
         self._untimed = 0
         self._unusable = Tally()
@@ -200,7 +199,6 @@ class FrameDecoder:
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
         losses, warn = self._report.losses, self._report.warnings.append
-        self._events.settle()
         losses += self._unreadable.losses()
         for loss in self._unusable.losses():
             reason = f"{loss.reason}: {loss.messages} states were left out"
@@ -376,7 +374,7 @@ class FrameDecoder:
         stamp = stamp_of(message)
         place = log_time if stamp == NEVER else stamp, log_time, self._seq
         named = "" if ident is None else str(ident)
-        self._events.take(found.contents[channel], message, place, named)
+        self.roster.happen(event_of(found.contents[channel], message, place, named))
 
     def _take_vehicle_lights(self, _channel: int, _log_time: int, data: memoryview) -> None:
         stamp, lights = _vehicle_lights(data)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from sgstore.traces.chunks import Messages
     from sgstore.vocabulary import TypeMeaning
-    from sgstore.world import Bools, Floats, Ints, TraceReport
+    from sgstore.world import Bools, Event, Floats, Ints, TraceReport
 
 Raw = TypeVar("Raw")
 
@@ -34,6 +34,9 @@ FAR: Final = 1e9
 
 NEAR_REFS: Final = 250_000
 """Messages behind a frame, and before the next one, that are referred to however many there are."""
+
+MOST_EVENTS: Final = 10_000
+"""Events that a report lists; a vehicle that leans on a wall collides in every frame. Blocks have them all."""
 
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = 0, 3, 6, 9, 12
 
@@ -76,7 +79,7 @@ class FrameRows:
 
 @dataclass(slots=True)
 class Roster:
-    """The entities of a trace in the order in which they were met; the index is the node id.
+    """The entities of a trace in the order in which they were met; the index is the node id. And its events.
 
     Attributes
     ----------
@@ -86,11 +89,15 @@ class Roster:
         How many there are.
     absurd : int
         Numbers that nothing on earth has, in states and poses.
+    happened : int
+        How many events there were.
     """
 
     report: TraceReport
     size: int = 0
     absurd: int = 0
+    happened: int = 0
+    _events: list[Event] = field(default_factory=list["Event"])
     _first: int = 0
     _rows: list[tuple[str, int, str, str, str, bool, str]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
     _poses: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
@@ -137,6 +144,26 @@ class Roster:
         self._rows.append(row)
         self.size += 1
         return node
+
+    def happen(self, event: Event) -> None:
+        """Take up an event."""
+        self.happened += 1
+        self._events.append(event)
+        if self.happened <= MOST_EVENTS:
+            self.report.events.append(event)
+
+    def take_events(self) -> tuple[Event, ...]:
+        """The events that were not taken yet."""
+        events, self._events = tuple(self._events), []
+        return events
+
+    def settle(self) -> None:
+        """Report what is odd, once everything was taken."""
+        warn = self.report.warnings.append
+        if self.absurd:
+            warn(f"{self.absurd} numbers of {FAR:g} and more are taken as missing")
+        if self.happened > MOST_EVENTS:
+            warn(f"of {self.happened} events the report lists the first {MOST_EVENTS}")
 
     def count_unknown(self, type_name: str) -> None:
         """Count an entity whose type name nothing maps."""
@@ -246,7 +273,7 @@ def assemble(
             window = size + (first > 0)
             if len(done) + len(raw) > window:  # the frame behind the block is complete now, too
                 done += _on_earth(decoder.complete(raw), decoder.roster)
-                yield _block(first, done, size, block_refs, decoder.roster.take(known))
+                yield _block(first, done, size, block_refs, decoder.roster, known)
                 first, done, raw = first + size, done[-2:], []
                 window = size + 1
             if len(done) + len(raw) == window:
@@ -259,18 +286,18 @@ def assemble(
     open_refs += between.take()
     done += _on_earth(decoder.complete(raw), decoder.roster)
     if len(done) - (first > 0) > size:
-        yield _block(first, done, size, block_refs, decoder.roster.take(known))
+        yield _block(first, done, size, block_refs, decoder.roster, known)
         first, done = first + size, done[-2:]
     left = len(done) - (first > 0)
-    entered = decoder.roster.take(decoder.roster.size)
-    if decoder.roster.absurd:
-        words = f"{decoder.roster.absurd} numbers of {FAR:g} and more are taken as missing"
-        decoder.roster.report.warnings.append(words)
+    last = (
+        _block(first, done, left, open_refs, decoder.roster, decoder.roster.size) if left else None
+    )
+    decoder.roster.settle()
     if between.dropped:
         words = f"{between.dropped} sensor messages stand far from any frame, and no frame refers to them"
         decoder.roster.report.warnings.append(words)
-    if left:
-        yield _block(first, done, left, open_refs, entered)
+    if last is not None:
+        yield last
 
 
 @dataclass(slots=True)
@@ -339,9 +366,13 @@ def _block(
     window: list[FrameRows],
     size: int,
     refs: list[MessageRefs],
-    entered: tuple[Entities, States],
+    roster: Roster,
+    known: int,
 ) -> FrameBlock:
-    """The block of ``size`` frames in a window, which has the frames before and behind it too, if any."""
+    """The block of ``size`` frames in a window, which has the frames before and behind it too, if any.
+
+    ``known``: how many entities had been met before the next block's first frame.
+    """
     skipped = int(first > 0)
     frames = window[skipped : skipped + size]
     counts = np.array([len(frame) for frame in frames], np.int64)
@@ -358,7 +389,7 @@ def _block(
     )
     nodes = np.concatenate([frame.node for frame in frames])
     ego = np.array([frame.ego for frame in frames], np.int64)
-    entities, scenery = entered
+    entities, scenery = roster.take(known)
     return FrameBlock(
         seq=np.arange(first, first + len(frames)),
         time_ns=np.array([frame.time_ns for frame in frames], np.int64),
@@ -376,6 +407,7 @@ def _block(
         entities=entities,
         scenery=scenery,
         messages=_joined(refs),
+        events=roster.take_events(),
     )
 
 

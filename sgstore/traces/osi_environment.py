@@ -13,11 +13,9 @@ from sgstore.traces.osi_schema import DECODE_ERRORS
 from sgstore.world import Event
 
 if TYPE_CHECKING:
-    from sgstore.world import TraceReport
+    from sgstore.traces.frames import Roster
 
 TYPE: Final = "osi3.EnvironmentalConditions"
-MOST_EVENTS: Final = 10_000
-"""Changes that a report lists."""
 _CLASSES: Final = (
     ("precipitation", "precipitation"),
     ("fog", "fog"),
@@ -33,16 +31,16 @@ class Environment:
     ----------
     message : type
         Class of the messages of the leading channel, which have the conditions as bytes.
-    report : TraceReport
+    roster : Roster
         Takes up an event of kind ``environment`` whenever a class of conditions changes; its ``detail`` is
         such as ``precipitation=light, fog=mist, illumination=level5, clouds=six_oktas, time_of_day=13:05:00``.
     """
 
-    def __init__(self, message: type[Any], report: TraceReport) -> None:
-        self._report = report
+    def __init__(self, message: type[Any], roster: Roster) -> None:
+        self._roster = roster
         self._told = b""
         self._state = ""
-        self._count = self._unread = 0
+        self._unread = 0
         try:
             found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(TYPE)
             self._class = message_factory.GetMessageClass(found)
@@ -64,20 +62,14 @@ class Environment:
         if state == self._state or not state:
             return
         self._state = state
-        self._count += 1
-        if self._count <= MOST_EVENTS:
-            detail = ", ".join([state, *more])
-            event = Event("environment", time_ns, log_time_ns, seq, detail=detail)
-            self._report.events.append(event)
+        detail = ", ".join([state, *more])
+        self._roster.happen(Event("environment", time_ns, log_time_ns, seq, detail=detail))
 
     def settle(self) -> None:
-        """Say what was not listed."""
+        """Say what could not be read."""
         if self._unread:
             words = f"weather and light cannot be read where they changed {self._unread} times"
-            self._report.warnings.append(words)
-        if self._count > MOST_EVENTS:
-            more = self._count - MOST_EVENTS
-            self._report.warnings.append(f"{more} more changes of weather and light are not listed")
+            self._roster.report.warnings.append(words)
 
 
 def classes_of(conditions: Any) -> str:

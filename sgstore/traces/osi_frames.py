@@ -115,7 +115,7 @@ class FrameDecoder:
         ].objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
         self._lights = TrafficLights(self.roster)
-        self._environment = Environment(survey.leads[leading].message, report)
+        self._environment = Environment(survey.leads[leading].message, self.roster)
         self._frames = 0
 
     def decode(self, run: Messages, row: int) -> RawFrame | None:
