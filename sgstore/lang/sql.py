@@ -29,6 +29,7 @@ from sgstore.lang.bound import (
     Scope,
     blocks_of,
 )
+from sgstore.lang.counting import Range, folded, frames_with
 from sgstore.lang.formulas import (
     Aliases,
     Leaf,
@@ -198,15 +199,6 @@ class Masks(Presence, ABC):
         select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
         return select.text()
 
-    def folded(self, text: str, nodes: frozenset[str]) -> str:
-        """A relation of the second phase as one of the first."""
-        keep = columns_of(nodes)
-        bit = bit_of('"frame_id"')
-        select = Select(['"frame_id" >> 6 AS "bucket"', *keep, f'bit_or({bit}) AS "mask"'])
-        select.join(nested(text, ":frames"), [])
-        select.group = ['"frame_id" >> 6', *keep]
-        return select.text()
-
     def number_of_frames(self, text: str) -> str:
         """How many frames a relation of the first phase that binds nothing speaks of, as ``frames``."""
         total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
@@ -217,7 +209,7 @@ class Masks(Presence, ABC):
         keys = frozenset(scope.outer)
         parts = self.phases(scope)
         if parts.rest or parts.late:
-            return self.folded(self.frames(scope, given, keys), keys)
+            return folded(self.frames(scope, given, keys), columns_of(keys))
         text = self.masks(scope, parts, given, keys)
         if set(scope.nodes) and not parts.blocks:
             return text  # grouped already, for the nodes inside are dropped
@@ -460,18 +452,28 @@ class Masks(Presence, ABC):
         wanted = not _COMPARED[sign](0, number)
         sign = sign if wanted else complement(sign)
         keys = frozenset(block.scope.outer)
+        parts = self.phases(block.scope)
+        if not (parts.rest or parts.late):
+            rows = self.masks(block.scope, parts, given, *_told_apart(block.scope))
+            name = self.share(rows, "counted")
+            return frames_with(name, columns_of(keys), Range.of(sign, number)), keys, wanted
         select = Select(['"frame_id"', *columns_of(keys)])
         select.join(nested(self.counted(block, given), ":counted"), [])
         select.group = ['"frame_id"', *columns_of(keys)]
         select.having = [f"count(*) {sign} {self.values.add(number)}"]
-        return self.folded(select.text(), keys), keys, wanted
+        return folded(select.text(), columns_of(keys)), keys, wanted
 
     def counted(self, block: BlockValue, given: Given | None, columns: Iterable[Leaf] = ()) -> str:
         """The matches of a block, one row each and frame."""
-        nodes = {key for key, node in block.scope.nodes.items() if node.role != "hidden"}
-        edges = frozenset(edge.key for edge in block.scope.edges if edge.named)
-        keys = frozenset(nodes) | frozenset(block.scope.outer)
-        return self.frames(block.scope, given, keys, edges, columns)
+        nodes, edges = _told_apart(block.scope)
+        return self.frames(block.scope, given, nodes, edges, columns)
+
+
+def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
+    """Nodes and edges by which the matches of a block differ, and the nodes outside that it speaks of."""
+    nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
+    edges = frozenset(edge.key for edge in scope.edges if edge.named)
+    return frozenset(nodes) | frozenset(scope.outer), edges
 
 
 def _masked(base: Base, nodes: frozenset[str], edges: frozenset[str]) -> str:

@@ -1,0 +1,102 @@
+"""Counts by sums of masks: the same frames as counting rows frame by frame."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from operator import eq, ge, gt, le, lt, ne
+from typing import TYPE_CHECKING
+
+import duckdb
+import pytest
+from oracle_worlds import World, random_world
+
+from sgstore.lang import compile_query
+from sgstore.lang.counting import MOST, Range, frames_with
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SIGNS: dict[str, Callable[[float, float], bool]] = {
+    "=": eq,
+    "<": lt,
+    "<=": le,
+    ">": gt,
+    ">=": ge,
+    "<>": ne,
+}
+Rows = list[tuple[int, int, int]]
+
+
+def found(rows: Rows, wanted: Range) -> set[tuple[int, int, int]]:
+    """Bucket, key and bit of the frames that the SQL finds among rows of (bucket, key, mask)."""
+    with duckdb.connect() as connection:
+        connection.execute('CREATE TABLE "given" ("bucket" BIGINT, "key" INTEGER, "mask" BIGINT)')
+        connection.execute(
+            'CREATE TABLE "bits" AS SELECT range AS bit, 1 << range AS m FROM range(60)'
+        )
+        connection.execute(
+            'INSERT INTO "given" SELECT unnest($1), unnest($2), unnest($3)',
+            [list(column) for column in zip(*rows, strict=True)],
+        )
+        sql = frames_with("given", ['"key"'], wanted)
+        masks = connection.execute(f'SELECT "bucket", "key", "mask" FROM ({sql})').fetchall()
+    return {(b, key, bit) for b, key, mask in masks for bit in range(60) if mask >> bit & 1}
+
+
+def counted(rows: Rows, holds: Callable[[int], bool]) -> set[tuple[int, int, int]]:
+    counts = Counter(
+        (bucket, key, bit) for bucket, key, mask in rows for bit in range(60) if mask >> bit & 1
+    )
+    return {frame for frame, count in counts.items() if holds(count)}
+
+
+@pytest.mark.parametrize("sign", SIGNS)
+@pytest.mark.parametrize("number", [-1, 0, 0.5, 1, 2, 2.5, 3, 7, 90])
+def test_sums_of_masks_find_the_frames_that_counting_finds(sign: str, number: float) -> None:
+    if SIGNS[sign](0, number):
+        return  # such a comparison is asked the other way round
+    rng = random.Random(3)
+    rows = [(rng.choice((5, 9)), rng.choice((1, 2, 3)), rng.getrandbits(60)) for _ in range(60)]
+    rows += [(5, 4, (1 << 60) - 1), (5, 4, 1 << 59), (5, 4, 1)]
+
+    frames = found(rows, Range.of(sign, number))
+
+    assert frames == counted(rows, lambda count: SIGNS[sign](count, number))
+
+
+@pytest.mark.parametrize("bound", [1, MOST - 1, MOST, MOST + 1, MOST + 2])
+@pytest.mark.parametrize("most", [MOST, MOST + 1, 40_000])
+def test_a_count_is_right_however_many_rows_there_are(bound: int, most: int) -> None:
+    """Some buckets have as many rows as can be added up, or more, and some frames are in all of them."""
+    rng = random.Random(1)
+    rows = [(1, 1, rng.getrandbits(60) | 1 << 59 | 1 << 11) for _ in range(most)]
+    rows += [(1, 2, rng.getrandbits(60)) for _ in range(5)]
+
+    for wanted, holds in (
+        (Range.of(">=", bound), lambda count: count >= bound),
+        (Range.of("=", bound), lambda count: count == bound),
+    ):
+        assert found(rows, wanted) == counted(rows, holds)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return random_world(4, traces=3, frames=14)
+
+
+@pytest.mark.parametrize("sign", SIGNS)
+def test_a_count_of_a_block_is_what_the_matches_of_the_block_say(sign: str, world: World) -> None:
+    text = f"MATCH (a:Entity) WHERE COUNT {{(a)-[:near|visible]->(b)-[r]-(c)}} {sign} 3 RETURN frame.id, a"
+    each = "MATCH (a:Entity) RETURN frame.id, a, COUNT {(a)-[:near|visible]->(b)-[r]-(c)} AS n"
+
+    statement, counts = (compile_query(q, world.catalog).rows() for q in (text, each))
+
+    def rows(of: object) -> list[tuple[int, ...]]:
+        return world.connection.execute(of.sql, list(of.values)).fetchall()
+
+    wanted = {row[:2] for row in rows(counts) if SIGNS[sign](row[2], 3)}
+    assert set(rows(statement)) == wanted
+    assert wanted
+    assert "sum(" in statement.sql
+    assert "sum(" not in counts.sql
