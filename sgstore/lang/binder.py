@@ -5,15 +5,18 @@ Everything that can be the user's fault is found here or in the parser, before a
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError, Span
 from sgstore.lang import bound as b
+from sgstore.lang import over_time as o
 from sgstore.lang import syntax as s
 from sgstore.lang.catalog import Catalog, Type
 from sgstore.lang.conditions import bind, condition, edge_attribute, node_attribute, parameter
 from sgstore.lang.names import RESERVED, Meaning, Names, ScopeBuilder, Session
+from sgstore.lang.steps import bind_sequence
+from sgstore.lang.tenses import settled
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     RELATION_ALIASES,
@@ -27,7 +30,8 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-_TEMPORAL_SETTINGS: Final = frozenset({"matches", "gaps", "end"})
+SETTINGS: Final = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION", "MATCHES", "GAPS", "END")
+"""What may stand after ``USING``."""
 
 
 def bind_query(
@@ -55,21 +59,70 @@ def bind_query(
     """
     session = Session(text, parameters, classed=catalog.classed)
     match = _only_match(statements, session)
-    ego, unknown_is_false = _settings(match.settings, session, catalog)
+    settings = chosen(match.settings, session, catalog)
+    if settings.end is not None:
+        session.refuse("USING END belongs to CHECK", match.settings[0].span)
+    if settings.gaps == "unknown":
+        session.refuse("USING GAPS unknown belongs to CHECK", match.settings[0].span)
+    query = _of_one_step(match, session) if _is_plain(match) else _of_steps(match, session)
+    refuse_unused(session)
+    refuse_strange(session, catalog)
+    return replace(
+        query,
+        relations=frozenset(session.relations),
+        injective=session.injective,
+        ego=settings.ego,
+        unknown_is_false=settings.unknown_is_false,
+        policy=settings.policy or "all",
+        gaps=settings.gaps or "break",
+    )
+
+
+def _is_plain(match: s.Match) -> bool:
+    """Whether it is one pattern, without a duration or a name."""
+    first = match.sequence.steps[0]
+    if len(match.sequence.steps) > 1 or not isinstance(first, s.Step):
+        return False
+    return bool(first.block.paths) and not first.hold and first.name is None
+
+
+def _of_one_step(match: s.Match, session: Session) -> b.Query:
+    """A pattern of single frames; it becomes a sequence of one step if it looks at other frames as well."""
     names = Names(session, ScopeBuilder(session))
-    bind_block(match.sequence.steps[0].block, names)
+    bind_block(match.block, names)
     distinct = names.scope.distinct()  # before RETURN, which must not change what matches
     result = _result(match.returns, names)
-    _refuse_unused(session)
-    _refuse_strange(session, catalog)
-    return b.Query(
-        replace(names.scope.finished(), distinct=distinct),
-        result,
-        frozenset(session.relations),
-        session.injective,
-        ego,
-        unknown_is_false,
-    )
+    scope = replace(names.scope.finished(), distinct=distinct)
+    where = tuple(settled(part, session) for part in scope.where)
+    when = tuple(part for part in where if b.is_temporal(part))
+    if not when and not any(b.is_temporal(value) for value in values_of(result)):
+        return b.Query(replace(scope, where=where), result, frozenset())
+    still = replace(scope, where=tuple(part for part in where if not b.is_temporal(part)))
+    step = o.Step(still, when, None, absent=False, span=match.block.span)
+    return b.Query(_told(scope), result, frozenset(), steps=(step,))
+
+
+def _of_steps(match: s.Match, session: Session) -> b.Query:
+    """A sequence of steps."""
+    found = bind_sequence(match.sequence, session, bind_block)
+    names = Names(session, found.scope(), found.meanings)
+    result = _result(match.returns, names)
+    steps, links = tuple(found.steps), tuple(found.links)
+    return b.Query(_told(names.scope.finished()), result, frozenset(), steps=steps, links=links)
+
+
+def _told(scope: b.Scope) -> b.Scope:
+    """What is known of a match once it is found: its nodes, and its edges that have names."""
+    edges = tuple(edge for edge in scope.edges if edge.named)
+    return replace(scope, edges=edges, where=())
+
+
+def values_of(result: b.Result) -> tuple[b.Bound, ...]:
+    """The expressions that a result speaks of: what it returns, orders by and samples by."""
+    values = [column.value for column in result.columns]
+    values += [key.value for key in result.order if not isinstance(key.value, str)]
+    per = result.sample.per if result.sample else None
+    return (*values, *([per] if per is not None and not isinstance(per, str) else []))
 
 
 def _only_match(statements: Sequence[s.Statement], session: Session) -> s.Match:
@@ -78,45 +131,85 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.Match:
         if isinstance(statement, s.Define):
             session.predicates[folded(statement.name)] = statement
         elif isinstance(statement, s.Check):
-            session.temporal("CHECK", statement.span)
+            session.refuse(
+                "a CHECK has a verdict, and no matches",
+                statement.span,
+                "ask for it by check: sgstore check STORE …",
+            )
         elif found is not None:
             session.refuse("one MATCH at a time", statement.span)
         else:
             found = statement
     if found is None:
-        session.refuse("nothing is asked", Span(0, len(session.text)), "add MATCH …")
-    step = found.sequence.steps[0]
-    if len(found.sequence.steps) > 1 or not isinstance(step, s.Step) or step.hold:
-        session.temporal("a sequence of steps", found.sequence.span)
+        names = [d.name for d in session.predicates.values() if isinstance(d.body, s.Sequence)]
+        hint = f"add MATCH {names[0]}()" if names else "add MATCH …"
+        session.refuse("nothing is asked", Span(0, len(session.text)), hint)
     return found
 
 
-def _settings(
-    settings: Sequence[s.Setting], session: Session, catalog: Catalog
-) -> tuple[str | None, bool]:
-    """The ego that was chosen, and whether what is unknown is false."""
-    ego, unknown_is_false = None, False
+@dataclass(slots=True)
+class Chosen:
+    """What ``USING`` chooses; ``None``: nothing."""
+
+    ego: str | None = None
+    unknown_is_false: bool = False
+    policy: str | None = None
+    gaps: str | None = None
+    end: str | None = None
+
+
+def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> Chosen:
+    """What a statement chooses by ``USING``.
+
+    Raises
+    ------
+    QueryNameError
+        There is no such setting, or no such value of it.
+    """
+    found = Chosen()
     for setting in settings:
         name, value = folded(setting.name), _setting_value(setting, session)
-        if name in _TEMPORAL_SETTINGS:
-            session.temporal(f"USING {setting.name}", setting.span)
-        if name == "nodes":
-            session.injective = _choice(setting, value, ("distinct", "any"), session) == "distinct"
-        elif name == "unknown":
-            unknown_is_false = _choice(setting, value, ("false",), session) == "false"
+        if name in _CHOICES:
+            _choose(found, setting, value, session)
         elif name == "ego":
             egos = {trace.ego for trace in catalog.traces if trace.ego}
             if value not in egos:
                 session.unknown("ego", value, setting.span, egos)
-            ego = value
+            found.ego = value
         elif name == "abstraction":
             if folded(value) not in catalog.sets:
                 known = [one.name for one in catalog.sets.values()]
                 session.unknown("abstraction", value, setting.span, known)
         else:
-            known = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION")
-            session.unknown("setting", setting.name, setting.span, known)
-    return ego, unknown_is_false
+            session.unknown("setting", setting.name, setting.span, SETTINGS)
+    return found
+
+
+_CHOICES: Final = {
+    "nodes": ("distinct", "any"),
+    "unknown": ("false",),
+    "matches": ("all", "first", "longest"),
+    "gaps": ("break", "bridge", "unknown"),
+    "end": ("strong", "weak", "pending"),
+}
+
+
+def _choose(found: Chosen, setting: s.Setting, value: str, session: Session) -> None:
+    """Take note of a setting whose values are a closed list."""
+    name, word = folded(setting.name), value.lower()
+    if word not in _CHOICES[name]:
+        session.unknown(f"value of {setting.name}", value, setting.span, _CHOICES[name])
+    match name:
+        case "nodes":
+            session.injective = word == "distinct"
+        case "unknown":
+            found.unknown_is_false = True
+        case "matches":
+            found.policy = word
+        case "gaps":
+            found.gaps = word
+        case _:
+            found.end = word
 
 
 def _setting_value(setting: s.Setting, session: Session) -> str:
@@ -125,13 +218,8 @@ def _setting_value(setting: s.Setting, session: Session) -> str:
     return str(parameter(setting.value, Names(session, ScopeBuilder(session))))
 
 
-def _choice(setting: s.Setting, value: str, known: tuple[str, ...], session: Session) -> str:
-    if value.lower() not in known:
-        session.unknown(f"value of {setting.name}", value, setting.span, known)
-    return value.lower()
-
-
-def _refuse_unused(session: Session) -> None:
+def refuse_unused(session: Session) -> None:
+    """Refuse parameters that came with a query and are not in it."""
     unused = sorted(set(session.parameters) - session.used)
     if unused:
         raise QueryError(
@@ -140,7 +228,7 @@ def _refuse_unused(session: Session) -> None:
         )
 
 
-def _refuse_strange(session: Session, catalog: Catalog) -> None:
+def refuse_strange(session: Session, catalog: Catalog) -> None:
     """Refuse relations that the abstraction that is asked does not have."""
     if catalog.relations is None:
         return
@@ -181,7 +269,7 @@ def conjuncts(expression: b.Bound) -> list[b.Bound]:
 
 
 def _node(node: s.NodePattern, names: Names) -> str:
-    kinds = _kinds(node.label, names.session) if node.label else b.ANY
+    kinds = kinds_of(node.label, names.session) if node.label else b.ANY
     if not kinds:
         names.session.refuse("no node can have this label", node.span)
     key = _known_node(node, names)
@@ -272,10 +360,17 @@ def _equality(attribute: b.Bound, prop: s.Property, names: Names) -> b.Bound:
     return condition(s.Comparison("=", s.Variable("", prop.name_span), prop.value, span), inner)
 
 
-def _kinds(label: s.LabelExpression, session: Session) -> b.Kinds:
+def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
+    """What a node with a label may be.
+
+    Raises
+    ------
+    QueryNameError
+        There is no such label.
+    """
     if isinstance(label, s.Label):
         return _labelled(label, session)
-    operands = [_kinds(operand, session) for operand in label.operands]
+    operands = [kinds_of(operand, session) for operand in label.operands]
     result = operands[0]
     for operand in operands[1:]:
         result = result & operand if label.word == "&" else result | operand
@@ -363,7 +458,7 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
 
 def _column(item: s.Item, names: Names) -> b.Column:
     assert item.value is not None  # noqa: S101 - the form of the item says so
-    value = bind(item.value, names)
+    value = settled(bind(item.value, names), names.session)
     if value.type is Type.list:
         names.session.refuse("a list cannot be returned", item.span)
     text = names.session.text[item.value.span.start : item.value.span.end]
@@ -377,7 +472,7 @@ def _key(value: s.Expression, result: b.Result, names: Names) -> b.Bound | str:
         return value.name
     if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
         names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
-    found = bind(value, names)
+    found = settled(bind(value, names), names.session)
     same = next((column.name for column in result.columns if column.value == found), None)
     if same is not None:
         return same

@@ -7,7 +7,7 @@ unnamed nodes begin with ``#``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
 from sgstore.lang.catalog import Attribute, Type
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.errors import Span
+    from sgstore.lang.over_time import Link, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +109,24 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A constant. ``closed``: a canonical word of the vocabulary, not a text of the user's."""
+    """A constant.
+
+    Attributes
+    ----------
+    value, type
+    closed : bool
+        Whether it is a canonical word of the vocabulary, not a text of the user's.
+    unit : str
+        ``s`` or ``frames`` if it was written as a length of time, such as ``2s``; no part of what it is.
+    span : Span or None
+        Where a length of time was written.
+    """
 
     value: int | float | str | bool | None
     type: Type
     closed: bool = False
+    unit: str = field(default="", compare=False)
+    span: Span | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,6 +236,63 @@ class Aggregate:
     type: Type
 
 
+@dataclass(frozen=True, slots=True)
+class Tense:
+    """An operator of time: its operands at other frames than this one.
+
+    Attributes
+    ----------
+    word : str
+        ``ALWAYS``, ``UNTIL``, ``PREVIOUS``, … as written.
+    operands : tuple of Bound
+        One or two conditions.
+    low, high : int
+        From when to when it looks, away from this frame; ns, or frames. ``high`` is ``None`` if it looks as far
+        as the trace goes.
+    frames : bool
+        Whether the bound counts frames.
+    """
+
+    word: str
+    operands: tuple[Bound, ...]
+    low: int = 0
+    high: int | None = None
+    frames: bool = False
+    type: Type = Type.boolean
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """A function of how something went.
+
+    Attributes
+    ----------
+    word : str
+        ``prev``, ``delta``, ``run_length``, ``since_true``, ``age`` or ``exists_now``.
+    operand : Bound
+        A value, a condition (``run_length``, ``since_true``), or a node (``age``, ``exists_now``).
+    by : int
+        How far ``delta`` looks back; ns, or frames.
+    frames : bool
+        Whether ``by``, or the number that it gives, counts frames; else time.
+    type : Type
+    """
+
+    word: str
+    operand: Bound
+    by: int = 0
+    frames: bool = False
+    type: Type = Type.number
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """The time of a step of a sequence; s since the trace began. ``step`` is its number."""
+
+    step: int
+    type: Type = Type.number
+
+
 Bound = (
     Value
     | Choices
@@ -236,6 +307,9 @@ Bound = (
     | Operation
     | BlockValue
     | Aggregate
+    | Tense
+    | Course
+    | Moment
 )
 
 
@@ -369,7 +443,8 @@ class Query:
     Attributes
     ----------
     scope : Scope
-        What stands in ``MATCH``.
+        What stands in ``MATCH``; of a query with steps, their nodes and the edges that have names, without
+        conditions.
     result : Result
     relations : frozenset of str
         Relations that it names, anywhere: what a trace must be able to answer.
@@ -379,6 +454,14 @@ class Query:
         The simulator's id of the ego that was chosen.
     unknown_is_false : bool
         Whether relations that a trace cannot answer count as absent.
+    steps : tuple of Step
+        Of a query that looks at more than one frame at a time; else empty.
+    links : tuple of Link
+        Between the steps.
+    policy : str
+        Which matches of a sequence are told: ``all``, ``first``, ``longest``.
+    gaps : str
+        Whether a gap in the recording ends a run (``break``) or not (``bridge``).
     """
 
     scope: Scope
@@ -387,6 +470,10 @@ class Query:
     injective: bool = True
     ego: str | None = None
     unknown_is_false: bool = False
+    steps: tuple[Step, ...] = ()
+    links: tuple[Link, ...] = ()
+    policy: str = "all"
+    gaps: str = "break"
 
 
 def walk(expression: Bound) -> Iterator[Bound]:
@@ -398,8 +485,18 @@ def walk(expression: Bound) -> Iterator[Bound]:
                 yield from walk(operand)
         case Aggregate(operand=operand) if operand is not None:
             yield from walk(operand)
+        case Tense(operands=operands):
+            for operand in operands:
+                yield from walk(operand)
+        case Course(operand=operand):
+            yield from walk(operand)
         case _:
             pass
+
+
+def is_temporal(expression: Bound) -> bool:
+    """Whether an expression looks at more than one frame."""
+    return any(isinstance(part, Tense | Course | Moment) for part in walk(expression))
 
 
 def nodes_of(expression: Bound) -> frozenset[str]:

@@ -306,19 +306,21 @@ def _block_body(span: Span, children: Children) -> s.Block:
 def _match_step(span: Span, children: Children) -> s.Step:
     paths, where, hold, name = children
     end = where.span.end if where else span.end
-    return s.Step(s.Block(paths, where, Span(span.start, end)), False, hold, name, span)
+    block = s.Block(paths, where, Span(span.start, end))
+    return s.Step(block, absent=False, hold=hold, name=name, span=span)
 
 
 def _holds_step(span: Span, children: Children) -> s.Step:
     condition, hold, name = children
-    return s.Step(s.Block((), condition, condition.span), False, hold, name, span)
+    block = s.Block((), condition, condition.span)
+    return s.Step(block, absent=False, hold=hold, name=name, span=span)
 
 
 def _absent_step(span: Span, children: Children) -> s.Step:
     (step,) = children
     if step.hold or step.name:
         raise BuildError("what must not happen has no duration and no name", step.span)
-    return s.Step(step.block, True, None, None, span)
+    return s.Step(step.block, absent=True, hold=None, name=None, span=span)
 
 
 def _scenario_step(span: Span, children: Children) -> s.ScenarioStep:
@@ -349,6 +351,10 @@ def _step_name(_: Span, children: Children) -> str:
 def _link(span: Span, children: Children) -> s.Link:
     kind, after, within = children[0] or ("then", None, None)
     return s.Link(kind, after, within, span)
+
+
+def _immediately(_: Span, __: Children) -> tuple[str, None, None]:
+    return "immediately", None, None
 
 
 def _other_link(kind: Literal["until", "while"]) -> Callable[[Span, Children], s.Link]:
@@ -486,7 +492,7 @@ BUILDERS: Final[dict[str, Callable[[Span, Children], Any]]] = {
     "while_link": _other_link("while"),
     "within": lambda _, children: ("then", None, children[0]),
     "after": lambda _, children: ("then", *children),
-    "immediately": lambda *_: ("immediately", None, None),
+    "immediately": _immediately,
     "where": _only,
     "patterns": _patterns,
     "path": _path,

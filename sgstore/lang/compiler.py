@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from sgstore.errors import QueryError
 from sgstore.lang import results
 from sgstore.lang.binder import bind_query
 from sgstore.lang.bound import Column, FrameAttribute, Result
@@ -169,6 +170,8 @@ def compile_query(
     statements = parse(text)
     seen = _seen(statements, catalog, parameters or {})
     bound = bind_query(text, statements, seen, parameters or {})
+    if bound.steps:
+        raise QueryError("sequences are bound, and cannot be asked yet", text=text)
     whole = Layout.of(bound).query if bound.result.form == "subgraphs" else bound
     return Compiled(text, bound, rewritten(whole, seen), seen, catalog)
 

@@ -74,10 +74,10 @@ def _type_of(value: object) -> Type:
     return Type.text if isinstance(value, str) else Type.number
 
 
-def _seconds(e: s.Duration, names: Names) -> b.Value:
-    if e.unit == "frames":
-        names.session.temporal("a number of frames", e.span)
-    return b.Value(e.ns / 1e9, Type.number)
+def _timespan(e: s.Duration, _: Names) -> b.Value:
+    from sgstore.lang.tenses import timespan  # tenses hold expressions, and expressions tenses
+
+    return timespan(e)
 
 
 def _parameter(e: s.Parameter, names: Names) -> b.Bound:
@@ -414,12 +414,14 @@ def _block(e: s.BlockExpression, names: Names) -> b.BlockValue:
 
 
 def _temporal(e: s.Temporal, names: Names) -> b.Bound:
-    names.session.temporal(e.word, e.span)
+    from sgstore.lang.tenses import tense  # as above
+
+    return tense(e, names)
 
 
 _BINDERS: Final[dict[type, Callable[[Any, Names], b.Bound]]] = {
     s.Constant: _constant,
-    s.Duration: _seconds,
+    s.Duration: _timespan,
     s.Parameter: _parameter,
     s.Variable: _variable,
     s.AttributeOf: _attribute,

@@ -196,7 +196,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return blocks(expression)
         case b.Operation():
             return _operation(expression, blocks)
-        case b.Choices() | b.Aggregate():
+        case b.Choices() | b.Aggregate() | b.Tense() | b.Course() | b.Moment():
             raise TypeError(f"{expression} has no value of its own")
 
 

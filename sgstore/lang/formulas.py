@@ -15,14 +15,17 @@ from sgstore.lang.bound import (
     BlockValue,
     Bound,
     Choices,
+    Course,
     EdgeAttribute,
     EdgeRelation,
     FrameAttribute,
     LabelTest,
+    Moment,
     NodeAttribute,
     NodeValue,
     Operation,
     PairNumber,
+    Tense,
     TraceAttribute,
     Value,
 )
@@ -240,7 +243,7 @@ def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: Valu
             return f"{name}({'DISTINCT ' * distinct}{inner})"
         case NodeAttribute(attribute=attribute) if attribute.values:
             return f"CAST({leaf(expression)} AS VARCHAR)"
-        case Choices() | LabelTest():
+        case Choices() | LabelTest() | Tense() | Course() | Moment():
             raise TypeError(f"{expression} is no column")
         case _:
             return leaf(expression)
@@ -328,7 +331,7 @@ def _membership(operation: Operation, leaf: Callable[[Leaf], str], values: Value
 def leaves(expression: Bound) -> Iterable[Leaf]:
     """The columns that an expression is made of."""
     match expression:
-        case Value() | Choices() | LabelTest():
+        case Value() | Choices() | LabelTest() | Tense() | Course() | Moment():
             return
         case Operation(operands=operands):
             for operand in operands:

@@ -38,10 +38,11 @@ _NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
 _EXTREME: Final = frozenset({"min", "max"})
 _AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
 _OTHERS: Final = frozenset({"coalesce", "known", "type", "lower", "upper"})
-_TEMPORAL: Final = frozenset(
-    {"prev", "delta", "runlength", "sincetrue", "t", "age", "existsnow", "historically"}
+_COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
+_TEMPORAL: Final = frozenset(map(folded, _COURSES))
+FUNCTIONS: Final = frozenset(
+    {*PAIR_FUNCTIONS, *_NUMERIC, *_EXTREME, *_OTHERS, *_AGGREGATES, *_COURSES}
 )
-FUNCTIONS: Final = frozenset({*PAIR_FUNCTIONS, *_NUMERIC, *_EXTREME, *_OTHERS, *_AGGREGATES})
 
 MAX_CALLS: Final = 30
 """Deepest nesting of predicates."""
@@ -61,7 +62,9 @@ def call(e: s.Call, names: Names) -> b.Bound:
     if name in names.session.predicates:
         return _predicate(e, names)
     if name in _TEMPORAL:
-        names.session.temporal(f"{e.name}()", e.name_span)
+        from sgstore.lang.tenses import course  # it holds expressions, and expressions calls
+
+        return course(e, names)
     if names.aggregates and name in _AGGREGATES and len(e.arguments) == 1:
         return _aggregate(name, e, names)
     if name in _FUNCTIONS:
@@ -172,7 +175,11 @@ def _predicate(e: s.Call, names: Names) -> b.Bound:
     session = names.session
     definition = session.predicates[folded(e.name)]
     if isinstance(definition.body, s.Sequence):
-        session.temporal("a scenario", e.name_span)
+        session.refuse(
+            f"{definition.name} is a scenario, which is a sequence and no condition",
+            e.name_span,
+            f"write MATCH {definition.name}()",
+        )
     if definition.name in session.calls or len(session.calls) > MAX_CALLS:
         session.refuse(f"{definition.name}() is defined by itself", e.name_span)
     _expect(e, len(definition.parameters), len(definition.parameters), names)

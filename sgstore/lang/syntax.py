@@ -407,6 +407,12 @@ class Match:
     returns: Returns | None
     span: Span
 
+    @property
+    def block(self) -> Block:
+        """The pattern of its first step; of a scenario, an empty one."""
+        first = self.sequence.steps[0]
+        return first.block if isinstance(first, Step) else Block((), None, first.span)
+
 
 @dataclass(frozen=True, slots=True)
 class Formal:
