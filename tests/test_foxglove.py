@@ -335,6 +335,16 @@ def test_the_ego_is_who_is_named_or_who_the_mapping_names(
     assert idents(blocks)[blocks[0].ego[0]] == expected
 
 
+def test_an_entity_without_an_id_is_not_the_ego_whose_axes_are_told(file: Path) -> None:
+    with SceneRecorder.of(file, "json") as recorder:
+        recorder.transform(1.0, "map", "base_link", (5, 0, 0))
+        recorder.scene(1.0, [cube("", (1, 0, 0), type="car")])
+    _, blocks, _ = read(file)
+
+    assert blocks[0].states.node.tolist() == [0, 1]
+    assert (blocks[0].ego.tolist(), blocks[0].states.x.tolist()) == ([1], [1.0, 5.0])
+
+
 def test_an_ego_that_is_not_there_is_answered_with_who_is(file: Path) -> None:
     with SceneRecorder.of(file, "json") as recorder:
         recorder.transform(1.0, "map", "tractor")

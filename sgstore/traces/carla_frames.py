@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -503,6 +504,7 @@ def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
         raise TraceError(reason) from error
 
 
+@lru_cache(maxsize=4096)  # vehicles show the same lights for long
 def _our_lights(bits: int) -> int:
     """Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS` for a ``carla.VehicleLightState``."""
     return sum((bits >> theirs & 1) << ours for ours, theirs in enumerate(_CARLA_LIGHTS))

@@ -249,7 +249,7 @@ class FrameDecoder:
         meaning = self._mapping.meaning(type_name)
         node = self.roster.enter(ident, meaning, type_name)
         self._idents.append(ident)
-        if self._ego < 0 and ident == self._ego_entity:
+        if self._ego < 0 and self._ego_entity and ident == self._ego_entity:
             self._ego = node
         return node
 

@@ -477,11 +477,14 @@ def derive(
         return wanted, derived
     steps = _neighbours(node, frame, time_ns, rows)
     columns = (
-        (_VELOCITY, 3, _slope(values[:, _X : _X + 3], rows, steps)),
-        (_ACCELERATION, 3, _accelerations(values, rows, steps)),
-        (_YAW_RATE, 1, _slope(values[:, [_HEADING]], rows, steps, turn=2 * np.pi)),
+        (_VELOCITY, 3, lambda: _slope(values[:, _X : _X + 3], rows, steps)),
+        (_ACCELERATION, 3, lambda: _accelerations(values, rows, steps)),
+        (_YAW_RATE, 1, lambda: _slope(values[:, [_HEADING]], rows, steps, turn=2 * np.pi)),
     )
-    for bit, (column, width, slopes) in enumerate(columns):
+    for bit, (column, width, slopes_of) in enumerate(columns):
+        if not lacking[:, bit].any():
+            continue
+        slopes = slopes_of()
         found = lacking[:, bit] & np.isfinite(slopes).all(axis=1)
         wanted[found, column : column + width] = slopes[found]
         derived |= found.astype(np.int64) << bit

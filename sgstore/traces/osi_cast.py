@@ -92,8 +92,11 @@ class Cast:
         """Take note of the objects in a message. ``objects``: the class of its moving objects."""
         if len(self.hosts) < _MOST_HOSTS:
             self.hosts.update(dict.fromkeys(hosts_of(message)))
-        contents: Sequence[bytes] = ground_truth_of(message).moving_object
-        for key, content in zip(keys_of(contents), contents, strict=True):
+        contents: Sequence[bytes] = list(ground_truth_of(message).moving_object)
+        keys = keys_of(contents)
+        if self._keys.issuperset(keys):
+            return
+        for key, content in zip(keys, contents, strict=True):
             if key in self._keys:
                 continue
             try:

@@ -67,6 +67,14 @@ MOVING_OBJECT_FIELDS: Final[dict[str, Any]] = {
 }
 """Fields of ``osi3.MovingObject`` that are read."""
 
+TRAFFIC_LIGHT_FIELDS: Final[dict[str, Any]] = {
+    **_ID,
+    "base": _STATIC_BASE,
+    "classification": dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
+    **_REFERENCES,
+}
+"""Fields of ``osi3.TrafficLight`` that are read."""
+
 GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
     "timestamp": _TIME,
     "host_vehicle_id": {"value": None},
@@ -85,12 +93,7 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
         },
         **_REFERENCES,
     },
-    "traffic_light": {
-        **_ID,
-        "base": _STATIC_BASE,
-        "classification": dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
-        **_REFERENCES,
-    },
+    "traffic_light": OPAQUE,
     "environmental_conditions": OPAQUE,
     "road_marking": _ID,
     "lane_boundary": _ID,
@@ -221,10 +224,15 @@ def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int,
     Source: protobuf encoding (protobuf.dev/programming-guides/encoding).
     """
     while position < stop:
-        tag, start = _varint(data, position, stop)
+        tag, start = data[position], position + 1
+        if tag >= 0x80:
+            tag, start = _varint(data, position, stop)
         wire = tag & 7
         if wire == 2:
-            length, start = _varint(data, start, stop)
+            length = data[start] if start < stop else 0x80
+            start += 1
+            if length >= 0x80:
+                length, start = _varint(data, start - 1, stop)
         elif wire == 0:
             length = _varint(data, start, stop)[1] - start
         elif wire in _WIDTHS:

@@ -31,6 +31,8 @@ from sgstore.traces.osi_schema import (
     GROUND_TRUTH,
     SENSOR_VIEW,
     ground_truth_of,
+    light_class,
+    lights_of,
     message_class,
     object_class,
     parse,
@@ -336,26 +338,27 @@ def _likeness(name: str, data: bytes) -> int:
 
     A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
     """
-    message, objects = _classes_of(name)
+    message, objects, bulbs = _classes_of(name)
     try:
-        return _things(ground_truth_of(parse(message, data)), objects)
+        ground = ground_truth_of(parse(message, data))
+        placed = [objects.FromString(content) for content in ground.moving_object]
+        placed += [bulbs.FromString(content) for content in lights_of(ground)] if bulbs else []
+        return _things([*placed, *ground.stationary_object], ground.lane)
     except DECODE_ERRORS:
         return -1
 
 
 @cache
-def _classes_of(name: str) -> tuple[type[Any], type[Any]]:
+def _classes_of(name: str) -> tuple[type[Any], type[Any], type[Any] | None]:
     schema = Schema(id=1, data=descriptors(), encoding="protobuf", name=name)
     message = message_class(schema)
-    return message, object_class(message)
+    return message, object_class(message), light_class(message)
 
 
-def _things(ground: Any, objects: type[Any]) -> int:
-    moving = [objects.FromString(content) for content in ground.moving_object]
-    placed = [*moving, *ground.stationary_object, *ground.traffic_light]
+def _things(placed: list[Any], lanes: Any) -> int:
     return sum(
         thing.id.HasField("value") and thing.base.HasField("position") for thing in placed
-    ) + sum(lane.id.HasField("value") for lane in ground.lane)
+    ) + sum(lane.id.HasField("value") for lane in lanes)
 
 
 def time_of(data: bytes) -> int | None:

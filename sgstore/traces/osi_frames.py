@@ -25,7 +25,14 @@ from sgstore.traces.osi_cast import is_key, keys_of
 from sgstore.traces.osi_environment import Environment
 from sgstore.traces.osi_lights import TrafficLights
 from sgstore.traces.osi_objects import MovingObjects
-from sgstore.traces.osi_schema import DECODE_ERRORS, enum_name, ground_truth_of, has_field, parse
+from sgstore.traces.osi_schema import (
+    DECODE_ERRORS,
+    enum_name,
+    ground_truth_of,
+    has_field,
+    light_class,
+    parse,
+)
 from sgstore.traces.osi_statics import UNTOLD
 from sgstore.traces.tally import Tally
 from sgstore.vocabulary import TypeMeaning, type_meanings
@@ -103,6 +110,8 @@ class FrameDecoder:
         self._idents = survey.cast.idents()
         self._nodes: dict[int, int] = {}
         self._keys: dict[bytes, int] = {}
+        self._last_keys: list[bytes] = []
+        self._last_nodes: list[int] = []
         self._open: RawFrame | None = None
         self._ahead: dict[int, list[bytes]] = {}
         self._aside: dict[int, int] = {}
@@ -114,7 +123,7 @@ class FrameDecoder:
             leading
         ].objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
-        self._lights = TrafficLights(self.roster)
+        self._lights = TrafficLights(self.roster, light_class(survey.leads[leading].message))
         self._environment = Environment(survey.leads[leading].message, self.roster)
         self._frames = 0
 
@@ -156,6 +165,10 @@ class FrameDecoder:
             warn(
                 f"{self._lights.unplaced} traffic lights have neither a position nor a reference to the"
                 " map: they are listed as entities, but are in no graph"
+            )
+        if self._lights.unreadable:
+            warn(
+                f"traffic lights cannot be read where they changed {self._lights.unreadable} times"
             )
         if self._untimed:
             warn(f"{self._untimed} frames bear no time of their own: their log time is taken")
@@ -254,14 +267,17 @@ class FrameDecoder:
     def _met(self, contents: Any, log_time: int) -> tuple[list[int], list[bytes]]:
         """Node ids of serialised objects, and the objects; without those that cannot be read or come twice."""
         objects = list(contents)
-        known = self._keys
         keys = keys_of(objects)
-        nodes = [known.get(key, _UNKNOWN) for key in keys]
+        if keys == self._last_keys:  # the same objects as in the last frame, in the same order
+            return self._last_nodes.copy(), objects
+        nodes = [self._keys.get(key, _UNKNOWN) for key in keys]
         if _UNKNOWN in nodes:
             for row, node in enumerate(nodes):
                 if node == _UNKNOWN:
                     nodes[row] = self._node_of(objects[row], keys[row], log_time)
         if len(set(nodes)) == len(nodes) and -1 not in nodes:
+            if all(map(self._keys.__contains__, keys)):
+                self._last_keys, self._last_nodes = keys, nodes.copy()
             return nodes, objects
         rows: dict[int, int] = {}
         for row, node in enumerate(nodes):
@@ -297,7 +313,8 @@ class FrameDecoder:
             role = enum_name(vehicle, "role") if has_field(type(vehicle), "role") else ""
             special = meanings[role.lower()].special if role.lower() in meanings else ""
         meaning = meanings.get(type_name.lower(), TypeMeaning("unknown"))
-        meaning = replace(meaning, special=special or meaning.special)
+        if special:
+            meaning = replace(meaning, special=special)
         ident = self._idents.get(thing.id.value, str(thing.id.value))
         return self.roster.enter(ident, meaning, type_name)
 

@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.traces.frames import FAR, NAN
-from sgstore.traces.osi_schema import enum_name, has_field, map_ref, static_pose
+from sgstore.traces.osi_schema import (
+    DECODE_ERRORS,
+    enum_name,
+    has_field,
+    lights_of,
+    map_ref,
+    static_pose,
+)
 from sgstore.vocabulary import LIGHT_STATE_CODE, TypeMeaning
 from sgstore.world import POSE
 
@@ -107,17 +114,27 @@ class TrafficLights:
     ----------
     roster : Roster
         Takes up each head as an entity of kind ``traffic_light``; its ident is the id of its first bulb.
+    message : type or None
+        Class of the bulbs; ``None``: the recording's version of OSI has none that could be read.
+
+    Attributes
+    ----------
+    unreadable : int
+        Bulbs that are malformed.
     """
 
-    def __init__(self, roster: Roster) -> None:
+    def __init__(self, roster: Roster, message: type[Any] | None) -> None:
         self._roster = roster
+        self._class = message
+        self._has_service = message is not None and has_field(
+            message, "classification.is_out_of_service"
+        )
+        self.unreadable = 0
         self._heads: list[_Head] = []
         self._head_of: dict[int, _Head] = {}
-        self._words: set[bytes] = set()
+        self._words: list[bytes] = []
         self._by_ref: dict[str, _Head] = {}
         self._by_cell: dict[tuple[int, int], list[_Head]] = {}
-        self._tells: dict[type[Any], tuple[bool, bool]] = {}
-        self._has_service = False
         self._fill()
 
     @property
@@ -127,22 +144,24 @@ class TrafficLights:
 
     def update(self, ground: Any) -> None:
         """Take up what a ground truth says of bulbs; of the others the last word stands."""
-        kind = type(ground)
-        if kind not in self._tells:
-            path = "traffic_light.classification"
-            self._tells[kind] = has_field(kind, path), has_field(kind, f"{path}.is_out_of_service")
-        has_any, self._has_service = self._tells[kind]
-        bulbs = ground.traffic_light if has_any else ()
-        words = [bulb.SerializeToString() for bulb in bulbs]
-        news = set(words) - self._words
-        if not news:
+        words = lights_of(ground)
+        if words == self._words or self._class is None:
             return
-        for bulb, word in zip(bulbs, words, strict=True):
+        news = set(words).difference(self._words)
+        self._words = words
+        for word in words if news else ():
             if word in news:
-                head = self._head_of.get(bulb.id.value) or self._enter(bulb)
-                head.bulbs[bulb.id.value] = self._lit(bulb.classification)
-        self._words = set(words)
+                self._take(word, self._class)
         self._fill()
+
+    def _take(self, word: bytes, message: type[Any]) -> None:
+        try:
+            bulb = message.FromString(word)
+            head = self._head_of.get(bulb.id.value) or self._enter(bulb)
+        except DECODE_ERRORS:  # whatever else is in the message is read all the same
+            self.unreadable += 1
+            return
+        head.bulbs[bulb.id.value] = self._lit(bulb.classification)
 
     def rows(self) -> tuple[Ints, Floats, Ints]:
         """Rows of the heads that have a place: node ids, columns :data:`POSE`, states."""

@@ -24,6 +24,7 @@ from sgstore.traces.osi_fields import (
     MAX_REFERENCES,
     MOVING_OBJECT_FIELDS,
     SENSOR_VIEW_FIELDS,
+    TRAFFIC_LIGHT_FIELDS,
     check_size,
     prune,
 )
@@ -36,6 +37,7 @@ GROUND_TRUTH: Final = "osi3.GroundTruth"
 SENSOR_VIEW: Final = "osi3.SensorView"
 HOST_DATA: Final = "osi3.HostVehicleData"
 MOVING_OBJECT: Final = "osi3.MovingObject"
+TRAFFIC_LIGHT: Final = "osi3.TrafficLight"
 ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
 
 MAX_DESCRIPTORS: Final = 4 << 20
@@ -66,6 +68,13 @@ _MOVING_OBJECT_NEEDS: Final = (
         for vector in ("position", "velocity", "acceleration")
         for name in ("x", "y", "z")
     ),
+)
+_TRAFFIC_LIGHT_NEEDS: Final = (
+    "id.value",
+    *(f"classification.{name}" for name in ("color", "icon", "mode")),
+    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
+    *(f"base.orientation.{name}" for name in ("roll", "pitch", "yaw")),
+    *(f"base.position.{name}" for name in ("x", "y", "z")),
 )
 _FIELDS: Final = {
     GROUND_TRUTH: GROUND_TRUTH_FIELDS,
@@ -102,7 +111,8 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
         files = list(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file)
         wanted = _FIELDS.get(schema.name) if fields is None else fields
         if wanted is not None:
-            prune(files, {MOVING_OBJECT: MOVING_OBJECT_FIELDS, schema.name: wanted})
+            parts = {MOVING_OBJECT: MOVING_OBJECT_FIELDS, TRAFFIC_LIGHT: TRAFFIC_LIGHT_FIELDS}
+            prune(files, parts | {schema.name: wanted})
         pool = descriptor_pool.DescriptorPool()
         _add(pool, {file.name: file for file in files})
         found = pool.FindMessageTypeByName(schema.name)
@@ -157,6 +167,24 @@ def object_class(message: type[Any]) -> type[Any]:
         raise TraceError(
             f"schema {MOVING_OBJECT}: its protobuf descriptors are malformed: {error}"
         ) from error
+
+
+def light_class(message: type[Any]) -> type[Any] | None:
+    """The class of the traffic lights in the messages of a class, which has them as bytes.
+
+    ``None`` where it has none that could be read.
+    """
+    try:
+        found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(TRAFFIC_LIGHT)
+        _require(found, _TRAFFIC_LIGHT_NEEDS)
+        return message_factory.GetMessageClass(found)
+    except DECODE_ERRORS:
+        return None
+
+
+def lights_of(ground: Any) -> list[bytes]:
+    """The traffic lights of a ground truth, serialised."""
+    return list(getattr(ground, "traffic_light", ()))
 
 
 def has_field(message: type[Any], path: str) -> bool:

@@ -26,6 +26,8 @@ from sgstore.traces.osi_schema import (
     SENSOR_VIEW,
     ground_truth_of,
     has_field,
+    light_class,
+    lights_of,
     message_class,
     object_class,
     parse,
@@ -63,6 +65,8 @@ class _Latch:
     """
 
     fields: tuple[str, ...]
+    bulb: type[Any] | None = None
+    words: dict[bytes, int | None] = field(default_factory=dict[bytes, "int | None"])
     told_by: dict[tuple[str, int], Ref] = field(default_factory=dict[tuple[str, int], Ref])
     repeated: set[tuple[str, int]] = field(default_factory=set[tuple[str, int]])
     lights: set[int] = field(default_factory=set[int])
@@ -78,11 +82,25 @@ class _Latch:
         new = {item for item in items if item not in self.told_by}
         self.repeated = (self.repeated - gone) | new
         self.told_by.update(dict.fromkeys(new, ref))
-        lights = {bulb.id.value for bulb in ground.traffic_light}
+        lights = self._lit(ground)
         if self.last is not None and self.lights - lights:
             self.refs[self.last] = None
         self.lights, self.last = lights, ref
         return any(name in LANE_FIELDS for name, _ in new)
+
+    def _lit(self, ground: Any) -> set[int]:
+        """Ids of the lights in a message; those that stand in it as in the last one are not read again."""
+        words = lights_of(ground)
+        if words != [*self.words]:
+            known = self.words
+            self.words = {word: known.get(word) or self._ident(word) for word in words}
+        return {ident for ident in self.words.values() if ident is not None}
+
+    def _ident(self, word: bytes) -> int | None:
+        try:
+            return None if self.bulb is None else int(self.bulb.FromString(word).id.value)
+        except DECODE_ERRORS:  # said when the frames are read
+            return None
 
 
 @dataclass(slots=True)
@@ -251,7 +269,9 @@ def _meet(recording: Recording, channel: int, result: Survey, maps: dict[int, ty
     except TraceError as error:
         lanes = None
         result.notes.append(f"its lanes cannot be read: {error.reason}")
-    result.leads[channel] = Lead(name, message, object_class(message), _Latch(present), lanes)
+    result.leads[channel] = Lead(
+        name, message, object_class(message), _Latch(present, light_class(message)), lanes
+    )
     return True
 
 
