@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+import math
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -13,6 +15,8 @@ if TYPE_CHECKING:
     import networkx as nx
 
     from sgstore.world import Codes, Floats, FrameBlock, Ints
+
+    Places = Sequence[tuple[int, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +111,9 @@ class LaneStates:
     along : float64
         Place of the box's centre along the lane's centre line, from the lane's start in its direction, beyond
         its ends too; m.
+    own : bool
+        Whether it is one of the lanes by which is told how far the entity is from others along the lanes: the
+        primary one and, in a junction, those beside it that its centre is in and, of a vehicle, run its way.
     """
 
     frame: Ints
@@ -117,6 +124,7 @@ class LaneStates:
     heading_error: Floats
     primary: np.ndarray[Any, np.dtype[np.bool_]]
     along: Floats
+    own: np.ndarray[Any, np.dtype[np.bool_]]
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -207,6 +215,47 @@ def named_graph(
     return graph
 
 
+class Reach:
+    """Where lanes begin, measured along others: what tells how far it is along the lanes of a map.
+
+    Parameters
+    ----------
+    lane, other : (n,) int64
+        Node ids of lanes; two may come more than once, where several ways join them.
+    start : (n,) float64
+        Of ``other``, along the lanes from the start of ``lane``; negative where one drives from ``other`` to
+        ``lane``; m.
+    """
+
+    FARTHEST: Final = 200.0
+    """How far is looked; m. The view ``pairs`` has this number too."""
+
+    def __init__(self, lane: Ints, other: Ints, start: Floats) -> None:
+        self._columns = lane, other, start
+
+    @cached_property
+    def _starts(self) -> dict[tuple[int, int], list[float]]:
+        found: dict[tuple[int, int], list[float]] = {}
+        rows = zip(*(column.tolist() for column in self._columns), strict=True)
+        for lane, other, start in rows:
+            found.setdefault((lane, other), []).append(start)
+        return found
+
+    def distance(self, one: Places, other: Places) -> float | None:
+        """How far it is from one entity to another, by their places; see :meth:`SceneGraph.lane_dist`."""
+        ahead, behind = math.inf, -math.inf
+        for lane, along in one:
+            for to, at in other:
+                for start in self._starts.get((lane, to), ()):
+                    way = start + (at - along)
+                    if way >= 0:
+                        ahead = min(ahead, way)
+                    else:
+                        behind = max(behind, way)
+        nearest = ahead if ahead <= -behind else behind
+        return nearest if abs(nearest) <= self.FARTHEST else None
+
+
 @dataclass(frozen=True, slots=True)
 class SceneGraph:
     """The scene graph of one frame: ``(V, E, Ego, kind, rel, att)`` of the paper, as records.
@@ -224,6 +273,8 @@ class SceneGraph:
         whatever is known (``x``, ``y``, ``heading``, ``speed``, ``light_state``, …). Missing ones are left out.
     edges : list of tuple
         ``(src, relation, dst, attributes)``.
+    reach : Reach, optional
+        Of the map that it lies on. Without it nothing is known of ways along lanes.
     """
 
     frame_id: int
@@ -233,6 +284,28 @@ class SceneGraph:
     ego: int | None
     nodes: dict[int, dict[str, Any]]
     edges: list[tuple[int, str, int, dict[str, Any]]]
+    reach: Reach | None = field(default=None, compare=False, repr=False)
+
+    def places(self) -> dict[int, list[tuple[int, float]]]:
+        """Where entities are along their own lanes: node id → pairs of a lane and the way from its start; m."""
+        found: dict[int, list[tuple[int, float]]] = {}
+        for src, relation, dst, about in self.edges:
+            if relation == "isIn" and about.get("is_own") and "along" in about:
+                found.setdefault(src, []).append((dst, about["along"]))
+        return found
+
+    def lane_dist(self, a: int, b: int) -> float | None:
+        """How far it is along the lanes from one entity to another; m.
+
+        From centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and of those
+        that ``travelsTo`` leads through; positive where one drives from a to b, negative where one drives from
+        b to a; of several ways the shortest. ``None`` if there is no way of at most 200 m: lane changes are
+        none.
+        """
+        places = self.places()
+        if self.reach is None:
+            return None
+        return self.reach.distance(places.get(a, ()), places.get(b, ()))
 
     def to_networkx(self) -> nx.MultiDiGraph[int]:
         """The graph as a ``networkx.MultiDiGraph``.
@@ -241,7 +314,9 @@ class SceneGraph:
         -------
         networkx.MultiDiGraph
             Node ids as nodes with their attributes; an edge's key and its attribute ``relation`` are the
-            relation. The graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``ego``.
+            relation. An edge between entities has the attribute ``lane_dist``, where that is known
+            (:meth:`lane_dist`). The graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and
+            ``ego``.
         """
         import networkx as nx  # half a second to import: only when asked for
 
@@ -253,6 +328,14 @@ class SceneGraph:
             ego=self.ego,
         )
         graph.add_nodes_from(self.nodes.items())
+        places = {} if self.reach is None else self.places()
+        known: dict[tuple[int, int], dict[str, Any]] = {}
         for src, relation, dst, attributes in self.edges:
-            graph.add_edge(src, dst, key=relation, relation=relation, **attributes)
+            more: dict[str, Any] = {}
+            if self.reach is not None and src in places and dst in places:
+                if (src, dst) not in known:
+                    far = self.reach.distance(places[src], places[dst])
+                    known[src, dst] = {} if far is None else {"lane_dist": far}
+                more = known[src, dst]
+            graph.add_edge(src, dst, key=relation, relation=relation, **attributes, **more)
         return graph

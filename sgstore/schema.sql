@@ -13,7 +13,7 @@
 -- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
 --
 -- Changes
---   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading.
+--   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; pairs.lane_dist, by lane_state.is_own and map_reach.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
 --     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
 --   * map_id, channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
@@ -103,7 +103,8 @@ CREATE TABLE edge (                                            -- ordered by all
 CREATE TABLE lane_state (                                      -- attributes of isIn edges from entities to lanes
   kind kind, frame_id BIGINT, node_id INTEGER, lane INTEGER,
   overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN,    -- offset to the left, m; rad
-  along FLOAT);                                                -- of the centre, from the start of the lane, m
+  along FLOAT,                                                 -- of the centre, from the start of the lane, m
+  is_own BOOLEAN, is_ego BOOLEAN);                             -- one by which ways along the lanes are told; as in state
 
 CREATE TABLE lane_gap (                                        -- attribute of the edges src follows dst and dst leads src
   frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);       -- from bumper to bumper along the lanes, m
@@ -149,6 +150,10 @@ CREATE TABLE map_node (
 
 CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
   map_id INTEGER, relation relation, src_kind kind, dst_kind kind, src INTEGER, dst INTEGER);
+
+CREATE TABLE map_reach (                                       -- for each two lanes that a way of up to 200 m joins
+  map_id INTEGER, src INTEGER, dst INTEGER,                    -- lanes, a lane and itself among them
+  start DOUBLE);                                               -- of dst, from the start of src; below 0: one drives back to src; m
 
 -- For sgstore verify ------------------------------------------------------------------------------------------------
 
@@ -217,10 +222,10 @@ FROM frame f JOIN (
 COMMENT ON VIEW edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
 
 CREATE VIEW lane_states AS
-SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary, along
+SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary, along, is_own
 FROM lane_state;
 
-COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m.';
+COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which pairs.lane_dist is told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
 
 CREATE VIEW lane_gaps AS
 SELECT frame_id, src, dst, gap FROM lane_gap;
@@ -238,7 +243,8 @@ SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * 
        CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
        src_kind, dst_kind, src_is_ego, dst_is_ego,
        CASE WHEN s1 < 0 THEN 0 ELSE s1 END AS lon_gap, CASE WHEN s2 < 0 THEN 0 ELSE s2 END AS lat_gap,
-       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading
+       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading,
+       CASE WHEN behind IS NULL OR ahead <= -behind THEN ahead ELSE behind END AS lane_dist
 FROM (
   SELECT *, CASE WHEN la + wa + lb + wb IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
       CASE WHEN s1 > 0 THEN s1 * s1 + greatest(t1, 0) * greatest(t1, 0) END, CASE WHEN s2 > 0 THEN s2 * s2 + greatest(t2, 0) * greatest(t2, 0) END,
@@ -263,9 +269,20 @@ FROM (
               cos(a.heading::DOUBLE) AS ca, sin(a.heading::DOUBLE) AS sa, cos(b.heading::DOUBLE) AS cb, sin(b.heading::DOUBLE) AS sb,
               a.length::DOUBLE / 2 AS la, a.width::DOUBLE / 2 AS wa, b.length::DOUBLE / 2 AS lb, b.width::DOUBLE / 2 AS wb,
               sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
-          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))));
+          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))))
+LEFT JOIN (  -- ways along the lanes; where nobody asks for them the database leaves the join out
+  SELECT at_frame, a_node, b_node, a_kind, b_kind, a_ego, b_ego, min(CASE WHEN way >= 0 THEN way END) AS ahead, max(CASE WHEN way < 0 THEN way END) AS behind
+  FROM (
+    SELECT a.frame_id AS at_frame, a.node_id AS a_node, b.node_id AS b_node, a.kind AS a_kind, b.kind AS b_kind,
+        a.is_ego AS a_ego, b.is_ego AS b_ego, r.start + (b.along::DOUBLE - a.along::DOUBLE) AS way
+    FROM lane_state a JOIN lane_state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id JOIN frame f ON f.frame_id = a.frame_id
+         JOIN map_reach r ON r.map_id = f.map_id AND r.src = a.lane AND r.dst = b.lane
+    WHERE a.is_own AND b.is_own)
+  WHERE way BETWEEN -200 AND 200
+  GROUP BY at_frame, a_node, b_node, a_kind, b_kind, a_ego, b_ego)
+ON at_frame = frame_id AND a_node = src AND b_node = dst AND a_kind = src_kind AND b_kind = dst_kind AND a_ego = src_is_ego AND b_ego = dst_is_ego;
 
-COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees.';
+COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; lane_dist: from centre to centre along the lanes, positive where one drives from src to dst, negative where one drives from dst to src, NULL where there is no way of 200 m or less (lane changes are none), m.';
 
 CREATE VIEW classes AS
 SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class

@@ -401,7 +401,9 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
     if ground is None:
         none = np.zeros(0, np.int64)
         empty = np.zeros(0)
-        return LaneStates(none, none, none, empty, empty, empty, np.zeros(0, np.bool_), empty)
+        return LaneStates(
+            none, none, none, *(empty,) * 3, none.astype(np.bool_), empty, none.astype(np.bool_)
+        )
     hits = ground.standing.hits
     return LaneStates(
         frame=bodies.frame[hits.row],
@@ -412,6 +414,7 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
         heading_error=hits.heading_error,
         primary=hits.primary,
         along=ground.standing.along,
+        own=ground.standing.own,
     )
 
 

@@ -216,7 +216,9 @@ class PaperMap(RoadMap):
             src=np.array([self.ids[a] for _, a, _ in links], np.int64),
             dst=np.array([self.ids[b] for _, _, b in links], np.int64),
         )
-        self.ribbons = _ribbons([p for p in patches if p.kind == "lane"], at)
+        lanes = [p for p in patches if p.kind == "lane"]
+        self.ribbons = _ribbons(lanes, at)
+        self._lanes, self._variant = len(lanes), ""
         self.asked = 0
 
     def moved(self, at: Place) -> PaperMap:

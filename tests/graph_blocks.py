@@ -52,6 +52,7 @@ class MapStub:
     digest: str
     nodes: MapNodes
     edges: MapEdges
+    reach: tuple[Any, Any, Any]
 
 
 def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
@@ -88,7 +89,22 @@ def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
             src=-1 - edges[:, 1],
             dst=-1 - edges[:, 2],
         ),
+        reach=_reach(lanes, rng),
     )
+
+
+def _reach(lanes: int, rng: np.random.Generator) -> tuple[Any, Any, Any]:
+    """Ways from lanes to lanes, both ways and some of them double; a lane and itself among them."""
+    lane, other = -2 - rng.integers(0, lanes, (2, 4 * lanes))
+    start = rng.uniform(10, 190, len(lane))
+    itself = -2 - np.arange(lanes)
+    columns = (
+        np.concatenate([itself, lane, other]),
+        np.concatenate([itself, other, lane]),
+        np.concatenate([np.zeros(lanes), start, -start]),
+    )
+    order = np.lexsort(columns[::-1])
+    return columns[0][order], columns[1][order], columns[2][order]
 
 
 def trace_info(path: str | Path = "/recordings/drive.mcap", **other: Any) -> TraceInfo:
@@ -220,6 +236,7 @@ class RandomTrace:
         rng = self.rng
         kept = rng.random(len(frame)) < (0.5 if self.road_map is not None else 0)
         count = int(kept.sum())
+        primary = rng.random(count) < 0.5
         return LaneStates(
             frame=frame[kept],
             node=node[kept],
@@ -227,8 +244,9 @@ class RandomTrace:
             overlap=rng.random(count),
             offset=rng.uniform(-2, 2, count),
             heading_error=rng.uniform(-1, 1, count),
-            primary=rng.random(count) < 0.5,
+            primary=primary,
             along=rng.uniform(-5, 80, count),
+            own=primary | (rng.random(count) < 0.2),
         )
 
 

@@ -14,10 +14,10 @@ VIEWS = {
     "nodes": "frame_id node_id kind is_ego name special subkind is_static x y z heading pitch roll speed"
     " vx vy vz accel ax ay az yaw_rate length width height light_state",
     "edges": "frame_id src relation dst src_kind dst_kind src_is_ego dst_is_ego",
-    "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary",
+    "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary along is_own",
     "lane_gaps": "frame_id src dst gap",
     "pairs": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
-    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading",
+    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading lane_dist",
     "classes": "frame_id abstraction class",
     "lanes": "map node_id name lane_type road section lane junction turn x y z heading length width",
     "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",

@@ -347,7 +347,7 @@ def test_a_graph_is_all_that_the_views_show_of_its_frame(store, name) -> None:
 
         assert graph.nodes == nodes
         assert Counter((s, r, d) for s, r, d, _ in graph.edges) == Counter(edges)
-        kept = ("overlap", "lane_offset", "heading_error", "is_primary", "along")
+        kept = ("overlap", "lane_offset", "heading_error", "is_primary", "along", "is_own")
         known = {("isIn", row["src"], row["dst"]): {k: row[k] for k in kept} for row in lanes}
         gaps = store.rows("SELECT src, dst, gap FROM lane_gaps WHERE frame_id = ?", [frame]).values
         known |= {("follows", a, b): {"gap": gap} for a, b, gap in gaps if gap is not None}

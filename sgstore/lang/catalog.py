@@ -343,6 +343,13 @@ EDGE_ATTRIBUTES: Final = _named(
             Unit.plain,
         ),
         _of_lane(
+            "is_own",
+            Type.boolean,
+            "is_own",
+            "one of the lanes by which lane_dist is told",
+            Unit.plain,
+        ),
+        _of_lane(
             "gap",
             Type.number,
             "gap",

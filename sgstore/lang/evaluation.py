@@ -9,7 +9,7 @@ import math
 import operator
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
@@ -19,6 +19,7 @@ import numpy as np
 from sgstore.geometry import pair_numbers
 from sgstore.lang import bound as b
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Unit
+from sgstore.lang.pairs import WAY
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
@@ -87,6 +88,10 @@ class FrameView:
     def pair(self, name: str, one: int, other: int) -> float | None:
         """A number of a pair of entities; ``None`` where something that it needs is missing."""
         key = (one, other)
+        if name == WAY:
+            reach = self.graph.reach
+            places = self._places.get(one, ()), self._places.get(other, ())
+            return None if reach is None else reach.distance(*places)
         if key not in self._pairs:
             boxes = [self._box(one), self._box(other)]
             if None in boxes:
@@ -100,6 +105,10 @@ class FrameView:
                 }
         value = self._pairs[key].get(name)
         return None if value is None or math.isnan(value) else value
+
+    @cached_property
+    def _places(self) -> Mapping[int, Sequence[tuple[int, float]]]:
+        return self.graph.places()
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int], dict[str, float]]:

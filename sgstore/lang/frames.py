@@ -42,7 +42,7 @@ from sgstore.lang.formulas import (
     quoted,
 )
 from sgstore.lang.kinds import Profile, homes_of, kind_conditions
-from sgstore.lang.pairs import needed_for, pair_column, pair_text, stage_of
+from sgstore.lang.pairs import WAY, needed_for, pair_column, pair_text, stage_of, way_text
 from sgstore.lang.phases import Given, Phases, apart
 from sgstore.lang.sql import Masks
 
@@ -255,8 +255,9 @@ class Frames(Masks):
                 join.texts[leaf] = frame_text(leaf, FRAME, TRACE, MAP)
             case BlockValue():
                 join.texts[leaf] = self._of_block(join, given, leaf)
-            case PairNumber():
-                pass  # computed in layers
+            case PairNumber(function=function, a=a, b=b):
+                if function == WAY:  # the others are computed in layers
+                    join.texts[leaf] = self._of_ways(join, scope, a, b)
 
     def _of_lane(self, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
         alias = quoted(f"{key}:in")
@@ -268,6 +269,17 @@ class Frames(Masks):
             on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
             join.select.join(f"{quoted(table)} AS {alias}", on, "LEFT JOIN")
         return lane_text(leaf, alias)
+
+    def _of_ways(self, join: Join, scope: Scope, a: str, b: str) -> str:
+        every = self.catalog.moving | self.catalog.fixed
+        conditions = [
+            condition
+            for alias, key in (('"a"', a), ('"b"', b))
+            for condition in kind_conditions(
+                scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', every
+            )
+        ]
+        return way_text(join.frame, join.nodes[a], join.nodes[b], conditions)
 
     def _of_block(self, join: Join, given: Given | None, leaf: BlockValue) -> str:
         """The value of a block for each frame and binding of the nodes outside."""
@@ -313,7 +325,9 @@ class _Layers:
 
     def text(self, writer: Frames, keys: list[str], wanted: list[Leaf]) -> str:
         """The whole: frame, keys and the values that are wanted."""
-        pairs = [leaf for leaf in self.needed if isinstance(leaf, PairNumber)]
+        pairs = [
+            leaf for leaf in self.needed if isinstance(leaf, PairNumber) and leaf.function != WAY
+        ]
         last = max((stage_of(pair.function) for pair in pairs), default=0)
         innermost = self.join.select
         innermost.where += [
@@ -451,8 +465,8 @@ def _valued(leaf: Leaf) -> frozenset[str]:
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit is Unit.binding else frozenset({node})
-        case PairNumber(a=a, b=b):
-            return frozenset({a, b})
+        case PairNumber(function=function, a=a, b=b):
+            return frozenset() if function == WAY else frozenset({a, b})
         case _:
             return frozenset()
 

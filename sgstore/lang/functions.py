@@ -26,6 +26,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, str]] = {
     "lon_gap": "how far the footprints are apart along a's axis; 0 where they overlap in it; m",
     "lat_gap": "how far the footprints are apart across a's axis; 0 where they overlap in it; m",
     "apparent_heading": "b's heading less the direction from a to b: 0 is a tail, 180 a front; degrees",
+    "lane_dist": "from centre to centre along the lanes, negative where b is behind; m; NULL beyond 200 m",
     "closing_speed": "how fast the centres approach one another; m/s",
     "ttc": "time to collision, the gap at the closing speed; s; NULL where they do not approach",
     "headway": "time until a has come as far as b is now, from bumper to bumper; s; NULL if b is not ahead",

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import string
 from functools import cache
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from sgstore.lang.formulas import quoted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 _HALF: Final = {
     "la": "{alength} / 2",
@@ -78,6 +81,37 @@ _PAIR: Final = {
     "ttc": "CASE WHEN {closing_speed} > 0 THEN {gap} / {closing_speed} END",
 }
 """Numbers of a pair (a, b) in terms of the columns of both and of one another, as in the view ``pairs``."""
+
+
+WAY: Final = "lane_dist"
+"""The number that no layer computes: it is looked up, by lanes and what lies between them."""
+
+
+def way_text(frame: str, a: str, b: str, conditions: Iterable[str]) -> str:
+    """How far it is along the lanes from a to b.
+
+    Parameters
+    ----------
+    frame, a, b : str
+        Columns of the frame and of both ids.
+    conditions : iterable of str
+        What is known of the rows ``"a"`` and ``"b"`` of ``lane_state`` besides, so that fewer are looked at.
+    """
+    # Each row is tied to the frame asked for, not to the others: that is what tells DuckDB where to begin.
+    more = "".join(f"\n        AND {condition}" for condition in conditions)
+    ahead = """min(CASE WHEN "way" >= 0 THEN "way" END)"""
+    behind = """max(CASE WHEN "way" < 0 THEN "way" END)"""
+    return f"""(
+    SELECT CASE WHEN {behind} IS NULL OR {ahead} <= -{behind} THEN {ahead} ELSE {behind} END
+    FROM (
+      SELECT "r"."start" + (CAST("b"."along" AS DOUBLE) - CAST("a"."along" AS DOUBLE)) AS "way"
+      FROM "lane_state" AS "a", "lane_state" AS "b", "frame" AS "f", "map_reach" AS "r"
+      WHERE "a"."frame_id" = {frame} AND "a"."node_id" = {a} AND "a"."is_own"
+        AND "b"."frame_id" = {frame} AND "b"."node_id" = {b} AND "b"."is_own"
+        AND "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
+        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"{more}
+    ) AS "ways" WHERE "way" BETWEEN -200 AND 200
+  )"""  # noqa: S608  columns that the compiler named
 
 
 @cache

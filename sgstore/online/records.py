@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from sgstore.geometry import wrapped
-from sgstore.graph import SceneGraph
+from sgstore.graph import Reach, SceneGraph
 from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATION_CODE, RELATIONS, VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ class Records:
 
     def __init__(self, road_map: RoadMap | None) -> None:
         self._map = road_map
+        self._reach = None if road_map is None else Reach(*road_map.reach)
         self._map_nodes: dict[int, Attributes] = {}
         self._standing: dict[int, Attributes] = {}
         if road_map is not None:
@@ -113,6 +114,7 @@ class Records:
             ego=ego,
             nodes=nodes,
             edges=_edges(graph, outer) + self._map_edges(mapped),
+            reach=self._reach,
         )
 
     def _map_node(self, node: int) -> Attributes:
@@ -192,7 +194,7 @@ def _edges(graph: GraphBlock, outer: Ints) -> list[Edge]:
                 "along": float(lanes.along[row]),
             }
         )
-        | {"is_primary": bool(lanes.primary[row])}
+        | {"is_primary": bool(lanes.primary[row]), "is_own": bool(lanes.own[row])}
         for row, key in enumerate(keys)
     }
     known = {(_IS_IN, *key): about for key, about in within.items()}

@@ -3,9 +3,10 @@
 What takes part are vehicles, parked ones too, on lanes for traffic, which face along their lane (by less than
 a right angle: who comes towards one leads nobody). Who never moves follows nobody.
 
-*Its own lanes* are the primary lane of a vehicle and, in a junction, where lanes lie on one another, every
-other lane of the same junction that its centre is in and that runs its way (:data:`SAME_WAY`): a vehicle at
-the mouth of a junction is on all the ways that begin there.
+*Its own lanes* are the primary lane of an entity and, in a junction, where lanes lie on one another, every
+other lane of the same junction that its centre is in and, if it is a vehicle, that runs its way
+(:data:`SAME_WAY`): a vehicle at the mouth of a junction is on all the ways that begin there. They are kept,
+because how far it is along the lanes from any entity to any other is told by them (``lane_dist``).
 
 *The next one ahead* is the one that comes first from the vehicle's centre on along the lane and, where nobody
 is before it on its lane, along the lanes that ``travelsTo`` leads to, through junctions too. Where the way
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
     from sgstore.config import Config
     from sgstore.relations.lanenet import LaneNet
     from sgstore.relations.scene import Bodies, Ground, Scene, Standing
-    from sgstore.world import Floats, Ints
+    from sgstore.roads import LaneHits
+    from sgstore.world import Bools, Floats, Ints
 
     Rows = NDArray[np.intp]
     Column = tuple[Rows, Rows, Floats]
@@ -78,16 +80,22 @@ class OwnLanes:
         return found, place[found]
 
 
-def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
-    """The vehicles that take part, on the lanes that are their own."""
-    hits = standing.hits
+def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
+    """Of each lane that a body touches whether it is one of its own."""
     lane = -2 - hits.lane
-    turned = np.abs(hits.heading_error)
     junction = np.full(len(bodies), -1)
     junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
     within = np.abs(hits.offset) <= net.widths[lane] / 2
     beside = (net.junction[lane] >= 0) & (net.junction[lane] == junction[hits.row])
-    own = (hits.primary & (turned < np.pi / 2)) | (beside & within & (turned <= SAME_WAY))
+    its_way = (np.abs(hits.heading_error) <= SAME_WAY) | ~IS_VEHICLE[bodies.kind[hits.row]]
+    return hits.primary | (beside & within & its_way)
+
+
+def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
+    """The vehicles that take part, on the lanes that are their own and that they face along."""
+    hits = standing.hits
+    lane = -2 - hits.lane
+    own = standing.own & (np.abs(hits.heading_error) < np.pi / 2)
     known = IS_VEHICLE[bodies.kind] & ~np.isnan(bodies.heading)
     kept = np.flatnonzero(own & net.traffic[lane] & known[hits.row])
     row, lane = hits.row[kept], lane[kept]

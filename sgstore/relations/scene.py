@@ -105,6 +105,8 @@ class Standing:
         Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Signals touch none.
     along : float64
         For each hit the place of the body's centre along the lane, beyond its ends too; m.
+    own : bool
+        For each hit whether the lane is one of the body's own (:func:`sgstore.relations.following.own_hits`).
     parts : tuple of int64 arrays
         Rows of :class:`Bodies`, ascending, and node ids of the crosswalks and waypoints that they are at.
     off_road : intp array
@@ -113,6 +115,7 @@ class Standing:
 
     hits: LaneHits
     along: Floats
+    own: Bools
     parts: tuple[Ints, Ints]
     off_road: NDArray[np.intp]
 
@@ -125,6 +128,7 @@ class Standing:
         return Standing(
             replace(hits, **(columns | {"row": place[columns["row"]]})),
             self.along[kept],
+            self.own[kept],
             (place[rows[there]], nodes[there]),
             off_road[off_road >= 0],
         )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.relations.along import Centrelines
-from sgstore.relations.following import next_ahead
+from sgstore.relations.following import next_ahead, own_hits
 from sgstore.relations.lanenet import LaneNet
 from sgstore.relations.scene import IS_SIGNAL, Bodies, Ground, Standing, joined, kinds_mask
 from sgstore.relations.upstream import SignalReach
@@ -127,7 +127,8 @@ class Survey:
         off_road = np.flatnonzero(
             ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
         )
-        return Standing(hits, along, parts, off_road)
+        own = own_hits(self._net, bodies, hits)
+        return Standing(hits, along, own, parts, off_road)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Ground:
         """The map under bodies, and around the egos.

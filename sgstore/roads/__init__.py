@@ -21,7 +21,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sgstore.roads.footprints import LaneIndex
-from sgstore.roads.lanegraph import LaneGraph
+from sgstore.roads.lanegraph import FARTHEST, LaneGraph, Reach
 from sgstore.roads.ribbons import LanePoints, Ribbons, lane_polygons, waypoints
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE
 
@@ -57,6 +57,8 @@ _FIRST_LANE: Final = OFF_ROAD - 1
 _QUADRANT: Final = np.pi / 4
 _MOST_PRESENT: Final = 1 << 24
 """Nodes times points that are looked at in one go."""
+_MERGED: Final = " without sections"
+"""What the variant of a map ends in whose lanes are one node for all sections."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -441,7 +443,7 @@ class RoadMap:
             junction_types=self.junction_types,
             controllers=self.controllers,
             warnings=self.warnings,
-            variant=f"{self._variant} without sections",
+            variant=f"{self._variant}{_MERGED}",
         )
 
     @cached_property
@@ -457,6 +459,33 @@ class RoadMap:
             *(_FIRST_LANE - ends[flow] for ends in (self.edges.src, self.edges.dst)),
             *(_FIRST_LANE - ends[change] for ends in (self.edges.src, self.edges.dst)),
         )
+
+    @cached_property
+    def reach(self) -> tuple[Ints, Ints, Floats]:
+        """Where lanes begin, measured along other lanes from whose start one can drive there, or back.
+
+        Returns
+        -------
+        lane, other : (n,) int64
+            Node ids. A lane stands beside itself too; two lanes come twice where one can drive either way.
+        start : (n,) float64
+            Of ``other``, along the lanes from the start of ``lane``; negative where one drives from ``other``
+            to ``lane``; m. No more than :data:`FARTHEST` lies between the end of one and the start of the next.
+
+        Notes
+        -----
+        Of a map without sections there is none: places along its lanes are told by section.
+        """
+        lanes = np.arange(self._lanes)
+        if _MERGED in self._variant:
+            lanes = lanes[:0]
+        ways = self.graph.downstream(FARTHEST) if len(lanes) else Reach.none()
+        start = self.ribbons.lengths[ways.lane] + ways.distance
+        lane = np.concatenate([lanes, ways.lane, ways.other])
+        other = np.concatenate([lanes, ways.other, ways.lane])
+        starts = np.concatenate([np.zeros(len(lanes)), start, -start])
+        order = np.lexsort((starts, other, lane))
+        return _FIRST_LANE - lane[order], _FIRST_LANE - other[order], starts[order]
 
     @cached_property
     def _index(self) -> LaneIndex:

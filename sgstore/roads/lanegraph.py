@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from sgstore.world import Floats, Ints
 
 
+FARTHEST: Final = 200.0
+"""How far along the lanes is looked from one entity to another; m. The view ``pairs`` has it too."""
 _MOST_AT_ONCE: Final = 1 << 22
 """Pairs of lanes whose distances are held at a time."""
 _NOTHING: Final = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
@@ -32,6 +34,11 @@ class Reach:
     lane: Ints
     other: Ints
     distance: Floats
+
+    @classmethod
+    def none(cls) -> Reach:
+        """Nothing lies downstream of anything."""
+        return cls(*_NOTHING)
 
 
 class LaneGraph:

@@ -192,7 +192,14 @@ class Deriving:
         old = set(before)
         edges += [e for e in whole.edges if e[:3] not in old and {e[0], e[2]} <= nodes.keys()]
         return SceneGraph(
-            whole.frame_id, whole.trace, whole.seq, whole.time_ns, whole.ego, nodes, edges
+            whole.frame_id,
+            whole.trace,
+            whole.seq,
+            whole.time_ns,
+            whole.ego,
+            nodes,
+            edges,
+            whole.reach,
         )
 
 

@@ -209,6 +209,8 @@ def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
         "heading_error": number(lanes.heading_error),
         "is_primary": lanes.primary,
         "along": number(lanes.along),
+        "is_own": lanes.own,
+        "is_ego": graph.frames.ego[lanes.frame] == lanes.node,
     }
 
 

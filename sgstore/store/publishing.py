@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sgstore.store.traces import Identity
     from sgstore.world import TraceInfo
 
-MAP_TABLES: Final = ("map", "map_node", "map_edge")
+MAP_TABLES: Final = ("map", "map_node", "map_edge", "map_reach")
 """Tables of a road map; they come into a store once, whatever the number of traces on it."""
 
 _TRACE: Final = """
@@ -178,6 +178,7 @@ DELETE FROM store.config WHERE config_id NOT IN (SELECT config_id FROM store.tra
 DELETE FROM store.map WHERE map_id NOT IN (SELECT map_id FROM store.trace WHERE map_id IS NOT NULL);
 DELETE FROM store.map_node WHERE map_id NOT IN (SELECT map_id FROM store.map);
 DELETE FROM store.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.map_reach WHERE map_id NOT IN (SELECT map_id FROM store.map);
 DELETE FROM store.manifest WHERE map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM store.map);
 """
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.graph import SceneGraph
+from sgstore.graph import Reach, SceneGraph
 from sgstore.store.packing import FRAME_BITS
 from sgstore.store.rows import arrays, run
 
@@ -40,7 +40,7 @@ SELECT DISTINCT src, relation, dst FROM edge
 WHERE bucket = $bucket AND mask & $bit <> 0 ORDER BY src, relation, dst
 """
 _LANES: Final = """
-SELECT src, dst, overlap, lane_offset, heading_error, is_primary, along
+SELECT src, dst, overlap, lane_offset, heading_error, is_primary, along, is_own
 FROM lane_states WHERE frame_id = $frame_id
 """
 _GAPS: Final = "SELECT src, dst, gap FROM lane_gaps WHERE frame_id = $frame_id"
@@ -53,6 +53,7 @@ _MAP_EDGES: Final = """
 SELECT src, relation::VARCHAR AS relation, dst FROM map_edge WHERE map_id = $map_id
 ORDER BY src DESC, map_edge.relation, dst DESC
 """
+_MAP_REACH: Final = "SELECT src, dst, start FROM map_reach WHERE map_id = $map_id"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ class _Map:
     src: Ints
     dst: Ints
     relation: list[str]
+    reach: Reach
 
 
 class Scenes:
@@ -99,8 +101,10 @@ class Scenes:
             ).values
         ]
         present = [row["node_id"] for row in rows(_PRESENT)]
+        reach = None
         if present:
             road_map = self._map(connection, about["map_id"], about["digest"])
+            reach = road_map.reach
             nodes |= {node: dict(road_map.nodes[node]) for node in present}
             edges += _edges_among(road_map, present)
         return SceneGraph(
@@ -111,12 +115,14 @@ class Scenes:
             ego=about["ego"],
             nodes=nodes,
             edges=edges,
+            reach=reach,
         )
 
     def _map(self, connection: DuckDBPyConnection, map_id: int, digest: str) -> _Map:
         if digest not in self._maps:
             where = {"map_id": map_id}
             edges = arrays(connection, _MAP_EDGES, where)
+            reach = arrays(connection, _MAP_REACH, where)
             fixed = {"is_ego": False, "is_static": True}
             self._maps[digest] = _Map(
                 nodes={
@@ -126,6 +132,7 @@ class Scenes:
                 src=-1 - edges["src"].astype(np.int64),
                 dst=-1 - edges["dst"].astype(np.int64),
                 relation=edges["relation"].tolist(),
+                reach=Reach(reach["src"], reach["dst"], reach["start"]),
             )
             while len(self._maps) > _MAPS:
                 self._maps.popitem(last=False)

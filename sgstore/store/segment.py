@@ -245,6 +245,7 @@ class Segment:
             insert("map", _map_columns(self._road_map))
             insert("map_node", _map_node_columns(self._road_map))
             insert("map_edge", _map_edge_columns(self._road_map))
+            insert("map_reach", _map_reach_columns(self._road_map))
 
     def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
         kinds, insert = self._kinds, self._staging.insert
@@ -333,3 +334,8 @@ def _map_edge_columns(road_map: RoadMap) -> Columns:
         "src_kind": kind[-1 - edges.src],
         "dst_kind": kind[-1 - edges.dst],
     }
+
+
+def _map_reach_columns(road_map: RoadMap) -> Columns:
+    src, dst, start = road_map.reach
+    return {"src": src, "dst": dst, "start": start}

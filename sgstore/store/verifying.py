@@ -195,6 +195,15 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         LEFT JOIN map_node b ON b.map_id = e.map_id AND b.node_id = e.dst
         WHERE a.kind IS DISTINCT FROM e.src_kind OR b.kind IS DISTINCT FROM e.dst_kind""",
     ),
+    (
+        "map",
+        "a way along lanes of a map leads to what is no lane of it",
+        """
+        SELECT NULL FROM map_reach r
+        LEFT JOIN map_node a ON a.map_id = r.map_id AND a.node_id = r.src
+        LEFT JOIN map_node b ON b.map_id = r.map_id AND b.node_id = r.dst
+        WHERE a.kind IS DISTINCT FROM 'lane' OR b.kind IS DISTINCT FROM 'lane'""",
+    ),
 )
 """What is looked at, what is wrong where a statement gives rows, and that statement: ids of traces at fault."""
 

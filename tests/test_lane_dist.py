@@ -1,0 +1,195 @@
+"""How far it is along the lanes from entity to entity: against Dijkstra, and the same wherever it is asked."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import networkx as nx
+import numpy as np
+import pytest
+from builders import PaperMap, Patch, Recording, graph_of, thing
+from graph_blocks import RandomTrace, map_stub, publish
+
+from sgstore.config import Config, Range
+from sgstore.graph import Reach
+from sgstore.lang.evaluation import FrameView
+from sgstore.opendrive import read_map
+from sgstore.query import Store
+from sgstore.roads.lanegraph import FARTHEST
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.store import StoreFile
+from sgstore.vocabulary import RELATION_CODE
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from sgstore.roads import RoadMap
+
+    Ways = nx.DiGraph[tuple[int, str]]
+
+ROADS = map_stub(seed=4)
+DRIVE = RandomTrace(seed=4, frames=70, road_map=ROADS, path="/r/drive.mcap")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    path = tmp_path_factory.mktemp("store") / "s.db"
+    file = StoreFile.create(path)
+    publish(file, DRIVE)
+    publish(file, RandomTrace(seed=5, frames=20, path="/r/field.mcap"))
+    return Store(path)
+
+
+def lane_ways(road_map: RoadMap) -> Ways:
+    """The lanes as roads from their starts to their ends, which are joined where traffic flows on."""
+    ways: Ways = nx.DiGraph()
+    for lane, length in enumerate(road_map.ribbons.lengths.tolist()):
+        ways.add_edge((lane, "start"), (lane, "end"), weight=length)
+    edges, lanes = road_map.edges, len(road_map.ribbons)
+    for code, src, dst in zip(edges.relation, edges.src, edges.dst, strict=True):
+        if code == RELATION_CODE["travelsTo"] and -1 - lanes <= src:
+            ways.add_edge((int(-2 - src), "end"), (int(-2 - dst), "start"), weight=0.0)
+    return ways
+
+
+def driven(ways: Ways, one: tuple[int, float], other: tuple[int, float]) -> float:
+    """How far one drives from a place to another, by Dijkstra; infinite where there is no way."""
+    (lane, along), (to, at) = one, other
+    if lane == to and at >= along:
+        return at - along
+    rest = ways.edges[(lane, "start"), (lane, "end")]["weight"] - along
+    try:
+        between = nx.dijkstra_path_length(ways, (lane, "end"), (to, "start"))
+    except nx.NetworkXNoPath:
+        return math.inf
+    return rest + between + at
+
+
+@pytest.mark.parametrize("town", ["Town01", "Town02", "Town07", "fabriksgatan", "soderleden"])
+def test_between_any_two_places_it_is_the_shorter_way_that_dijkstra_finds(
+    data: Path, town: str
+) -> None:
+    path = data / f"maps/{town}.xodr"
+    road_map = read_map(path.read_text(), town)
+    ways, reach = lane_ways(road_map), Reach(*road_map.reach)
+    rng = np.random.default_rng(1)
+    lengths = road_map.ribbons.lengths
+    near = road_map.graph.downstream(120.0)
+    some = rng.integers(0, len(near.lane), 500)
+    pairs = [*zip(near.lane[some].tolist(), near.other[some].tolist(), strict=True)]
+    pairs += rng.integers(0, len(lengths), (400, 2)).tolist()
+    pairs += [(lane, lane) for lane in rng.integers(0, len(lengths), 100).tolist()]
+    found = 0
+    for lane, other in pairs:
+        one, two = ((n, float(rng.uniform(0, lengths[n]))) for n in (lane, other))
+        ahead, back = driven(ways, one, two), driven(ways, two, one)
+        expected = ahead if ahead <= back else -back
+        known = reach.distance([(-2 - one[0], one[1])], [(-2 - two[0], two[1])])
+        if abs(abs(expected) - FARTHEST) < 1e-6:
+            continue
+        if abs(expected) > FARTHEST:
+            assert known is None
+        else:
+            found += 1
+            assert known == pytest.approx(expected, abs=1e-9)
+    assert found > 200
+
+
+def test_the_view_the_language_the_graph_and_networkx_say_the_same_to_the_last_bit(
+    store: Store,
+) -> None:
+    query = "MATCH (a:Entity), (b:Entity) RETURN frame.id, a.id, b.id, lane_dist(a, b)"
+    asked = {row[-4:-1]: row[-1] for row in store.find(query).rows()}
+    sql = "SELECT frame_id, src, dst, lane_dist FROM pairs"
+    told = {row[:3]: row[3] for row in store.sql(sql).values}
+    known = 0
+    for frame in sorted({frame for frame, *_ in told}):
+        graph = store.file.graph(frame)
+        view, places = FrameView(graph), graph.places()
+        drawn = graph.to_networkx()
+        for a in graph.nodes:
+            for b in graph.nodes:
+                if a < 0 or b < 0 or a == b:
+                    continue
+                far = graph.lane_dist(a, b)
+                assert view.pair("lane_dist", a, b) == far
+                assert asked[frame, a, b] == far
+                if (frame, a, b) in told:  # the view has what moves
+                    assert told[frame, a, b] == far
+                known += far is not None
+                assert far is None or (a in places and b in places)
+                for edge in (drawn.get_edge_data(a, b) or {}).values():
+                    assert edge.get("lane_dist") == far
+    assert known > 50
+
+
+TOWN = PaperMap(
+    Patch("in", -100, -4, 0, 0, to=("straight", "left")),
+    Patch("straight", 0, -4, 20, 0, junction="j", road="r1", to=("out",)),
+    Patch("left", 0, -4, 15, 3, junction="j", road="r2", to=("north",)),
+    Patch("out", 20, -4, 300, 0),
+    Patch("north", 30, 40, 90, 44),
+    Patch("contrary", -100, 0, 100, 4),
+)
+
+
+def test_whoever_is_ahead_and_whatever_it_is_has_a_distance_and_opposite_lanes_have_none() -> None:
+    things = [
+        thing("ego", -50, -2),
+        thing("behind", -90, -2),
+        thing("turning", 5, -2),
+        thing("walker", 10, -2, kind="person", heading=math.pi / 2, length=0.5, width=0.5),
+        thing("gone", 30, -2),
+        thing("far", 160, -2),
+        thing("oncoming", -20, 2, heading=math.pi),
+    ]
+    recording = Recording()
+    generator = SceneGraphGenerator(TOWN, Config(range=Range(400)))
+    lanes = generator.block(recording.block(things)).lanes
+    places: dict[str, list[tuple[int, float]]] = {}
+    for node, lane, along, own in zip(lanes.node, lanes.lane, lanes.along, lanes.own, strict=True):
+        if own:
+            places.setdefault(recording.names[node], []).append((int(lane), float(along)))
+    reach = Reach(*TOWN.reach)
+
+    def far(one: str, other: str) -> float | None:
+        return reach.distance(places[one], places[other])
+
+    assert far("ego", "behind") == pytest.approx(-40)
+    assert far("behind", "ego") == pytest.approx(40)
+    assert len(places["turning"]) == len(places["walker"]) == 2, "on both ways of the junction"
+    assert far("ego", "turning") == pytest.approx(55)
+    assert far("turning", "gone") == pytest.approx(25), "by the way straight on"
+    assert far("gone", "walker") == pytest.approx(-20)
+    assert far("ego", "far") is None, "farther than it is looked"
+    assert far("turning", "far") == pytest.approx(155)
+    assert far("ego", "oncoming") is None
+    assert far("ego", "ego") == 0
+
+
+def test_the_gap_between_who_follows_and_who_leads_is_the_lane_distance_less_half_of_both() -> None:
+    rng = np.random.default_rng(3)
+    recording = Recording()
+    # One whose centre is beyond the end of its lane is taken to be at the end by who follows it.
+    x = [x for x in rng.uniform(-99, 150, 40).tolist() if not 15 <= x <= 21]
+    things = [thing(f"c{i}", at, -2, length=float(rng.uniform(3, 6))) for i, at in enumerate(x)]
+    graph = graph_of(recording.block(things), TOWN, Config(range=Range(400)))
+    lanes, gaps, reach = graph.lanes, graph.gaps, Reach(*TOWN.reach)
+    places: dict[int, list[tuple[int, float]]] = {}
+    for node, lane, along, own in zip(lanes.node, lanes.lane, lanes.along, lanes.own, strict=True):
+        if own:
+            places.setdefault(int(node), []).append((int(lane), float(along)))
+    lengths = {recording.names.index(t.name): t.length for t in things}
+    assert len(gaps) > 20
+    for src, dst, gap in zip(gaps.src.tolist(), gaps.dst.tolist(), gaps.gap, strict=True):
+        far = reach.distance(places[src], places[dst])
+        assert far is not None
+        assert max(far - (lengths[src] + lengths[dst]) / 2, 0) == pytest.approx(gap, abs=1e-9)
+
+
+def test_lanes_without_sections_have_no_places_so_that_nothing_is_known(data: Path) -> None:
+    path = data / "maps/Town02.xodr"
+    road_map = read_map(path.read_text(), "Town02")
+    assert len(road_map.reach[0]) > len(road_map.ribbons)
+    assert not len(road_map.without_sections.reach[0])
