@@ -297,6 +297,8 @@ class TraceInfo:
     context : MessageRefs
         Messages that later ones depend on: maps, latched messages, those that carry static data. A clip
         must bring the ones before its start.
+    mapping : str
+        Digest of the mapping by which it is understood, of flavours that need one.
     """
 
     path: Path
@@ -309,6 +311,7 @@ class TraceInfo:
     map_text: str
     map_name: str
     context: MessageRefs
+    mapping: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -380,6 +383,8 @@ class TraceReport:
         Type names that no mapping knows → how many entities bear them.
     warnings : list of str
         What is odd but lost nothing.
+    about_ego : list of str
+        Those of the warnings that do not concern who names the egos.
     losses : list of Loss
         What could not be used.
     events : list of Event
@@ -390,6 +395,7 @@ class TraceReport:
     states: int = 0
     unknown_types: dict[str, int] = field(default_factory=dict[str, int])
     warnings: list[str] = field(default_factory=list[str])
+    about_ego: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
     events: list[Event] = field(default_factory=list[Event])
 

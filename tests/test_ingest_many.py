@@ -7,6 +7,8 @@ import signal
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from carla_recordings import Bridge, vehicle
+from foxglove_scenes import SceneRecorder, cube
 from killing import content, made
 from recordings import Recorder, car, drive, person
 
@@ -19,6 +21,8 @@ from sgstore.traces import fetch
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from sgstore.ingest import TraceOutcome
 
 
 def rows(store: Path, sql: str) -> list[tuple[Any, ...]]:
@@ -359,3 +363,35 @@ def test_a_folder_or_pattern_that_means_nothing_is_told(tmp_path, name) -> None:
 
     with pytest.raises(StoreError, match=r"no recording \(\.mcap|no file fits this pattern"):
         recordings([tmp_path / name])
+
+
+def test_who_names_the_egos_is_not_told_that_there_are_several(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Bridge(path) as bridge:
+        bridge.actors({1: ("vehicle.audi.tt", "hero"), 2: ("vehicle.audi.tt", "ego_vehicle")})
+        bridge.objects(0.0, [vehicle(1), vehicle(2, 20.0)])
+
+    (alone,) = ingest(tmp_path / "one.db", [path])
+    named = ingest(tmp_path / "two.db", [path], egos=["hero", "ego_vehicle"])
+
+    assert any(warning.startswith("several egos: ") for warning in alone.warnings)
+    assert [outcome.status for outcome in named] == ["added", "added"]
+    assert not any("ego" in warning for outcome in named for warning in outcome.warnings)
+    store = StoreFile(tmp_path / "two.db")
+    assert not any("ego" in warning for one in store.traces() for warning in one.report["warnings"])
+
+
+def test_another_mapping_is_another_configuration(tmp_path: Path) -> None:
+    path, mapping = tmp_path / "a.mcap", tmp_path / "m.toml"
+    with SceneRecorder.of(path, "json") as recorder:
+        recorder.scene(1.0, [cube("a", type="car", kind="bus")])
+    config = Config(mapping=str(mapping))
+
+    def again(text: str) -> TraceOutcome:
+        mapping.write_text(text)
+        return ingest(tmp_path / "s.db", [path], config=config)[0]
+
+    assert again('[entity]\ntype = "metadata.type"\n').status == "added"
+    assert again('# the same\n[entity]\ntype = "metadata.type"\n').status == "present"
+    changed = again('[entity]\ntype = "metadata.kind"\n')
+    assert (changed.status, "with other settings" in str(changed.error)) == ("failed", True)

@@ -246,6 +246,8 @@ class Reading:
         parked: Codes,
     ) -> None:
         report, told = trace.report, tally.as_dict()
+        moot = report.about_ego if self._job.config.egos else []
+        warnings = [warning for warning in report.warnings if warning not in moot]
         for one, segment in zip(group, segments, strict=True):
             outcome = one.view.outcome
             if self._job.config.egos and not one.met:
@@ -256,9 +258,10 @@ class Reading:
             outcome.entities = tally.entities
             outcome.clock_jumps, outcome.gaps = told["clock_jumps"], told["gaps"]
             outcome.unknown_types = self._job.config.unknown_of(report.unknown_types)
-            outcome.warnings += report.warnings
+            outcome.warnings += warnings
             outcome.losses += report.losses
-            segment.seal(replace(report, warnings=outcome.warnings), told, parked)
+            kept = replace(report, warnings=outcome.warnings, about_ego=[])
+            segment.seal(kept, told, parked)
             outcome.status = "sealed"
 
     def _meant(self, block: FrameBlock) -> FrameBlock:

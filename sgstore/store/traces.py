@@ -41,6 +41,7 @@ class Identity:
     settings : str
         The config as JSON, without its egos: the trace has one.
     settings_digest : str
+        Of the settings, and of the mapping by which the recording is understood.
     payloads : Payloads
     map_digest, map_name : str
         Empty without a map.
@@ -74,7 +75,7 @@ class Identity:
             digest=info.digest,
             ego=plain(info.ego),
             settings=settings,
-            settings_digest=hashlib.sha256(settings.encode()).hexdigest(),
+            settings_digest=hashlib.sha256(f"{settings}{info.mapping}".encode()).hexdigest(),
             payloads=config.payloads,
             map_digest=road_map.digest if road_map else "",
             map_name=plain(road_map.name) if road_map else "",

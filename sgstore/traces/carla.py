@@ -104,6 +104,7 @@ class CarlaTrace(Opened):
         """
         report = self.report = TraceReport()
         report.warnings += [*self._survey.notes, *self._notes]
+        report.about_ego += self._notes
         report.losses += self._survey.lost.losses()
         window = self._recording.window
         decoder = FrameDecoder(

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
@@ -104,6 +105,7 @@ class FoxgloveTrace(Opened):
             map_text="",
             map_name="",
             context=refs_of(self._survey.context(), channels),
+            mapping=sha256(repr(self._mapping).encode("utf-8", "replace")).hexdigest(),
         )
 
     @classmethod
@@ -125,6 +127,7 @@ class FoxgloveTrace(Opened):
         """
         report = self.report = TraceReport()
         report.warnings += self._notes
+        report.about_ego += self._notes
         decoder = FrameDecoder(
             self._survey.readers,
             self._leading,

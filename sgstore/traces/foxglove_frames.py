@@ -199,6 +199,7 @@ class FrameDecoder:
             )
         if self._ego < 0:
             warn(NO_EGO)
+            self._report.about_ego.append(NO_EGO)
 
     # Messages ------------------------------------------------------------------------------------------
 

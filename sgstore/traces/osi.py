@@ -70,7 +70,8 @@ class OsiTrace(Opened):
             raise TraceError(reason, path=recording.path)
         self._survey = found
         self._leading = leading
-        self._ego = found.cast.ego(ego, found.notes)
+        self._notes: list[str] = []
+        self._ego = found.cast.ego(ego, self._notes)
         self.report = TraceReport()
         self.info = self._info(found, digest)
 
@@ -89,7 +90,8 @@ class OsiTrace(Opened):
             The file cannot be read any more.
         """
         report = self.report = TraceReport()
-        report.warnings += self._survey.notes
+        report.warnings += [*self._survey.notes, *self._notes]
+        report.about_ego += self._notes
         decoder = FrameDecoder(self._survey, self._leading, self._ego, report)
         topic = self._recording.channels[self._leading].topic
         yield from self._told(decoder, size, report, topic)

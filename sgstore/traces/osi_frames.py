@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from sgstore.traces.osi_survey import Survey
     from sgstore.world import Bools, Floats, Ints, TraceReport
 
+NO_EGO: Final = "no host vehicle is among the moving objects: there is no ego unless one is named"
+"""What a report says of it."""
+
 _VEHICLE: Final = 2
 """``MovingObject.TYPE_VEHICLE``: what it is stands in ``vehicle_classification.type``."""
 _NO_VECTOR: Final = (NAN, NAN, NAN)
@@ -173,7 +176,8 @@ class FrameDecoder:
         if self._untimed:
             warn(f"{self._untimed} frames bear no time of their own: their log time is taken")
         if self._ego is None:
-            warn("no host vehicle is among the moving objects: there is no ego unless one is named")
+            warn(NO_EGO)
+            self._report.about_ego.append(NO_EGO)
 
     def complete(self, frames: list[RawFrame]) -> list[FrameRows]:
         """Frames with their numbers, read for all of them at once."""
