@@ -12,6 +12,14 @@ import numpy as np
 
 from sgstore.abstractions import AT_INGEST, Classes, Grounds, Seen, abstraction_named
 from sgstore.store.adding import add_files, note, writing
+from sgstore.store.covering import (
+    CodedClasses,
+    coded_classes,
+    imported_names,
+    seen_of,
+    times,
+    triples,
+)
 from sgstore.store.packing import BUCKET_BITS, FRAME_BITS, masks_of, texts, trace_bucket
 from sgstore.store.seen import Graphs
 from sgstore.store.staging import Staging
@@ -19,7 +27,7 @@ from sgstore.store.traces import frame_named, trace_named
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -166,6 +174,49 @@ class Abstracted:
                 [abstraction_named(name).name, low, high],
             ).fetchnumpy()
         return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
+
+    def coded(self, name: str) -> CodedClasses:
+        """The class of each frame as a number, computed where it was not.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            Others keep the store for too long.
+        """
+        self.complete(name)
+        with self._access.reading() as connection:
+            return coded_classes(connection, abstraction_named(name).name)
+
+    def times(self) -> tuple[Ints, Ints]:
+        """Ids of all frames, ascending, and their simulation times; ns."""
+        with self._access.reading() as connection:
+            return times(connection)
+
+    def imported_names(self) -> dict[str, int]:
+        """What imported files call their graphs, and the ids of the frames that these became."""
+        with self._access.reading() as connection:
+            return imported_names(connection)
+
+    def features(self, name: str, frame_id: Ints) -> Iterator[dict[tuple[str, ...], int]]:
+        """What the graphs of frames are made of in an abstraction: :func:`sgstore.store.covering.triples`.
+
+        Parameters
+        ----------
+        name : str
+        frame_id : int64
+            Ascending.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        """
+        function = abstraction_named(name).function
+        with self._access.reading() as connection:
+            for _, row, seen in seen_of(connection, self._graphs, frame_id):
+                yield from triples(function(seen), row)
 
     def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
         """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.

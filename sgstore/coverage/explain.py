@@ -1,0 +1,211 @@
+"""What tells frames of one selection from those of another: features that differ, and a tree of questions.
+
+S3C asked so what failing test inputs have that training inputs have not. (Woodlief et al., ICSE 2024, RQ2.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.coverage.asking import query_of_features
+from sgstore.coverage.classed import shared
+from sgstore.coverage.features import features
+from sgstore.coverage.tables import Table, of_unknown
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.coverage.classed import Classed
+    from sgstore.coverage.features import Feature
+    from sgstore.world import Bools, Floats
+
+DEPTH: Final = 4
+"""Questions, one after another, in the tree."""
+
+SMALLEST: Final = 5
+"""Least weight of a side of a question: of classes, or of frames."""
+
+_THRESHOLDS: Final = (0, 1, 2, 3)
+"""How often a feature must occur at least, less one, for the answer yes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question of a tree, whether a feature occurs more often than so; and the answer."""
+
+    feature: Feature
+    more_than: int
+    answer: bool
+
+    def __str__(self) -> str:
+        text = " ".join(self.feature)
+        if self.more_than == 0:
+            return text if self.answer else f"no {text}"
+        return f"{text} {'>' if self.answer else '<='} {self.more_than}"
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """Where questions lead: how much of both selections comes here."""
+
+    questions: tuple[Question, ...]
+    ours: float
+    theirs: float
+
+
+def tree(
+    counts: NDArray[np.int64],
+    names: tuple[Feature, ...],
+    ours: Bools,
+    weight: Floats,
+    depth: int = DEPTH,
+) -> list[Leaf]:
+    """A decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
+
+    Parameters
+    ----------
+    counts : (C, F) int64
+        How often each feature occurs in each case.
+    names : tuple of Feature
+    ours : (C,) bool
+    weight : (C,) float64
+    depth : int
+
+    Returns
+    -------
+    list of Leaf
+        Those with the most of ours for what they have of theirs first.
+    """
+    leaves: list[Leaf] = []
+    _grow(counts, names, ours, weight, depth, (), leaves)
+    leaves.sort(key=lambda leaf: (-leaf.ours / max(leaf.ours + leaf.theirs, 1e-12), -leaf.ours))
+    return leaves
+
+
+def _grow(
+    counts: NDArray[np.int64],
+    names: tuple[Feature, ...],
+    ours: Bools,
+    weight: Floats,
+    depth: int,
+    asked: tuple[Question, ...],
+    leaves: list[Leaf],
+) -> None:
+    best = _best(counts, ours, weight) if depth else None
+    if best is None:
+        leaves.append(Leaf(asked, float(weight[ours].sum()), float(weight[~ours].sum())))
+        return
+    feature, more_than = best
+    yes = counts[:, feature] > more_than
+    for answer in (True, False):
+        side = yes if answer else ~yes
+        question = Question(names[feature], more_than, answer)
+        _grow(
+            counts[side],
+            names,
+            ours[side],
+            weight[side],
+            depth - 1,
+            (*asked, question),
+            leaves,
+        )
+
+
+def _best(counts: NDArray[np.int64], ours: Bools, weight: Floats) -> tuple[int, int] | None:
+    """The question that makes both sides purest; ``None`` if none makes them purer."""
+    good = np.where(ours, weight, 0.0)
+    total, positive = float(weight.sum()), float(good.sum())
+    if min(positive, total - positive) < 1e-9:
+        return None
+    before = _impurity(np.array([positive]), np.array([total]))[0]
+    best: tuple[float, int, int] = (1e-9 * total, -1, 0)
+    for more_than in _THRESHOLDS:
+        yes = (counts > more_than).astype(np.float64)
+        all_yes, good_yes = weight @ yes, good @ yes
+        gain = (
+            before - _impurity(good_yes, all_yes) - _impurity(positive - good_yes, total - all_yes)
+        )
+        gain[np.minimum(all_yes, total - all_yes) < SMALLEST] = -np.inf
+        feature = int(np.argmax(gain)) if len(gain) else -1
+        if feature >= 0 and gain[feature] > best[0]:
+            best = (float(gain[feature]), feature, more_than)
+    return None if best[1] < 0 else best[1:]
+
+
+def _impurity(positive: Floats, total: Floats) -> Floats:
+    """Gini's impurity times the weight."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(total > 0, positive / total, 0.0)
+    return 2 * share * (1 - share) * total
+
+
+def explain(
+    b: Classed,
+    a: Classed,
+    abstraction: str,
+    *,
+    by_frame: bool = False,
+    depth: int = DEPTH,
+) -> tuple[Table, Table]:
+    """What tells ``b`` from ``a``: classes count once each, or as often as they have frames.
+
+    Parameters
+    ----------
+    b, a : Classed
+    abstraction : str
+        That of their classes.
+    by_frame : bool
+    depth : int
+        Questions, one after another.
+
+    Returns
+    -------
+    differing : Table
+        ``feature``, ``share_of_b``, ``share_of_a``, ``difference``, and the ``query`` that finds it; the
+        largest difference first.
+    leaves : Table
+        ``questions``, ``of_b``, ``of_a``, ``share_of_b`` among what comes there.
+    """
+    _, (b, a) = shared(b, a)
+    names = tuple(sorted({*features(b, abstraction).names, *features(a, abstraction).names}))
+    of_b, of_a = features(b, abstraction, names), features(a, abstraction, names)
+    weights = [
+        of.frames.astype(np.float64) if by_frame else np.ones(len(of.codes)) for of in (of_b, of_a)
+    ]
+    shares = [
+        weight @ of.there / max(float(weight.sum()), 1e-12)
+        for weight, of in zip(weights, (of_b, of_a), strict=True)
+    ]
+    order = np.argsort(-np.abs(shares[0] - shares[1]), kind="stable")
+    rows: list[tuple[Any, ...]] = [
+        (
+            " ".join(names[i]),
+            float(shares[0][i]),
+            float(shares[1][i]),
+            float(shares[0][i] - shares[1][i]),
+            query_of_features([names[i]]),
+        )
+        for i in order.tolist()
+    ]
+    unit = "frames with a class" if by_frame else "distinct classes"
+    said = [f"B: {unit} of {b.chosen.text}", f"A: {unit} of {a.chosen.text}"]
+    said += of_unknown(b.unknown, b.chosen.text) + of_unknown(a.unknown, a.chosen.text)
+    counts = np.concatenate([of_b.counts, of_a.counts])
+    ours: NDArray[np.bool_] = np.arange(len(counts)) < len(of_b.codes)
+    grown = tree(counts, names, ours, np.concatenate(weights), depth)
+    leaves = [
+        (
+            " and ".join(map(str, leaf.questions)) or "(all)",
+            leaf.ours,
+            leaf.theirs,
+            leaf.ours / (leaf.ours + leaf.theirs) if leaf.ours + leaf.theirs else None,
+        )
+        for leaf in grown
+    ]
+    return (
+        Table(("feature", "share_of_b", "share_of_a", "difference", "query"), rows, said),
+        Table(("questions", "of_b", "of_a", "share_of_b"), leaves),
+    )

@@ -1,0 +1,207 @@
+"""What frames are made of in an abstraction: features, such as (car, near, ego), and k of them together.
+
+Equal classes have equal features, so one frame of each class is looked at, however many there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.coverage.asking import query_of_features
+from sgstore.coverage.tables import SHARES, Table, of_unknown, share
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.coverage.classed import Classed
+    from sgstore.world import Bools, Ints
+
+Feature = tuple[str, ...]
+"""Labels of an edge's source, of itself and of its destination; or of a node, in abstractions without edges."""
+
+MOST: Final = 5_000_000
+"""Most combinations that are gone through: more are an error, not a part of the answer."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of classes.
+
+    Attributes
+    ----------
+    names : tuple of Feature
+        In alphabetical order.
+    codes : (C,) int64
+        The classes, ascending.
+    counts : (C, F) int64
+        How often each class has each feature.
+    frames : (C,) int64
+        How many frames each class has.
+    """
+
+    names: tuple[Feature, ...]
+    codes: Ints
+    counts: NDArray[np.int64]
+    frames: Ints
+
+    @property
+    def there(self) -> Bools:
+        """(C, F): whether a class has a feature."""
+        return self.counts > 0
+
+
+def features(a: Classed, abstraction: str, names: Sequence[Feature] | None = None) -> Features:
+    """The features of the classes of a selection; ``a`` has classes of this very abstraction.
+
+    Parameters
+    ----------
+    a : Classed
+    abstraction : str
+    names : sequence of Feature, optional
+        Those that are asked for; by default all that occur.
+    """
+    codes, first = a.present(), a.first()
+    order = np.argsort(first[codes], kind="stable")
+    bags = list(a.chosen.store.file.abstracted.features(abstraction, first[codes[order]]))
+    if any(len(name) == 3 for bag in bags for name in bag):
+        bags = [{name: n for name, n in bag.items() if len(name) == 3} for bag in bags]
+    names = tuple(sorted({name for bag in bags for name in bag}) if names is None else names)
+    place = {name: i for i, name in enumerate(names)}
+    counts = np.zeros((len(codes), len(names)), np.int64)
+    for row, bag in zip(order.tolist(), bags, strict=True):
+        for name, often in bag.items():
+            if name in place:
+                counts[row, place[name]] = often
+    return Features(names, codes, counts, a.sizes()[codes])
+
+
+@dataclass(frozen=True)
+class Combinations:
+    """Which combinations of k features occur.
+
+    Attributes
+    ----------
+    features : Features
+    k : int
+    members : (M, k) int64
+        All combinations: indices of features, ascending.
+    frames : (M,) int64
+        Frames in which each occurs.
+    """
+
+    features: Features
+    k: int
+    members: Ints
+    frames: Ints
+
+    def texts(self, rows: Sequence[int] | Ints) -> list[str]:
+        """Combinations for people."""
+        names = self.features.names
+        return [" & ".join(" ".join(names[i]) for i in self.members[row].tolist()) for row in rows]
+
+
+def combined(found: Features, k: int) -> Combinations:
+    """All combinations of k features, and in how many frames each occurs.
+
+    Raises
+    ------
+    ValueError
+        k is not positive, or there are more combinations than can be gone through.
+    """
+    many = len(found.names)
+    if k < 1 or comb(many, k) > MOST:
+        raise ValueError(
+            f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
+            " ask for a smaller k, or for an abstraction with fewer labels"
+        )
+    members = np.array(list(combinations(range(many), k)), np.int64).reshape(-1, k)
+    if k == 2:
+        there = found.there.astype(np.float64)
+        both = (there * found.frames[:, None]).T @ there
+        frames = both[members[:, 0], members[:, 1]].astype(np.int64)
+    else:
+        frames = np.fromiter(_counted(found, members), np.int64, len(members))
+    return Combinations(found, k, members, frames)
+
+
+def _counted(found: Features, members: Ints) -> Iterator[int]:
+    """Frames of combinations, one after another; bits of eight classes a byte."""
+    packed = np.packbits(found.there, axis=0).T.copy()
+    for row in members.tolist():
+        both = np.bitwise_and.reduce(packed[row], axis=0)
+        classes = np.flatnonzero(np.unpackbits(both, count=len(found.codes)))
+        yield int(found.frames[classes].sum())
+
+
+def combos(
+    a: Classed,
+    abstraction: str,
+    k: int,
+    reference: Classed | None = None,
+) -> tuple[Table, Table, Combinations]:
+    """How many combinations of k features a selection has, and which ones it lacks.
+
+    Parameters
+    ----------
+    a : Classed
+    abstraction : str
+    k : int
+    reference : Classed, optional
+        What it is measured by: combinations that occur there. By default all combinations of features of ``a``.
+
+    Returns
+    -------
+    shares : Table
+    missing : Table
+        ``combination``, ``frames`` in the reference (``None`` without one), and the ``query`` that would find
+        it.
+    found : Combinations
+        Of ``a``, over the features of both.
+    """
+    own = features(a, abstraction)
+    other = None if reference is None else features(reference, abstraction)
+    names = tuple(sorted({*own.names, *(other.names if other else ())}))
+    found = combined(_over(own, names), k)
+    name, kinds = a.chosen.text, f"combinations of {k} of the {len(names)} features"
+    if other is None or reference is None:
+        wanted, there = np.ones(len(found.frames), np.bool_), None
+        denominator = f"all {kinds} of {name}, whether they can be or not (product)"
+    else:
+        theirs = combined(_over(other, names), k)
+        there = theirs.frames
+        wanted = there > 0
+        denominator = f"{kinds} that occur in {reference.chosen.text} (observed)"
+    covered = (found.frames > 0) & wanted
+    shares = Table(
+        SHARES,
+        [share(f"{k}-way combinations", int(covered.sum()), int(wanted.sum()), denominator)],
+        of_unknown(a.unknown, name),
+    )
+    gaps = np.flatnonzero(wanted & (found.frames == 0))
+    if there is not None:
+        gaps = gaps[np.argsort(-there[gaps], kind="stable")]
+    rows = [
+        (
+            text,
+            None if there is None else int(there[row]),
+            query_of_features([names[i] for i in found.members[row].tolist()]),
+        )
+        for row, text in zip(gaps.tolist(), found.texts(gaps), strict=True)
+    ]
+    missing = Table(("combination", "frames_in_reference", "query"), rows)
+    return shares, missing, found
+
+
+def _over(own: Features, names: tuple[Feature, ...]) -> Features:
+    """The same over more features."""
+    place = {name: i for i, name in enumerate(names)}
+    counts = np.zeros((len(own.codes), len(names)), np.int64)
+    counts[:, [place[name] for name in own.names]] = own.counts
+    return Features(names, own.codes, counts, own.frames)

@@ -1,0 +1,90 @@
+"""Which frames coverage is of: a store, or what a query finds in it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sgstore.errors import StoreError
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sgstore.world import Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Frames of a store.
+
+    Attributes
+    ----------
+    text : str
+        What they were called.
+    store : Store
+    frame_id : int64 or None
+        Ascending; ``None``: all.
+    left_out : tuple of str
+        Traces that cannot answer the query.
+    """
+
+    text: str
+    store: Store
+    frame_id: Ints | None = None
+    left_out: tuple[str, ...] = ()
+
+    def rows_of(self, frame_id: Ints) -> Ints:
+        """Which of frames, by ascending id, are chosen: their rows."""
+        if self.frame_id is None:
+            return np.arange(len(frame_id))
+        at = np.searchsorted(frame_id, self.frame_id)
+        known = at < len(frame_id)
+        known[known] = frame_id[at[known]] == self.frame_id[known]
+        return at[known].astype(np.int64)
+
+
+def selection_of(text: str) -> Chosen:
+    """The frames that a text means: ``STORE``, or ``STORE:QUERY`` for those in which the query holds.
+
+    Raises
+    ------
+    StoreError
+        There is no such store.
+    QueryError
+        The query is none.
+    """
+    whole = Path(text)
+    if whole.exists():
+        return Chosen(text, Store(whole))
+    for colon in re.finditer(":", text):
+        path, query = Path(text[: colon.start()]), text[colon.end() :]
+        if path.is_file():
+            store = Store(path)
+            found = frames_of(store, query)
+            return Chosen(text, store, found, store.find(query).left_out)
+    raise StoreError(
+        f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)'"
+    )
+
+
+def frames_of(store: Store, query: str) -> Ints:
+    """Ids of the frames in which a query holds, ascending."""
+    found = np.fromiter((frame.frame_id for frame in store.find(query).frames()), np.int64)
+    return np.unique(found)
+
+
+def names_of(store: Store, frame_id: Sequence[int] | Ints) -> list[str]:
+    """Frames as every command takes them: ``TRACE#SEQ``."""
+    from sgstore.store.covering import seq_of, trace_of
+
+    traces = {trace.trace_id: trace.name for trace in store.info()}
+    ids = np.asarray(frame_id, np.int64)
+    return [
+        f"{traces.get(trace, trace)}#{seq}"
+        for trace, seq in zip(trace_of(ids).tolist(), seq_of(ids).tolist(), strict=True)
+    ]
