@@ -241,7 +241,7 @@ SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * 
        turned - 360 * ceil((turned - 180) / 360) AS rel_heading, px AS lon, py AS lat, closing_speed,
        CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS ttc,
        CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
-       src_kind, dst_kind, src_is_ego, dst_is_ego,
+       src_kind, dst_kind, of_ego = true AS src_is_ego, to_ego = true AS dst_is_ego,
        CASE WHEN s1 < 0 THEN 0 ELSE s1 END AS lon_gap, CASE WHEN s2 < 0 THEN 0 ELSE s2 END AS lat_gap,
        CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading,
        CASE WHEN behind IS NULL OR ahead <= -behind THEN ahead ELSE behind END AS lane_dist
@@ -263,14 +263,14 @@ FROM (
         SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd,
             CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned, degrees(hb - atan2(dy, dx)) AS sighted
         FROM (
-          SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
+          SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS of_ego, b.is_ego AS to_ego,
               b.x::DOUBLE - a.x AS dx, b.y::DOUBLE - a.y AS dy, b.z::DOUBLE - a.z AS dz, b.vx::DOUBLE - a.vx AS dvx, b.vy::DOUBLE - a.vy AS dvy,
               a.heading::DOUBLE AS ha, b.heading::DOUBLE AS hb,
               cos(a.heading::DOUBLE) AS ca, sin(a.heading::DOUBLE) AS sa, cos(b.heading::DOUBLE) AS cb, sin(b.heading::DOUBLE) AS sb,
               a.length::DOUBLE / 2 AS la, a.width::DOUBLE / 2 AS wa, b.length::DOUBLE / 2 AS lb, b.width::DOUBLE / 2 AS wb,
               sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
           FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))))
-LEFT JOIN (  -- ways along the lanes; where nobody asks for them the database leaves the join out
+LEFT JOIN (  -- ways along the lanes. A filter on a column of ON reaches these tables too if it compares: hence "= true" above
   SELECT at_frame, a_node, b_node, a_kind, b_kind, a_ego, b_ego, min(CASE WHEN way >= 0 THEN way END) AS ahead, max(CASE WHEN way < 0 THEN way END) AS behind
   FROM (
     SELECT a.frame_id AS at_frame, a.node_id AS a_node, b.node_id AS b_node, a.kind AS a_kind, b.kind AS b_kind,
@@ -280,7 +280,7 @@ LEFT JOIN (  -- ways along the lanes; where nobody asks for them the database le
     WHERE a.is_own AND b.is_own)
   WHERE way BETWEEN -200 AND 200
   GROUP BY at_frame, a_node, b_node, a_kind, b_kind, a_ego, b_ego)
-ON at_frame = frame_id AND a_node = src AND b_node = dst AND a_kind = src_kind AND b_kind = dst_kind AND a_ego = src_is_ego AND b_ego = dst_is_ego;
+ON at_frame = frame_id AND a_node = src AND b_node = dst AND a_kind = src_kind AND b_kind = dst_kind AND a_ego = of_ego AND b_ego = to_ego;
 
 COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; lane_dist: from centre to centre along the lanes, positive where one drives from src to dst, negative where one drives from dst to src, NULL where there is no way of 200 m or less (lane changes are none), m.';
 

@@ -52,7 +52,8 @@ def test_what_was_published_is_without_fault(store) -> None:
     assert found.faults == []
     assert found.traces == 2
     tables = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
-    tables += ("lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "frame_class")
+    tables += ("lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "map_reach")
+    tables += ("frame_class",)
     count = sum(store.rows(f"SELECT count(*) FROM {table}").values[0][0] for table in tables)
     assert found.rows == count
 
@@ -106,6 +107,7 @@ CHANGES = {
     "a map that is changed": ("UPDATE map SET text = text || ' '", "map"),
     "a lane of a map": ("UPDATE map_node SET x = x + 1 WHERE node_id = -2", "map"),
     "an edge of a map to nowhere": ("UPDATE map_edge SET dst = -9999", "map"),
+    "a way along lanes to nowhere": ("UPDATE map_reach SET dst = -9999", "map"),
     "a manifest that is gone": ("DELETE FROM manifest WHERE trace_id IS NOT NULL", "rows"),
     "a trace that says otherwise": ("UPDATE trace SET frames = 7", "frames"),
 }

@@ -412,4 +412,19 @@ def test_the_filter_on_the_frame_of_a_pair_reaches_both_states(store) -> None:
 
     found = scans(store, f"SELECT * FROM pairs WHERE frame_id = {frame}")
 
-    assert [str(frame) in filters for _, filters in found] == [True, True]
+    tables = ("state", "lane_state")
+    assert [(t, str(frame) in filters) for t, filters in sorted(found) if t in tables] == [
+        (t, True) for t in ("lane_state", "lane_state", "state", "state")
+    ]
+
+
+def test_pairs_of_the_ego_look_at_the_lanes_of_the_ego_only(store) -> None:
+    found = scans(store, "SELECT src, dst, lane_dist FROM pairs WHERE src_is_ego")
+
+    assert sum("is_ego" in filters for table, filters in found if table == "lane_state") == 1
+
+
+def test_a_mean_of_other_numbers_of_pairs_looks_at_no_lanes(store) -> None:
+    found = scans(store, "SELECT avg(gap), max(ttc) FROM pairs WHERE src_is_ego")
+
+    assert [table for table, _ in found] == ["state", "state"]
