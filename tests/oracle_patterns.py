@@ -87,12 +87,17 @@ class Writer:
             f"COUNT(DISTINCT {b}.id)",
             f"MAX({a}.x)",
             f"AVG({b}.y)",
+            f"MIN({a}.kind)",
+            f"MAX({b}.name)",
         ]
+        of_edges = [f"type({edge})" for edge in self.edges]
+        plain[:0] = of_edges
+        counted += [f"{word}({edge})" for word in ("MIN", "MAX") for edge in of_edges]
         chosen = self.rng.sample(plain, self.rng.choice((1, 2)))
         if self.rng.random() < 0.4:
-            chosen = self.rng.sample(plain[:6], self.rng.choice((0, 1))) + self.rng.sample(
-                counted, 2
-            )
+            keys = plain[: 6 + len(of_edges)]
+            chosen = self.rng.sample(keys, self.rng.choice((0, 1, 2)))
+            chosen += self.rng.sample(counted, self.rng.choice((1, 2)))
             return f" RETURN {', '.join(chosen)}"
         return f" RETURN {self.rng.choice(('', 'DISTINCT '))}{', '.join(chosen)}"
 

@@ -1,4 +1,4 @@
-"""Counts by sums of masks: the same frames as counting rows frame by frame."""
+"""Counts by masks: the same as counting frame by frame."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ import duckdb
 import pytest
 from oracle_worlds import World, random_world
 
-from sgstore.lang import compile_query
+from sgstore.lang import compile_query, rewrite
+from sgstore.lang.compiler import Compiled
 from sgstore.lang.counting import MOST, Range, frames_with
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from sgstore.lang.results import Statement
 
 SIGNS: dict[str, Callable[[float, float], bool]] = {
     "=": eq,
@@ -92,7 +95,7 @@ def test_a_count_of_a_block_is_what_the_matches_of_the_block_say(sign: str, worl
 
     statement, counts = (compile_query(q, world.catalog).rows() for q in (text, each))
 
-    def rows(of: object) -> list[tuple[int, ...]]:
+    def rows(of: Statement) -> list[tuple[int, ...]]:
         return world.connection.execute(of.sql, list(of.values)).fetchall()
 
     wanted = {row[:2] for row in rows(counts) if SIGNS[sign](row[2], 3)}
@@ -100,3 +103,42 @@ def test_a_count_of_a_block_is_what_the_matches_of_the_block_say(sign: str, worl
     assert wanted
     assert "sum(" in statement.sql
     assert "sum(" not in counts.sql
+
+
+COUNTS = [
+    "MATCH (a)-[:near]->(b) RETURN COUNT(*)",
+    "MATCH (a)-[r]->(b) RETURN a.kind, type(r) AS relation, b.kind, COUNT(*) AS n ORDER BY n DESC",
+    "MATCH (a:Vehicle)-[:isIn]->(l:Lane) RETURN l.road, l.width > 3, COUNT(*), COUNT(DISTINCT a.id)",
+    "MATCH (a)-[r]->(b) RETURN trace.name, trace.map, MIN(a.name), MAX(type(r)), 2 * COUNT(*)",
+    "MATCH (a) WHERE NOT EXISTS {(a)-[:near]->()} RETURN a, a.is_static, COUNT(*)",
+    "MATCH (a:Car)-[:near]->(:Train) RETURN COUNT(*)",
+    "USING NODES any MATCH (a)-[:near|visible]->()<-[d]-(b) RETURN type(d), a.kind, COUNT(*)",
+    "MATCH (a)-[:near]->(b) WHERE a.speed > b.speed RETURN a.special, b.ident, COUNT(*)",
+]
+
+
+@pytest.mark.parametrize("text", COUNTS)
+def test_counts_by_buckets_are_counts_by_frames(text: str, world: World) -> None:
+    compiled = compile_query(text, world.catalog)
+    query = compiled.bound
+    for rule in rewrite.RULES:
+        query = query if rule is rewrite.count_by_buckets else rule(query, world.catalog)
+    by_frames = Compiled(text, compiled.bound, query, world.catalog).rows()
+
+    def rows(of: Statement) -> list[tuple[object, ...]]:
+        return world.connection.execute(of.sql, list(of.values)).fetchall()
+
+    assert rows(compiled.rows()) == rows(by_frames)
+    assert "held" in compiled.rows().sql
+    assert "held" not in by_frames.sql
+
+
+@pytest.mark.parametrize(
+    "returned", ["COUNT(*), AVG(a.x)", "COUNT(*), a.speed", "COUNT(a.speed)", "COUNT(*), frame.seq"]
+)
+def test_what_changes_from_frame_to_frame_is_not_counted_by_buckets(
+    returned: str, world: World
+) -> None:
+    statement = compile_query(f"MATCH (a)-[:near]->(b) RETURN {returned}", world.catalog).rows()
+
+    assert "held" not in statement.sql

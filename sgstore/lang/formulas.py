@@ -238,6 +238,8 @@ def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: Valu
             return _value(expression, values)
         case Operation():
             return _operation(expression, leaf, values)
+        case Aggregate(operand=FrameAttribute(attribute=Attribute(name="held")) as held):
+            return f"CAST(coalesce(sum({leaf(held)}), 0) AS BIGINT)"
         case Aggregate(word=name, operand=operand, distinct=distinct):
             inner = "*" if operand is None else expression_text(operand, leaf, values)
             return f"{name}({'DISTINCT ' * distinct}{inner})"

@@ -42,6 +42,7 @@ from sgstore.lang.formulas import (
     quoted,
 )
 from sgstore.lang.kinds import Profile, homes_of, kind_conditions
+from sgstore.lang.lasting import HELD, join_lasting
 from sgstore.lang.pairs import WAY, needed_for, pair_column, pair_text, stage_of, way_text
 from sgstore.lang.phases import Given, Phases, apart
 from sgstore.lang.sql import Masks
@@ -111,6 +112,8 @@ class Frames(Masks):
         """
         parts = self.phases(scope)
         wanted = list(dict.fromkeys(columns))
+        if HELD in wanted and not (parts.rest or parts.late):
+            return self._by_buckets(scope, parts, given, nodes, edges, wanted)
         conditions = [*parts.rest, *_bounds(parts.rest)]
         needed = list(dict.fromkeys([*(leaf for c in conditions for leaf in leaves(c)), *wanted]))
         join = Join()
@@ -125,6 +128,30 @@ class Frames(Masks):
         text = layers.text(self, columns_of(nodes, edges), wanted)
         hidden = bound | parts.late > nodes or ties > edges
         return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
+
+    def _by_buckets(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+        wanted: list[Leaf],
+    ) -> str:
+        """One row a bucket and binding, with the number of frames that it stands for."""
+        select = Select()
+        select.join(nested(self.masks(scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
+        bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
+        bucket = f'{PATTERN}."bucket"'
+        texts = join_lasting(select, bucket, bound, scope, self.catalog, wanted)
+        texts[HELD] = self.held(PATTERN)
+        for leaf in wanted:
+            if isinstance(leaf, EdgeRelation):
+                texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
+        columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
+        columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
+        select.columns = [_named(text, name) for name, text in columns.items()]
+        return select.text()
 
     def _ends(self, scope: Scope, needed: list[Leaf]) -> set[str]:
         """Nodes at the ends of edges whose attributes are needed."""
@@ -199,7 +226,7 @@ class Frames(Masks):
         pairs_on_map = on_map and PairNumber in kinds
         trace = TraceAttribute in kinds or position or pairs_on_map
         since = any(_since_start(leaf) for leaf in needed)
-        if on_map or trace or since or FrameAttribute in kinds:
+        if on_map or trace or since or any(_of_frame(leaf) for leaf in needed):
             join.select.join(f'"frame" AS {FRAME}', [f'{FRAME}."frame_id" = {join.frame}'])
         if trace or since:
             on = [f'{TRACE}."trace_id" = {FRAME}."trace_id"']
@@ -251,6 +278,8 @@ class Frames(Masks):
                 join.texts[leaf] = f"CAST({join.edges[edge]} AS VARCHAR)"
             case EdgeAttribute(edge=edge):
                 join.texts[leaf] = self._of_lane(join, scope, edge, leaf)
+            case FrameAttribute() if leaf is HELD:
+                join.texts[leaf] = "1"
             case FrameAttribute() | TraceAttribute():
                 join.texts[leaf] = frame_text(leaf, FRAME, TRACE, MAP)
             case BlockValue():
@@ -339,7 +368,7 @@ class _Layers:
         ids |= {quoted(f"{k}.type"): v for k, v in self.join.edges.items()}
         names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
         texts = {quoted(column_of(leaf)): text for leaf, text in self.join.texts.items()}
-        known = {'"frame_id"': self.join.frame, **texts, **ids}
+        known = {'"frame_id"': self.join.frame, **ids, **texts}
         if last == 0:
             innermost.columns = [_named(known[n], n) for n in dict.fromkeys(names)]
             return innermost.text()
@@ -480,6 +509,10 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
         elif isinstance(leaf, NodeAttribute):
             homes |= homes_of(leaf.attribute, profile)
     return {home for home in homes if profile.has(home)}
+
+
+def _of_frame(leaf: Leaf) -> bool:
+    return isinstance(leaf, FrameAttribute) and leaf is not HELD
 
 
 def _since_start(leaf: Leaf) -> bool:

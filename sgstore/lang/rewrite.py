@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.lang.bound import (
     ANY,
     EGO,
+    Aggregate,
     BlockValue,
     Bound,
     Choices,
@@ -24,8 +25,11 @@ from sgstore.lang.bound import (
     Query,
     Scope,
     Value,
+    walk,
 )
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Catalog, Triple, Type
+from sgstore.lang.formulas import leaves
+from sgstore.lang.lasting import HELD, is_lasting
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -388,6 +392,53 @@ def _words(kinds: frozenset[str]) -> Choices:
     return Choices(tuple(Value(kind, Type.text, closed=True) for kind in KINDS if kind in kinds))
 
 
+# Results -------------------------------------------------------------------------------------------
+
+
+def count_by_buckets(query: Query, catalog: Catalog) -> Query:
+    """``COUNT(*)`` of what is the same in all frames of a bucket adds up how many frames each row holds in.
+
+    Nothing else of the result may need single frames: values are constants, and of the other aggregates there
+    are only those to which it is all the same how often a value comes.
+    """
+    result = query.result
+    values = [column.value for column in result.columns]
+    values += [key.value for key in result.order if not isinstance(key.value, str)]
+    parts = [part for value in values for part in walk(value)]
+    counts = [part for part in parts if isinstance(part, Aggregate)]
+    listed = result.form != "rows" or result.whole or result.framed or result.sample is not None
+    if listed or not any(_counts_all(part) for part in counts):
+        return query
+    if not all(
+        _counts_all(part) or part.distinct or part.word in {"min", "max"} for part in counts
+    ):
+        return query
+    if not all(
+        is_lasting(leaf, query.scope, catalog) for value in values for leaf in leaves(value)
+    ):
+        return query
+    columns = tuple(replace(column, value=_weighed(column.value)) for column in result.columns)
+    order = tuple(
+        key if isinstance(key.value, str) else replace(key, value=_weighed(key.value))
+        for key in result.order
+    )
+    return replace(query, result=replace(result, columns=columns, order=order))
+
+
+def _counts_all(part: Aggregate) -> bool:
+    return part.word == "count" and part.operand is None
+
+
+def _weighed(value: Bound) -> Bound:
+    match value:
+        case Aggregate() if _counts_all(value):
+            return replace(value, operand=HELD)
+        case Operation(operands=operands):
+            return replace(value, operands=tuple(_weighed(operand) for operand in operands))
+        case _:
+            return value
+
+
 RULES: Final[tuple[Callable[[Query, Catalog], Query], ...]] = (
     push_negations,
     counts_to_existence,
@@ -398,4 +449,5 @@ RULES: Final[tuple[Callable[[Query, Catalog], Query], ...]] = (
     labels_to_conditions,
     narrow_kinds,
     order_edges,
+    count_by_buckets,
 )

@@ -204,6 +204,10 @@ class Masks(Presence, ABC):
         total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
         return Select([total], [nested(text, ":pattern")]).text()
 
+    def held(self, alias: str) -> str:
+        """In how many frames a row of a relation of the first phase holds."""
+        return f'bit_count({alias}."mask")'
+
     def existence(self, scope: Scope, given: Given | None) -> str:
         """In which frames a block has a match: one row a bucket and binding of the nodes outside."""
         keys = frozenset(scope.outer)
