@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from sgstore.config import Config
@@ -67,7 +68,7 @@ __all__ = [
 ]
 
 
-def open(path: str | Path, *, memory: int = 0) -> Store:
+def open(path: str | Path, *, memory: int = 0, tables: Mapping[str, object] | None = None) -> Store:
     """The store at a path; see :class:`sgstore.query.Store`.
 
     Raises
@@ -77,7 +78,7 @@ def open(path: str | Path, *, memory: int = 0) -> Store:
     """
     from sgstore.query import Store
 
-    return Store(path, memory=memory)
+    return Store(path, memory=memory, tables=tables)
 
 
 def __getattr__(name: str) -> Any:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from importlib import import_module
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.errors import MissingExtraError
 from sgstore.graph import graph_of_records
 from sgstore.lang import Compiled, compile_query
 from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
@@ -20,7 +19,8 @@ from sgstore.lang.phases import Window
 from sgstore.lang.results import EXTENTS
 from sgstore.lang.rewrite import rewritten
 from sgstore.lang.subgraphs import Layout, shown
-from sgstore.store import FrameRef
+from sgstore.store import FrameRef, write_parquet
+from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
@@ -239,12 +239,7 @@ class Matches:
         MissingExtraError
             pyarrow is not installed.
         """
-        try:
-            arrow = import_module("pyarrow")
-        except ImportError as error:
-            raise MissingExtraError("tables of Arrow", "arrow") from error
-        columns = list(zip(*self, strict=True)) or [() for _ in self.columns]
-        return arrow.table(dict(zip(self.columns, map(list, columns), strict=True)))
+        return arrow_table(self.columns, self)
 
     def df(self) -> Any:
         """All rows as a ``pandas.DataFrame``.
@@ -254,11 +249,37 @@ class Matches:
         MissingExtraError
             pandas is not installed.
         """
-        try:
-            pandas = import_module("pandas")
-        except ImportError as error:
-            raise MissingExtraError("data frames", "pandas") from error
-        return pandas.DataFrame.from_records(self.rows(), columns=list(self.columns))
+        return pandas_frame(self.columns, self)
+
+    def polars(self) -> Any:
+        """All rows as a ``polars.DataFrame``.
+
+        Raises
+        ------
+        MissingExtraError
+            polars is not installed.
+        """
+        return polars_frame(self.columns, self)
+
+    def parquet(self, path: str | Path) -> int:
+        """Write all rows to a Parquet file, as they come; how many there are.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written.
+        """
+        return write_parquet(self.columns, self, Path(path))
+
+    def csv(self, path: str | Path) -> int:
+        """Write all rows to a CSV file, as they come; how many there are.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written.
+        """
+        return write_csv(self.columns, self, Path(path))
 
     def explain(self) -> str:
         """What became of the query, stage by stage: parse, bind, rewrite, emit."""

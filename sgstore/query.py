@@ -16,10 +16,11 @@ from sgstore.abstractions import abstractions
 from sgstore.graph import named_graph
 from sgstore.lang import compile_query
 from sgstore.matches import Matches
-from sgstore.store import FrameRef, StoreFile
+from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     import networkx as nx
@@ -41,19 +42,32 @@ class Store:
     path : str or Path
     memory : int
         Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is less.
+    tables : mapping of str to path or data frame, optional
+        Tables of one's own that are joined to the frames, in SQL and in patterns: Parquet, CSV or JSON files,
+        or data frames of pandas, polars, pyarrow; see :mod:`sgstore.store.joining`.
 
     Raises
     ------
     StoreError
-        There is no such file, it is no store, or one of another version.
+        There is no such file, it is no store, or one of another version; or a table cannot be read.
 
     Attributes
     ----------
     file : StoreFile
     """
 
-    def __init__(self, path: str | Path, *, memory: int = 0) -> None:
-        self.file = StoreFile(path, memory=memory)
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        memory: int = 0,
+        tables: Mapping[str, object] | UserTables | None = None,
+    ) -> None:
+        self.file = StoreFile(
+            path,
+            memory=memory,
+            tables=tables if isinstance(tables, UserTables) else UserTables(tables or {}),
+        )
         self._held: tuple[tuple[int, ...], Catalog] | None = None
 
     def catalog(self) -> Catalog:
@@ -231,6 +245,7 @@ class Store:
 
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
+        about |= self.file.labels(frame.frame_id)
         whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
         whole |= {"id": trace.trace_id, "uri": str(trace.path), "ego": trace.ego or None}
         whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}

@@ -39,6 +39,12 @@ MAX_QUESTION: Final = 1 << 20
 START_S: Final = 30.0
 """How long the process may take to start."""
 
+READ_S: Final = 60.0
+"""How much longer for each table that it reads first; s."""
+
+_TABLE_BYTES: Final = 4 << 30
+"""The largest file that it may write, and that only while it reads tables, into a folder of its own."""
+
 _ADDRESS_SPACE: Final = 4 << 30
 """What Python, its libraries and the database's threads reserve beside the memory for answers; bytes."""
 
@@ -78,11 +84,13 @@ class Sandbox:
         Most memory that a question may take; bytes.
     max_rows : int
         Longest answer; rows.
+    tables : mapping of str to path, optional
+        Tables of one's own that can be joined: Parquet, CSV or JSON files. They are read in that process too.
 
     Raises
     ------
     StoreError
-        There is no such file, it is no store, or one of another version.
+        There is no such file, it is no store, or one of another version; or a table cannot be read.
     """
 
     def __init__(
@@ -92,11 +100,14 @@ class Sandbox:
         timeout_s: float = TIMEOUT_S,
         memory: int = MEMORY,
         max_rows: int = MAX_ROWS,
+        tables: Mapping[str, str | Path] | None = None,
     ) -> None:
         self._store = Path(store)
         self._timeout_s = timeout_s
         self._memory = memory
         self._max_rows = max_rows
+        self._tables = {name: str(Path(path).resolve()) for name, path in (tables or {}).items()}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._turn = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         with self._turn:
@@ -153,12 +164,16 @@ class Sandbox:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
             )
+            self._folder = tempfile.TemporaryDirectory(prefix="sgstore-sandbox-")
             settings = {
                 "store": str(self._store.absolute()),
                 "memory": self._memory,
                 "rows": self._max_rows,
+                "tables": self._tables,
+                "folder": self._folder.name,
             }
-            reply = self._exchange(self._child, json.dumps(settings), START_S)
+            wait = START_S + READ_S * len(self._tables)
+            reply = self._exchange(self._child, json.dumps(settings), wait)
             if "error" in reply:
                 self._kill()
             _answer(reply)
@@ -191,11 +206,13 @@ class Sandbox:
         raise SqlError("stopped: it took more memory than is allowed")
 
     def _kill(self) -> None:
-        if self._child is None:
-            return
-        with self._child as child:  # which waits for its end and closes the pipes
-            child.kill()
-        self._child = None
+        if self._child is not None:
+            with self._child as child:  # which waits for its end and closes the pipes
+                child.kill()
+            self._child = None
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
 
 
 def _sent_and_read(child: subprocess.Popen[bytes], line: bytes) -> bytes:
@@ -228,14 +245,17 @@ def main() -> None:
     """Answer the questions that come on stdin, until it ends."""
     lines, replies = sys.stdin.buffer, sys.stdout.buffer
     settings = json.loads(lines.readline())
-    tempfile.gettempdir()  # it finds out by writing, which is about to be forbidden
-    _limit(settings["memory"])
+    tempfile.tempdir = settings["folder"]
+    _limit(settings["memory"], files=_TABLE_BYTES)
     from sgstore.query import Store
+    from sgstore.store import UserTables
 
     path = Path(settings["store"])
     try:
+        tables = UserTables(settings["tables"])
+        _limit(settings["memory"], files=0)
         os.chdir(path.parent)  # so that the database knows no more of where it is than its name
-        store = Store(path.name, memory=settings["memory"])
+        store = Store(path.name, memory=settings["memory"], tables=tables)
     except OSError as error:
         _send(replies, _refusal(StoreError(f"{path}: {error.strerror}")))
         return
@@ -295,15 +315,15 @@ def _send(to: IO[bytes], reply: object) -> None:
     to.flush()
 
 
-def _limit(memory: int) -> None:
-    """What the operating system allows this process, where it can be told."""
+def _limit(memory: int, *, files: int) -> None:
+    """What the operating system allows this process, where it can be told; it cannot be widened again."""
     try:
         import resource
     except ImportError:  # not on Windows: there the database's own limits and the deadline hold
         return
     for limit, most in (
         (resource.RLIMIT_AS, _ADDRESS_SPACE + 2 * memory),
-        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_FSIZE, files),
         (resource.RLIMIT_CORE, 0),
     ):
         _, hard = resource.getrlimit(limit)

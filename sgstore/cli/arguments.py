@@ -13,6 +13,8 @@ from sgstore.cli.output import Format, say
 from sgstore.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.sandbox import Answer
@@ -40,6 +42,15 @@ Parameters = Annotated[
     list[str] | None,
     typer.Option("--param", metavar="NAME=VALUE", help="Value of $NAME in the query; repeatable."),
 ]
+With = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--with",
+        metavar="[NAME=]FILE",
+        help="Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns"
+        " or t; repeatable.",
+    ),
+]
 RowFormat = Annotated[Format, typer.Option("--format", help="How rows are printed.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Short for --format json.")]
 Output = Annotated[
@@ -65,16 +76,55 @@ def sgstore(
         typer.echo(context.get_help())
 
 
-def open_store(store: Path) -> Store:
-    """The store at a path."""
+def open_store(store: Path, tables: Mapping[str, Path] | None = None) -> Store:
+    """The store at a path, with tables of the user's own; rows of these that belong to no frame are told."""
     from sgstore.query import Store
 
-    return Store(store)
+    opened = Store(store, tables=tables)
+    for name, joined in opened.file.joined().items():
+        if joined.matched < joined.rows:
+            lost = joined.rows - joined.matched
+            say(f"{name}: {lost} of {joined.rows} rows belong to no frame of the store")
+    return opened
 
 
 def form_of(form: Format, *, as_json: bool) -> Format:
     """What ``--format`` and ``--json`` mean together."""
     return Format.json if as_json else form
+
+
+_ENDINGS: Final = {
+    ".json": Format.json,
+    ".ndjson": Format.ndjson,
+    ".jsonl": Format.ndjson,
+    ".csv": Format.csv,
+    ".parquet": Format.parquet,
+    ".arrow": Format.arrow,
+    ".feather": Format.arrow,
+}
+
+
+def form_for(form: Format, output: Path | None, *, as_json: bool) -> Format:
+    """What ``--format`` and ``--json`` mean together; without them a file's name says it."""
+    chosen = form_of(form, as_json=as_json)
+    if chosen is Format.table and output is not None:
+        return _ENDINGS.get(output.suffix.lower(), chosen)
+    return chosen
+
+
+def tables_of(given: list[str] | None) -> dict[str, Path]:
+    """``--with`` as files by the names of their tables: ``NAME=FILE``, or the name of the file."""
+    tables: dict[str, Path] = {}
+    for text in given or []:
+        name, equals, path = text.partition("=")
+        file = Path(path if equals else text)
+        name = name if equals else re.sub(r"\W", "_", file.stem)
+        if not name.isidentifier():
+            raise typer.BadParameter(f"--with {text!r}: expected NAME=FILE, such as labels={file}")
+        if name in tables:
+            raise typer.BadParameter(f"--with: two tables are called {name!r}; write NAME=FILE")
+        tables[name] = file
+    return tables
 
 
 def query_of(text: str | None, file: Path | None) -> str:

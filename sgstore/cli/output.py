@@ -1,4 +1,4 @@
-"""Rows for people and for machines: a table that fits the terminal, JSON, NDJSON, CSV, Parquet.
+"""Rows for people and for machines: a table that fits the terminal, JSON, NDJSON, CSV, Parquet, Arrow.
 
 In JSON, 64-bit ids and times (``frame_id``, ``trace_id``, ``bucket`` and whatever ends in ``_ns``) are texts,
 because many JSON readers round whole numbers beyond 2⁵³; so is any other whole number beyond that.
@@ -31,7 +31,11 @@ class Format(StrEnum):
     ndjson = "ndjson"
     csv = "csv"
     parquet = "parquet"
+    arrow = "arrow"
 
+
+_BINARY: Final = frozenset({Format.parquet, Format.arrow})
+_WITHOUT_NESTING: Final = frozenset({Format.csv, *_BINARY})
 
 LONG: Final = frozenset({"frame_id", "trace_id", "bucket"})
 SAFE_INTEGER: Final = 2**53
@@ -55,9 +59,9 @@ def write_rows(
         Plain Python values; ``None`` is a missing one.
     form : Format
     output : Path, optional
-        A file to write instead of stdout; Parquet needs one, unless stdout is a pipe or a file.
+        A file to write instead of stdout; Parquet and Arrow need one, unless stdout is a pipe or a file.
     types : sequence of str, optional
-        The database's types of the columns, for Parquet.
+        The database's types of the columns, for Parquet and Arrow.
 
     Returns
     -------
@@ -67,12 +71,12 @@ def write_rows(
     Raises
     ------
     ExportError
-        The file cannot be written, or Parquet would go to a terminal.
+        The file cannot be written, or Parquet or Arrow would go to a terminal.
     """
-    if form in {Format.csv, Format.parquet} and not types:
+    if form in _WITHOUT_NESTING and not types:
         rows = ([_flat(value) for value in row] for row in rows)
-    if form is Format.parquet:
-        return _write_parquet(columns, rows, output, types)
+    if form in _BINARY:
+        return _write_binary(columns, rows, form, output, types)
     if output is None:
         return _write_text(columns, rows, form, sys.stdout)
     try:
@@ -179,28 +183,37 @@ def _json_value(value: Any, name: str = "") -> Any:
             return value.isoformat() if hasattr(value, "isoformat") else str(value)
 
 
-def _write_parquet(
+def _write_binary(
     columns: Sequence[str],
     rows: Iterable[Sequence[Any]],
+    form: Format,
     output: Path | None,
     types: Sequence[str] | None,
 ) -> int:
+    """Write Parquet, or by way of it, so that memory stays bounded and types are those of the whole, Arrow."""
     from sgstore.store import write_parquet
 
-    if output is not None:
+    if form is Format.parquet and output is not None:
         return write_parquet(columns, rows, output, types)
-    if sys.stdout.isatty():
+    if output is None and sys.stdout.isatty():
         raise ExportError(
-            "Parquet is not for a terminal: name a file with -o FILE, or redirect stdout"
+            f"{form.capitalize()} is not for a terminal: name a file with -o FILE, or redirect stdout"
         )
     import tempfile
     from pathlib import Path
 
+    from sgstore.store.dataframes import arrow_file
+
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows.parquet"
         number = write_parquet(columns, rows, file, types)
-        with file.open("rb") as source:
-            shutil.copyfileobj(source, sys.stdout.buffer)
+        if form is Format.arrow:
+            ready = output or Path(folder) / "rows.arrow"
+            arrow_file(file, ready)
+            file = ready
+        if output is None:
+            with file.open("rb") as source:
+                shutil.copyfileobj(source, sys.stdout.buffer)
     return number
 
 

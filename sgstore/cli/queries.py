@@ -19,13 +19,15 @@ from sgstore.cli.arguments import (
     QueryText,
     RowFormat,
     StorePath,
+    With,
     app,
-    form_of,
+    form_for,
     open_store,
     parameters_of,
     query_of,
     say_left_out,
     seconds_of,
+    tables_of,
     text_of,
 )
 from sgstore.cli.output import Format, say, write_document, write_rows, write_text
@@ -70,6 +72,7 @@ def find(
     safe: Safe = False,
     timeout: Timeout = "5s",
     max_rows: MaxRows = 10_000,
+    tables: With = None,
 ) -> int:
     """Find frames by a pattern of their scene graphs.
 
@@ -78,11 +81,11 @@ def find(
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
-        with _sandbox(store, timeout, max_rows) as box:
+        with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.find(query_of(query, file), **parameters_of(parameters))
-        number = _write_answer(answer, form_of(form, as_json=as_json), output)
+        number = _write_answer(answer, form_for(form, output, as_json=as_json), output)
         return NO_MATCH if require and not number else 0
-    opened = open_store(store)
+    opened = open_store(store, tables_of(tables))
     matches = opened.find(query_of(query, file), **parameters_of(parameters))
     if explain:
         typer.echo(matches.explain())
@@ -92,7 +95,7 @@ def find(
         number = matches.count()
         typer.echo(number)
     else:
-        form = form_of(form, as_json=as_json)
+        form = form_for(form, output, as_json=as_json)
         columns, rows = _as_shown(matches, form)
         number = write_rows(columns, rows, form, output)
         if not number and form is Format.table:
@@ -165,28 +168,34 @@ def sql(
     safe: Safe = False,
     timeout: Timeout = "5s",
     max_rows: MaxRows = 10_000,
+    tables: With = None,
 ) -> int:
     """Ask a store in SQL, read only.
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     """
     if safe:
-        with _sandbox(store, timeout, max_rows) as box:
+        with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))
-        _write_answer(answer, form_of(form, as_json=as_json), output)
+        _write_answer(answer, form_for(form, output, as_json=as_json), output)
         return 0
-    from sgstore.store import StoreFile
-
-    with StoreFile(store).user_batches(query_of(statement, file)) as batches:
+    opened = open_store(store, tables_of(tables)).file
+    with opened.user_batches(query_of(statement, file)) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
-        write_rows(batches.columns, rows, form_of(form, as_json=as_json), output, batches.types)
+        form = form_for(form, output, as_json=as_json)
+        write_rows(batches.columns, rows, form, output, batches.types)
     return 0
 
 
-def _sandbox(store: Path, timeout: str, max_rows: int) -> Sandbox:
+def _sandbox(store: Path, timeout: str, max_rows: int, tables: list[str] | None) -> Sandbox:
     from sgstore.sandbox import Sandbox
 
-    return Sandbox(store, timeout_s=seconds_of(timeout, "--timeout"), max_rows=max_rows)
+    return Sandbox(
+        store,
+        timeout_s=seconds_of(timeout, "--timeout"),
+        max_rows=max_rows,
+        tables=tables_of(tables),
+    )
 
 
 def _write_answer(answer: Answer, form: Format, output: Path | None) -> int:

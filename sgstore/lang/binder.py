@@ -57,7 +57,7 @@ def bind_query(
     QueryError
         Types do not fit, or a part belongs to the temporal layer.
     """
-    session = Session(text, parameters, classed=catalog.classed)
+    session = Session(text, parameters, classed=catalog.classed, tables=catalog.tables)
     match = _only_match(statements, session)
     settings = chosen(match.settings, session, catalog)
     if settings.end is not None:

@@ -122,6 +122,8 @@ class Attribute:
         All values that it can have, if they are a closed list.
     meaning : str
         For the documentation; with unit.
+    table : str
+        The user's own table that it is a column of; empty for all others.
     """
 
     name: str
@@ -131,6 +133,7 @@ class Attribute:
     unit: Unit = Unit.plain
     kinds: frozenset[str] = _EVERY
     values: tuple[str, ...] = ()
+    table: str = ""
 
 
 def _state(name: str, meaning: str, unit: Unit = Unit.plain) -> Attribute:
@@ -439,6 +442,31 @@ class TraceFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class TableFacts:
+    """What the compiler knows of a table of a user's own.
+
+    Attributes
+    ----------
+    name : str
+    columns : mapping of str to Type
+    refused : str or None
+        Why its columns are not attributes of frames; ``None`` if they are: it has one row a frame.
+    """
+
+    name: str
+    columns: Mapping[str, Type]
+    refused: str | None = None
+
+    def attribute(self, column: str) -> Attribute | None:
+        """The attribute of frames that a column is, whatever the case of letters; ``None``: no such column."""
+        name = next((one for one in self.columns if one.lower() == column.lower()), None)
+        if name is None:
+            return None
+        home = {Home.state: name}
+        return Attribute(f"{self.name}.{name}", self.columns[name], home, "", table=self.name)
+
+
+@dataclass(frozen=True, slots=True)
 class Catalog:
     """What a store holds, as far as the compiler cares.
 
@@ -460,6 +488,8 @@ class Catalog:
         Those that the abstraction has; ``None``: all.
     shadows : tuple of (str, str)
         Tables that are others under the abstraction, and what they are there.
+    tables : mapping of str to TableFacts
+        Tables of users' own that are joined.
     sets : mapping of str to Catalog
         The catalogs of the abstractions that a query can name, by folded name.
     """
@@ -474,4 +504,5 @@ class Catalog:
     name: str = ""
     relations: frozenset[str] | None = None
     shadows: tuple[tuple[str, str], ...] = ()
+    tables: Mapping[str, TableFacts] = field(default_factory=dict[str, TableFacts])
     sets: Mapping[str, Catalog] = field(default_factory=dict[str, "Catalog"])

@@ -141,9 +141,26 @@ def _attribute(e: s.AttributeOf, names: Names) -> b.Bound:
             names.session.unknown(f"attribute of {owner}", e.name, _tail(e), known_names)
         return make(found, found.type)
     meaning = names.meaning(owner)
+    if meaning is None and owner in names.session.tables:
+        return _column(e, names)
     if meaning is not None and meaning.edge is not None:
         return edge_attribute(meaning.edge, e.name, _tail(e), names)
     return node_attribute(names.node(owner, e.owner.span), e.name, _tail(e), names)
+
+
+def _column(e: s.AttributeOf, names: Names) -> b.FrameAttribute:
+    """A column of a user's own table: what its row for the frame says."""
+    table, session = names.session.tables[e.owner.name], names.session
+    found = table.attribute(e.name)
+    if found is None:
+        session.unknown(f"column of {table.name}", e.name, _tail(e), table.columns)
+    if table.refused:
+        session.refuse(
+            f"the columns of {table.name} are not attributes of frames: it has {table.refused}",
+            e.span,
+            "in SQL it can be joined by whatever it has",
+        )
+    return b.FrameAttribute(found, found.type)
 
 
 def _class_attribute(name: str, names: Names) -> Attribute | None:

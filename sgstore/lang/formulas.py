@@ -188,10 +188,23 @@ def _label(at: Aliases) -> str:
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
 
 
+def as_type(column: str, kind: Type) -> str:
+    """A column of a user's own table as a value of patterns."""
+    return f"CAST({column} AS {_NATIVE[kind]})"
+
+
+_NATIVE: Final = {Type.number: "DOUBLE", Type.text: "VARCHAR", Type.boolean: "BOOLEAN"}
+
+
 def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, map_: str) -> str:
     """The value of an attribute of the frame or of the trace."""
     attribute = leaf.attribute
     home, column = next(iter(attribute.columns.items()))
+    if attribute.table:
+        value = as_type(f'"u".{quoted(column)}', attribute.type)
+        on = [f'"u"."frame_id" = {frame}."frame_id"']
+        rows = Select([f"any_value({value})"], [f'{quoted(attribute.table)} AS "u"'], on)
+        return f"({rows.text()})"
     alias = map_ if home is Home.map else frame if isinstance(leaf, FrameAttribute) else trace
     value = f"{alias}.{quoted(column)}"
     match attribute.unit:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.errors import Span
+    from sgstore.lang.catalog import TableFacts
     from sgstore.lang.syntax import Define
 
 MANY: Final = 16
@@ -74,6 +75,8 @@ class Session:
         Predicates whose bodies are being bound.
     classed : tuple of str
         Abstractions in which the store has the classes of frames.
+    tables : mapping of str to TableFacts
+        Tables of users' own that are joined, by name.
     numbers, blocks : int
         Unnamed nodes and edges, and blocks, so far.
     """
@@ -87,6 +90,7 @@ class Session:
     keys: set[str] = field(default_factory=set[str])
     calls: list[str] = field(default_factory=list[str])
     classed: tuple[str, ...] = ()
+    tables: Mapping[str, TableFacts] = field(default_factory=dict[str, "TableFacts"])
     numbers: int = 0
     blocks: int = 0
 
@@ -242,7 +246,8 @@ class Names:
         if meaning is None and name == THE_EGO:
             key = self.scope.top.the_ego(span)
         elif meaning is None:
-            self.session.unknown("variable", name, span, self.visible())
+            known = {*self.visible(), *self.session.tables}
+            self.session.unknown("variable", name, span, known)
         elif meaning.node is None:
             self.session.refuse(f"'{name}' is not a node", span)
         else:

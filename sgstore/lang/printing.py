@@ -141,6 +141,8 @@ def _leaf(value: Bound) -> str:
             text = node
         case NodeAttribute(node=owner) | EdgeAttribute(edge=owner):
             text = f"{owner}.{value.attribute.name}"
+        case FrameAttribute(attribute=attribute) if attribute.table:
+            text = attribute.name
         case FrameAttribute(attribute=attribute):
             text = f"frame.{attribute.name}"
         case TraceAttribute(attribute=attribute):

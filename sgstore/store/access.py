@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Final
 import duckdb
 
 from sgstore.errors import StoreError
+from sgstore.store.joining import tables_folder
 
 try:
     import fcntl
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Generator
 
     from duckdb import DuckDBPyConnection
+
+    from sgstore.store.joining import UserTables
 
 STORAGE_VERSION: Final = "v1.5.0"
 """Format of the file: the newest that every supported DuckDB can read."""
@@ -99,10 +102,15 @@ class Access:
         Most memory that reading may take; bytes. Beyond it DuckDB spills to temporary files.
     wait_s : float
         How long to wait for others; s.
+    tables : UserTables, optional
+        Tables of users' own that readers see too.
     """
 
-    def __init__(self, path: Path, *, memory: int, wait_s: float) -> None:
+    def __init__(
+        self, path: Path, *, memory: int, wait_s: float, tables: UserTables | None = None
+    ) -> None:
         self.path = path
+        self._tables = tables
         self._memory = memory
         self._wait_s = wait_s
         with _doors_lock:
@@ -120,6 +128,8 @@ class Access:
         deadline = _Deadline(self._wait_s)
         connection = self._enter(deadline)
         try:
+            if self._tables is not None:
+                self._tables.show(connection)
             yield connection
         finally:
             connection.close()
@@ -168,6 +178,7 @@ class Access:
                 with translated(self.path):
                     connection = duckdb.connect(str(self.path), read_only=True, config=config)
                     # Among the settings above DuckDB might take these before the folder, and refuse that.
+                    connection.execute("SET allowed_directories = [?]", [str(tables_folder())])
                     connection.execute("SET enable_external_access = false")
                     connection.execute("SET lock_configuration = true")
                     return connection

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store.rows import Parameters
     from sgstore.store.sealed import Sealed
+    from sgstore.store.joining import Joined, UserTables
     from sgstore.store.verifying import Fault, Verification
     from sgstore.traces.carried import Carried
     from sgstore.world import TraceInfo
@@ -74,17 +75,28 @@ class StoreFile:
         less. Beyond it the database spills to temporary files.
     wait_s : float
         How long to wait for others that write, or read while this one writes; s.
+    tables : UserTables, optional
+        Tables of users' own that are seen beside its views.
 
     Raises
     ------
     StoreError
-        There is no such file, it is no store, or one of another version.
+        There is no such file, it is no store, or one of another version; or a table is called like one of its
+        own.
     """
 
-    def __init__(self, path: str | Path, *, memory: int = 0, wait_s: float = WAIT_S) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        memory: int = 0,
+        wait_s: float = WAIT_S,
+        tables: UserTables | None = None,
+    ) -> None:
         self.path = Path(path)
+        self.tables = tables
         self._memory = memory or default_memory()
-        self._access = Access(self.path, memory=self._memory, wait_s=wait_s)
+        self._access = Access(self.path, memory=self._memory, wait_s=wait_s, tables=tables)
         self._scenes = Scenes()
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
@@ -184,6 +196,16 @@ class StoreFile:
         ):
             yield batches
 
+    def joined(self) -> dict[str, Joined]:
+        """How the rows of users' own tables belong to frames, by the names of the tables."""
+        with self._reading() as connection:
+            return {} if self.tables is None else self.tables.joined(connection)
+
+    def labels(self, frame_id: int) -> dict[str, Any]:
+        """What users' own tables say of a frame, by ``TABLE.COLUMN``, if they have one row for it."""
+        with self._reading() as connection:
+            return {} if self.tables is None else self.tables.labels(connection, frame_id)
+
     def catalog(self) -> Catalog:
         """What the store holds, as the compiler of queries wants to know it."""
         from sgstore.store.cataloguing import (
@@ -191,7 +213,8 @@ class StoreFile:
         )
 
         with self._reading() as connection:
-            return catalog_of(connection)
+            catalog = catalog_of(connection)
+            return catalog if self.tables is None else self.tables.known(connection, catalog)
 
     def traces(self) -> tuple[StoredTrace, ...]:
         """All traces, in the order in which they came."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
 from sgstore.errors import SqlError
+from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
+from sgstore.store.parquet import write_parquet
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -57,6 +60,56 @@ class Rows:
     def dicts(self) -> list[dict[str, Any]]:
         """The rows, each as a dict from column to value."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.values]
+
+    def arrow(self) -> Any:
+        """The rows as a ``pyarrow.Table``.
+
+        Raises
+        ------
+        MissingExtraError
+            pyarrow is not installed.
+        """
+        return arrow_table(self.columns, self.values, self.types)
+
+    def df(self) -> Any:
+        """The rows as a ``pandas.DataFrame``.
+
+        Raises
+        ------
+        MissingExtraError
+            pandas is not installed.
+        """
+        return pandas_frame(self.columns, self.values)
+
+    def polars(self) -> Any:
+        """The rows as a ``polars.DataFrame``.
+
+        Raises
+        ------
+        MissingExtraError
+            polars is not installed.
+        """
+        return polars_frame(self.columns, self.values)
+
+    def parquet(self, path: str | Path) -> int:
+        """Write the rows to a Parquet file, in the types of the database; how many there are.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written.
+        """
+        return write_parquet(self.columns, self.values, Path(path), self.types)
+
+    def csv(self, path: str | Path) -> int:
+        """Write the rows to a CSV file; how many there are.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written.
+        """
+        return write_csv(self.columns, self.values, Path(path))
 
 
 class Batches:
