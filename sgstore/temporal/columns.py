@@ -65,6 +65,27 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
     return table.value(formula, np.array([[len(times) - 1]]))[0]
 
 
+def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
+    """Where a formula is true for each of several bindings in one trace.
+
+    Parameters
+    ----------
+    formula : Formula
+    columns : mapping of str to (B, F) bool, or (1, F)
+        The propositions for each binding; (1, F): the same for all.
+    times : (F,) int64
+        As in :func:`evaluate`; F is at least 1.
+    rows : int
+        B, the number of bindings.
+
+    Returns
+    -------
+    (B, F) bool
+    """
+    last = np.full((rows, 1), len(times) - 1)
+    return _Table(columns, times).value(formula, last)
+
+
 def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
     """The value of a formula at the first frame, if the trace ended at each of its frames in turn.
 

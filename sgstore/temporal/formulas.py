@@ -212,7 +212,7 @@ def _formula(e: s.Expression) -> Formula:
         case s.Constant(value=bool() as value):
             return Constant(value)
         case s.Logic(word=word, operands=operands):
-            return _LOGIC[word](*map(_formula, operands))
+            return LOGIC[word](*map(_formula, operands))
         case s.Temporal(word=word, operands=operands):
             return _temporal(word, tuple(map(_formula, operands)), e)
         case _:
@@ -238,7 +238,7 @@ def _implies(condition: Formula, consequence: Formula) -> Formula:
     return Or((Not(condition), consequence))
 
 
-_LOGIC: Final[dict[str, Callable[..., Formula]]] = {
+LOGIC: Final[dict[str, Callable[..., Formula]]] = {
     "NOT": Not,
     "AND": _and,
     "OR": _or,

@@ -117,6 +117,8 @@ class Online:
     Parameters
     ----------
     formula : Formula
+    every : bool
+        Whether the value at every frame is to be told, or the verdict only, which is cheaper.
 
     Attributes
     ----------
@@ -126,8 +128,9 @@ class Online:
         Whether that is the value whatever comes.
     """
 
-    def __init__(self, formula: Formula) -> None:
+    def __init__(self, formula: Formula, *, every: bool = True) -> None:
         self._formula = formula
+        self._every = every
         self.terms = _Terms()
         self._names = sorted(propositions(formula))
         self.past = {
@@ -179,6 +182,11 @@ class Online:
         self.number += 1
         self.time = time_ns
         frame = _Frame(self, letter)
+        if not self._every and self._first is not None:
+            self._first = self._moved(self._first, letter, frame)
+            frame.keep()
+            self.verdict = self._ended(self._first)
+            return []
         here = (
             frame.now(self._formula) if not self._plain else self._remembered(None, letter, frame)
         )
@@ -194,6 +202,19 @@ class Online:
             known += [(number, value) for number in moved.pop(term, ())]
         self._open = moved
         return sorted(known)
+
+    @property
+    def state(self) -> object:
+        """What the verdict still depends on.
+
+        If a step of a formula that is :attr:`plain` leaves it the same, it stays so while the propositions do.
+        """
+        return self._first
+
+    @property
+    def plain(self) -> bool:
+        """Whether a step depends on the propositions alone: no bounds, and nothing of the past."""
+        return self._plain
 
     def finish(self) -> list[tuple[int, bool]]:
         """End the trace: the frames whose value was not known yet, in order, and these values."""
