@@ -12,8 +12,10 @@ import sys
 import typer
 
 from sgstore.cli import (
+    coverage,
     exports,
     graphs,
+    imports,
     library,
     live,
     maps,
@@ -33,6 +35,7 @@ __all__ = ["app", "main"]
 
 VERBS = (
     traces,
+    imports,
     stores,
     graphs,
     maps,
@@ -40,6 +43,7 @@ VERBS = (
     settings,
     queries,
     library,
+    coverage,
     payloads,
     pictures,
     exports,

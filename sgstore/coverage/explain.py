@@ -5,7 +5,7 @@ S3C asked so what failing test inputs have that training inputs have not. (Woodl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -155,6 +155,7 @@ def explain(
     Parameters
     ----------
     b, a : Classed
+        A frame of the same store that is in both counts for ``b`` only.
     abstraction : str
         That of their classes.
     by_frame : bool
@@ -169,6 +170,7 @@ def explain(
     leaves : Table
         ``questions``, ``of_b``, ``of_a``, ``share_of_b`` among what comes there.
     """
+    a, twice = _without(a, b)
     _, (b, a) = shared(b, a)
     names = tuple(sorted({*features(b, abstraction).names, *features(a, abstraction).names}))
     of_b, of_a = features(b, abstraction, names), features(a, abstraction, names)
@@ -192,6 +194,7 @@ def explain(
     ]
     unit = "frames with a class" if by_frame else "distinct classes"
     said = [f"B: {unit} of {b.chosen.text}", f"A: {unit} of {a.chosen.text}"]
+    said += [f"{twice} frames of both count for B only"] if twice else []
     said += of_unknown(b.unknown, b.chosen.text) + of_unknown(a.unknown, a.chosen.text)
     counts = np.concatenate([of_b.counts, of_a.counts])
     ours: NDArray[np.bool_] = np.arange(len(counts)) < len(of_b.codes)
@@ -209,3 +212,12 @@ def explain(
         Table(("feature", "share_of_b", "share_of_a", "difference", "query"), rows, said),
         Table(("questions", "of_b", "of_a", "share_of_b"), leaves),
     )
+
+
+def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
+    """``a`` without the frames that ``b`` has, too; and how many these are."""
+    if a.chosen.store.file.path.resolve() != b.chosen.store.file.path.resolve():
+        return a, 0
+    rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))
+    kept = replace(a, frame_id=a.frame_id[rows], code=a.code[rows])
+    return kept, len(a.frame_id) - len(rows)

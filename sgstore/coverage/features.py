@@ -14,6 +14,7 @@ import numpy as np
 
 from sgstore.coverage.asking import query_of_features
 from sgstore.coverage.tables import SHARES, Table, of_unknown, share
+from sgstore.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -112,20 +113,18 @@ def combined(found: Features, k: int) -> Combinations:
 
     Raises
     ------
-    ValueError
+    ConfigError
         k is not positive, or there are more combinations than can be gone through.
     """
     many = len(found.names)
     if k < 1 or comb(many, k) > MOST:
-        raise ValueError(
+        raise ConfigError(
             f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
             " ask for a smaller k, or for an abstraction with fewer labels"
         )
     members = np.array(list(combinations(range(many), k)), np.int64).reshape(-1, k)
     if k == 2:
-        there = found.there.astype(np.float64)
-        both = (there * found.frames[:, None]).T @ there
-        frames = both[members[:, 0], members[:, 1]].astype(np.int64)
+        frames = _together(found)[members[:, 0], members[:, 1]]
     else:
         frames = np.fromiter(_counted(found, members), np.int64, len(members))
     return Combinations(found, k, members, frames)
@@ -205,3 +204,37 @@ def _over(own: Features, names: tuple[Feature, ...]) -> Features:
     counts = np.zeros((len(own.codes), len(names)), np.int64)
     counts[:, [place[name] for name in own.names]] = own.counts
     return Features(names, own.codes, counts, own.frames)
+
+
+def covered_combinations(found: Combinations) -> Table:
+    """The combinations that occur, the most frequent first: ``combination``, ``frames``."""
+    rows = np.flatnonzero(found.frames)
+    rows = rows[np.argsort(-found.frames[rows], kind="stable")]
+    listed = zip(found.texts(rows), found.frames[rows].tolist(), strict=True)
+    return Table(("combination", "frames"), list(listed))
+
+
+def matrix(
+    a: Classed, abstraction: str, reference: Classed | None = None
+) -> tuple[list[str], Ints, Bools]:
+    """Which pairs of features occur together: names, frames with both (F, F), and which pairs should (F, F).
+
+    Parameters
+    ----------
+    a, abstraction, reference
+        As :func:`combos` takes them.
+    """
+    own = features(a, abstraction)
+    other = None if reference is None else features(reference, abstraction)
+    names = tuple(sorted({*own.names, *(other.names if other else ())}))
+    frames = _together(_over(own, names))
+    wanted = np.ones(frames.shape, np.bool_)
+    if other is not None:
+        wanted = _together(_over(other, names)) > 0
+    return [" ".join(name) for name in names], frames, wanted
+
+
+def _together(found: Features) -> Ints:
+    """(F, F): frames in which two features occur."""
+    there = found.there.astype(np.float64)
+    return ((there * found.frames[:, None]).T @ there).astype(np.int64)
