@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import partial
 from typing import TYPE_CHECKING, Any, overload
 
 from sgstore.abstractions import abstractions
@@ -250,7 +251,8 @@ class Store:
         whole |= {"id": trace.trace_id, "uri": str(trace.path), "ego": trace.ego or None}
         whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}
         whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
-        return FrameView(self.file.graph(frame.frame_id), about, whole)
+        classes = partial(self.file.abstracted.class_of, frame.frame_id)
+        return FrameView(self.file.graph(frame.frame_id), about, whole, classes)
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

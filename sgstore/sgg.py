@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.abstractions import Classes, Grounds, Seen, abstraction_named
 from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
 from sgstore.online import Online
 from sgstore.relations import RELATIONS
@@ -90,6 +91,8 @@ class SceneGraphGenerator:
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self._still = StillPairs(config)
         self._parking = Parking()
+        self._grounds: Grounds | None = None
+        self._classes = Classes()
         self.answers = self._answers(road_map)
 
     def _answers(self, road_map: RoadMap | None) -> tuple[str, ...]:
@@ -215,6 +218,36 @@ class SceneGraphGenerator:
             shown = map_of_graphs(self._road_map, self._config)
             self._online = Online(fresh, shown, self._config.ego)
         return self._online.step(frame.meant(self._config.types))
+
+    def class_of(self, abstraction: str = "RSV") -> str | None:
+        """The class of the graph of the last step in an abstraction; the one that it would have in a store.
+
+        Returns
+        -------
+        str or None
+            32 hexadecimal digits; ``None`` where the graph is so symmetric that it was given up.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        ValueError
+            There was no step yet.
+        """
+        if self._online is None or self._online.last is None:
+            raise ValueError("there was no step yet")
+        graph, kinds = self._online.last
+        if self._grounds is None and self._road_map is not None:
+            shown = map_of_graphs(self._road_map, self._config)
+            self._grounds = None if shown is None else Grounds.of(shown)
+        seen = Seen.of(graph, kinds, self._grounds)
+        (found,) = self._classes.of(abstraction_named(abstraction).function(seen))
+        return found or None
+
+    @property
+    def kinds(self) -> Codes:
+        """(n,) int8: kinds of the entities met so far, by node id."""
+        return self._kinds
 
     def _learn(self, frames: FrameBlock) -> None:
         entities, nodes = frames.entities, frames.states.node
@@ -401,9 +434,8 @@ def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
     if ground is None:
         none = np.zeros(0, np.int64)
         empty = np.zeros(0)
-        return LaneStates(
-            none, none, none, *(empty,) * 3, none.astype(np.bool_), empty, none.astype(np.bool_)
-        )
+        false = np.zeros(0, np.bool_)
+        return LaneStates(none, none, none, empty, empty, empty, false, empty, false)
     hits = ground.standing.hits
     return LaneStates(
         frame=bodies.frame[hits.row],

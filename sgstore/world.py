@@ -1,6 +1,6 @@
 """What a simulator said: frames of a trace as arrays, and where its messages stand in the file.
 
-No behaviour: these are the values that readers hand to the scene graph generator and to the store.
+These are the values that readers hand to the scene graph generator and to the store, which rounds them.
 Conventions of axes, units and signs are those of :mod:`sgstore.geometry`: OpenDRIVE's inertial
 axes, metres, radians, seconds, ``int64`` nanoseconds. A missing number is NaN, a missing code -1.
 
@@ -10,11 +10,13 @@ belong to the road map (:mod:`sgstore.roads`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sgstore.geometry import wrapped
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -415,3 +417,85 @@ class Clip:
     trace: str
     start_ns: int
     end_ns: int
+
+
+# What a store keeps of it: float32 about an origin
+
+_LARGEST: Final = np.nextafter(np.float32(np.pi), np.float32(0))
+"""The largest float32 that is not above π: the float32 nearest to π is."""
+
+KEPT: Final = (
+    *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
+    *("length", "width", "height", "steer", "throttle", "brake"),
+)
+"""Columns of :class:`States` that a store keeps as they are, cut to float32."""
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What positions of a trace are relative to; whole metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+def origin_of(frames: FrameBlock) -> Origin | None:
+    """The middle of all that has a place in the first frame that has any, in whole metres.
+
+    It is the same for any ego. Where nothing that moves has a place, that of the scenery; ``None`` while
+    nothing has one.
+    """
+    states, scenery = frames.states, frames.scenery
+    placed = np.flatnonzero(np.isfinite(states.x) & np.isfinite(states.y))
+    if len(placed):
+        frame = frames.frame_of[placed]
+        return _middle(states.take(placed[frame == frame[0]]))
+    standing = np.isfinite(scenery.x) & np.isfinite(scenery.y)
+    return _middle(scenery.take(standing)) if standing.any() else None
+
+
+def _middle(states: States) -> Origin:
+    z = states.z[np.isfinite(states.z)]
+    x, y = round(float(np.median(states.x))), round(float(np.median(states.y)))
+    return Origin(float(x), float(y), float(round(float(np.median(z)))) if len(z) else 0.0)
+
+
+def as_kept(frames: FrameBlock, origin: Origin) -> FrameBlock:
+    """The frames with the numbers that a store gives back of them, so that graphs made of either are equal."""
+    return replace(
+        frames,
+        states=_as_kept(frames.states, origin),
+        scenery=_as_kept(frames.scenery, origin),
+    )
+
+
+def _as_kept(states: States, origin: Origin) -> States:
+    """States as float32 about an origin. Doing it twice changes nothing, nor does storing them afterwards.
+
+    A float32 has 24 bits. If the sum of the origin and one has bits below those of a float64, rounding takes
+    some off its end, and the difference to the origin fits into 24 bits all the more.
+    """
+    columns = {name: _widened(getattr(states, name)) for name in KEPT}
+    columns["heading"] = _widened(turned(states.heading))
+    for name in ("x", "y", "z"):
+        zero = getattr(origin, name)
+        columns[name] = zero + _widened(getattr(states, name) - zero)
+    return replace(states, **columns)
+
+
+def _widened(values: Floats) -> Floats:
+    """The float32 nearest to values, NaN where there is none."""
+    kept = number(values).astype(np.float64)
+    return np.where(np.isfinite(kept), kept, np.nan)
+
+
+def turned(heading: Floats) -> Floats:
+    """Headings in (-π, π], and so that they still are when they are cut to float32."""
+    return np.clip(wrapped(heading), -float(_LARGEST), float(_LARGEST))
+
+
+def number(values: Floats) -> NDArray[np.float32]:
+    """float32; what is too large for it becomes infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

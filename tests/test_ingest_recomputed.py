@@ -18,9 +18,18 @@ from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.store.packing import Origin, as_kept, number, origin_of
 from sgstore.vocabulary import KIND_CODE, RELATIONS
-from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
+from sgstore.world import (
+    BUCKET_FRAMES,
+    Entities,
+    FrameBlock,
+    MessageRefs,
+    Origin,
+    States,
+    as_kept,
+    number,
+    origin_of,
+)
 
 if TYPE_CHECKING:
     from sgstore.graph import GraphBlock

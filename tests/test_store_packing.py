@@ -12,15 +12,13 @@ from hypothesis import strategies as st
 
 from sgstore.store.packing import (
     NodeKinds,
-    Origin,
     edge_columns,
     frame_ids,
     masks_of,
-    origin_of,
     state_columns,
 )
 from sgstore.vocabulary import RELATIONS
-from sgstore.world import BUCKET_FRAMES
+from sgstore.world import BUCKET_FRAMES, Origin, origin_of
 
 SMALL = st.integers(-3, 3)
 FAR = st.integers(-(1 << 31), 1 << 31)

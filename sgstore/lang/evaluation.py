@@ -37,11 +37,15 @@ class FrameView:
     graph : SceneGraph
     frame, trace : mapping
         Attributes of ``frame`` and ``trace`` by their names in the language, as far as they are known.
+    classes : callable, optional
+        Gives the class of the graph in an abstraction, by its name; asked only where a query asks, and once.
+        Without it classes are not known.
     """
 
     graph: SceneGraph
     frame: Attributes = field(default_factory=dict[str, Any])
     trace: Attributes = field(default_factory=dict[str, Any])
+    classes: Callable[[str], str | None] | None = None
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:
@@ -79,6 +83,16 @@ class FrameView:
         for edge in self.graph.edges:
             found[edge[1], edge[at]].append(edge[other])  # type: ignore[index, arg-type]
         return found
+
+    def class_in(self, abstraction: str) -> str | None:
+        """The class of the graph in an abstraction; ``None`` where it is not known."""
+        if abstraction not in self._classes:
+            self._classes[abstraction] = self.classes(abstraction) if self.classes else None
+        return self._classes[abstraction]
+
+    @cached_property
+    def _classes(self) -> dict[str, str | None]:
+        return {}
 
     def is_one(self, node: int, kinds: b.Kinds) -> bool:
         """Whether a node is of these kinds."""
@@ -193,6 +207,9 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
         case b.EdgeAttribute(edge=edge, attribute=attribute):
             name = attribute.name
             return lambda at: at.edges[edge][1].get(name)
+        case b.FrameAttribute(attribute=attribute) if attribute.unit is Unit.classed:
+            (name,) = attribute.columns.values()
+            return lambda at: at.view.class_in(name)
         case b.FrameAttribute(attribute=attribute):
             name = attribute.name
             return lambda at: at.view.frame.get(name)

@@ -11,6 +11,7 @@ import numpy as np
 from sgstore.geometry import wrapped
 from sgstore.graph import Reach, SceneGraph
 from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATION_CODE, RELATIONS, VEHICLE_LIGHTS
+from sgstore.world import number
 
 if TYPE_CHECKING:
     from sgstore.graph import GraphBlock
@@ -150,7 +151,8 @@ def _moving(states: States) -> list[Attributes]:
     }
     columns["heading"] = np.degrees(wrapped(states.heading))
     columns |= {name: np.degrees(getattr(states, name)) for name in ("pitch", "roll", "yaw_rate")}
-    columns["speed"] = np.sqrt(states.vx**2 + states.vy**2 + np.nan_to_num(states.vz) ** 2)
+    speed = np.sqrt(states.vx**2 + states.vy**2 + np.nan_to_num(states.vz) ** 2)
+    columns["speed"] = number(speed).astype(np.float64)
     columns["accel"] = states.ax * np.cos(states.heading) + states.ay * np.sin(states.heading)
     names = tuple(columns)
     table = np.stack([columns[name] for name in names], axis=1)
@@ -185,21 +187,27 @@ def _edges(graph: GraphBlock, outer: Ints) -> list[Edge]:
     new[1:] = (np.diff(src) != 0) | (np.diff(relation) != 0) | (np.diff(dst) != 0)
     ends = zip(src[new].tolist(), relation[new].tolist(), dst[new].tolist(), strict=True)
     keys = zip(_outward(lanes.node, outer).tolist(), lanes.lane.tolist(), strict=True)
+    numbers = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
+    about = (
+        *(number(column).tolist() for column in numbers),
+        lanes.primary.tolist(),
+        lanes.own.tolist(),
+    )
     within = {
         key: _numbers(
             {
-                "overlap": float(lanes.overlap[row]),
-                "lane_offset": float(lanes.offset[row]),
-                "heading_error": math.degrees(lanes.heading_error[row]),
-                "along": float(lanes.along[row]),
+                "overlap": overlap,
+                "lane_offset": offset,
+                "heading_error": math.degrees(error),
+                "along": along,
             }
         )
-        | {"is_primary": bool(lanes.primary[row]), "is_own": bool(lanes.own[row])}
-        for row, key in enumerate(keys)
+        | {"is_primary": primary, "is_own": own}
+        for key, overlap, offset, error, along, primary, own in zip(keys, *about, strict=True)
     }
     known = {(_IS_IN, *key): about for key, about in within.items()}
     gaps = graph.gaps
-    columns = (_outward(gaps.src, outer), _outward(gaps.dst, outer), gaps.gap)
+    columns = (_outward(gaps.src, outer), _outward(gaps.dst, outer), number(gaps.gap))
     for a, b, gap in zip(*(column.tolist() for column in columns), strict=True):
         known[_FOLLOWS, a, b] = known[_LEADS, b, a] = _numbers({"gap": gap})
     return [(a, RELATIONS[code], b, dict(known.get((code, a, b), {}))) for a, code, b in ends]

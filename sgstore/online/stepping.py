@@ -16,7 +16,7 @@ import numpy as np
 from sgstore.online.frame import NUMBERS, WHOLE
 from sgstore.online.records import Known, Records
 from sgstore.vocabulary import KINDS
-from sgstore.world import Entities, FrameBlock, MessageRefs, States
+from sgstore.world import Entities, FrameBlock, MessageRefs, Origin, States, as_kept, origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sgstore.graph import GraphBlock, SceneGraph
     from sgstore.online.frame import Entity, Frame
     from sgstore.roads import RoadMap
-    from sgstore.world import Ints
+    from sgstore.world import Codes, Ints
 
 REMEMBERED: Final = 20_000
 """Entities that are absent and still known by their ids; some 5 MB."""
@@ -35,6 +35,11 @@ SPARE: Final = 2048
 
 class Generator(Protocol):
     """What makes graphs of blocks: :class:`sgstore.sgg.SceneGraphGenerator`."""
+
+    @property
+    def kinds(self) -> Codes:
+        """Kinds of the entities that it has met, by node id."""
+        ...
 
     def block(self, frames: FrameBlock) -> GraphBlock:
         """The graphs of the next frames."""
@@ -52,6 +57,11 @@ class Online:
         The map that its graphs lie on.
     ego : str
         The ego of frames that name none.
+
+    Attributes
+    ----------
+    last : tuple or None
+        The last graph as a block, and the kinds of its entities by the block's node ids.
     """
 
     def __init__(
@@ -62,6 +72,8 @@ class Online:
         self._ego = ego
         self._records = Records(road_map)
         self._seq = 0
+        self._origin: Origin | None = None
+        self.last: tuple[GraphBlock, Codes] | None = None
         self._next = 0
         self._moving: OrderedDict[str, Known] = OrderedDict()  # whom the last frame had, at the end
         self._standing: dict[str, tuple[Entity, Known]] = {}
@@ -76,11 +88,12 @@ class Online:
         if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
             self._generator, self._inner, self._introduced = self._make(), {}, 0
             new = [entity for entity, _ in self._standing.values()]
-        block = self._block(frame, moving, new)
+        block = self._kept(self._block(frame, moving, new))
         for row, entity in enumerate(new):
             self._records.stand(self._standing[entity.ident][1], block.scenery, row)
         graph = self._generator.block(block)
         self._seq += 1
+        self.last = graph, self._generator.kinds
         while len(self._moving) > len(moving) + REMEMBERED:
             ident, _ = self._moving.popitem(last=False)
             self._inner.pop(ident, None)
@@ -149,6 +162,11 @@ class Online:
             scenery=self._states(standing),
             messages=MessageRefs(none, none, none, none, none),
         )
+
+    def _kept(self, block: FrameBlock) -> FrameBlock:
+        """A block with the numbers that a store would keep of it, if these frames were its trace."""
+        self._origin = self._origin or origin_of(block)
+        return as_kept(block, self._origin or Origin(0.0, 0.0, 0.0))
 
     def _node(self, entity: Entity) -> int:
         known = self._standing[entity.ident][1] if entity.static else self._moving[entity.ident]

@@ -175,6 +175,15 @@ class Abstracted:
             ).fetchnumpy()
         return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
 
+    def class_of(self, frame_id: int, name: str) -> str | None:
+        """The class of a frame in an abstraction; ``None`` where it is not in the store, or was given up."""
+        with self._access.reading() as connection:
+            found = connection.execute(
+                "SELECT any_value(class) FROM classes WHERE frame_id = ? AND abstraction = ?",
+                [frame_id, name],
+            ).fetchone()
+        return found[0] if found else None
+
     def coded(self, name: str) -> CodedClasses:
         """The class of each frame as a number, computed where it was not.
 

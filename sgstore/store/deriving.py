@@ -17,13 +17,13 @@ from sgstore.errors import AbstractionError, StoreError
 from sgstore.graph import SceneGraph
 from sgstore.store import packing
 from sgstore.store.adding import add_files, note, writing
-from sgstore.store.packing import FRAME_BITS, NodeKinds, Origin, as_json, texts
+from sgstore.store.packing import FRAME_BITS, NodeKinds, as_json, texts
 from sgstore.store.rows import run
 from sgstore.store.seen import Graphs, filled
 from sgstore.store.staging import Staging
 from sgstore.store.traces import trace_named
 from sgstore.vocabulary import folded
-from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
+from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, Origin, States
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

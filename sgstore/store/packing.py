@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sgstore.geometry import wrapped
-from sgstore.world import BUCKET_FRAMES
+from sgstore.world import BUCKET_FRAMES, KEPT, number, turned
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from sgstore.graph import GraphBlock
-    from sgstore.world import Bools, Codes, Entities, Floats, FrameBlock, Ints, MessageRefs, States
+    from sgstore.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
 
 Whole = NDArray[np.signedinteger[Any]]
 
@@ -36,23 +35,6 @@ BUCKET_BITS: Final = 18
 FRAME_BITS: Final = 6
 """Bits of a frame's number in its bucket."""
 MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
-
-_LARGEST: Final = np.nextafter(np.float32(np.pi), np.float32(0))
-"""The largest float32 that is not above π: the float32 nearest to π is."""
-
-_STATE_FLOATS: Final = (
-    *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
-    *("length", "width", "height", "steer", "throttle", "brake"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """What positions of a trace are relative to; whole metres."""
-
-    x: float
-    y: float
-    z: float
 
 
 @dataclass(slots=True)
@@ -140,9 +122,9 @@ def state_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds, origin: Or
     """Table ``state``, but for the constants of entities; kinds and states of lights as codes."""
     frames, states = graph.frames, graph.frames.states
     row = frames.frame_of
-    plain = {name: getattr(states, name) for name in _STATE_FLOATS}
+    plain = {name: getattr(states, name) for name in KEPT}
     plain |= {
-        "heading": _turned(states.heading),
+        "heading": turned(states.heading),
         "x": states.x - origin.x,
         "y": states.y - origin.y,
         "z": states.z - origin.z,
@@ -237,7 +219,7 @@ def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
     }
     for name, values in poses.items():
         values[rows] = getattr(scenery, name)
-    poses["heading"] = _turned(poses["heading"])
+    poses["heading"] = turned(poses["heading"])
     for name in ("x", "y", "z"):
         poses[name] -= getattr(origin, name)
     return {
@@ -257,67 +239,6 @@ def message_columns(messages: MessageRefs, channel_ids: Ints) -> Columns:
     """Places of messages, with the channels' ids in the file."""
     columns = {f.name: getattr(messages, f.name) for f in fields(messages)}
     return columns | {"channel": channel_ids[messages.channel]}
-
-
-def origin_of(frames: FrameBlock) -> Origin | None:
-    """The middle of all that has a place in the first frame that has any, in whole metres.
-
-    It is the same for any ego. Where nothing that moves has a place, that of the scenery; ``None`` while
-    nothing has one.
-    """
-    states, scenery = frames.states, frames.scenery
-    placed = np.flatnonzero(np.isfinite(states.x) & np.isfinite(states.y))
-    if len(placed):
-        frame = frames.frame_of[placed]
-        return _middle(states.take(placed[frame == frame[0]]))
-    standing = np.isfinite(scenery.x) & np.isfinite(scenery.y)
-    return _middle(scenery.take(standing)) if standing.any() else None
-
-
-def _middle(states: States) -> Origin:
-    z = states.z[np.isfinite(states.z)]
-    x, y = round(float(np.median(states.x))), round(float(np.median(states.y)))
-    return Origin(float(x), float(y), float(round(float(np.median(z)))) if len(z) else 0.0)
-
-
-def as_kept(frames: FrameBlock, origin: Origin) -> FrameBlock:
-    """The frames with the numbers that a store gives back of them, so that graphs made of either are equal."""
-    return replace(
-        frames,
-        states=_as_kept(frames.states, origin),
-        scenery=_as_kept(frames.scenery, origin),
-    )
-
-
-def _as_kept(states: States, origin: Origin) -> States:
-    """States as float32 about an origin. Doing it twice changes nothing, nor does storing them afterwards.
-
-    A float32 has 24 bits. If the sum of the origin and one has bits below those of a float64, rounding takes
-    some off its end, and the difference to the origin fits into 24 bits all the more.
-    """
-    columns = {name: _widened(getattr(states, name)) for name in _STATE_FLOATS}
-    columns["heading"] = _widened(_turned(states.heading))
-    for name in ("x", "y", "z"):
-        zero = getattr(origin, name)
-        columns[name] = zero + _widened(getattr(states, name) - zero)
-    return replace(states, **columns)
-
-
-def _widened(values: Floats) -> Floats:
-    """The float32 nearest to values, NaN where there is none."""
-    kept = number(values).astype(np.float64)
-    return np.where(np.isfinite(kept), kept, np.nan)
-
-
-def _turned(heading: Floats) -> Floats:
-    """Headings in (-π, π], and so that they still are when they are cut to float32."""
-    return np.clip(wrapped(heading), -float(_LARGEST), float(_LARGEST))
-
-
-def number(values: Floats) -> NDArray[np.float32]:
-    """float32; what is too large for it becomes infinite."""
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
 
 
 def unless(values: Whole, missing: Bools) -> Ints:

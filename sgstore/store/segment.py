@@ -16,12 +16,12 @@ from sgstore.store import packing, payloads
 from sgstore.store.access import translated
 from sgstore.store.classes import IngestedClasses
 from sgstore.store.happenings import Happenings
-from sgstore.store.packing import MAX_FRAMES, NodeKinds, Origin, texts
+from sgstore.store.packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store.publishing import MAP_TABLES, fill_trace, publish_in
 from sgstore.store.sealed import Sealed
 from sgstore.store.staging import Staging
 from sgstore.store.traces import Identity
-from sgstore.world import BUCKET_FRAMES
+from sgstore.world import BUCKET_FRAMES, Origin, as_kept, origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -108,8 +108,8 @@ class Segment:
         Positions are kept as float32 about an origin, all else as float32. Graphs that are made of these
         numbers can be made again from the store, to the last edge; so this comes before the generator.
         """
-        self._origin = self._origin or packing.origin_of(frames)
-        return packing.as_kept(frames, self._origin or Origin(0.0, 0.0, 0.0))
+        self._origin = self._origin or origin_of(frames)
+        return as_kept(frames, self._origin or Origin(0.0, 0.0, 0.0))
 
     def append(self, graph: GraphBlock) -> None:
         """Add the next frames of the trace.
@@ -137,7 +137,7 @@ class Segment:
         self._staging.settle(whole=self._next_seq % BUCKET_FRAMES == 0)
         self._next_seq += len(frames)
         self._kinds.learn(frames.entities)
-        self._origin = self._origin or packing.origin_of(frames)
+        self._origin = self._origin or origin_of(frames)
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
         self._see_messages(graph)
 
