@@ -33,11 +33,13 @@ OWNERS = {
     "lz4": {"traces", "exporters"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "networkx": {"graph"},
+    "networkx": {"graph", "exporters"},
     "shapely": {"geometry", "roads", "opendrive"},
     "lark": {"lang"},
     "matplotlib": {"draw"},
-    "PIL": {"draw"},
+    "PIL": {"draw", "exporters"},
+    "torch": {"exporters"},
+    "torch_geometric": {"exporters"},
     "carla": {"traces"},
 }
 MASKS_ARE_KNOWN_TO = {"store", "lang/sql", "lang/presence", "lang/counting"}

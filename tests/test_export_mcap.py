@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader
 from recordings import Recorder, bulb, car, drive, house, ns
 
 from sgstore.errors import ExportError, TraceError
-from sgstore.exporters import EXPORTERS, Source, exporter_named
+from sgstore.exporters import Source
 from sgstore.exporters.clips import clip_name
 from sgstore.exporters.mcap import write_clips
 from sgstore.traces import open_trace
@@ -24,10 +24,8 @@ from sgstore.world import Clip, MessageRefs, States
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.exporters import Exporter
     from sgstore.world import FrameBlock
 
-each_exporter = pytest.mark.parametrize("exporter", EXPORTERS, ids=lambda exporter: exporter.name)
 Key = tuple[str, int, int, int, bytes]
 
 
@@ -322,16 +320,15 @@ def test_a_small_interval_found_by_its_index_is_what_was_written(tmp_path: Path)
     assert found == [m[-1] for m in within(path, 200.0, 200.95)]
 
 
-# The laws of every exporter --------------------------------------------------------------------------
+# All of it or nothing ---------------------------------------------------------------------------------
 
 
-@each_exporter
-def test_the_same_clips_are_the_same_bytes(tmp_path: Path, exporter: Exporter) -> None:
+def test_the_same_clips_are_the_same_bytes(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap", frames=30)
     clips = [Clip("drive", ns(0.5), ns(1.0)), Clip("drive", ns(1.5), ns(2.0))]
 
     for name in ("one", "two"):
-        exporter.write_clips(
+        write_clips(
             clips, {"drive": source(path)}, tmp_path / name, provenance={"query": "MATCH (a)"}
         )
 
@@ -340,12 +337,11 @@ def test_the_same_clips_are_the_same_bytes(tmp_path: Path, exporter: Exporter) -
     assert [file.read_bytes() for file in one] == [file.read_bytes() for file in two]
 
 
-@each_exporter
-def test_a_manifest_tells_of_every_clip(tmp_path: Path, exporter: Exporter) -> None:
+def test_a_manifest_tells_of_every_clip(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap", frames=30)
     clips = [Clip("drive", ns(0.5), ns(1.0)), Clip("drive", ns(1.5), ns(2.0))]
 
-    written = exporter.write_clips(
+    written = write_clips(
         clips, {"drive": source(path)}, tmp_path / "out", provenance={"query": "MATCH (a)"}
     )
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
@@ -362,8 +358,7 @@ def test_a_manifest_tells_of_every_clip(tmp_path: Path, exporter: Exporter) -> N
         assert {c["topic"]: c["messages"] for c in told["messages"]}["truth"] == 6 + 1
 
 
-@each_exporter
-def test_nothing_is_overwritten(tmp_path: Path, exporter: Exporter) -> None:
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
     clips, sources = [Clip("drive", 0, ns(1.0))], {"drive": source(path)}
     for name in ("drive_001.mcap", "manifest.json"):
@@ -372,38 +367,35 @@ def test_nothing_is_overwritten(tmp_path: Path, exporter: Exporter) -> None:
         (folder / name).write_text("mine")
 
         with pytest.raises(ExportError, match="exists already and is not overwritten"):
-            exporter.write_clips(clips, sources, folder)
+            write_clips(clips, sources, folder)
 
         assert [file.read_text() for file in folder.iterdir()] == ["mine"]
 
 
-@each_exporter
-def test_a_link_is_not_followed(tmp_path: Path, exporter: Exporter) -> None:
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "drive_001.mcap").symlink_to(tmp_path / "elsewhere")
 
     with pytest.raises(ExportError):
-        exporter.write_clips([Clip("drive", 0, ns(1.0))], {"drive": source(path)}, folder)
+        write_clips([Clip("drive", 0, ns(1.0))], {"drive": source(path)}, folder)
 
     assert not (tmp_path / "elsewhere").exists()
 
 
-@each_exporter
-def test_an_export_that_fails_leaves_nothing_behind(tmp_path: Path, exporter: Exporter) -> None:
+def test_an_export_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
     good, empty = Clip("drive", 0, ns(1.0)), Clip("drive", ns(50.0), ns(60.0))
     folder = tmp_path / "out"
 
     with pytest.raises(ExportError, match="no message between 50000000000 and 60000000000 ns"):
-        exporter.write_clips([good, empty], {"drive": source(path)}, folder)
+        write_clips([good, empty], {"drive": source(path)}, folder)
 
     assert list(folder.iterdir()) == []
 
 
-@each_exporter
-def test_what_cannot_be_exported_is_named(tmp_path: Path, exporter: Exporter) -> None:
+def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
     known = {"drive": source(path)}
     for clip, words in (
@@ -411,26 +403,23 @@ def test_what_cannot_be_exported_is_named(tmp_path: Path, exporter: Exporter) ->
         (Clip("drive", 9, 5), "before its start"),
     ):
         with pytest.raises(ExportError, match=words):
-            exporter.write_clips([clip], known, tmp_path / "out")
+            write_clips([clip], known, tmp_path / "out")
 
     path.write_bytes(path.read_bytes() + b"\0")
     with pytest.raises(ExportError, match="has changed since it was ingested"):
-        exporter.write_clips([Clip("drive", 0, 5)], known, tmp_path / "out")
+        write_clips([Clip("drive", 0, 5)], known, tmp_path / "out")
 
     path.unlink()
     with pytest.raises(TraceError, match="no such file"):
-        exporter.write_clips([Clip("drive", 0, 5)], known, tmp_path / "out")
+        write_clips([Clip("drive", 0, 5)], known, tmp_path / "out")
 
 
-@each_exporter
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, exporter: Exporter) -> None:
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
     (tmp_path / "file").touch()
 
     with pytest.raises(ExportError, match="cannot be written"):
-        exporter.write_clips(
-            [Clip("drive", 0, 5)], {"drive": source(path)}, tmp_path / "file" / "out"
-        )
+        write_clips([Clip("drive", 0, 5)], {"drive": source(path)}, tmp_path / "file" / "out")
 
 
 def test_what_was_lost_of_the_source_is_told(tmp_path: Path) -> None:
@@ -486,9 +475,3 @@ def test_a_source_without_context_has_none(tmp_path: Path) -> None:
 def test_a_clips_name_is_safe_whatever_the_trace_is_called(trace: str, name: str) -> None:
     assert clip_name(trace, 7, ".mcap") == name
     assert os.sep not in name
-
-
-def test_an_exporter_is_found_by_its_name() -> None:
-    assert exporter_named("mcap") is EXPORTERS[0]
-    with pytest.raises(ExportError, match="no export format 'mcp'; did you mean 'mcap'"):
-        exporter_named("mcp")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -25,78 +25,137 @@ from sgstore.cli.arguments import (
     seconds_of,
 )
 from sgstore.cli.output import Format, say, write_rows
+from sgstore.cli.progress import count_bar
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from sgstore.query import Store
+    from sgstore.world import Clip
 
 BEFORE_AFTER: Final = "2s"
 
 
-class ClipFormat(StrEnum):
-    """Formats that clips are exported in."""
+class Clouds(StrEnum):
+    """What clouds of points are written as."""
 
-    mcap = "mcap"
+    pcd = "pcd"
+    npy = "npy"
+    bin = "bin"
+
+
+Folder = Annotated[
+    Path, typer.Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten.")
+]
+Frames = Annotated[
+    Path | None,
+    typer.Option("--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."),
+]
+Form = Annotated[
+    str, typer.Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package.")
+]
+Before = Annotated[
+    str, typer.Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
+]
+After = Annotated[str, typer.Option("--after", metavar="TIME", help="Time after each match.")]
+LabelTexts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--label",
+        metavar="NAME=TEXT",
+        help="A value for each frame: an expression, or a query that is true where it matches.",
+    ),
+]
+WithGraph = Annotated[
+    bool, typer.Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw.")
+]
+Abstraction = Annotated[
+    str, typer.Option("--abstraction", help="nx, pyg, s3c: what the graphs are seen as.")
+]
+Channels = Annotated[
+    list[str] | None,
+    typer.Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
+]
+CloudForm = Annotated[
+    Clouds, typer.Option("--clouds", help="frames: what clouds of points are written as.")
+]
 
 
 @app.command()
 def export(
     store: StorePath,
     query: QueryText = None,
-    to: Annotated[
-        Path,
-        typer.Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten."),
-    ] = Path("clips"),
+    to: Folder = Path("clips"),
     file: QueryFile = None,
     parameters: Parameters = None,
-    frames: Annotated[
-        Path | None,
-        typer.Option(
-            "--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."
-        ),
-    ] = None,
-    clip_format: Annotated[
-        ClipFormat, typer.Option("--format", help="What the clips are written as.")
-    ] = ClipFormat.mcap,
-    before: Annotated[
-        str, typer.Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
-    ] = BEFORE_AFTER,
-    after: Annotated[
-        str, typer.Option("--after", metavar="TIME", help="Time after each match.")
-    ] = BEFORE_AFTER,
+    frames: Frames = None,
+    form: Form = "mcap",
+    before: Before = BEFORE_AFTER,
+    after: After = BEFORE_AFTER,
+    labels: LabelTexts = None,
+    with_graph: WithGraph = False,
+    abstraction: Abstraction = "",
+    channels: Channels = None,
+    clouds: CloudForm = Clouds.pcd,
     as_json: AsJson = False,
 ) -> int:
     """Cut matches out of their recordings, as clips with the original messages.
 
-    RETURN CLIPS(-3s, +5s) in the query wins over --before and --after.
+    Other formats: tables (parquet), pictures and clouds (frames), graphs for
+    networkx (nx), PyTorch Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s)
+    in the query wins over --before and --after.
     """
-    from sgstore.exporters.stored import around_frames, write_stored
+    from sgstore.exporters.export import Export
+    from sgstore.exporters.labels import parse_labels
+    from sgstore.exporters.stored import labelled, write_export
 
+    texts = parse_labels(labels or [])
     opened = open_store(store)
+    values = parameters_of(parameters)
     margins = seconds_of(before, "--before"), seconds_of(after, "--after")
-    if frames is not None:
-        if query or file:
-            raise typer.BadParameter("give a QUERY or --frames, not both")
-        clips = around_frames(opened, lines_of(frames), *margins)
-        text = ""
-    else:
-        text = query_of(query, file)
-        matches = opened.find(text, **parameters_of(parameters))
-        say_left_out(matches)
-        clips = list(matches.clips(*margins))
+    if frames is not None and (query or file):
+        raise typer.BadParameter("give a QUERY or --frames, not both")
+    text = query_of(query, file) if frames is None else ""
+    clips = _clips(opened, frames, text, values, margins)
     if not clips:
         say("nothing matches: nothing to export")
         return 0
-    written = write_stored(opened, clips, to, form=clip_format.value, query=text)
-    for clip in written:
-        for loss in clip.losses:
-            say(f"{clip.file.name}: lost: {loss.reason}")
-    columns = ("clip", "trace", "start_ns", "seconds", "messages")
-    rows = (
-        (
-            str(clip.file),
-            clip.trace,
-            clip.start_ns,
-            round((clip.end_ns - clip.start_ns) / 1e9, 3),
-            sum(channel.messages for channel in clip.messages),
+    with count_bar(to.name or "export", "clips") as progress:
+        order = Export(
+            opened,
+            tuple(clips),
+            abstraction=abstraction,
+            with_graph=with_graph,
+            channels=tuple(channels or ()),
+            clouds=clouds.value,
+            provenance={"query": text} if text else {},
+            progress=progress,
         )
-        for clip in written
+        written = write_export(labelled(order, texts, **values), to, form)
+    for one in written:
+        for loss in one.losses:
+            say(f"{one.file.name}: lost: {loss.reason}")
+    rows = [one.as_row() for one in written]
+    write_rows(
+        tuple(rows[0]),
+        [tuple(row.values()) for row in rows],
+        form_of(Format.table, as_json=as_json),
     )
-    write_rows(columns, rows, form_of(Format.table, as_json=as_json))
-    return LOSS if any(clip.losses for clip in written) else 0
+    return LOSS if any(one.losses for one in written) else 0
+
+
+def _clips(
+    store: Store,
+    frames: Path | None,
+    text: str,
+    parameters: dict[str, Any],
+    margins: tuple[float, float],
+) -> list[Clip]:
+    """The clips around what a query finds, or around frames that are named."""
+    if frames is not None:
+        from sgstore.exporters.stored import around_frames
+
+        return around_frames(store, lines_of(frames), *margins)
+    matches = store.find(text, **parameters)
+    say_left_out(matches)
+    return list(matches.clips(*margins))

@@ -1,8 +1,9 @@
 """What every exporter of clips needs: where they come from, what they are called, how they reach their folder.
 
 An export is whole or it is not there: its files are written into a folder of their own beside their
-place, and moved there, one after another, when all of them are finished. Nothing that exists is ever
-overwritten, and nothing is written outside the folder that the user names.
+place, and moved there, one after another, when all of them are finished, the manifest last: where there is
+none, there is no export. Nothing that exists is ever overwritten, and nothing is written outside the folder
+that the user names.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import ExportError
+from sgstore.traces.fetch import digest_of
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Generator, Mapping, Sequence
 
     from sgstore.world import Loss, MessageRefs
 
@@ -102,6 +104,55 @@ class WrittenClip:
         values["file"] = self.file.name
         return values
 
+    def as_row(self) -> dict[str, Any]:
+        """What a person wants to know of it."""
+        return {
+            "clip": str(self.file),
+            "trace": self.trace,
+            "start_ns": self.start_ns,
+            "seconds": round((self.end_ns - self.start_ns) / 1e9, 3),
+            "messages": sum(channel.messages for channel in self.messages),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenFile:
+    """A file, or a folder of files, that was written.
+
+    Attributes
+    ----------
+    file : Path
+        In the folder of the export.
+    sha256 : str
+        Of a file; empty for a folder: a table beside it has those of its files.
+    holds : str
+        What it holds: ``nodes``, ``pictures``, ….
+    count : int
+        How many of these.
+    losses : tuple of Loss
+        What of the graphs or of the recordings is not in it.
+    """
+
+    file: Path
+    sha256: str
+    holds: str
+    count: int
+    losses: tuple[Loss, ...] = ()
+
+    @classmethod
+    def of(cls, file: Path, holds: str, count: int, losses: Sequence[Loss] = ()) -> WrittenFile:
+        """A file or a folder that is there, with its hash."""
+        digest = digest_of(file) if file.is_file() else ""
+        return cls(file, digest, holds, count, tuple(losses))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The file as plain values, as it stands in a manifest."""
+        return asdict(self) | {"file": self.file.name}
+
+    def as_row(self) -> dict[str, Any]:
+        """What a person wants to know of it."""
+        return {"file": str(self.file), "holds": self.holds, "count": self.count}
+
 
 def provenance_of(told: dict[str, str]) -> dict[str, str]:
     """What the caller tells of an export, with the hash of its query and the version of the tool."""
@@ -120,14 +171,25 @@ def clip_name(trace: str, number: int, ending: str) -> str:
 
     Whatever may not stand in a name becomes ``_``; the number, unique in an export, keeps names apart.
     """
-    name = _UNSAFE.sub("_", trace)[:_LONGEST_NAME].strip("._-") or "clip"
-    if _RESERVED.fullmatch(name):
-        name = f"_{name}"
-    return f"{name}_{number:03d}{ending}"
+    return f"{safe_name(trace, 'clip')}_{number:03d}{ending}"
+
+
+def safe_name(text: str, otherwise: str) -> str:
+    """A name for a file or a folder, safe on every system: no separators, no dots in front, nothing reserved.
+
+    Parameters
+    ----------
+    text : str
+        Whatever may not stand in a name becomes ``_``.
+    otherwise : str
+        The name, if nothing is left.
+    """
+    name = _UNSAFE.sub("_", text)[:_LONGEST_NAME].strip("._-") or otherwise
+    return f"_{name}" if _RESERVED.fullmatch(name) else name
 
 
 @contextmanager
-def export_folder(to: Path, names: Sequence[str]) -> Generator[Path]:
+def export_folder(to: Path, names: Sequence[str] = ()) -> Generator[Path]:
     """A folder to write the files of an export into; they are moved to ``to`` if all goes well.
 
     Parameters
@@ -135,7 +197,7 @@ def export_folder(to: Path, names: Sequence[str]) -> Generator[Path]:
     to : Path
         Made if it does not exist.
     names : sequence of str
-        The files that will be there, without the manifest.
+        Files and folders that are known to be there at the end, so that it is seen at once if one is taken.
 
     Raises
     ------
@@ -144,44 +206,82 @@ def export_folder(to: Path, names: Sequence[str]) -> Generator[Path]:
     """
     try:
         to.mkdir(parents=True, exist_ok=True)
-        taken = [name for name in (*names, MANIFEST) if os.path.lexists(to / name)]
-        if taken:
-            raise ExportError(
-                f"{to}: {taken[0]} exists already and is not overwritten; choose another folder"
-            )
+        _refuse_taken(to, (*names, MANIFEST))
         work = Path(tempfile.mkdtemp(prefix=".export-", dir=to))
         try:
             yield work
-            _move([work / name for name in (*names, MANIFEST)], to)
+            found = sorted(entry.name for entry in work.iterdir() if entry.name != MANIFEST)
+            _refuse_taken(to, found)
+            _move([work / name for name in (*found, MANIFEST)], to)
         finally:
             shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
         raise ExportError(f"{to}: cannot be written: {error.strerror or error}") from error
 
 
+def _refuse_taken(to: Path, names: Sequence[str]) -> None:
+    taken = [name for name in names if os.path.lexists(to / name)]
+    if taken:
+        raise ExportError(
+            f"{to}: {taken[0]} exists already and is not overwritten; choose another folder"
+        )
+
+
 def write_manifest(folder: Path, clips: Sequence[WrittenClip]) -> None:
-    """Write the manifest of an export: the same bytes for the same clips."""
-    content = {"format": "sgstore.clips", "tool": tool(), "clips": [c.as_dict() for c in clips]}
+    """Write the manifest of clips as files: the same bytes for the same clips."""
+    _write_json(
+        folder, {"format": "sgstore.clips", "tool": tool(), "clips": [c.as_dict() for c in clips]}
+    )
+
+
+def write_file_manifest(
+    folder: Path, about: Mapping[str, Any], files: Sequence[WrittenFile]
+) -> None:
+    """Write the manifest of any other export: what it is about, and its files."""
+    _write_json(
+        folder,
+        {
+            "format": "sgstore.export",
+            "tool": tool(),
+            **about,
+            "files": [f.as_dict() for f in files],
+        },
+    )
+
+
+def _write_json(folder: Path, content: Mapping[str, Any]) -> None:
     text = json.dumps(content, indent=2, sort_keys=True, ensure_ascii=False)
-    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
-def _move(files: Sequence[Path], to: Path) -> None:
-    """Move files to a folder, all or none; a file that came into being meanwhile is not overwritten."""
+def _move(things: Sequence[Path], to: Path) -> None:
+    """Move files and folders to a folder, all or none; what came into being meanwhile is not overwritten."""
     moved: list[Path] = []
     try:
-        for file in files:
-            target = to / file.name
-            try:
-                target.hardlink_to(file)  # unlike a renaming, it fails where something is
-            except FileExistsError:
-                raise
-            except OSError:  # a file system without links
-                with target.open("xb"):
-                    pass
-                file.replace(target)
-            moved.append(target)
+        for thing in things:
+            target = to / thing.name
+            if thing.is_dir():
+                target.mkdir()  # unlike a renaming, it fails where something is
+                moved.append(target)
+                thing.replace(target)
+            else:
+                _move_file(thing, target)
+                moved.append(target)
     except BaseException:
         for target in moved:
-            target.unlink(missing_ok=True)
+            if target.is_dir():
+                shutil.rmtree(target, ignore_errors=True)
+            else:
+                target.unlink(missing_ok=True)
         raise
+
+
+def _move_file(file: Path, target: Path) -> None:
+    try:
+        target.hardlink_to(file)  # unlike a renaming, it fails where something is
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with target.open("xb"):
+            pass
+        file.replace(target)

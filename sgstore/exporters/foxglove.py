@@ -1,23 +1,31 @@
 """What sensors measured → messages of Foxglove's types, which Foxglove, Lichtblick and our own reader show.
 
-Pictures are PNG: a few lines, no package, nothing lost. What is neither a picture nor points is JSON.
+Pictures are PNG. What is neither a picture nor points is JSON.
 
-Source: foxglove-sdk, schemas (public lists of fields); PNG specification (third edition), chapters 9 to 11.
+Source: foxglove-sdk, schemas (public lists of fields).
 """
 
 from __future__ import annotations
 
 import json
 import math
-import struct
-import zlib
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf import (
+    descriptor_pb2,
+    descriptor_pool,
+    duration_pb2,
+    message_factory,
+    timestamp_pb2,
+)
+
+from sgstore.exporters.pictures import png
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
     from numpy.typing import NDArray
 
 _FIELD: Final = descriptor_pb2.FieldDescriptorProto
@@ -26,12 +34,14 @@ _SCALARS: Final = {
     "string": _FIELD.TYPE_STRING,
     "bytes": _FIELD.TYPE_BYTES,
     "fixed32": _FIELD.TYPE_FIXED32,
+    "bool": _FIELD.TYPE_BOOL,
 }
+_GOOGLE: Final = {"Timestamp": timestamp_pb2.DESCRIPTOR, "Duration": duration_pb2.DESCRIPTOR}
 _TYPES: Final = {
     "Vector3": "x=1:double y=2:double z=3:double",
     "Quaternion": "x=1:double y=2:double z=3:double w=4:double",
     "Pose": "position=1:Vector3 orientation=2:Quaternion",
-    "PackedElementField": "name=1:string offset=2:fixed32 type=3:NumericType",
+    "PackedElementField": "name=1:string offset=2:fixed32 type=3:PackedElementField.NumericType",
     "CompressedImage": "timestamp=1:Timestamp data=2:bytes format=3:string frame_id=4:string",
     "CameraCalibration": "timestamp=1:Timestamp width=2:fixed32 height=3:fixed32"
     " distortion_model=4:string D=5:double* K=6:double* R=7:double* P=8:double* frame_id=9:string",
@@ -39,17 +49,10 @@ _TYPES: Final = {
     " fields=5:PackedElementField* data=6:bytes",
 }
 """Fields of the messages, ``name=number:type``, with * if repeated; each after those that it needs."""
-_NUMERIC: Final = (
-    "UNKNOWN",
-    "UINT8",
-    "INT8",
-    "UINT16",
-    "INT16",
-    "UINT32",
-    "INT32",
-    "FLOAT32",
-    "FLOAT64",
-)
+_ENUMS: Final = {
+    "PackedElementField.NumericType": "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64",
+}
+"""Their enumerations, by owner and name, numbered from 0."""
 _NUMERIC_OF: Final = {"f4": 7, "f8": 8, "u4": 5, "i4": 6, "u1": 1}
 
 IMAGE, CALIBRATION, CLOUD = "CompressedImage", "CameraCalibration", "PointCloud"
@@ -62,41 +65,69 @@ def schema() -> bytes:
 
 @cache
 def _file() -> descriptor_pb2.FileDescriptorSet:
-    stamp = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    return descriptors(_TYPES, _ENUMS)
+
+
+def descriptors(
+    types: Mapping[str, str], enums: Mapping[str, str]
+) -> descriptor_pb2.FileDescriptorSet:
+    """Descriptors of messages of Foxglove's, and of what of Google's they need.
+
+    Parameters
+    ----------
+    types : mapping
+        Name → fields, ``name=number:type``, with * if repeated; each after those that it needs.
+    enums : mapping
+        ``Owner.Name`` → words, numbered from 0.
+    """
+    needed = " ".join(types.values())
+    used = [file for name, file in _GOOGLE.items() if f":{name}" in needed]
+    google = [descriptor_pb2.FileDescriptorProto.FromString(file.serialized_pb) for file in used]
     file = descriptor_pb2.FileDescriptorProto(
-        name="foxglove.proto", package="foxglove", syntax="proto3", dependency=[stamp.name]
+        name="foxglove.proto",
+        package="foxglove",
+        syntax="proto3",
+        dependency=[file.name for file in google],
     )
-    for name, items in _TYPES.items():
+    for name, items in types.items():
         message = file.message_type.add(name=name)
         for item in items.split():
             label, _, rest = item.partition("=")
             number, _, kind = rest.partition(":")
             field = message.field.add(name=label, number=int(number))
             field.label = _FIELD.LABEL_REPEATED if kind.endswith("*") else _FIELD.LABEL_OPTIONAL
-            _set_type(field, kind.removesuffix("*"))
-    enum = next(m for m in file.message_type if m.name == "PackedElementField").enum_type
-    numeric = enum.add(name="NumericType")
-    for number, word in enumerate(_NUMERIC):
-        numeric.value.add(name=word, number=number)
-    return descriptor_pb2.FileDescriptorSet(file=[stamp, file])
+            _set_type(field, kind.removesuffix("*"), enums)
+        for name_of, words in enums.items():
+            owner, _, own = name_of.partition(".")
+            if owner == name:
+                enum = message.enum_type.add(name=own)
+                for number, word in enumerate(words.split()):
+                    enum.value.add(name=word, number=number)
+    return descriptor_pb2.FileDescriptorSet(file=[*google, file])
 
 
-def _set_type(field: descriptor_pb2.FieldDescriptorProto, kind: str) -> None:
+def _set_type(
+    field: descriptor_pb2.FieldDescriptorProto, kind: str, enums: Mapping[str, str]
+) -> None:
     if kind in _SCALARS:
         field.type = _SCALARS[kind]
-    elif kind == "NumericType":
-        field.type, field.type_name = _FIELD.TYPE_ENUM, ".foxglove.PackedElementField.NumericType"
+    elif kind in enums:
+        field.type, field.type_name = _FIELD.TYPE_ENUM, f".foxglove.{kind}"
     else:
-        package = "google.protobuf" if kind == "Timestamp" else "foxglove"
+        package = "google.protobuf" if kind in _GOOGLE else "foxglove"
         field.type, field.type_name = _FIELD.TYPE_MESSAGE, f".{package}.{kind}"
 
 
 @cache
 def message_type(name: str) -> type[Any]:
     """The class of a message."""
+    return class_of(_file(), name)
+
+
+def class_of(files: descriptor_pb2.FileDescriptorSet, name: str) -> type[Any]:
+    """The class of a message that descriptors describe."""
     pool = descriptor_pool.DescriptorPool()
-    for file in _file().file:
+    for file in files.file:
         pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
 
@@ -104,7 +135,7 @@ def message_type(name: str) -> type[Any]:
 def image(pixels: NDArray[np.uint8], time_ns: int, frame_id: str) -> bytes:
     """A picture, (height, width, 3), as ``foxglove.CompressedImage``."""
     out = message_type(IMAGE)(format="png", frame_id=frame_id, data=png(pixels))
-    _stamp(out, time_ns)
+    stamp(out, time_ns)
     return out.SerializeToString()
 
 
@@ -118,7 +149,7 @@ def calibration(width: int, height: int, fov: float, time_ns: int, frame_id: str
     out.K.extend([focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0])
     out.R.extend([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
     out.P.extend([focal, 0.0, x, 0.0, 0.0, focal, y, 0.0, 0.0, 0.0, 1.0, 0.0])
-    _stamp(out, time_ns)
+    stamp(out, time_ns)
     return out.SerializeToString()
 
 
@@ -129,7 +160,7 @@ def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
     out.pose.orientation.w = 1.0
     for name, (kind, offset, *_) in (points.dtype.fields or {}).items():
         out.fields.add(name=name, offset=offset, type=_NUMERIC_OF[kind.str[1:]])
-    _stamp(out, time_ns)
+    stamp(out, time_ns)
     return out.SerializeToString()
 
 
@@ -152,25 +183,6 @@ def _plain(value: Any) -> Any:
             return value
 
 
-def png(pixels: NDArray[np.uint8]) -> bytes:
-    """A picture, (height, width, 3), as a PNG file.
-
-    Each row is written as its difference to the one above (filter 2), which costs little and makes most
-    pictures a third smaller.
-    """
-    height, width, _ = pixels.shape
-    rows = pixels.reshape(height, -1)
-    lines = np.empty((height, 3 * width + 1), np.uint8)
-    lines[:, 0] = 2
-    lines[0, 1:] = rows[0]
-    lines[1:, 1:] = rows[1:] - rows[:-1]
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
-        for tag, data in parts
-    )
-
-
-def _stamp(message: Any, time_ns: int) -> None:
+def stamp(message: Any, time_ns: int) -> None:
+    """Set the field ``timestamp`` of a message."""
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)

@@ -33,6 +33,7 @@ from sgstore.exporters.clips import (
     tool,
     write_manifest,
 )
+from sgstore.exporters.mcap_graphs import Added, Waiting, is_added
 from sgstore.exporters.mcap_writer import McapWriter
 from sgstore.traces import open_recording
 from sgstore.traces.fetch import digest_of
@@ -40,12 +41,26 @@ from sgstore.traces.mcap_file import CLIP, McapFile
 from sgstore.world import Clip, Loss, TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from mcap.records import Channel
+
+    from sgstore.exporters.export import Export
     from sgstore.traces.chunks import Messages
     from sgstore.traces.osi_file import OsiFile
     from sgstore.world import Bools, Ints
+
+
+def write(export: Export, folder: Path) -> list[WrittenClip]:
+    """Cut the clips of an export out of their recordings; see :func:`write_clips`.
+
+    With ``with_graph`` or labels, every clip has channels more: see :mod:`sgstore.exporters.mcap_graphs`.
+    """
+    added = Added(export) if export.with_graph or export.labels is not None else None
+    return _write_into(
+        folder, export.clips, export.sources(), dict(export.provenance), added, export.tell
+    )
 
 
 def write_clips(
@@ -83,7 +98,6 @@ def write_clips(
         A recording cannot be read.
     """
     told = provenance_of(dict(provenance or {}))
-    names = [clip_name(clip.trace, number, ".mcap") for number, clip in enumerate(clips, 1)]
     for clip in clips:
         if clip.trace not in sources:
             known = ", ".join(sorted(sources)) or "none"
@@ -92,18 +106,38 @@ def write_clips(
             raise ExportError(
                 f"a clip of {clip.trace!r} ends at {clip.end_ns} ns, before its start"
             )
-    written: dict[int, WrittenClip] = {}
-    with export_folder(to, names) as folder:
-        for trace in dict.fromkeys(clip.trace for clip in clips):
-            with open_recording(sources[trace].path) as recording:
-                source = _survey(recording, sources[trace])
-                for number, clip in enumerate(clips):
-                    if clip.trace == trace:
-                        file = folder / names[number]
-                        written[number] = _write_clip(recording, source, clip, file, told)
-        result = [written[number] for number in range(len(clips))]
+    with export_folder(to, _names(clips)) as folder:
+        result = _write_into(folder, clips, sources, told)
         write_manifest(folder, result)
     return [_moved(clip, to) for clip in result]
+
+
+def _names(clips: Sequence[Clip]) -> list[str]:
+    return [clip_name(clip.trace, number, ".mcap") for number, clip in enumerate(clips, 1)]
+
+
+def _write_into(
+    folder: Path,
+    clips: Sequence[Clip],
+    sources: Mapping[str, Source],
+    told: dict[str, str],
+    added: Added | None = None,
+    tell: Callable[[int, int], None] | None = None,
+) -> list[WrittenClip]:
+    """Clips in the order in which they were asked for, written recording by recording."""
+    names = _names(clips)
+    written: dict[int, WrittenClip] = {}
+    for trace in dict.fromkeys(clip.trace for clip in clips):
+        with open_recording(sources[trace].path) as recording:
+            source = _survey(recording, sources[trace])
+            for number, clip in enumerate(clips):
+                if clip.trace != trace:
+                    continue
+                cutting = _Cutting(recording, source, clip, told, added, number + 1)
+                written[number] = cutting.write(folder / names[number])
+                if tell is not None:
+                    tell(len(written), len(clips))
+    return [written[number] for number in range(len(clips))]
 
 
 @dataclass(slots=True)
@@ -194,93 +228,125 @@ class _Cut:
         return rows, context[rows]
 
 
-def _write_clip(
-    recording: McapFile | OsiFile, found: _Surveyed, clip: Clip, file: Path, told: dict[str, str]
-) -> WrittenClip:
-    losses = found.losses_within(clip)
-    with file.open("xb") as stream:
-        writer = McapWriter(stream, recording.profile, tool(), recording.compression)
-        losses += _write_head(writer, recording, found, clip, told)
-        context = _write_messages(writer, recording, _Cut.of(clip, found))
-        writer.finish()
-    if sum(writer.counts.values()) == context:
-        raise ExportError(
-            f"{found.source.path}: no message between {clip.start_ns} and {clip.end_ns} ns; the recording"
-            f" has them from {found.start_ns} to {found.end_ns} ns"
-        )
-    _validate(file, writer.counts)
-    return WrittenClip(
-        file=file,
-        sha256=digest_of(file),
-        trace=clip.trace,
-        source=found.source.path.name,
-        source_sha256=found.digest,
-        start_ns=clip.start_ns,
-        end_ns=clip.end_ns,
-        messages=_counts(recording, writer.counts),
-        context=context,
-        losses=tuple(losses),
-        provenance=told,
-    )
+@dataclass(slots=True)
+class _Cutting:
+    """One clip on its way into a file. ``number``: of the clip in its export, counted from 1."""
 
+    recording: McapFile | OsiFile
+    found: _Surveyed
+    clip: Clip
+    told: dict[str, str]
+    added: Added | None
+    number: int
 
-def _write_head(
-    writer: McapWriter,
-    recording: McapFile | OsiFile,
-    found: _Surveyed,
-    clip: Clip,
-    told: dict[str, str],
-) -> list[Loss]:
-    """Definitions, metadata and attachments of the source, and what makes the file a clip of it."""
-    losses: list[Loss] = []
-    for _, schema in sorted(recording.schemas.items()):
-        writer.define(schema)
-    for _, channel in sorted(recording.channels.items()):
-        writer.define(channel)
-    for place in sorted(recording.metadata, key=lambda place: place.offset):
-        record = recording.metadata[place]
-        if record.name != CLIP:  # of a source that is a clip itself: this one takes its place
-            writer.metadata(record.name, record.metadata)
-    own = {
-        "trace": clip.trace,
-        "start_ns": str(clip.start_ns),
-        "end_ns": str(clip.end_ns),
-        "source": found.source.path.name,
-        "source_sha256": found.digest,
-    }
-    writer.metadata(CLIP, {**told, **own})
-    for place in recording.attachments:
-        try:
-            writer.attachment(recording.pieces(place))
-        except (struct.error, UnicodeDecodeError):
-            reason = "an attachment is malformed and was left out"
-            losses.append(Loss(reason, 0, place.length, offset=place.offset))
-    return losses
-
-
-def _write_messages(writer: McapWriter, recording: McapFile | OsiFile, cut: _Cut) -> int:
-    """The messages of a clip; returns how many of them are context."""
-    carried = 0
-    for run in recording.walk(TraceReport(), cut.chunks.__contains__):
-        for row, context in zip(*cut.rows(run), strict=True):
-            channel = int(run.channel[row])
-            late = (run.chunk_offset, int(run.offset[row])) in cut.late
-            if late and writer.counts[channel]:
-                continue
-            carried += bool(context)
-            writer.message(
-                channel,
-                int(run.sequence[row]),
-                int(run.log_time_ns[row]),
-                int(run.publish_time_ns[row]),
-                run.data(int(row)),
+    def write(self, file: Path) -> WrittenClip:
+        """Write it, test it, and tell of it."""
+        losses = self.found.losses_within(self.clip)
+        with file.open("xb") as stream:
+            recording = self.recording
+            writer = McapWriter(stream, recording.profile, tool(), recording.compression)
+            losses += self._write_head(writer)
+            context = self._write_messages(writer, _Cut.of(self.clip, self.found))
+            writer.finish()
+        own = {n: k for n, k in writer.counts.items() if n in recording.channels}
+        if sum(own.values()) == context:
+            raise ExportError(
+                f"{self.found.source.path}: no message between {self.clip.start_ns} and {self.clip.end_ns} ns;"
+                f" the recording has them from {self.found.start_ns} to {self.found.end_ns} ns"
             )
-    return carried
+        _validate(file, writer.counts)
+        return WrittenClip(
+            file=file,
+            sha256=digest_of(file),
+            trace=self.clip.trace,
+            source=self.found.source.path.name,
+            source_sha256=self.found.digest,
+            start_ns=self.clip.start_ns,
+            end_ns=self.clip.end_ns,
+            messages=(
+                *_counts(recording, self._kept(), writer.counts),
+                *self._counts_added(writer.counts),
+            ),
+            context=context,
+            losses=tuple(losses),
+            provenance=self.told,
+        )
+
+    def _write_head(self, writer: McapWriter) -> list[Loss]:
+        """Definitions, metadata and attachments of the source, and what makes the file a clip of it."""
+        losses: list[Loss] = []
+        recording = self.recording
+        for _, schema in sorted(recording.schemas.items()):
+            writer.define(schema)
+        for _, channel in sorted(self._kept().items()):
+            writer.define(channel)
+        if self.added is not None:
+            for record in self.added.definitions(recording.schemas, recording.channels):
+                writer.define(record)
+        for place in sorted(recording.metadata, key=lambda place: place.offset):
+            record = recording.metadata[place]
+            if record.name != CLIP:  # of a source that is a clip itself: this one takes its place
+                writer.metadata(record.name, record.metadata)
+        own = {
+            "trace": self.clip.trace,
+            "start_ns": str(self.clip.start_ns),
+            "end_ns": str(self.clip.end_ns),
+            "source": self.found.source.path.name,
+            "source_sha256": self.found.digest,
+        }
+        writer.metadata(CLIP, {**self.told, **own})
+        for place in recording.attachments:
+            try:
+                writer.attachment(recording.pieces(place))
+            except (struct.error, UnicodeDecodeError):
+                reason = "an attachment is malformed and was left out"
+                losses.append(Loss(reason, 0, place.length, offset=place.offset))
+        return losses
+
+    def _kept(self) -> dict[int, Channel]:
+        """Channels of the source: all, but for those that this clip brings anew."""
+        channels = dict(self.recording.channels)
+        if self.added is None:
+            return channels
+        return {number: channel for number, channel in channels.items() if not is_added(channel)}
+
+    def _counts_added(self, counts: dict[int, int]) -> list[ChannelCount]:
+        if self.added is None:
+            return []
+        return [
+            ChannelCount(n, topic, schema, counts[n]) for n, topic, schema in self.added.channels()
+        ]
+
+    def _write_messages(self, writer: McapWriter, cut: _Cut) -> int:
+        """The messages of a clip, and what is added to them; returns how many of them are context."""
+        carried, kept = 0, self._kept()
+        more = () if self.added is None else self.added.messages(self.number)
+        waiting = Waiting(writer, more)
+        for run in self.recording.walk(TraceReport(), cut.chunks.__contains__):
+            for row, context in zip(*cut.rows(run), strict=True):
+                channel = int(run.channel[row])
+                late = (run.chunk_offset, int(run.offset[row])) in cut.late
+                if channel not in kept or (late and writer.counts[channel]):
+                    continue
+                carried += bool(context)
+                log_time = int(run.log_time_ns[row])
+                waiting.write_before(log_time)
+                writer.message(
+                    channel,
+                    int(run.sequence[row]),
+                    log_time,
+                    int(run.publish_time_ns[row]),
+                    run.data(int(row)),
+                )
+        waiting.write_rest()
+        return carried
 
 
-def _counts(recording: McapFile | OsiFile, counts: dict[int, int]) -> tuple[ChannelCount, ...]:
+def _counts(
+    recording: McapFile | OsiFile, channels: Mapping[int, Channel], counts: dict[int, int]
+) -> tuple[ChannelCount, ...]:
     result: list[ChannelCount] = []
-    for number, channel in sorted(recording.channels.items()):
+    for number, channel in sorted(channels.items()):
         schema = recording.schemas.get(channel.schema_id)
         name = schema.name if schema else ""
         result.append(ChannelCount(number, channel.topic, name, counts[number]))
