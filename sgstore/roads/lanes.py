@@ -72,10 +72,38 @@ class PlainLane:
     speed_limit: float = np.nan
 
 
+@dataclass(frozen=True, slots=True)
+class PlainSignal:
+    """A traffic light or sign.
+
+    Attributes
+    ----------
+    name, kind : str
+        Its id, and one of :data:`sgstore.vocabulary.SIGNALS`.
+    x, y, z, heading : float
+        Where it stands and faces; m, rad. NaN: not known.
+    lanes : tuple of int
+        Lanes that it applies to, by their number.
+    """
+
+    name: str
+    kind: str
+    x: float = np.nan
+    y: float = np.nan
+    z: float = np.nan
+    heading: float = np.nan
+    lanes: tuple[int, ...] = ()
+
+
 def road_map_of(
-    lanes: Sequence[PlainLane], *, name: str, text: str, warnings: Iterable[str] = ()
+    lanes: Sequence[PlainLane],
+    signals: Sequence[PlainSignal] = (),
+    *,
+    name: str,
+    text: str,
+    warnings: Iterable[str] = (),
 ) -> RoadMap:
-    """The road map that plain lanes make; ``text`` is what they were read from.
+    """The road map that plain lanes and signals make; ``text`` is what they were read from.
 
     Raises
     ------
@@ -85,12 +113,13 @@ def road_map_of(
     ribbons = ribbons_of(lanes)
     surfaces = plain_nodes(lanes, ribbons)
     roads, junctions = _roads(lanes, ribbons), _junctions(lanes)
-    nodes = MapNodes.joined([MapNodes.of("off_road", ["off_road"]), surfaces, roads, junctions])
+    off_road = MapNodes.of("off_road", ["off_road"])
+    nodes = MapNodes.joined([off_road, surfaces, roads, junctions, _signals(signals)])
     return RoadMap(
         name=name,
         text=text,
         nodes=nodes,
-        edges=_edges(lanes, ribbons, roads, junctions),
+        edges=_edges(lanes, ribbons, roads, junctions, signals),
         ribbons=ribbons,
         shapes=np.full(len(nodes), None, object),
         lane_changes=_lane_changes(lanes),
@@ -207,8 +236,21 @@ def _junctions(lanes: Sequence[PlainLane]) -> MapNodes:
     return MapNodes.of("junction", names, junction=names)
 
 
+def _signals(signals: Sequence[PlainSignal]) -> MapNodes:
+    columns = {
+        name: np.array([getattr(signal, name) for signal in signals], np.float64)
+        for name in ("x", "y", "z", "heading")
+    }
+    kinds = [signal.kind for signal in signals]
+    return MapNodes.of(kinds, [signal.name for signal in signals], **columns)
+
+
 def _edges(
-    lanes: Sequence[PlainLane], ribbons: Ribbons, roads: MapNodes, junctions: MapNodes
+    lanes: Sequence[PlainLane],
+    ribbons: Ribbons,
+    roads: MapNodes,
+    junctions: MapNodes,
+    signals: Sequence[PlainSignal],
 ) -> MapEdges:
     first_road = _FIRST_LANE + len(lanes)
     first_junction = first_road + len(roads)
@@ -239,6 +281,14 @@ def _edges(
     }
     parts = {"isIn": np.array(within, np.int64).reshape(-1, 2)}
     parts |= {relation: _FIRST_LANE + pairs for relation, pairs in among_lanes.items()}
+    first_signal = first_junction + len(junctions)
+    controls = [
+        (first_signal + row, _FIRST_LANE + lane)
+        for row, signal in enumerate(signals)
+        for lane in signal.lanes
+        if lanes[lane].type in DRIVING
+    ]
+    parts["controlsTrafficOf"] = np.array(controls, np.int64).reshape(-1, 2)
     return edges_of([(relation, pairs[:, 0], pairs[:, 1]) for relation, pairs in parts.items()])
 
 

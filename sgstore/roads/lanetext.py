@@ -5,10 +5,11 @@ The text is JSON, one lane a line, so that people can read it and tools can comp
     {"format": "sgstore lanes", "version": 1, "warnings": [], "lanes": [
     {"name": "1/0/-1", "type": "driving", …, "left": [x, y, x, y, …], "right": […], "z": […], "onto": [1]},
     …
-    ]}
+    ], "signals": [{"name": "7", "kind": "traffic_light", "x": 1.5, "y": -3.0, "lanes": [0]}]}
 
-Lengths are rounded to a tenth of a millimetre when the text is written, and the map is always made from the
-text: what is read back is what was there before. Texts come from files, so nothing in them is trusted.
+``signals`` is left out where there are none. Lengths are rounded to a tenth of a millimetre when the text is
+written, and the map is always made from the text: what is read back is what was there before. Texts come from
+files, so nothing in them is trusted.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import MapError
-from sgstore.roads.lanes import PlainLane, road_map_of
+from sgstore.roads.lanes import PlainLane, PlainSignal, road_map_of
+from sgstore.vocabulary import SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -33,6 +35,7 @@ VERSION: Final = 1
 
 MAX_CHARACTERS: Final = 128 << 20
 MAX_LANES: Final = 100_000
+MAX_SIGNALS: Final = 100_000
 MAX_SECTIONS: Final = 4_000_000
 """Greatest number of cross sections of all lanes."""
 MAX_COORDINATE: Final = 1e8
@@ -46,6 +49,7 @@ DIGITS: Final = 4
 """Digits that are kept of a length in metres."""
 
 _NAMES: Final = ("name", "type", "road", "junction")
+_POSE: Final = ("x", "y", "z", "heading")
 _RELATED: Final = ("onto", "left_beside", "right_beside", "against")
 
 
@@ -54,11 +58,17 @@ def is_lane_text(text: str) -> bool:
     return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
 
 
-def lane_text(lanes: Sequence[PlainLane], warnings: Iterable[str] = ()) -> str:
-    """The text of plain lanes; ``warnings`` are kept in it."""
+def lane_text(
+    lanes: Sequence[PlainLane],
+    warnings: Iterable[str] = (),
+    signals: Sequence[PlainSignal] = (),
+) -> str:
+    """The text of plain lanes and signals; ``warnings`` are kept in it."""
     head = {"format": FORMAT, "version": VERSION, "warnings": list(warnings)}
     rows = ",\n".join(_dumps(_fields(lane)) for lane in lanes)
-    return f'{_dumps(head)[:-1]}, "lanes": [\n{rows}\n]}}\n'
+    more = ",\n".join(_dumps(_signal_fields(signal)) for signal in signals)
+    more = f', "signals": [\n{more}\n]' if more else ""
+    return f'{_dumps(head)[:-1]}, "lanes": [\n{rows}\n]{more}}}\n'
 
 
 def read_lane_text(text: str, name: str) -> RoadMap:
@@ -89,7 +99,9 @@ def read_lane_text(text: str, name: str) -> RoadMap:
     lanes = [_lane(row, number, len(rows)) for number, row in enumerate(rows)]
     if sum(len(lane.z) for lane in lanes) > MAX_SECTIONS:
         raise MapError(f"more than {MAX_SECTIONS:,} cross sections", element="lanes")
-    return road_map_of(lanes, name=name, text=text, warnings=warnings)
+    return road_map_of(
+        lanes, _signals(document, len(lanes)), name=name, text=text, warnings=warnings
+    )
 
 
 def _dumps(value: Any) -> str:
@@ -116,6 +128,26 @@ def _fields(lane: PlainLane) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value not in ("", [])}
 
 
+def _signal_fields(signal: PlainSignal) -> dict[str, Any]:
+    """A signal as JSON has it; what is missing is left out."""
+    places = {key: round(getattr(signal, key), DIGITS) for key in _POSE}
+    told = {key: place for key, place in places.items() if math.isfinite(place)}
+    return {"name": signal.name, "kind": signal.kind, **told, "lanes": list(signal.lanes)}
+
+
+def _signals(document: dict[str, Any], lanes: int) -> list[PlainSignal]:
+    rows = document.get("signals", [])
+    if not isinstance(rows, list) or len(rows) > MAX_SIGNALS:
+        raise MapError(f"expected a list of at most {MAX_SIGNALS:,} signals", element="signals")
+    found: list[PlainSignal] = []
+    for number, row in enumerate(rows):
+        if not isinstance(row, dict):
+            raise MapError(f"signal {number} is no object", element="signals")
+        fields: dict[str, Any] = row
+        found.append(_Row(fields, number, lanes, "signal").signal())
+    return found
+
+
 def _lane(row: Any, number: int, lanes: int) -> PlainLane:
     if not isinstance(row, dict):
         raise MapError(f"lane {number} is no object", element="lanes")
@@ -124,10 +156,11 @@ def _lane(row: Any, number: int, lanes: int) -> PlainLane:
 
 
 class _Row:
-    """A lane of a text; whatever is asked of it is what it must be, or a :class:`MapError` says what is not."""
+    """A lane or signal; whatever is asked of it is what it must be, or a :class:`MapError` says what is not."""
 
-    def __init__(self, fields: dict[str, Any], number: int, lanes: int) -> None:
+    def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str = "lane") -> None:
         self._fields = fields
+        self._what = what
         self._number = number
         self._lanes = lanes
 
@@ -154,8 +187,27 @@ class _Row:
             speed_limit=self._speed(),
         )
 
+    def signal(self) -> PlainSignal:
+        if self._fields.get("kind") not in SIGNALS:
+            raise self._wrong("kind", f"one of {', '.join(SIGNALS)}")
+        return PlainSignal(
+            self._text("name"),
+            self._text("kind"),
+            lanes=self._related("lanes"),
+            **{key: self._place(key) for key in _POSE},
+        )
+
     def _wrong(self, key: str, expected: str) -> MapError:
-        return MapError(f"lane {self._number}: expected {expected}", element=f"lanes/{key}")
+        reason = f"{self._what} {self._number}: expected {expected}"
+        return MapError(reason, element=f"{self._what}s/{key}")
+
+    def _place(self, key: str) -> float:
+        value = self._fields.get(key, math.nan)
+        if key in self._fields and (
+            type(value) not in {int, float} or not abs(value) < MAX_COORDINATE
+        ):
+            raise self._wrong(key, f"a number below {MAX_COORDINATE:.0e}")
+        return float(value)
 
     def _text(self, key: str) -> str:
         value = self._fields.get(key, "")

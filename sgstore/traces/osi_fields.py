@@ -36,6 +36,10 @@ _VECTOR: Final = dict.fromkeys(("x", "y", "z"))
 _ANGLES: Final = dict.fromkeys(("roll", "pitch", "yaw"))
 _EXTENTS: Final = dict.fromkeys(("length", "width", "height"))
 _ID: Final = {"id": {"value": None}}
+_ASSIGNED: Final = {
+    "assigned_lane_id": {"value": None},
+    "logical_lane_assignment": {"assigned_lane_id": {"value": None}},
+}
 _REFERENCES: Final = {"source_reference": {"type": None, "identifier": None}}
 _STATIC_BASE: Final = {"dimension": _EXTENTS, "position": _VECTOR, "orientation": _ANGLES}
 _LIGHT_STATE: Final = dict.fromkeys(
@@ -70,7 +74,10 @@ MOVING_OBJECT_FIELDS: Final[dict[str, Any]] = {
 TRAFFIC_LIGHT_FIELDS: Final[dict[str, Any]] = {
     **_ID,
     "base": _STATIC_BASE,
-    "classification": dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
+    "classification": {
+        **dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
+        **_ASSIGNED,
+    },
     **_REFERENCES,
 }
 """Fields of ``osi3.TrafficLight`` that are read."""
@@ -89,7 +96,11 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
         **_ID,
         "main_sign": {
             "base": _STATIC_BASE,
-            "classification": {"type": None, "value": {"value": None, "value_unit": None}},
+            "classification": {
+                "type": None,
+                "value": {"value": None, "value_unit": None},
+                **_ASSIGNED,
+            },
         },
         **_REFERENCES,
     },

@@ -126,7 +126,11 @@ class FrameDecoder:
             leading
         ].objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
-        self._lights = TrafficLights(self.roster, light_class(survey.leads[leading].message))
+        self._lights = TrafficLights(
+            self.roster,
+            light_class(survey.leads[leading].message),
+            {bulb: one.name for bulb, one in survey.signals.items()},
+        )
         self._environment = Environment(survey.leads[leading].message, self.roster)
         self._frames = 0
 

@@ -13,7 +13,7 @@ Source: open-simulation-interface 3.8.0 (osi_lane.proto, osi_logicallane.proto).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -31,7 +31,8 @@ from sgstore.roads.lanelines import (
     about_lanes,
     plain_lanes,
 )
-from sgstore.roads.lanetext import OF_LANES, lane_text
+from sgstore.roads.lanes import PlainLane, PlainSignal
+from sgstore.roads.lanetext import MAX_NAME, OF_LANES, lane_text
 from sgstore.roads.sections import Sections
 from sgstore.traces.osi_schema import (
     DECODE_ERRORS,
@@ -52,6 +53,9 @@ if TYPE_CHECKING:
 
 FIELDS: Final = ("lane", "lane_boundary", "logical_lane", "logical_lane_boundary")
 """Fields of a ground truth that make up a map."""
+
+OWN: Final = "osi:"
+"""Before the OSI id of a light or sign that refers to no map, as its name in the map of the lanes."""
 
 _PLACE: Final = dict.fromkeys(("x", "y", "z"))
 _ID: Final = {"value": None}
@@ -140,6 +144,19 @@ _FAR: Final = 1e8
 """Greatest distance of a place from the origin; m."""
 
 
+@dataclass(frozen=True, slots=True)
+class LaneSignal:
+    """A light or sign that is assigned to lanes.
+
+    ``pose``: columns of :data:`sgstore.world.POSE`; ``lanes``: ids of physical or logical lanes.
+    """
+
+    name: str
+    kind: str
+    pose: tuple[float, ...]
+    lanes: tuple[int, ...]
+
+
 def _paths(fields: dict[str, Any]) -> Iterator[str]:
     """Paths to all fields that a lane must have, with dots between the names."""
     for name, inner in fields.items():
@@ -200,8 +217,10 @@ class OsiLanes:
         if number and warning not in self.warnings:
             self.warnings.append(warning)
 
-    def text(self) -> tuple[str, str]:
+    def text(self, signals: Iterable[LaneSignal] = ()) -> tuple[str, str]:
         """The text of the road map, and what the recording calls the map; empty if it tells no lanes.
+
+        ``signals``: what applies to lanes; of those that are called alike the first one counts.
 
         Raises
         ------
@@ -224,11 +243,33 @@ class OsiLanes:
                 areas += self._guarded(_area, ident, lane, borders)
             else:
                 lines += self._guarded(_physical_line, ident, lane, borders)
-        plain, warnings = plain_lanes(_sections_numbered(lines), areas)
+        lines = _sections_numbered(lines)
+        plain, warnings = plain_lanes(lines, areas)
         self.warnings += [about_lanes(which, what) for what, which in self._broken.items()]
         if not plain:
             return "", ""
-        return lane_text(plain, [*self.warnings, *warnings]), self._name()
+        rows = self._rows(lines, plain)
+        named = {
+            one.name: _plain_signal(one, [row for lane in one.lanes for row in rows.get(lane, ())])
+            for one in reversed([*signals])
+        }
+        found = [one for one in reversed(named.values()) if one.lanes and len(one.name) <= MAX_NAME]
+        return lane_text(plain, [*self.warnings, *warnings], found), self._name()
+
+    def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
+        """Id of each lane → numbers of the plain lanes that it is."""
+        row_of = {lane.name: row for row, lane in enumerate(plain)}
+        rows: dict[int, list[int]] = {}
+        for line in lines:
+            name = line.name or line.ident
+            row = row_of.get(name, row_of.get(f"{name}#{line.ident}"))
+            if row is None:
+                continue
+            ident = int(line.ident)
+            logical = self._told["logical_lane"].get(ident)
+            for lane in {ident, *(_physical(logical) if logical is not None else ())}:
+                rows.setdefault(lane, []).append(row)
+        return rows
 
     def _guarded(
         self, read: Callable[[Any, _Borders], Any], ident: int, lane: Any, borders: _Borders
@@ -255,6 +296,11 @@ class OsiLanes:
         if not (np.abs(line) < _FAR).all():
             raise ValueError("a point of it is no place")
         return line
+
+
+def _plain_signal(signal: LaneSignal, lanes: Iterable[int]) -> PlainSignal:
+    x, y, z, heading = signal.pose[:4]
+    return PlainSignal(signal.name, signal.kind, x, y, z, heading, tuple(sorted(set(lanes))))
 
 
 class _Borders:

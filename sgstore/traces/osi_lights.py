@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.traces.frames import FAR, NAN
+from sgstore.traces.osi_lanes import OWN, LaneSignal
 from sgstore.traces.osi_schema import (
     DECODE_ERRORS,
+    assigned_lanes,
     enum_name,
     has_field,
     lights_of,
@@ -29,7 +31,7 @@ from sgstore.vocabulary import LIGHT_STATE_CODE, TypeMeaning
 from sgstore.world import POSE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from sgstore.traces.frames import Roster
     from sgstore.world import Floats, Ints
@@ -89,6 +91,8 @@ class _Head:
     node: int
     map_ref: str
     pose: tuple[float, ...]
+    first: int
+    lanes: set[int] = field(default_factory=set[int])
     bulbs: dict[int, int] = field(default_factory=dict[int, int])
     bottom: float = math.inf
     top: float = -math.inf
@@ -116,6 +120,8 @@ class TrafficLights:
         Takes up each head as an entity of kind ``traffic_light``; its ident is the id of its first bulb.
     message : type or None
         Class of the bulbs; ``None``: the recording's version of OSI has none that could be read.
+    names : mapping, optional
+        First bulb of a head that refers to no map → name of the signal that it is in the map of the lanes.
 
     Attributes
     ----------
@@ -123,9 +129,15 @@ class TrafficLights:
         Bulbs that are malformed.
     """
 
-    def __init__(self, roster: Roster, message: type[Any] | None) -> None:
+    def __init__(
+        self,
+        roster: Roster,
+        message: type[Any] | None,
+        names: Mapping[int, str] | None = None,
+    ) -> None:
         self._roster = roster
         self._class = message
+        self._names = names or {}
         self._has_service = message is not None and has_field(
             message, "classification.is_out_of_service"
         )
@@ -163,6 +175,19 @@ class TrafficLights:
             return
         head.bulbs[bulb.id.value] = self._lit(bulb.classification)
 
+    def signals(self) -> dict[int, LaneSignal]:
+        """First bulb of each head that is assigned to lanes → the signal that it is."""
+        return {
+            head.first: LaneSignal(
+                head.map_ref or f"{OWN}{head.first}",
+                "traffic_light",
+                head.pose,
+                tuple(sorted(head.lanes)),
+            )
+            for head in self._heads
+            if head.lanes
+        }
+
     def rows(self) -> tuple[Ints, Floats, Ints]:
         """Rows of the heads that have a place: node ids, columns :data:`POSE`, states."""
         return self._rows
@@ -183,19 +208,20 @@ class TrafficLights:
         """The head that a bulb belongs to, which may be a new one."""
         ident = bulb.id.value
         pose = static_pose(bulb.base) or (NAN,) * 16
-        ref = map_ref(bulb)
+        ref, lanes = map_ref(bulb), assigned_lanes(bulb.classification)
         head = self._by_ref.get(ref) if ref else self._beside(pose)
         if head is None:
             icon = enum_name(bulb.classification, "icon")
             meaning = TypeMeaning("traffic_light", subkind=_SUBKINDS.get(icon, ""))
-            node = self._roster.enter(str(ident), meaning, icon, ref)
-            head = _Head(node, ref, pose)
+            name = ref or self._names.get(ident, "")
+            head = _Head(self._roster.enter(str(ident), meaning, icon, name), ref, pose, ident)
             self._heads.append(head)
             if ref:
                 self._by_ref[ref] = head
             elif not math.isnan(pose[0]):
                 self._by_cell.setdefault(_cell(pose), []).append(head)
         head.join(pose)
+        head.lanes.update(lanes)
         self._head_of[ident] = head
         return head
 

@@ -267,6 +267,25 @@ def map_ref(thing: Any) -> str:
     return ""
 
 
+def assigned_lanes(classification: Any) -> list[int]:
+    """Ids of the physical and logical lanes that a light or sign is told to apply to.
+
+    Raises
+    ------
+    ValueError
+        There are more than any has.
+    """
+    physical = getattr(classification, "assigned_lane_id", ())
+    logical = getattr(classification, "logical_lane_assignment", ())
+    if len(physical) + len(logical) > MAX_REFERENCES:
+        reason = (
+            f"assigned to {len(physical) + len(logical)} lanes; at most {MAX_REFERENCES} are read"
+        )
+        raise ValueError(reason)
+    idents = [*physical, *(one.assigned_lane_id for one in logical)]
+    return list(dict.fromkeys(int(ident.value) for ident in idents))
+
+
 def static_pose(base: Any) -> tuple[float, ...] | None:
     """Pose and size of what does not move: the columns of :data:`sgstore.world.POSE`.
 

@@ -14,8 +14,16 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.opendrive.objects import kind_of_object
-from sgstore.traces.osi_schema import DECODE_ERRORS, enum_name, has_field, map_ref, static_pose
-from sgstore.vocabulary import ENTITY_KINDS, TypeMeaning, type_meanings
+from sgstore.traces.osi_lanes import OWN, LaneSignal
+from sgstore.traces.osi_schema import (
+    DECODE_ERRORS,
+    assigned_lanes,
+    enum_name,
+    has_field,
+    map_ref,
+    static_pose,
+)
+from sgstore.vocabulary import ENTITY_KINDS, SIGNALS, TypeMeaning, type_meanings
 
 if TYPE_CHECKING:
     from sgstore.traces.frames import Roster
@@ -40,6 +48,7 @@ class _Static:
     map_ref: str
     pose: tuple[float, ...]
     unmapped: bool
+    lanes: tuple[int, ...] = ()
 
 
 @dataclass(slots=True)
@@ -99,14 +108,24 @@ class Statics:
         meaning = type_meanings().get(f"{prefix}_{type_name}".lower(), TypeMeaning(otherwise))
         if meaning.kind == "speed_limit":
             meaning = _with_value(meaning, told.classification)
+        lanes = assigned_lanes(told.classification) if meaning.kind in SIGNALS else []
         self._found[key] = _Static(
             ident=str(number),
             meaning=meaning,
             type_name=type_name,
-            map_ref=map_ref(thing),
+            map_ref=map_ref(thing) or (f"{OWN}{number}" if lanes else ""),
             pose=pose,
             unmapped=meaning.kind == "sign" and (type_name in UNTOLD or type_name[-1].isdigit()),
+            lanes=tuple(lanes),
         )
+
+    def signals(self) -> list[LaneSignal]:
+        """The signs that are assigned to lanes."""
+        return [
+            LaneSignal(thing.map_ref, thing.meaning.kind, thing.pose, thing.lanes)
+            for thing in self._found.values()
+            if thing.lanes
+        ]
 
 
 def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:

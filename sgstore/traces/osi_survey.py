@@ -15,9 +15,11 @@ import numpy as np
 
 from sgstore.errors import MapError, TraceError
 from sgstore.roads.lanetext import OF_LANES
+from sgstore.traces.frames import Roster
 from sgstore.traces.osi_cast import Cast
 from sgstore.traces.osi_lanes import FIELDS as LANE_FIELDS
-from sgstore.traces.osi_lanes import OsiLanes
+from sgstore.traces.osi_lanes import LaneSignal, OsiLanes
+from sgstore.traces.osi_lights import TrafficLights
 from sgstore.traces.osi_schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
@@ -145,6 +147,10 @@ class Survey:
         What is odd but lost nothing.
     window : tuple of int
         Log times, both included, between which messages are frames.
+    signals : dict
+        First bulb of each traffic light that is assigned to lanes → the signal of the map of its lanes.
+    lights : dict
+        Channel id → all traffic lights, as messages of that channel are to be read.
     """
 
     leads: dict[int, Lead] = field(default_factory=dict[int, Lead])
@@ -157,6 +163,8 @@ class Survey:
     others: dict[int, tuple[int, Ref]] = field(default_factory=dict[int, tuple[int, Ref]])
     notes: list[str] = field(default_factory=list[str])
     window: tuple[int, int] = (0, 0)
+    signals: dict[int, LaneSignal] = field(default_factory=dict[int, LaneSignal])
+    lights: dict[int, TrafficLights] = field(default_factory=dict[int, TrafficLights])
 
     def leading(self) -> int | None:
         """The channel with most frames, a ground truth before a sensor view; ``None`` if none has any.
@@ -219,6 +227,9 @@ def survey(recording: Recording) -> Survey:
             else:
                 _look_at_frame(result, channel, run, int(row))
     if not result.map_text:
+        leading = result.leading()
+        lights = result.lights.get(leading) if leading is not None else None
+        result.signals = {} if lights is None else lights.signals()
         _make_map_of_lanes(result, recording.path.stem)
     return result
 
@@ -230,7 +241,9 @@ def _make_map_of_lanes(result: Survey, name: str) -> None:
         if lead.lanes is None:
             continue
         try:
-            result.map_text, told = lead.lanes.text()
+            result.map_text, told = lead.lanes.text(
+                [*result.signals.values(), *result.statics.signals()]
+            )
         except MapError as error:
             lead.lanes.warnings.append(str(error))
         else:
@@ -269,6 +282,7 @@ def _meet(recording: Recording, channel: int, result: Survey, maps: dict[int, ty
     except TraceError as error:
         lanes = None
         result.notes.append(f"its lanes cannot be read: {error.reason}")
+    result.lights[channel] = TrafficLights(Roster(TraceReport()), light_class(message))
     result.leads[channel] = Lead(
         name, message, object_class(message), _Latch(present, light_class(message)), lanes
     )
@@ -302,6 +316,8 @@ def _look_at_frame(result: Survey, channel: int, run: Messages, row: int) -> Non
         ground = ground_truth_of(message)
         if lead.latch.look(ground, ref_of(run, row)) and lead.lanes is not None:
             lead.lanes.take(data)
+        for lights in result.lights.values():
+            lights.update(ground)
         result.statics.look(ground, lead.latch.fields, log_time)
         result.cast.look(message, lead.objects)
     except DECODE_ERRORS:  # counted as a loss when the frames are read
