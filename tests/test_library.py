@@ -1,0 +1,232 @@
+"""The library of named patterns: each finds the scene that is drawn beside it, and not its counter-example."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import library_page
+import pytest
+from library_scenes import SCENES, traces
+from scenes import APART, store_of
+from test_temporal import FORMULAS, never, property_named
+
+from sgstore.demo import RECORDING
+from sgstore.errors import QueryError, QueryNameError
+from sgstore.ingest import ingest
+from sgstore.lang import pattern, patterns
+from sgstore.lang.parser import parse
+from sgstore.lang.standard import entries, predicates, scenario
+from sgstore.lang.syntax import Check, Define, Match
+from sgstore.query import Store
+from sgstore.temporal import formula_of
+
+if TYPE_CHECKING:
+    from sgstore.temporal import Formula
+
+FOUND = [name for name, one in patterns().items() if one.kind in {"concept", "scenario"}]
+STATES = [
+    n for n in FOUND if not re.search(r"^(THEN|FOR|UNTIL)", patterns()[n].query, re.MULTILINE)
+]
+RULES = [name for name, one in patterns().items() if one.kind == "property"]
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A store of the bundled recording."""
+    path = tmp_path_factory.mktemp("library") / "sample.sgstore"
+    ingest(path, [RECORDING])
+    return Store(path)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A store of all scenes."""
+    found, _ = traces()
+    return store_of(tmp_path_factory.mktemp("library") / "scenes.sgstore", found)
+
+
+PLACES = traces()[1]
+
+
+def found_in(store: Store, name: str) -> list[tuple[str, int]]:
+    """The scenes, as trace and number in it, in which a pattern is found."""
+    intervals = store.find(patterns()[name].text).intervals()
+    return sorted({(i.trace, int(i.start // APART)) for i in intervals})
+
+
+# What is in it ----------------------------------------------------------------------------------------------
+
+
+def test_the_library_has_what_it_says() -> None:
+    kinds = [(one.library, one.kind) for one in patterns().values()]
+
+    assert kinds.count(("leaderboard", "scenario")) == 48
+    assert kinds.count(("concepts", "concept")) >= 20
+    assert kinds.count(("sgsm", "property")) == 2 * 9
+    assert kinds.count(("sceneflow", "property")) >= 8
+    assert kinds.count(("std", "predicate")) >= 25
+
+
+@pytest.mark.parametrize("name", patterns())
+def test_a_text_is_one_sentence_of_its_kind(name: str) -> None:
+    one = patterns()[name]
+    (statement,) = parse(one.text)
+    kind = {"predicate": Define, "property": Check}.get(one.kind, Match)
+
+    assert isinstance(statement, kind)
+    assert one.sentence.endswith(".")
+    if isinstance(statement, Define | Check):
+        assert statement.name == name
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_a_pattern_is_a_scenario_that_queries_may_use(name: str) -> None:
+    definition = scenario(name)
+
+    assert definition is not None
+    assert definition.name == name
+    assert [p.name for p in definition.parameters] == [*patterns()[name].parameters]
+
+
+def test_every_pattern_has_a_drawn_example() -> None:
+    drawn = {name for name, one in patterns().items() if one.example}
+
+    assert drawn == set(SCENES) == {*FOUND, *RULES}
+
+
+def test_the_page_and_the_drawings_are_up_to_date() -> None:
+    again = "python tests/library_page.py makes it again"
+
+    assert library_page.DRAWINGS.read_text(encoding="utf-8") == library_page.drawings(), again
+    assert library_page.PAGE.read_text(encoding="utf-8") == library_page.page(), again
+
+
+# Names, parameters, files -----------------------------------------------------------------------------------
+
+
+def test_a_name_may_be_written_otherwise_where_only_one_is_meant() -> None:
+    assert pattern("Hard-Braking".replace("-", "")).name == "hard_braking"
+    assert pattern("CutIn").library == "leaderboard"
+    assert pattern("cut_in").library == "concepts"
+    with pytest.raises(QueryNameError, match="'CUTIN' may be cut_in or CutIn"):
+        pattern("CUTIN")
+
+
+def test_a_name_that_is_not_there_gets_a_suggestion() -> None:
+    with pytest.raises(QueryNameError) as caught:
+        pattern("jaywalkin")
+
+    assert caught.value.hint == "did you mean 'jaywalking'?"
+    assert scenario("nothing_like_it") is None
+    assert scenario("stopped") is None
+
+
+def test_parameters_are_written_into_the_text_as_their_types_are() -> None:
+    cut_in = pattern("cut_in")
+
+    assert "$" not in cut_in.text
+    assert "THEN WITHIN 4s" in cut_in.text
+    assert "THEN WITHIN 2.5s" in cut_in.written(within=2.5)
+    assert "THEN WITHIN 300ms" in cut_in.written(within="300ms")
+    assert "< 0.5 * e.speed" in cut_in.written(headway=0.5)
+    assert "ego.speed > 12" in pattern("phi4").written(S="12")
+
+
+@pytest.mark.parametrize("value", ["soon", True, float("nan"), "2; MATCH (e)", None, "-1s", -1])
+def test_a_value_of_another_type_is_refused(value: object) -> None:
+    with pytest.raises(QueryError, match="parameter 'within' cannot be") as caught:
+        pattern("cut_in").written(within=value)
+
+    assert caught.value.hint == "expected a duration such as 4s"
+
+
+def test_a_parameter_that_a_pattern_does_not_have_is_refused() -> None:
+    with pytest.raises(QueryNameError, match="cut_in has no parameter 'speed'") as caught:
+        pattern("cut_in").written(speed=3)
+
+    assert caught.value.hint == "it has: headway, within, hold"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("-- recipe x: S.\nMATCH (e)", "line 2: expected '-- KIND NAME: sentence'"),
+        ("MATCH (e)", "line 1: expected '-- KIND NAME: sentence'"),
+        ("-- concept x: S.\n-- param a: 3", "line 2: expected '-- param NAME = DEFAULT: meaning'"),
+        ("-- concept x: S.\n-- param a = soon: m", "line 2: expected '-- param NAME = DEFAULT"),
+        ("-- concept x: S.\n-- param a = 3: m\nMATCH (e)", "'a' is not both told and used"),
+        ("-- concept x: S.\n-- source: s\nMATCH (e) LIMIT $n", "'n' is not both told and used"),
+        ("-- concept x: S.\nMATCH (e)", "'x': it has no source"),
+        ("-- concept x: S.\n-- source: s\n", "'x': it has no text"),
+    ],
+)
+def test_a_file_that_cannot_be_read_says_where(text: str, reason: str) -> None:
+    with pytest.raises(QueryError, match=rf"^mine\.sgql.*{re.escape(reason)}"):
+        list(entries(text, "mine"))
+
+
+def test_what_a_head_says_may_take_several_lines() -> None:
+    head = "-- concept x: One\n--   two.\n-- param a = 3: m,\n--   n\n-- source: s\n--   t\n"
+    text = head + "MATCH (e) LIMIT $a\n\n-- end"
+    (one,) = entries(text, "mine")
+
+    assert (one.sentence, one.source, one.parameters["a"].meaning) == ("One two.", "s t", "m, n")
+    assert one.text == "MATCH (e) LIMIT 3"
+
+
+def test_predicates_are_looked_up_without_regard_to_case() -> None:
+    assert predicates()["hardbrake"].name == "hard_brake"
+    assert "cutin" not in predicates()
+    assert len(predicates()) == len([*predicates()])
+
+
+# Rules of SGSM are the published formulas -------------------------------------------------------------------
+
+
+def published(name: str) -> Formula:
+    """A rule as coded, as a formula over the propositions that SGSM published under the names of its atoms."""
+    text = pattern(f"{name.lower()}_as_coded").text.split(":", 1)[1]
+    view = pattern("nothing_in_view").query.split(" AS", 1)[1]
+    text = text.replace("nothing_in_view()", f"({view})")
+    text = re.sub(r"ego_is_faster_than\(\d+\)", "ego_is_faster_than_s", text)
+    text = text.replace("()", "")
+    if found := re.fullmatch(r"\s*NOT EVENTUALLY run_length\((.*)\) >= (\d+)frames\s*", text):
+        # A run of n frames that ends somewhere: SGSM's $[n][…].
+        row = formula_of(found[1].replace("is_in_junction", "is_in_juntion"))
+        return never(row, int(found[2]))
+    return formula_of(text)
+
+
+@pytest.mark.parametrize("name", [*sorted({n.split("_")[0] for n in FORMULAS}), "Phi7", "Phi8"])
+def test_a_rule_of_sgsm_is_the_formula_whose_published_verdicts_are_met(name: str) -> None:
+    known = {"Phi4": "Phi4_S_15", "Phi7": "Phi7_T_5", "Phi8": "Phi8_T_5"}.get(name, name)
+
+    assert published(name) == property_named(known)
+
+
+# What they find ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_pattern_can_be_asked_of_the_sample(sample: Store, name: str) -> None:
+    matches = sample.find(patterns()[name].text)
+
+    assert all(interval.trace == "town" for interval in matches.intervals())
+    assert matches.left_out == ()
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_pattern_finds_its_drawn_example_and_not_its_counter_example(
+    scenes: Store, name: str
+) -> None:
+    example, *others = PLACES[name]
+    found = found_in(scenes, name)
+
+    assert example in found
+    assert not set(others) & set(found)
+
+
+@pytest.mark.parametrize("name", [n for n in FOUND if patterns()[n].kind == "concept"])
+def test_a_concept_has_a_counter_example(name: str) -> None:
+    assert len(PLACES[name]) == 2
