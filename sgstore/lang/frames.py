@@ -1,31 +1,26 @@
 """Bound patterns → SQL, second phase: conditions and results that need values of single frames.
 
 The frames that the first phase leaves are joined with ``state`` (and the tables of constants) for each node
-whose values are asked for. Numbers of pairs are computed in layers, one statement within the other, so that
-each part has a name and is computed once; a condition stands in the first layer that has all its parts. Of
-``gap`` and ``ttc``, which are dear, a cheap lower bound is compared before.
+whose values are asked for; numbers of pairs are computed around that join (:mod:`sgstore.lang.layers`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang.bound import (
     BlockValue,
-    Bound,
     EdgeAttribute,
     EdgeRelation,
     FrameAttribute,
     NodeAttribute,
     NodeValue,
-    Operation,
     PairNumber,
     Scope,
     TraceAttribute,
     nodes_of,
 )
-from sgstore.lang.catalog import Home, Type, Unit
+from sgstore.lang.catalog import Home, Unit
 from sgstore.lang.formulas import (
     Aliases,
     Leaf,
@@ -43,7 +38,8 @@ from sgstore.lang.formulas import (
 )
 from sgstore.lang.kinds import Profile, homes_of, kind_conditions
 from sgstore.lang.lasting import HELD, join_lasting
-from sgstore.lang.pairs import WAY, needed_for, pair_column, pair_text, stage_of, way_text
+from sgstore.lang.layers import Join, Layers, bounds, column_of, named
+from sgstore.lang.pairs import WAY, way_text
 from sgstore.lang.phases import Given, Phases, apart
 from sgstore.lang.sql import Masks
 
@@ -54,37 +50,6 @@ PATTERN: Final = '":pattern"'
 FRAME: Final = '":frame"'
 TRACE: Final = '":trace"'
 MAP: Final = '":map"'
-_DEAR: Final = {"gap", "ttc"}
-_LESS: Final = {"<", "<=", "="}
-_MORE: Final = {">", ">=", "="}
-
-
-@dataclass(slots=True)
-class Join:
-    """The join of the second phase in the making.
-
-    Attributes
-    ----------
-    select : Select
-    frame : str
-        The column of the frame; empty as long as there is none.
-    nodes, edges : dict of str to str
-        Node → the column of its id, edge → the column of its relation.
-    at : dict of str to Aliases
-        Tables of a node's values that are joined.
-    texts : dict of Leaf to str
-        Values that are there, as they are computed.
-    lanes : set of str
-        Aliases of the rows that are joined for attributes of edges.
-    """
-
-    select: Select = field(default_factory=Select)
-    frame: str = ""
-    nodes: dict[str, str] = field(default_factory=dict[str, str])
-    edges: dict[str, str] = field(default_factory=dict[str, str])
-    at: dict[str, Aliases] = field(default_factory=dict[str, Aliases])
-    texts: dict[Leaf, str] = field(default_factory=dict[Leaf, str])
-    lanes: set[str] = field(default_factory=set[str])
 
 
 class Frames(Masks):
@@ -114,7 +79,7 @@ class Frames(Masks):
         wanted = list(dict.fromkeys(columns))
         if HELD in wanted and not (parts.rest or parts.late):
             return self._by_buckets(scope, parts, given, nodes, edges, wanted)
-        conditions = [*parts.rest, *_bounds(parts.rest)]
+        conditions = [*parts.rest, *bounds(parts.rest)]
         needed = list(dict.fromkeys([*(leaf for c in conditions for leaf in leaves(c)), *wanted]))
         join = Join()
         bound = nodes | {key for leaf in needed for key in nodes_of(leaf)}
@@ -124,8 +89,8 @@ class Frames(Masks):
         ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation)}
         given = self._first_phase(join, scope, parts, given, bound, ties, needed)
         self._second_phase(join, scope, parts, given, needed)
-        layers = _Layers(join, needed, conditions)
-        text = layers.text(self, columns_of(nodes, edges), wanted)
+        layers = Layers(join, needed, conditions)
+        text = layers.text(self.values, columns_of(nodes, edges), wanted)
         hidden = bound | parts.late > nodes or ties > edges
         return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
 
@@ -150,7 +115,7 @@ class Frames(Masks):
                 texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
         columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
         columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
-        select.columns = [_named(text, name) for name, text in columns.items()]
+        select.columns = [named(text, name) for name, text in columns.items()]
         return select.text()
 
     def _ends(self, scope: Scope, needed: list[Leaf]) -> set[str]:
@@ -168,7 +133,7 @@ class Frames(Masks):
         ties: frozenset[str],
         needed: list[Leaf],
     ) -> Given | None:
-        """What the first phase leaves, one row a frame; what it gives to the blocks of the second."""
+        """What the first phase leaves, and its frames; what it gives to the blocks of the second."""
         if parts.empty:
             return None
         nodes = bound - parts.late
@@ -177,11 +142,56 @@ class Frames(Masks):
         if blocks:
             given = Given(self.share(text, "pattern"), nodes, ties)
             text = Select(["*"], [quoted(given.name)]).text()
-        join.select.join(nested(self.expanded(text, nodes, ties), PATTERN[1:-1]), [])
-        join.frame = f'{PATTERN}."frame_id"'
         join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
         join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
+        leader = self._leader(scope, parts, nodes, needed)
+        if leader is None:
+            join.select.join(nested(self.expanded(text, nodes, ties), PATTERN[1:-1]), [])
+            join.frame = f'{PATTERN}."frame_id"'
+        else:
+            join.select.join(nested(text, PATTERN[1:-1]), [])
+            self._join_leader(join, scope, leader)
         return given
+
+    def _leader(
+        self, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
+    ) -> str | None:
+        """The node whose states bring the frames with them, so that masks need not be expanded.
+
+        The many states are then looked up in the few rows of the first phase, rather than these, one row a
+        frame, among the states. Only where a query chooses traces it is better to say which frames are asked.
+        """
+        if parts.trace or (scope is self.query.scope and self.query.ego is not None):
+            return None
+        moving = [
+            key
+            for key in sorted({key for leaf in needed for key in _valued(leaf)} & nodes)
+            if Profile.of(scope.kinds(key), self.catalog).places == 1
+            and Home.state in self._homes(scope, key, needed)
+        ]
+        others = [key for key in moving if scope.kinds(key).other]
+        return next(iter(others or moving), None)
+
+    def _join_leader(self, join: Join, scope: Scope, key: str) -> None:
+        alias = quoted(key)
+        frame = f'{alias}."frame_id"'
+        on = [f'{frame} >> 6 = {PATTERN}."bucket"', f'{alias}."node_id" = {join.nodes[key]}']
+        on += self._of_kinds(scope, key, alias)
+        join.select.join(f'"state" AS {alias}', [*on, self.in_mask(PATTERN, frame)])
+        join.select.where += self.within(frame, 64)
+        join.frame = frame
+        join.at[key] = Aliases(state=alias)
+
+    def _of_kinds(self, scope: Scope, key: str, state: str) -> list[str]:
+        """Conditions that keep states to what a node may be."""
+        return kind_conditions(
+            scope.kinds(key), f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
+        )
+
+    def _homes(self, scope: Scope, key: str, needed: list[Leaf]) -> set[Home]:
+        """Where the values of a node that are needed live."""
+        of_it = [leaf for leaf in needed if key in _valued(leaf)]
+        return _homes(of_it, Profile.of(scope.kinds(key), self.catalog))
 
     def _second_phase(
         self, join: Join, scope: Scope, parts: Phases, given: Given | None, needed: list[Leaf]
@@ -194,11 +204,10 @@ class Frames(Masks):
             for a, b in apart(scope, set(join.nodes), parts.late)
         ]
         if parts.empty:
-            join.select.where += self.within(join.frame, 64)
             join.select.where += self.of_traces(f"{join.frame} >> 24", scope)
         self._join_rows(join, scope, parts, needed)
         for key in sorted({key for leaf in needed for key in _valued(leaf)}):
-            self._join_values(join, scope, key, [leaf for leaf in needed if key in _valued(leaf)])
+            self._join_values(join, scope, key, self._homes(scope, key, needed))
         for leaf in needed:
             self._say(join, scope, given, leaf)
 
@@ -206,10 +215,9 @@ class Frames(Masks):
         """A node that is bound by its state in the frame."""
         alias = quoted(key)
         on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
-        on += kind_conditions(
-            scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', self.catalog.moving
-        )
+        on += self._of_kinds(scope, key, alias)
         join.select.join(f'"state" AS {alias}', on)
+        join.select.where += self.within(f'{alias}."frame_id"', 64)
         join.frame = join.frame or f'{alias}."frame_id"'
         join.nodes[key] = f'{alias}."node_id"'
         join.at[key] = Aliases(state=alias)
@@ -238,19 +246,15 @@ class Frames(Masks):
             on = [f'{MAP}."map_id" = {TRACE}."map_id"']
             join.select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
 
-    def _join_values(self, join: Join, scope: Scope, key: str, needed: list[Leaf]) -> None:
+    def _join_values(self, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
         """The tables that some values of a node come from."""
-        kinds = scope.kinds(key)
-        profile = Profile.of(kinds, self.catalog)
-        homes = _homes(needed, profile)
+        profile = Profile.of(scope.kinds(key), self.catalog)
         at, node = join.at.get(key, Aliases()), join.nodes[key]
         state, entity, part = at.state, None, None
         if Home.state in homes and state is None:
             state = quoted(key)
             on = [f'{state}."frame_id" = {join.frame}', f'{state}."node_id" = {node}']
-            on += kind_conditions(
-                kinds, f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
-            )
+            on += self._of_kinds(scope, key, state) + self.within(f'{state}."frame_id"', 64)
             alone = profile.places == 1
             join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
         if homes & {Home.entity, Home.scenery}:
@@ -342,151 +346,6 @@ class Frames(Masks):
             value = expression_text(leaf.value, lambda part: quoted(column_of(part)), self.values)
             select.columns.append(f'{leaf.word.lower()}({value}) AS "value"')
         return select.text()
-
-
-@dataclass(slots=True)
-class _Layers:
-    """The statements around a join that compute numbers of pairs and test conditions."""
-
-    join: Join
-    needed: list[Leaf]
-    conditions: list[Bound]
-
-    def text(self, writer: Frames, keys: list[str], wanted: list[Leaf]) -> str:
-        """The whole: frame, keys and the values that are wanted."""
-        pairs = [
-            leaf for leaf in self.needed if isinstance(leaf, PairNumber) and leaf.function != WAY
-        ]
-        last = max((stage_of(pair.function) for pair in pairs), default=0)
-        innermost = self.join.select
-        innermost.where += [
-            expression_text(c, self.join.texts.__getitem__, writer.values)
-            for c in self.conditions
-            if _stage(c) == 0
-        ]
-        ids = {quoted(f"{k}.id"): v for k, v in self.join.nodes.items()}
-        ids |= {quoted(f"{k}.type"): v for k, v in self.join.edges.items()}
-        names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
-        texts = {quoted(column_of(leaf)): text for leaf, text in self.join.texts.items()}
-        known = {'"frame_id"': self.join.frame, **ids, **texts}
-        if last == 0:
-            innermost.columns = [_named(known[n], n) for n in dict.fromkeys(names)]
-            return innermost.text()
-        carried = dict.fromkeys([*names, *texts])
-        innermost.columns = [_named(known[n], n) for n in carried if n in known]
-        innermost.columns += [_named(text, n) for n, text in self._raw(pairs).items()]
-        text = innermost.text()
-        for stage in range(1, last + 1):
-            text = self._layer(writer, text, stage, pairs)
-        final = Select(list(dict.fromkeys(names)), [nested(text, f":layer {last}")])
-        final.where = self._tests(writer, last)
-        return final.text()
-
-    def _layer(self, writer: Frames, text: str, stage: int, pairs: list[PairNumber]) -> str:
-        select = Select(["*"], [nested(text, f":layer {stage - 1}")])
-        parts = dict.fromkeys(
-            (name, pair.a, pair.b)
-            for pair in pairs
-            for name in sorted(needed_for(pair.function))
-            if stage_of(name) == stage
-        )
-        select.columns += [_named(pair_text(*part), pair_column(*part)) for part in parts]
-        select.where = self._tests(writer, stage - 1) if stage > 1 else []
-        return select.text()
-
-    def _tests(self, writer: Frames, stage: int) -> list[str]:
-        return [
-            expression_text(c, lambda leaf: quoted(column_of(leaf)), writer.values)
-            for c in self.conditions
-            if _stage(c) == stage
-        ]
-
-    def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
-        """The raw columns that numbers of pairs are made of."""
-        columns: dict[str, str] = {}
-        for pair in pairs:
-            for name in sorted(needed_for(pair.function)):
-                if stage_of(name) == 0:
-                    key = pair.a if name[0] == "a" else pair.b
-                    columns[pair_column(name, pair.a, pair.b)] = _raw_text(
-                        name[1:], self.join.at[key]
-                    )
-        return columns
-
-
-def _raw_text(name: str, at: Aliases) -> str:
-    """A raw column of a node, wherever it lives; positions about the trace's origin."""
-    parts: list[str] = []
-    if at.state:
-        parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")
-    if at.entity and name not in {"vx", "vy"}:
-        parts.append(f"CAST({at.entity}.{quoted(name)} AS DOUBLE)")
-    if at.map and name not in {"vx", "vy"}:
-        value = f"{at.map}.{quoted(name)}"
-        parts.append(f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value)
-    if not parts:
-        return "CAST(NULL AS DOUBLE)"
-    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
-
-
-def _named(text: str, name: str) -> str:
-    return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
-
-
-def column_of(leaf: Leaf) -> str:
-    """The name of the column of a value."""
-    match leaf:
-        case NodeValue(node=owner):
-            name = "id"
-        case NodeAttribute(node=owner, attribute=attribute):
-            name = attribute.name
-        case EdgeRelation(edge=owner):
-            name = "type"
-        case EdgeAttribute(edge=owner, attribute=attribute):
-            name = attribute.name
-        case FrameAttribute(attribute=attribute):
-            owner, name = "frame", attribute.name
-        case TraceAttribute(attribute=attribute):
-            owner, name = "trace", attribute.name
-        case PairNumber(function=function, a=a, b=b):
-            return f"{function}({a}, {b})"
-        case BlockValue(number=number):
-            return f"block {number}"
-    return f"{owner}.{name}"
-
-
-def _stage(condition: Bound) -> int:
-    """The layer after which a condition can be tested."""
-    found = [leaf for leaf in leaves(condition) if isinstance(leaf, PairNumber)]
-    return max((stage_of(pair.function) for pair in found), default=0)
-
-
-def _bounds(conditions: list[Bound]) -> list[Bound]:
-    """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
-    found: list[Bound] = []
-    for condition in conditions:
-        match condition:
-            case Operation(word, (PairNumber() as pair, limit)) if word in _LESS:
-                found += _bound(pair, limit)
-            case Operation(word, (limit, PairNumber() as pair)) if word in _MORE:
-                found += _bound(pair, limit)
-            case _:
-                pass
-    return found
-
-
-def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
-    if pair.function not in _DEAR or any(_dear(leaf) for leaf in leaves(limit)):
-        return []
-    least = PairNumber("at_least", pair.a, pair.b)
-    if pair.function == "ttc":
-        closing = PairNumber("closing_speed", pair.a, pair.b)
-        limit = Operation("*", (limit, closing), Type.number)
-    return [Operation("<=", (least, limit), Type.boolean)]
-
-
-def _dear(leaf: Leaf) -> bool:
-    return isinstance(leaf, PairNumber) and leaf.function in _DEAR
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:

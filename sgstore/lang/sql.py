@@ -199,6 +199,10 @@ class Masks(Presence, ABC):
         select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
         return select.text()
 
+    def in_mask(self, alias: str, frame: str) -> str:
+        """Whether a frame of the same bucket is one of those in which a row of the first phase holds."""
+        return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
+
     def number_of_frames(self, text: str) -> str:
         """How many frames a relation of the first phase that binds nothing speaks of, as ``frames``."""
         total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
