@@ -68,7 +68,8 @@ class Entities:
     static : (n,) bool
         Whether it never moves: its pose comes once, in :attr:`FrameBlock.scenery`.
     map_ref : tuple of str
-        Id of the OpenDRIVE signal or object that this entity is, or the empty string.
+        Id of the OpenDRIVE signal or object that this entity is, or the empty string. Of a signal that the map
+        does not have: the lanes that it applies to, as :func:`sgstore.roads.lanes_ref` names them.
     """
 
     first: int
@@ -476,18 +477,17 @@ def _as_kept(states: States, origin: Origin) -> States:
     A float32 has 24 bits. If the sum of the origin and one has bits below those of a float64, rounding takes
     some off its end, and the difference to the origin fits into 24 bits all the more.
     """
-    columns = {name: _widened(getattr(states, name)) for name in KEPT}
-    columns["heading"] = _widened(turned(states.heading))
-    for name in ("x", "y", "z"):
-        zero = getattr(origin, name)
-        columns[name] = zero + _widened(getattr(states, name) - zero)
-    return replace(states, **columns)
-
-
-def _widened(values: Floats) -> Floats:
-    """The float32 nearest to values, NaN where there is none."""
-    kept = number(values).astype(np.float64)
-    return np.where(np.isfinite(kept), kept, np.nan)
+    if not len(states):
+        return states
+    # All columns at once: a frame that comes alone is a few dozen rows.
+    names = (*KEPT, "heading", "x", "y", "z")
+    shift = np.array([0.0] * (len(names) - 3) + [origin.x, origin.y, origin.z])[:, None]
+    given = [getattr(states, name) for name in KEPT]
+    given += [turned(states.heading), states.x, states.y, states.z]
+    kept = number(np.stack(given) - shift).astype(np.float64)
+    kept[~np.isfinite(kept)] = np.nan
+    kept[-3:] += shift[-3:]
+    return replace(states, **dict(zip(names, kept, strict=True)))
 
 
 def turned(heading: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,10 @@ from opendrive_maps import a_map, a_road, element, lane, line, link, section
 
 from sgstore.exporters import Source
 from sgstore.exporters.mcap import write_clips
+from sgstore.ingest import examine, ingest
 from sgstore.opendrive import read_map
+from sgstore.roads import lanes_ref
+from sgstore.store import StoreFile
 from sgstore.traces import open_trace
 from sgstore.traces.carla_lights import Light, signals_of
 from sgstore.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
@@ -316,6 +320,57 @@ def test_lights_that_no_signal_tells_the_lanes_of_are_counted(path: Path, text: 
         bridge.objects(0.0, [vehicle(1)])
 
     assert any(w.startswith("2 traffic lights are no signal") for w in read(path)[2].warnings)
+
+
+BOX = {"centre": (-11.75, 23, -3)}
+"""Of a light at (120, 10) that faces along y: on the lane that leads to the signal ``forth``."""
+
+
+def without_signals() -> RoadMap:
+    return read_map(re.sub(r"<signals>.*?</signals>", "", crossing().text, flags=re.DOTALL), "bare")
+
+
+def test_a_light_that_the_map_does_not_have_applies_to_the_lanes_of_its_box() -> None:
+    road_map = without_signals()
+    lights = {
+        1: Light(120, 20, 5, 0, (97.0, -1.75, 0.0, 0.0, 3.0, 3.0)),
+        2: Light(120, 20, 5, 0, (97.0, -8.0, 0.0, 0.0, 3.0, 3.0)),
+    }
+
+    found = signals_of(lights, road_map)
+
+    assert found == {1: lanes_ref(["1/0/-1"])}
+    (lane,) = road_map.lanes_of_signal(found[1]).tolist()
+    assert road_map.nodes.name[-1 - lane] == "1/0/-1"
+    assert road_map.lanes_of_signal(lanes_ref(["9/0/-1"])).tolist() == []
+    assert road_map.lanes_of_signal("lanes:{").tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("road_map", "lanes"), [(crossing(), {"2/0/-1"}), (without_signals(), {"1/0/-1"})]
+)
+def test_lights_find_their_lanes_in_a_map_that_is_given(
+    path: Path, tmp_path: Path, road_map: RoadMap, lanes: set[str]
+) -> None:
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        bridge.light_places([light(80, 120, 10, math.pi / 2, **BOX)])
+        bridge.objects(0.0, [vehicle(1, 95.0, -1.75)])
+    given = tmp_path / "m.xodr"
+    given.write_text(road_map.text)
+
+    (outcome,) = ingest(tmp_path / "s.db", [path], road_map=given)
+
+    assert outcome.status == "added"
+    assert not any("for which lanes" in warning for warning in outcome.warnings)
+    assert not any(
+        "for which lanes" in warning for warning in examine(path, road_map=given).warnings
+    )
+    found = StoreFile(tmp_path / "s.db").rows(
+        "SELECT DISTINCT l.name FROM edges e JOIN entities n ON n.node_id = e.src"
+        " JOIN lanes l ON l.node_id = e.dst WHERE e.relation = 'controlsTrafficOf' AND n.ident = '80'"
+    )
+    assert {name for (name,) in found.values} == lanes
 
 
 # What a clip needs --------------------------------------------------------------------------------

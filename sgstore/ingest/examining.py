@@ -13,7 +13,7 @@ from sgstore.config import Config
 from sgstore.errors import SgstoreError
 from sgstore.ingest.maps import Maps
 from sgstore.ingest.tally import Tally
-from sgstore.traces import open_recording, open_trace
+from sgstore.traces import on_map, open_recording, open_trace
 from sgstore.world import BUCKET_FRAMES, Loss, TraceReport
 
 if TYPE_CHECKING:
@@ -166,6 +166,7 @@ def _read(
         _tell(found, trace.info, channels)
         used, odd = maps.of(trace.info)
         found.road_map = used.name if used else ""
+        on_map(trace, used)
         try:
             for block in trace.blocks(2 * BUCKET_FRAMES):
                 tally.see(block)

@@ -17,7 +17,7 @@ from sgstore.ingest.tally import Tally
 from sgstore.relations.keeping import renamed
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import Segment, StoreFile, new_segment
-from sgstore.traces import open_trace
+from sgstore.traces import on_map, open_trace
 from sgstore.vocabulary import KIND_CODE, kinds_labelled
 
 if TYPE_CHECKING:
@@ -108,6 +108,7 @@ class Reading:
             mapping=job.config.mapping,
         ) as trace:
             road_map, odd = self._maps.of(trace.info)
+            on_map(trace, road_map)
             wanted = [one for one in self._wanted(trace, views) if self._is_new(one, road_map)]
             if job.dry_run:
                 for one in wanted:

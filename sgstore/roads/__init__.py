@@ -11,6 +11,7 @@ Nodes. Every part of a map that can be a node of a scene graph has a node id bel
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import chain
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from sgstore.roads.footprints import LaneIndex
 from sgstore.roads.lanegraph import FARTHEST, LaneGraph, Reach
 from sgstore.roads.ribbons import LanePoints, Ribbons, lane_polygons, waypoints
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE
+from sgstore.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -42,6 +43,7 @@ __all__ = [
     "Ribbons",
     "RoadMap",
     "first_sections",
+    "lanes_ref",
 ]
 
 OFF_ROAD: Final = -1
@@ -400,7 +402,19 @@ class RoadMap:
         return row[order], -1 - columns[place][order]
 
     def lanes_of_signal(self, signal: str) -> Ints:
-        """Node ids of the driving lanes that an OpenDRIVE signal applies to; empty for an unknown id."""
+        """Node ids of the driving lanes that an OpenDRIVE signal applies to; empty for an unknown id.
+
+        The lanes of a signal that the map does not have may be told by :func:`lanes_ref` instead of its id.
+        """
+        if signal.startswith(_LANES_REF):
+            names = _names_in(signal)
+            nodes = self.nodes
+            found = [
+                -1 - column
+                for column in range(len(nodes))
+                if nodes.lane_type[column] in DRIVING and nodes.name[column] in names
+            ]
+            return np.array(found, np.int64)
         return self._controlled.get(signal, np.zeros(0, np.int64))
 
     def waypoints(self, spacing: float) -> LanePoints:
@@ -525,6 +539,22 @@ class RoadMap:
         controls = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
         src, dst = self.edges.src[controls], self.edges.dst[controls]
         return {self.nodes.name[-1 - node]: dst[src == node] for node in np.unique(src).tolist()}
+
+
+_LANES_REF: Final = "lanes:"
+
+
+def lanes_ref(names: Iterable[str]) -> str:
+    """What stands for the id of a signal that a map does not have, but of which the lanes are known by name."""
+    return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
+
+
+def _names_in(ref: str) -> set[str]:
+    try:
+        told = json.loads(ref.removeprefix(_LANES_REF))
+    except (ValueError, RecursionError):
+        return set()
+    return {name for name in told if isinstance(name, str)} if isinstance(told, list) else set()
 
 
 def first_sections(nodes: MapNodes) -> Ints:

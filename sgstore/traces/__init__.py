@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
 
 from sgstore.errors import TraceError
 from sgstore.traces.carla import CarlaTrace
@@ -28,6 +28,7 @@ from sgstore.world import TraceReport
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from sgstore.roads import RoadMap
     from sgstore.traces.recording import Recording
     from sgstore.world import FrameBlock, TraceInfo
 
@@ -38,6 +39,7 @@ __all__ = [
     "Trace",
     "digest_of",
     "mark_of",
+    "on_map",
     "open_recording",
     "open_trace",
     "read_message",
@@ -170,6 +172,20 @@ def open_trace(
     except BaseException:
         recording.close()
         raise
+
+
+def on_map(trace: Trace, road_map: RoadMap | None) -> None:
+    """Tell a trace which road map it is read with, if that matters to its flavour.
+
+    Then the flavour's class has a method ``on_map``; it is called before frames are read.
+    """
+    if isinstance(trace, _OnMap):
+        trace.on_map(road_map)
+
+
+@runtime_checkable
+class _OnMap(Protocol):
+    def on_map(self, road_map: RoadMap | None) -> None: ...
 
 
 def _takes_mapping(reader: Reader) -> bool:

@@ -27,6 +27,7 @@ from sgstore.world import TraceInfo, TraceReport
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from sgstore.roads import RoadMap
     from sgstore.traces.recording import Recording
     from sgstore.world import FrameBlock
 
@@ -117,6 +118,11 @@ class CarlaTrace(Opened):
         )
         topic = self._survey.topic(self._leading)
         yield from self._told(decoder, size, report, topic)
+
+    def on_map(self, road_map: RoadMap | None) -> None:
+        """Find the lanes of traffic lights in the road map that the recording is read with."""
+        if self._survey.lights and road_map is not None:
+            self._signals = signals_of(self._survey.lights, road_map)
 
     def _find_signals(self) -> dict[int, str]:
         """Which signals of the recording's own map its traffic lights are."""

@@ -211,8 +211,8 @@ class FrameDecoder:
             )
         if self._lights.aimless:
             warn(
-                f"{self._lights.aimless} traffic lights are no signal of the recording's road map:"
-                " for which lanes they are is not known"
+                f"{self._lights.aimless} traffic lights are no signal of the road map, and their boxes are on"
+                " none of its lanes: for which lanes they are is not known"
             )
         if self._untimed:
             warn(f"{self._untimed} frames bear no time of their own: their log time is taken")

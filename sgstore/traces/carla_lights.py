@@ -2,7 +2,8 @@
 
 The bridge tells the place of a light and the box on the road that triggers it, but no lane. The lanes are
 those of the signal of the map that it is: the one that stands where it stands, or else the one that applies
-to the lanes of its box, or to those that they lead to.
+to the lanes of its box, or to those that they lead to. A light that the map does not have at all applies to the
+lanes of its box.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.roads import lanes_ref
 from sgstore.traces.carla_channels import ident_of
 from sgstore.traces.cdr import number, records
 from sgstore.traces.frames import FAR, NAN
@@ -86,13 +88,14 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
 
 
 def signals_of(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int, str]:
-    """Id of the signal of a road map that each light is; lights that are none are left out."""
+    """Id of the signal of a road map that each light is, or else the lanes that it applies to by name.
+
+    Lights that are no signal and whose box is on no lane are left out.
+    """
     nodes = road_map.nodes
     columns = np.flatnonzero(nodes.kind == KIND_CODE["traffic_light"])
-    if not len(columns):
-        return {}
     found: dict[int, str] = {}
-    for ident, light in lights.items():
+    for ident, light in lights.items() if len(columns) else ():
         apart = np.hypot(nodes.x[columns] - light.x, nodes.y[columns] - light.y)
         turn = nodes.heading[columns] - light.heading
         turn = np.abs(np.arctan2(np.sin(turn), np.cos(turn)))
@@ -109,7 +112,8 @@ def _by_boxes(
 ) -> dict[int, str]:
     """The signals that apply to the lanes of the boxes of lights, or to those that they lead to.
 
-    Of several signals it is the one that has most of these lanes, then the nearest.
+    Of several signals it is the one that has most of these lanes, then the nearest; without any, the lanes of
+    the box are named.
     """
     nodes, edges = road_map.nodes, road_map.edges
     boxes = np.array([light.box for light in lights.values()], np.float64).reshape(-1, 6)
@@ -128,6 +132,7 @@ def _by_boxes(
             for lane in hits.lane[_through(hits, row, boxes[row])].tolist()
             if nodes.lane_type[-1 - lane] == _DRIVING
         }
+        own = sorted(lanes, reverse=True)
         lanes = lanes.union(*(after.get(lane, ()) for lane in lanes))
         ranked = [
             (-len(lanes & theirs), _apart(nodes.x[place[name]], nodes.y[place[name]], light), name)
@@ -136,6 +141,8 @@ def _by_boxes(
         ]
         if ranked:
             found[ident] = min(ranked)[2]
+        elif own:
+            found[ident] = lanes_ref(nodes.name[-1 - lane] for lane in own)
     return found
 
 
