@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import library_page
@@ -203,6 +204,22 @@ def test_a_rule_of_sgsm_is_the_formula_whose_published_verdicts_are_met(name: st
     known = {"Phi4": "Phi4_S_15", "Phi7": "Phi7_T_5", "Phi8": "Phi8_T_5"}.get(name, name)
 
     assert published(name) == property_named(known)
+
+
+# Examples of the literature ---------------------------------------------------------------------------------
+
+TEXT = (Path(__file__).parent / "examples.sgql").read_text(encoding="utf-8")
+EXAMPLES = {one.name: one for one in entries(TEXT, "examples")}
+STATE_EXAMPLES = [
+    n for n, one in EXAMPLES.items() if not one.is_check and not TIME.search(one.query)
+]
+
+
+@pytest.mark.parametrize("name", STATE_EXAMPLES)
+def test_an_example_of_the_literature_can_be_asked(sample: Store, name: str) -> None:
+    matches = sample.find(EXAMPLES[name].text)
+
+    assert len(matches.rows()) >= {"e13": 1, "e14": 5, "e18": 1, "e24": 3}.get(name, 0)
 
 
 # What they find ---------------------------------------------------------------------------------------------

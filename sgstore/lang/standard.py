@@ -20,6 +20,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import cache
 from importlib import resources
 from types import MappingProxyType
@@ -217,7 +218,7 @@ def pattern(name: str) -> NamedPattern:
         return found[like[0]]
     if like:
         raise QueryNameError(f"'{name}' may be {' or '.join(like)}", hint="write one of them")
-    near = suggestion(name, found)
+    near = next(iter(get_close_matches(name, found, 1)), suggestion(name, found))
     hint = f"did you mean '{near}'?" if near else "'sgstore patterns list' names them all"
     raise QueryNameError(f"no pattern is called '{name}'", hint=hint)
 

@@ -1,0 +1,128 @@
+"""The verbs about the library: what they print, and how they end."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sgstore.cli import run
+from sgstore.demo import RECORDING
+from sgstore.ingest import ingest
+from sgstore.lang import pattern, patterns
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+OK, USAGE, NO_MATCH = 0, 2, 4
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("library") / "town.sgstore"
+    ingest(path, [RECORDING])
+    return str(path)
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What a command line that ends well prints."""
+    assert run(["patterns", *arguments]) == OK
+    return capsys.readouterr().out
+
+
+def test_list_names_them_all_or_those_of_a_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = json.loads(said(capsys, "list", "--json"))
+
+    assert [row["name"] for row in rows] == [*patterns()]
+    assert rows[0]["sentence"] == pattern("stopped").sentence
+    text = said(capsys, "list", "--kind", "concept")
+    assert "cut_in" in text
+    assert "ParkingExit" not in text
+
+
+def test_show_prints_a_query_that_can_be_asked(
+    capsys: pytest.CaptureFixture[str], store: str, tmp_path: Path
+) -> None:
+    text = said(capsys, "show", "low_ttc")
+    file = tmp_path / "low.sgql"
+    file.write_text(text, encoding="utf-8")
+
+    assert "-- param ttc = 1.5: the largest time to collision; s" in text
+    assert "--   ····e→" in text
+    assert run(["find", store, "-f", str(file), "--count"]) == OK
+    frames = Store(store).find(pattern("low_ttc").text).count()
+    assert capsys.readouterr().out == f"{frames}\n"
+
+
+def test_show_gives_the_same_as_data(capsys: pytest.CaptureFixture[str]) -> None:
+    told = json.loads(said(capsys, "show", "CutIn", "--json"))
+
+    assert told["library"] == "leaderboard"
+    assert told["parameters"][0] == {
+        "name": "within",
+        "type": "duration",
+        "default": "4s",
+        "meaning": "the longest time from the first step to the second",
+    }
+    assert "THEN WITHIN $within" in told["query"]
+    assert told["example"] == pattern("CutIn").example
+
+
+def test_run_finds_when_and_who(capsys: pytest.CaptureFixture[str], store: str) -> None:
+    lines = said(capsys, "run", store, "merge_conflict").splitlines()
+    rows = json.loads(said(capsys, "run", store, "merge_conflict", "--json"))
+
+    assert lines[0].split()[:9] == ["from", "start", "end", "frames", "e", "a", "c", "b", "v"]
+    assert lines[2].startswith("town#")
+    assert len(rows) == len(lines) - 2
+    assert {row["trace"] for row in rows} == {"town"}
+    assert all(row["start"] <= row["end"] for row in rows)
+
+
+def test_run_takes_parameters(capsys: pytest.CaptureFixture[str], store: str) -> None:
+    few, many = (
+        sum(
+            row["frames"]
+            for row in json.loads(said(capsys, "run", store, "low_ttc", f"ttc={t}", "--json"))
+        )
+        for t in (0.8, 3)
+    )
+
+    assert 0 < few < many
+
+
+def test_run_gives_clips_of_a_pattern(capsys: pytest.CaptureFixture[str], store: str) -> None:
+    arguments = ("run", store, "merge_conflict", "--clips", "--json")
+    bare = json.loads(said(capsys, *arguments))
+    wide = json.loads(said(capsys, *arguments, "--before", "500ms", "--after", "1s"))
+
+    assert int(wide[0]["start_ns"]) == int(bare[0]["start_ns"]) - 500_000_000
+    assert [set(clip) for clip in bare] == [{"trace", "start_ns", "end_ns"}] * len(bare)
+
+
+def test_run_ends_with_a_code_of_its_own_where_nothing_matches(
+    capsys: pytest.CaptureFixture[str], store: str
+) -> None:
+    assert run(["patterns", "run", store, "emergency_vehicle_near", "--require"]) == NO_MATCH
+    assert "nothing matches" in capsys.readouterr().err
+    assert said(capsys, "run", store, "emergency_vehicle_near", "--json") == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["show", "cut_inn"], "did you mean 'cut_in'?"),
+        (["run", "{}", "cut_in", "speed=3"], "it has: headway, within, hold"),
+        (["run", "{}", "cut_in", "within=soon"], "expected a duration such as 4s"),
+        (["run", "{}", "cut_in", "soon"], "expected NAME=VALUE"),
+        (["run", "{}", "stopped"], "stopped is a condition"),
+        (["list", "--kind", "recipe"], "recipe"),
+    ],
+)
+def test_wrong_usage_is_told(
+    capsys: pytest.CaptureFixture[str], store: str, arguments: list[str], reason: str
+) -> None:
+    assert run(["patterns", *(a.format(store) for a in arguments)]) == USAGE
+    assert reason in " ".join(capsys.readouterr().err.replace("│", " ").split())
