@@ -25,6 +25,8 @@ TRACE: Final = "online"
 """What the graphs of the online mode have for the name of a trace."""
 
 _IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
+_TELLS: Final = np.isin(np.arange(len(RELATIONS)), (_IS_IN, _LEADS, _FOLLOWS))
+"""Of each relation whether its edges may have attributes."""
 _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _INPUTS: Final = ("steer", "throttle", "brake")
@@ -179,38 +181,47 @@ def _coded(lights: int, light: int, derived: int) -> Attributes:
 
 def _edges(graph: GraphBlock, outer: Ints) -> list[Edge]:
     """Edges that have an end in the trace, each once, in the order of their ends."""
-    edges, lanes = graph.edges, graph.lanes
+    edges = graph.edges
     src, dst = _outward(edges.src, outer), _outward(edges.dst, outer)
     order = np.lexsort((dst, edges.relation, src))
     src, relation, dst = src[order], edges.relation[order], dst[order]
     new = np.ones(len(src), np.bool_)
     new[1:] = (np.diff(src) != 0) | (np.diff(relation) != 0) | (np.diff(dst) != 0)
-    ends = zip(src[new].tolist(), relation[new].tolist(), dst[new].tolist(), strict=True)
-    keys = zip(_outward(lanes.node, outer).tolist(), lanes.lane.tolist(), strict=True)
-    numbers = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
-    about = (
-        *(number(column).tolist() for column in numbers),
-        lanes.primary.tolist(),
-        lanes.own.tolist(),
+    src, relation, dst = src[new], relation[new], dst[new]
+    about: list[Attributes] = [{} for _ in range(len(src))]
+    known = _attributes(graph, outer)
+    rows = np.flatnonzero(_TELLS[relation])
+    keys = zip(relation[rows].tolist(), src[rows].tolist(), dst[rows].tolist(), strict=True)
+    for row, key in zip(rows.tolist(), keys, strict=True):
+        if key in known:
+            about[row] = known[key]
+    names = [RELATIONS[code] for code in relation.tolist()]
+    return list(zip(src.tolist(), names, dst.tolist(), about, strict=True))
+
+
+def _attributes(graph: GraphBlock, outer: Ints) -> dict[tuple[int, int, int], Attributes]:
+    """Attributes of the edges that have any, by relation and ends."""
+    lanes, gaps = graph.lanes, graph.gaps
+    told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
+    columns = (
+        *(_outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
+        *(number(column).tolist() for column in told),
+        *(lanes.primary.tolist(), lanes.own.tolist()),
     )
-    within = {
-        key: _numbers(
-            {
-                "overlap": overlap,
-                "lane_offset": offset,
-                "heading_error": math.degrees(error),
-                "along": along,
-            }
-        )
-        | {"is_primary": primary, "is_own": own}
-        for key, overlap, offset, error, along, primary, own in zip(keys, *about, strict=True)
-    }
-    known = {(_IS_IN, *key): about for key, about in within.items()}
-    gaps = graph.gaps
+    known: dict[tuple[int, int, int], Attributes] = {}
+    for node, lane, overlap, offset, error, along, primary, own in zip(*columns, strict=True):
+        numbers = {
+            "overlap": overlap,
+            "lane_offset": offset,
+            "heading_error": math.degrees(error),
+            "along": along,
+        }
+        known[_IS_IN, node, lane] = _numbers(numbers) | {"is_primary": primary, "is_own": own}
     columns = (_outward(gaps.src, outer), _outward(gaps.dst, outer), number(gaps.gap))
     for a, b, gap in zip(*(column.tolist() for column in columns), strict=True):
-        known[_FOLLOWS, a, b] = known[_LEADS, b, a] = _numbers({"gap": gap})
-    return [(a, RELATIONS[code], b, dict(known.get((code, a, b), {}))) for a, code, b in ends]
+        known[_FOLLOWS, a, b] = _numbers({"gap": gap})
+        known[_LEADS, b, a] = _numbers({"gap": gap})
+    return known
 
 
 def _outward(nodes: Ints, outer: Ints) -> Ints:
