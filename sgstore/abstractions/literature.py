@@ -376,7 +376,7 @@ def _numbered(seen: Seen, inside: Part, lanes: Part) -> Ints:
     here_frame, here, role = lanes
     distance, has_ego = _from_ego(seen)
     rows = np.flatnonzero(role == OPPOSING)
-    if not len(rows):
+    if not len(rows) or not len(inside[0]):  # then all of them are there by their names
         return role
     order = rows[np.lexsort((here[rows], here_frame[rows]))]
     frame, src, strand = inside

@@ -25,6 +25,7 @@ from math import comb, prod
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sgstore.coverage.asking import block_of, query_of_blocks
 from sgstore.coverage.frames import frames_of
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 
     from sgstore.coverage.frames import Chosen
     from sgstore.world import Bools, Ints
+
+Bits = NDArray[np.uint8]
+"""Truth values of frames, eight a byte."""
 
 NONE: Final = "none"
 """Value of a slot in a frame in which none of its patterns holds."""
@@ -180,7 +184,41 @@ class Tuples:
     frames: Ints
 
 
-def tuples(chosen: Chosen, specification: Specification, k: int = 0) -> Tuples:
+class _Held:
+    """The frames of a selection in which patterns hold; each is asked for once."""
+
+    def __init__(self, chosen: Chosen) -> None:
+        self._chosen = chosen
+        ids = chosen.store.file.abstracted.times()[0]
+        self._ids = ids[chosen.rows_of(ids)]
+        self._known: dict[str, Bools] = {}
+
+    def of(self, pattern: str) -> Bools:
+        """(F,): whether a pattern holds; it does everywhere if it is empty."""
+        if pattern not in self._known:
+            there = np.ones(len(self._ids), np.bool_)
+            if pattern:
+                there = np.isin(self._ids, frames_of(self._chosen.store, pattern))
+            self._known[pattern] = there
+        return self._known[pattern]
+
+    def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
+        """(slot, value) → in which frames, of those that count, it has this value; bits of eight frames a byte."""
+        counts = self.of(specification.where)
+        held: dict[tuple[str, str], Bits] = {}
+        for slot in specification.slots:
+            none = counts.copy()
+            for value, pattern in slot.values.items():
+                there = counts & self.of(pattern)
+                none &= ~there
+                held[slot.name, value] = np.packbits(there)
+            held[slot.name, NONE] = np.packbits(none)
+        return held
+
+
+def tuples(
+    chosen: Chosen, specification: Specification, k: int = 0, held: _Held | None = None
+) -> Tuples:
     """All combinations of values of k slots that can be, and how many frames have each.
 
     Parameters
@@ -189,6 +227,8 @@ def tuples(chosen: Chosen, specification: Specification, k: int = 0) -> Tuples:
     specification : Specification
     k : int
         How many slots are combined; 0: all of them.
+    held : optional
+        What has been asked of the selection before.
 
     Raises
     ------
@@ -201,7 +241,7 @@ def tuples(chosen: Chosen, specification: Specification, k: int = 0) -> Tuples:
     k = k or len(slots)
     if k > len(slots):
         raise ConfigError(f"{specification.name}: combinations of {k}, but {len(slots)} slots")
-    held = _held(chosen, specification)
+    values_held = (held or _Held(chosen)).values(specification)
     subsets = comb(len(slots), k)
     most = (
         sum(prod(len(s.domain) for s in some) for some in combinations(slots, k))
@@ -215,7 +255,7 @@ def tuples(chosen: Chosen, specification: Specification, k: int = 0) -> Tuples:
     found = Tuples([], [], np.zeros(0, np.int64))
     frames: list[int] = []
     for some in combinations(slots, k):
-        for values, often in _counted(some, held):
+        for values, often in _counted(some, values_held):
             named = {slot.name: value for slot, value in zip(some, values, strict=True)}
             if any(one.items() <= named.items() for one in specification.impossible):
                 continue
@@ -225,25 +265,8 @@ def tuples(chosen: Chosen, specification: Specification, k: int = 0) -> Tuples:
     return Tuples(found.slots, found.values, np.array(frames, np.int64))
 
 
-def _held(chosen: Chosen, specification: Specification) -> dict[tuple[str, str], Bools]:
-    """(slot, value) → in which frames, of those that count, it has this value; bits of eight frames a byte."""
-    ids = chosen.store.file.abstracted.times()[0]
-    ids = ids[chosen.rows_of(ids)]
-    if specification.where:
-        ids = ids[np.isin(ids, frames_of(chosen.store, specification.where))]
-    held: dict[tuple[str, str], Any] = {}
-    for slot in specification.slots:
-        none = np.ones(len(ids), np.bool_)
-        for value, pattern in slot.values.items():
-            there = np.isin(ids, frames_of(chosen.store, pattern))
-            none &= ~there
-            held[slot.name, value] = np.packbits(there)
-        held[slot.name, NONE] = np.packbits(none)
-    return held
-
-
 def _counted(
-    slots: Sequence[Slot], held: Mapping[tuple[str, str], Any]
+    slots: Sequence[Slot], held: Mapping[tuple[str, str], Bits]
 ) -> Iterator[tuple[tuple[str, ...], int]]:
     """Each combination of values of some slots, with its frames."""
     for values in product(*(slot.domain for slot in slots)):
@@ -274,8 +297,10 @@ def slot_coverage(
     covered: list[Row] = []
     missing: list[Row] = []
     parts = [0, 0]
+    held = _Held(chosen)
     for one in specifications:
-        found = tuples(chosen, one, k)
+        with chosen.store.file.snapshot():
+            found = tuples(chosen, one, k, held)
         many, of = int((found.frames > 0).sum()), len(found.frames)
         parts = [parts[0] + many, parts[1] + of]
         size = k or len(one.slots)

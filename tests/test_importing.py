@@ -1,0 +1,394 @@
+"""Graphs from elsewhere: what a file holds is in the store, and what is wrong with it is said, with its place."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import json
+import lzma
+import random
+import re
+from pathlib import Path
+
+import networkx as nx
+import pytest
+
+import sgstore
+from sgstore.cli import run
+from sgstore.errors import ConfigError, TraceError
+from sgstore.importing import Words, import_graphs
+from sgstore.store import StoreFile
+
+HEADER = "ds,sg,n_img,t_id,node1,edge,node2\n"
+TWO = HEADER + (
+    "d,a.png,3,0,Ego Lane,isIn,Root Road\n"
+    "d,a.png,3,1,ego,isIn,Ego Lane\n"
+    "d,a.png,3,2,car_0,isIn,Left 1 of Ego Lane\n"
+    "d,a.png,3,3,car_0,near,ego\n"
+    "d,b.png,1,0,ego,isIn,Ego Lane\n"
+    "d,b.png,1,1,truck_1,isIn,Off Road\n"
+)
+
+
+def imported(folder: Path, text: str, form: str, **options):
+    """The store of one file; an error is raised."""
+    file = folder / f"graphs.{'json' if form == 'nodelink' else 'csv'}"
+    file.write_text(text, encoding="utf-8")
+    (done,) = import_graphs(folder / "x.sgstore", [file], form, **options)
+    if done.error is not None:
+        raise done.error
+    return sgstore.open(folder / "x.sgstore"), done
+
+
+def edges(graph: nx.MultiDiGraph) -> set[tuple[str, str, str]]:
+    return {(a, d["label"], b) for a, b, d in graph.edges(data=True)}
+
+
+def test_a_graph_of_s3c_is_a_frame_whose_scene_is_what_the_rows_say(tmp_path: Path) -> None:
+    store, done = imported(tmp_path, TWO, "s3c")
+
+    assert (done.status, done.frames, done.entities, done.edges) == ("added", 2, 3, 6)
+    assert edges(store.graph("graphs#0", "RSV")) == {
+        ("Ego Lane", "isIn", "Root Road"),
+        ("Left 1 of Ego Lane", "isIn", "Root Road"),  # every lane of RSV is
+        ("ego", "isIn", "Ego Lane"),
+        ("car_1", "isIn", "Left 1 of Ego Lane"),
+        ("car_1", "near", "ego"),
+    }
+    assert edges(store.graph("graphs#1", "RSV")) == {
+        ("ego", "isIn", "Ego Lane"),
+        ("Ego Lane", "isIn", "Root Road"),
+        ("truck_2", "isIn", "Off Road"),
+    }
+    assert store.sql("SELECT graph, place, images FROM imports ORDER BY place").values == [
+        ("a.png", 2, 3),
+        ("b.png", 6, 1),
+    ]
+
+
+def test_imported_frames_are_found_by_patterns_sql_and_names_of_lanes(tmp_path: Path) -> None:
+    store, _ = imported(tmp_path, TWO, "s3c")
+    left = "MATCH (c:Car&!Ego)-[:isIn]->(:Lane {name: 'Left 1 of Ego Lane'}) RETURN c.ident"
+
+    assert store.find(left).rows() == [("car_0",)]
+    assert [f.seq for f in store.find("MATCH (e:Ego)-[:isIn]->(:Lane)").frames()] == [0, 1]
+    assert store.sql("SELECT count(*) FROM edges WHERE relation = 'isIn'").values == [(5,)]
+    assert store.find("MATCH (a)-[:opposes]->(b)").left_out == ("graphs",)
+    assert store.find("MATCH (a)-[:visible]->(b)").left_out == ()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "carla_max_vehicle_v3_Town02",
+        "carla_zero_vehicle_v3_Town02",
+        "carla_zero_vehicle_v3_Town04",
+        "carla_zero_vehicle_v3",
+    ],
+)
+def test_every_row_that_s3c_published_comes_back_from_the_store(
+    data: Path, tmp_path: Path, name: str
+) -> None:
+    file = data / "s3c" / f"{name}.csv.xz"
+    (done,) = import_graphs(tmp_path / "x.sgstore", [file], "s3c")
+    wanted = set()
+    with lzma.open(file, "rt", encoding="utf-8") as text:
+        for row in csv.DictReader(text):
+            wanted.add((row["sg"], row["node1"], row["edge"], row["node2"]))
+    found = sgstore.open(tmp_path / "x.sgstore").sql(
+        """
+        WITH names AS (
+          SELECT frame_id, n.node_id, coalesce(x.ident, n.name) AS name
+          FROM nodes n JOIN frames f USING (frame_id)
+               LEFT JOIN entities x ON x.trace_id = f.trace_id AND x.node_id = n.node_id)
+        SELECT i.graph, a.name, e.relation::VARCHAR, b.name FROM edges e JOIN imports i USING (frame_id)
+        JOIN names a ON a.frame_id = e.frame_id AND a.node_id = e.src
+        JOIN names b ON b.frame_id = e.frame_id AND b.node_id = e.dst
+        """
+    )
+
+    assert done.error is None
+    assert set(found.values) == wanted
+    assert len(found.values) == len(wanted)
+
+
+def test_classes_are_those_that_s3c_published(data: Path, tmp_path: Path) -> None:
+    """One graph for each class of isomorphic ones: 1,254, 3, 6 and 8."""
+    numbers = {"max_vehicle_v3_Town02": 1254, "zero_vehicle_v3_Town02": 3, "zero_vehicle_v3": 8}
+    files = [data / "s3c" / f"carla_{name}.csv.xz" for name in numbers]
+    import_graphs(tmp_path / "x.sgstore", files, "s3c")
+    store = sgstore.open(tmp_path / "x.sgstore")
+
+    for abstraction in ("RSV", "junction", "SG"):
+        found = [
+            len(set(store.classes(abstraction, f"carla_{name}.csv")["class"])) for name in numbers
+        ]
+        assert found == list(numbers.values())
+
+
+def test_what_networkx_writes_comes_back_with_its_attributes(tmp_path: Path) -> None:
+    graph = nx.MultiDiGraph(time_ns="9007199254740993", ego=1)
+    graph.add_node(1, kind="car", x=1.5, y=-2.0, z=0.0, heading=90.0, speed=3.0, light_brake=True)
+    graph.add_node("p", kind="person", x=4.0, y=0.0, z=0.0, pose="odd")
+    graph.add_node(-3, kind="lane", name="5/0/-1", lane_type="driving", width=3.5)
+    graph.add_edge(1, -3, key="isIn", relation="isIn", overlap=0.8, is_primary=True)
+    graph.add_edge("p", 1, key="near", relation="near")
+    text = json.dumps(nx.node_link_data(graph, edges="edges"))
+    store, done = imported(tmp_path, text, "nodelink")
+    found = store.graph("graphs#0")
+    ego = found.nodes[found.graph["ego"]]
+
+    assert done.lost == {"attribute pose": 1}
+    assert found.graph["time_ns"] == 9007199254740993
+    assert ego["heading"] == pytest.approx(90)
+    assert (ego["vx"], ego["vy"], ego["light_brake"]) == (pytest.approx(0, abs=1e-6), 3.0, True)
+    assert {n["name"] for _, n in found.nodes(data=True) if n["kind"] == "lane"} == {"5/0/-1"}
+    (lane,) = [d for _, _, d in found.edges(data=True) if d["relation"] == "isIn"]
+    assert (lane["overlap"], lane["is_primary"]) == (pytest.approx(0.8), True)
+    assert store.find("MATCH (e:Ego)<-[:near]-(p:Person) WHERE dist(e, p) < 4").count() == 1
+
+
+def test_graphs_of_this_house_have_the_same_classes_when_they_come_back(tmp_path: Path) -> None:
+    """Entities and their relations: what is known without a map."""
+    from sgstore.ingest import ingest
+
+    sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+    ingest(tmp_path / "town.sgstore", [sample], rate=1, until=20)
+    town = sgstore.open(tmp_path / "town.sgstore")
+    frames = town.classes("ER")["frame_id"].tolist()
+    lines = []
+    for frame in frames:
+        graph = town.graph(frame)
+        graph.graph["time_ns"] = str(graph.graph["time_ns"])
+        lines.append(json.dumps(nx.node_link_data(graph, edges="links")))
+    store, done = imported(tmp_path, "\n".join(lines), "nodelink")
+
+    assert done.frames == len(frames) >= 20
+    for abstraction in ("E", "ER"):
+        wanted = town.classes(abstraction)["class"].tolist()
+        assert store.classes(abstraction)["class"].tolist() == wanted
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_graph_and_the_same_in_another_order_have_one_class_in_all_formats(
+    tmp_path: Path, seed: int
+) -> None:
+    rng = random.Random(seed)
+    nodes = ["ego", *(f"{rng.choice(['car', 'truck', 'person'])}_{i}" for i in range(6))]
+    relations = ["near", "visible", "inDFrontOf", "toLeftOf"]
+    rows = {(*rng.sample(nodes, 2), rng.choice(relations)) for _ in range(15)}
+    rows = sorted({*rows, *((n, "ego", "near") for n in nodes[1:])})
+    graph = nx.MultiDiGraph()
+    graph.add_nodes_from((n, {"base_class": re.sub(r"_\d+", "", n)}) for n in nodes)
+    for a, b, r in rng.sample(rows, len(rows)):
+        graph.add_edge(a, b, label=r)
+    text = "graph,src,relation,dst\n" + "".join(f"g,{a},{r},{b}\n" for a, b, r in rows)
+    s3c = HEADER + "".join(f"d,g,1,{i},{a},{r},{b}\n" for i, (a, b, r) in enumerate(rows))
+    listed = json.dumps([nx.node_link_data(graph, edges="links")], indent=1)
+    found = set()
+    for form, content in (("csv", text), ("s3c", s3c), ("nodelink", listed)):
+        (tmp_path / form).mkdir()
+        store, _ = imported(tmp_path / form, content, form)
+        found.update(store.classes("ER")["class"].tolist())
+
+    assert len(found) == 1
+
+
+CSV = "graph,src,relation,dst\n"
+WRONG = [
+    ("s3c", "a,b\n", "row 1: expected the header of S3C"),
+    ("s3c", HEADER, "no row beside the header"),
+    ("s3c", "", "empty; expected a header"),
+    ("s3c", HEADER + "d,a,1,0,ego,isIn\n", "row 2: 6 columns, expected 7"),
+    ("s3c", HEADER + "d,a,x,0,ego,isIn,Ego Lane\n", "row 2, column n_img: expected a number"),
+    ("s3c", HEADER + "d,a,1,0,ego,isIn,dragon_3\n", "row 2, column node2: 'dragon' is of no kind"),
+    ("s3c", HEADER + "d,a,1,0,ego,nearr,car_1\n", r"row 2, column edge: .*did you mean 'near'"),
+    ("s3c", HEADER + "d,,1,0,ego,near,car_1\n", "row 2, column sg: expected the name of a graph"),
+    ("s3c", HEADER + "d,a,1,0,ego,near,\n", "row 2, column node2: expected the name of a node"),
+    ("s3c", HEADER + "d,a,1,0,ego,,car_1\n", "row 2, column edge: empty"),
+    ("s3c", HEADER + 'd,a,1,0,ego,near,"car\n', "no CSV"),
+    (
+        "s3c",
+        HEADER + "d,a,1,0,ego,near,car_1\nd,b,1,0,ego,near,car_1\nd,a,1,1,ego,near,car_2\n",
+        "row 4: a graph of the same name begins at 2 already",
+    ),
+    ("s3c", HEADER + "d,a,1,0,ego,near,hero\n", "both the ego of graph 'a'"),
+    ("csv", "graph,src,relation\n", "row 1: no column 'dst'"),
+    ("csv", "graph,src,relation,dst,node1\n", "columns src and node1 both say 'src'"),
+    (
+        "csv",
+        "graph,src,relation,dst,t\na,ego,near,car_1,nan\n",
+        "row 2, column t: nan is out of range",
+    ),
+    (
+        "csv",
+        "graph,src,relation,dst,src_kind\na,x,near,ego,car\na,x,near,ego,truck\n",
+        "row 3, column src: 'x' is 'truck' here and 'car' in row 2",
+    ),
+    ("csv", CSV + "a,vehicle,near,ego\n", "it can be any of car, truck"),
+    ("nodelink", "", "empty; expected a graph"),
+    ("nodelink", "[]", "an empty list"),
+    ("nodelink", "{", "no JSON"),
+    ("nodelink", "[" * 100_000, "nested too deeply"),
+    ("nodelink", "3", "no node-link graph"),
+    ("nodelink", '{"nodes": [], "edges": {}}', "expected a list 'edges'"),
+    ("nodelink", '{"directed": false, "nodes": []}', "an undirected graph"),
+    ("nodelink", '{"nodes": [{"id": 1}, {"id": 1}]}', "line 1, node 1: the id '1' comes twice"),
+    ("nodelink", '{"nodes": [{"kind": "car"}]}', "line 1, node 0: expected an object with an 'id'"),
+    (
+        "nodelink",
+        '{"nodes": [{"id": "ego"}], "edges": [{"source": "ego", "target": "x", "label": "near"}]}',
+        "line 1, edge 0: no node 'x' in this graph",
+    ),
+    (
+        "nodelink",
+        '{"nodes": [{"id": "ego"}, {"id": "car_1"}], "edges": [{"source": "ego", "target": "car_1"}]}',
+        "line 1, edge 0: says no relation",
+    ),
+    (
+        "nodelink",
+        '{"nodes": [{"id": "ego", "x": "left"}]}',
+        "line 1, node 0: expected a number as 'x'",
+    ),
+    ("nodelink", '{"nodes": [{"id": "ego"}]}\n{"nodes": 3}', "line 2: no node-link graph"),
+    (
+        "nodelink",
+        '{"nodes": [{"id": "ego"}]}\n{"graph": {"t": 1}, "nodes": [{"id": "ego"}]}',
+        "do not agree on whether there are times",
+    ),
+    ("nodelink", '{"nodes": [{"id": "Ego Lane", "is_ego": true}]}', "the ego cannot be a lane"),
+    (
+        "nodelink",
+        '{"nodes": [{"id": 1, "kind": "lane", "name": "a"}, {"id": 2, "kind": "lane", "name": "a"}]}',
+        "line 1, node 1: '1' and '2' are the same lane 'a'",
+    ),
+    (
+        "nodelink",
+        '{"nodes": [{"id": "light", "kind": "traffic_light", "light_state": "pink"}]}',
+        "no state of a light: 'pink'",
+    ),
+]
+
+
+@pytest.mark.parametrize(("form", "text", "said"), WRONG)
+def test_what_is_wrong_with_a_file_is_said_and_nothing_comes_into_the_store(
+    tmp_path: Path, form: str, text: str, said: str
+) -> None:
+    with pytest.raises(TraceError, match=said) as error:
+        imported(tmp_path, text, form)
+
+    assert "graphs." in str(error.value)
+    assert not (tmp_path / "x.sgstore").exists()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_text_that_is_no_utf_8_and_a_broken_archive_are_errors_with_their_line(
+    tmp_path: Path,
+) -> None:
+    plain, packed = tmp_path / "a.csv", tmp_path / "b.csv.gz"
+    plain.write_bytes(HEADER.encode() + b"d,a,1,0,ego,near,car_\xff\n")
+    packed.write_bytes(gzip.compress(TWO.encode())[:-20])
+    done = import_graphs(tmp_path / "x.sgstore", [plain, packed, tmp_path / "none.csv"], "s3c")
+
+    assert [one.status for one in done] == ["failed"] * 3
+    assert "line 2: no UTF-8 at byte 21" in str(done[0].error)
+    assert "cannot be read" in str(done[1].error)
+    assert "No such file" in str(done[2].error)
+
+
+def test_an_archive_of_nothing_but_air_is_refused_before_it_fills_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sgstore.importing import lines
+
+    monkeypatch.setattr(lines, "_FREE", 1 << 16)
+    monkeypatch.setattr(lines, "MAX_RATIO", 10)
+    file = tmp_path / "air.csv.xz"
+    file.write_bytes(lzma.compress(HEADER.encode() + b"\n" * 500_000))
+    (done,) = import_graphs(tmp_path / "x.sgstore", [file], "s3c")
+
+    assert "unpacked, from a file of" in str(done.error)
+
+
+def test_a_client_says_what_words_mean_and_what_nobody_knows_is_counted(tmp_path: Path) -> None:
+    text = HEADER + (
+        "d,a,1,0,ego,nextTo,dragon_3\nd,a,1,1,dragon_3,guards,ego\nd,a,1,2,elf_1,near,ego\n"
+    )
+    told = Words({"dragon": "animal"}, {"nextTo": "near"}, unknown_as="other")
+    store, done = imported(tmp_path, text, "s3c", words=told)
+
+    assert done.lost == {"relation guards": 1}
+    assert store.sql(
+        "SELECT kind::VARCHAR, ident, type_name, subkind FROM entities ORDER BY 1"
+    ).values == [
+        ("animal", "dragon_3", "dragon", None),
+        ("car", "ego", None, None),
+        ("unknown", "elf_1", "elf", "elf"),
+    ]
+    assert store.find("MATCH (:Ego)-[:near]->(:Animal)").count() == 1
+    assert store.info()[0].report["losses"][0]["messages"] == 1
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"kinds": {"x": "dragon"}},
+        {"kinds": {"x": "vehicle"}},
+        {"relations": {"x": "nearr"}},
+        {"unknown_as": "lane"},
+        {"unknown_as": "dragon"},
+    ],
+)
+def test_a_meaning_that_is_none_is_refused(given) -> None:
+    with pytest.raises(ConfigError):
+        Words(**given)
+
+
+def test_a_file_comes_in_once_unless_it_is_forced_and_another_way_to_read_it_is_told(
+    tmp_path: Path,
+) -> None:
+    store, _ = imported(tmp_path, TWO, "s3c")
+    file = tmp_path / "graphs.csv"
+    path = tmp_path / "x.sgstore"
+    again = import_graphs(path, [file], "s3c")[0]
+    otherwise = import_graphs(path, [file], "s3c", period_s=0.5)[0]
+    forced = import_graphs(path, [file], "s3c", period_s=0.5, force=True)[0]
+
+    assert (again.status, again.frames) == ("present", 2)
+    assert "already in the store" in str(otherwise.error)
+    assert forced.status == "replaced"
+    assert store.sql("SELECT seq, t FROM frames ORDER BY seq").values == [(0, 0.0), (1, 0.5)]
+    assert not StoreFile(path).verify(recordings=True).faults
+
+
+def test_a_graph_of_more_than_a_bucket_of_frames_keeps_entities_and_order(tmp_path: Path) -> None:
+    rows = "".join(f"g{i},car_{i % 7},near,ego\n" for i in range(300))
+    store, done = imported(tmp_path, CSV + rows, "csv")
+    found = store.sql(
+        "SELECT i.graph, x.ident FROM imports i JOIN frames f USING (frame_id) JOIN edges e USING (frame_id)"
+        " JOIN entities x ON x.trace_id = f.trace_id AND x.node_id = e.src ORDER BY f.seq"
+    )
+
+    assert (done.frames, done.entities) == (300, 8)
+    assert found.values == [(f"g{i}", f"car_{i % 7}") for i in range(300)]
+
+
+def test_the_verb_imports_and_its_exit_code_says_what_was_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, odd = tmp_path / "two.csv", tmp_path / "odd.csv"
+    file.write_text(TWO)
+    odd.write_text(HEADER + "d,a,1,0,ego,guards,elf_1\n")
+    store = str(tmp_path / "x.sgstore")
+    codes = [
+        run(["import", store, str(file), "--format", "s3c", "--json"]),
+        run(["import", store, str(odd), "--format", "s3c"]),
+        run(["import", store, str(odd), "--format", "s3c", "--unknown-as", "other"]),
+        run(["import", store, str(odd), "--format", "s3c", "--kind", "elf"]),
+    ]
+    out, err = capsys.readouterr()
+
+    assert codes == [0, 1, 3, 2]
+    assert json.loads(out[: out.index("]") + 1])[0]["frames"] == 2
+    assert "relation guards: 1 times, cannot be kept" in err
+    assert "'elf' is of no kind that is known" in err
