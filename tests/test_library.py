@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from sgstore.temporal import Formula
 
 FOUND = [name for name, one in patterns().items() if one.kind in {"concept", "scenario"}]
-STATES = [
-    n for n in FOUND if not re.search(r"^(THEN|FOR|UNTIL)", patterns()[n].query, re.MULTILINE)
-]
+TIME = re.compile(r"\b(THEN|FOR >=|UNTIL|EVENTUALLY)")
+STATES = [n for n in FOUND if not TIME.search(patterns()[n].query)]
 RULES = [name for name, one in patterns().items() if one.kind == "property"]
 
 
