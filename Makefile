@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test lint format bench fuzz oracle sample clean
+.PHONY: help demo test lint format bench fuzz pyg oracle sample clean
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -14,6 +14,7 @@ help:
 	@echo "make fuzz    read 100,000 recordings that were hurt on purpose (about half an hour)"
 	@echo "make kill    kill ingest 200 times at random and look whether the stores are whole and equal"
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
+	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
@@ -61,6 +62,12 @@ kill: $(VENV)/.dev
 
 soak: $(VENV)/.dev
 	$(BIN)/python tests/soaking.py 600
+
+# In an environment of its own, because torch is large.
+pyg: $(VENV)/.base
+	@test -x build/pyg/bin/python || $(BIN)/python -m venv build/pyg || $(BIN)/python -m virtualenv -q build/pyg
+	@build/pyg/bin/python -m pip install -q --disable-pip-version-check -e '.[pyg]'
+	build/pyg/bin/python tests/learning.py
 
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
