@@ -6,7 +6,7 @@ whose values are asked for; numbers of pairs are computed around that join (:mod
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeGuard
 
 from sgstore.lang.bound import (
     BlockValue,
@@ -91,7 +91,10 @@ class Frames(Masks):
         self._second_phase(join, scope, parts, given, needed)
         layers = Layers(join, needed, conditions)
         text = layers.text(self.values, columns_of(nodes, edges), wanted)
-        hidden = bound | parts.late > nodes or ties > edges
+        told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
+        told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
+        told |= {leaf.node for leaf in wanted if _is_id(leaf)}
+        hidden = (bound | parts.late | ties) - nodes - edges - told
         return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
 
     def _by_buckets(
@@ -180,6 +183,8 @@ class Frames(Masks):
         join.select.join(f'"state" AS {alias}', [*on, self.in_mask(PATTERN, frame)])
         join.select.where += self.within(frame, 64)
         join.frame = frame
+        # Said of the bucket, so that constants are looked up for the rows of masks, and not for all states.
+        join.trace = f'{PATTERN}."bucket" >> 18'
         join.at[key] = Aliases(state=alias)
 
     def _of_kinds(self, scope: Scope, key: str, state: str) -> list[str]:
@@ -259,7 +264,8 @@ class Frames(Masks):
             join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
         if homes & {Home.entity, Home.scenery}:
             entity = quoted(f"{key}.entity")
-            on = [f'{entity}."trace_id" = {join.frame} >> 24', f'{entity}."node_id" = {node}']
+            trace = join.trace or f"{join.frame} >> 24"
+            on = [f'{entity}."trace_id" = {trace}', f'{entity}."node_id" = {node}']
             how = "LEFT JOIN" if profile.mapped else "JOIN"
             join.select.join(f'"entity" AS {entity}', on, how)
         if Home.map in homes:
@@ -346,6 +352,10 @@ class Frames(Masks):
             value = expression_text(leaf.value, lambda part: quoted(column_of(part)), self.values)
             select.columns.append(f'{leaf.word.lower()}({value}) AS "value"')
         return select.text()
+
+
+def _is_id(leaf: Leaf) -> TypeGuard[NodeAttribute]:
+    return isinstance(leaf, NodeAttribute) and leaf.attribute.unit is Unit.binding
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:

@@ -53,6 +53,8 @@ class Join:
     select : Select
     frame : str
         The column of the frame; empty as long as there is none.
+    trace : str
+        The id of the trace; empty: that of the frame's.
     nodes, edges : dict of str to str
         Node → the column of its id, edge → the column of its relation.
     at : dict of str to Aliases
@@ -65,6 +67,7 @@ class Join:
 
     select: Select = field(default_factory=Select)
     frame: str = ""
+    trace: str = ""
     nodes: dict[str, str] = field(default_factory=dict[str, str])
     edges: dict[str, str] = field(default_factory=dict[str, str])
     at: dict[str, Aliases] = field(default_factory=dict[str, Aliases])
