@@ -192,16 +192,25 @@ class SceneGraphGenerator:
     def step(self, frame: Frame) -> SceneGraph:
         """The scene graph of the next frame, for a client that owns the loop; the same as of a recording.
 
+        As :meth:`steps`, for the frame's ego.
+        """
+        return self.steps(frame)[0]
+
+    def steps(self, frame: Frame, egos: Sequence[str] = ("",)) -> list[SceneGraph]:
+        """The scene graphs of the next frame as several egos have them; work that they share is done once.
+
         Parameters
         ----------
         frame : Frame
-            See :class:`sgstore.online.Frame`. Its ego, else that of the config, is the ego.
+            See :class:`sgstore.online.Frame`.
+        egos : sequence of str
+            Ids of the egos. Empty: the ego of the frame, else that of the config.
 
         Returns
         -------
-        SceneGraph
-            As a store gives it, and ``ident``, the client's own id, for each entity. ``trace`` is ``online``,
-            ``frame_id`` is ``seq``: the number of the step.
+        list of SceneGraph
+            One for each ego, as a store gives it, and ``ident``, the client's own id, for each entity.
+            ``trace`` is ``online``, ``frame_id`` is ``seq``: the number of the step.
 
         Raises
         ------
@@ -217,10 +226,17 @@ class SceneGraphGenerator:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
             shown = map_of_graphs(self._road_map, self._config)
             self._online = Online(fresh, shown, self._config.ego)
-        return self._online.step(frame.meant(self._config.types))
+        return self._online.step(frame.meant(self._config.types), egos)
 
-    def class_of(self, abstraction: str = "RSV") -> str | None:
+    def class_of(self, abstraction: str = "RSV", number: int = 0) -> str | None:
         """The class of the graph of the last step in an abstraction; the one that it would have in a store.
+
+        Parameters
+        ----------
+        abstraction : str
+            Its name.
+        number : int
+            Of the graph: which of the egos' it is, from 0.
 
         Returns
         -------
@@ -236,11 +252,11 @@ class SceneGraphGenerator:
         """
         if self._online is None or self._online.last is None:
             raise ValueError("there was no step yet")
-        graph, kinds = self._online.last
+        graphs, kinds = self._online.last
         if self._grounds is None and self._road_map is not None:
             shown = map_of_graphs(self._road_map, self._config)
             self._grounds = None if shown is None else Grounds.of(shown)
-        seen = Seen.of(graph, kinds, self._grounds)
+        seen = Seen.of(graphs[number], kinds, self._grounds)
         (found,) = self._classes.of(abstraction_named(abstraction).function(seen))
         return found or None
 

@@ -273,6 +273,18 @@ def test_an_ego_of_the_config_serves_frames_that_name_none() -> None:
 # Memory -------------------------------------------------------------------------------------------
 
 
+def test_several_egos_have_the_graphs_of_generators_of_their_own() -> None:
+    together, others = generator(), {ego: generator() for ego in ("a", "b", "nobody")}
+    for step in range(4):
+        things = [thing("a", 3.0 * step, -2), thing("b", 30, -2), thing("c", -30 + step, 2)]
+        graphs = together.steps(frame_of(*things, ego=None), tuple(others))
+        for nth, (ego, alone) in enumerate(others.items()):
+            graph = alone.step(frame_of(*things, ego=ego))
+            assert graphs[nth] == graph
+            assert together.class_of("RSV", nth) == alone.class_of("RSV")
+    assert [graph.ego for graph in graphs] == [0, 1, None]
+
+
 def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gc
 from collections import OrderedDict
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
@@ -21,7 +20,7 @@ from sgstore.vocabulary import KINDS
 from sgstore.world import Entities, FrameBlock, MessageRefs, Origin, States, as_kept, origin_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable, Sequence
 
     from sgstore.graph import GraphBlock, SceneGraph
     from sgstore.online.frame import Entity, Frame
@@ -43,8 +42,8 @@ class Generator(Protocol):
         """Kinds of the entities that it has met, by node id."""
         ...
 
-    def block(self, frames: FrameBlock) -> GraphBlock:
-        """The graphs of the next frames."""
+    def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
+        """The graphs of the next frames, as each ego has them."""
         ...
 
 
@@ -63,7 +62,7 @@ class Online:
     Attributes
     ----------
     last : tuple or None
-        The last graph as a block, and the kinds of its entities by the block's node ids.
+        The last graphs as blocks, and the kinds of their entities by the blocks' node ids.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Online:
         self._records = Records(road_map)
         self._seq = 0
         self._origin: Origin | None = None
-        self.last: tuple[GraphBlock, Codes] | None = None
+        self.last: tuple[list[GraphBlock], Codes] | None = None
         self._next = 0
         self._moving: OrderedDict[str, Known] = OrderedDict()  # whom the last frame had, at the end
         self._standing: dict[str, tuple[Entity, Known]] = {}
@@ -84,8 +83,15 @@ class Online:
         self._introduced = 0
         self._outer: Ints = np.zeros(64, np.int64)
 
-    def step(self, frame: Frame) -> SceneGraph:
-        """The scene graph of the next frame; see :meth:`sgstore.sgg.SceneGraphGenerator.step`."""
+    def step(self, frame: Frame, egos: Sequence[str]) -> list[SceneGraph]:
+        """The scene graphs of the next frame; see :meth:`sgstore.sgg.SceneGraphGenerator.step`.
+
+        Parameters
+        ----------
+        frame : Frame
+        egos : sequence of str
+            Whose graphs; an empty id means the ego of the frame, else that of the config.
+        """
         moving, new = self._met(frame)
         if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
             self._generator, self._inner, self._introduced = self._make(), {}, 0
@@ -93,15 +99,18 @@ class Online:
         block = self._kept(self._block(frame, moving, new))
         for row, entity in enumerate(new):
             self._records.stand(self._standing[entity.ident][1], block.scenery, row)
-        graph = self._generator.block(block)
+        here = {entity.ident for entity in moving}
+        named = (ego or frame.ego or self._ego for ego in egos)
+        nodes = [self._inner[ego] if ego in here else -1 for ego in named]
+        graphs = self._generator.blocks(block, [np.array([node]) for node in nodes])
         self._seq += 1
-        self.last = graph, self._generator.kinds
+        self.last = graphs, self._generator.kinds
         while len(self._moving) > len(moving) + REMEMBERED:
             ident, _ = self._moving.popitem(last=False)
             self._inner.pop(ident, None)
         known = {self._moving[e.ident].node: self._moving[e.ident] for e in moving}
-        with _uncollected():
-            return self._records.graph(graph, self._outer, known)
+        with _Uncollected():
+            return [self._records.graph(graph, self._outer, known) for graph in graphs]
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
         """What moves in a frame, and what stands in it that was not known.
@@ -151,8 +160,6 @@ class Online:
         for inner, entity in enumerate(new, start=first):
             self._inner[entity.ident] = inner
             self._outer[inner] = self._node(entity)
-        ego = frame.ego or self._ego
-        here = any(e.ident == ego for e in moving)
         time, none = np.array([frame.time_ns]), np.zeros(0, np.int64)
         return FrameBlock(
             seq=np.array([self._seq]),
@@ -160,7 +167,7 @@ class Online:
             log_time_ns=time,
             offsets=np.array([0, len(moving)]),
             states=self._states(moving),
-            ego=np.array([self._inner[ego] if here else -1]),
+            ego=np.array([-1]),  # it is told apart from the block
             entities=_entities(first, new),
             scenery=self._states(standing),
             messages=MessageRefs(none, none, none, none, none),
@@ -188,19 +195,19 @@ class Online:
         )
 
 
-@contextmanager
-def _uncollected() -> Generator[None]:
+class _Uncollected:
     """No garbage is looked for meanwhile, if it is at all.
 
     The records of a graph are thousands of small objects, none of them garbage. Python would look through them
     several times while they are made, and every few frames through all that the client has: 30 ms and more.
     """
-    running = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if running:
+
+    def __enter__(self) -> None:
+        self._running = gc.isenabled()
+        gc.disable()
+
+    def __exit__(self, *_exception: object) -> None:
+        if self._running:
             gc.enable()
 
 
