@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from sgstore.history import CheckRun
     from sgstore.lang import Catalog
     from sgstore.lang.evaluation import FrameView
     from sgstore.lang.pattern import Pattern
@@ -102,6 +103,39 @@ class Store:
         pattern = query if isinstance(query, Pattern) else Pattern.of(query)
         given = {**pattern.parameters, **parameters}
         return Matches(self.file, self.catalog, str(pattern), given)
+
+    def check(
+        self,
+        text: str,
+        /,
+        *,
+        sgsm_compat: bool = False,
+        status: bool = False,
+        **parameters: object,
+    ) -> CheckRun:
+        """Verdicts of ``CHECK`` statements for every trace; nothing is asked before they are iterated.
+
+        Parameters
+        ----------
+        text : str
+            ``CHECK name: FORALL (…) formula RESET WHEN …; …``, see the documentation of the language.
+        sgsm_compat : bool
+            Whether a trace violates a check if any of its beginnings would, as SGSM reports.
+        status : bool
+            Whether the status at each frame is told, too.
+        **parameters
+            Values of ``$name``.
+
+        Raises
+        ------
+        QueryError
+            The text has no checks, or names what the store does not know; it says where.
+        """
+        from sgstore.history import CheckRun  # with numpy: only for who asks
+
+        return CheckRun(
+            self.file, self.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
+        )
 
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None

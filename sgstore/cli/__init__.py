@@ -12,6 +12,7 @@ import sys
 import typer
 
 from sgstore.cli import (
+    checks,
     coverage,
     exports,
     graphs,
@@ -42,6 +43,7 @@ VERBS = (
     live,
     settings,
     queries,
+    checks,
     library,
     coverage,
     payloads,

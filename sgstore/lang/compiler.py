@@ -10,12 +10,13 @@ from sgstore.lang import results
 from sgstore.lang.binder import bind_query
 from sgstore.lang.bound import Column, FrameAttribute, Result
 from sgstore.lang.catalog import FRAME_ATTRIBUTES, Type
+from sgstore.lang.checks import bind_checks
 from sgstore.lang.parser import parse
 from sgstore.lang.phases import traces_of
 from sgstore.lang.printing import query_text, statements_text
 from sgstore.lang.rewrite import rewritten
 from sgstore.lang.subgraphs import Layout
-from sgstore.lang.syntax import Match
+from sgstore.lang.syntax import Check, Match
 from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.bound import Query
     from sgstore.lang.catalog import Catalog
+    from sgstore.lang.checks import BoundCheck
     from sgstore.lang.phases import Window
     from sgstore.lang.results import Statement
 
@@ -176,12 +178,33 @@ def compile_query(
     return Compiled(text, bound, rewritten(whole, seen), seen, catalog)
 
 
+def compile_checks(
+    text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
+) -> tuple[BoundCheck, ...]:
+    """The checks of a text, bound; what they need of single frames is compiled when it is asked.
+
+    Parameters
+    ----------
+    text : str
+        ``CHECK`` statements, with the predicates that they need.
+    catalog, parameters
+        As in :func:`compile_query`.
+
+    Raises
+    ------
+    QueryError
+        As in :func:`compile_query`; or there is no check.
+    """
+    given = parameters or {}
+    return bind_checks(text, parse(text), lambda one: _seen([one], catalog, given), given)
+
+
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
     """The catalog of the abstraction that a query names, if it is known; else that of the store."""
     settings = (
         setting
         for statement in statements
-        if isinstance(statement, Match)
+        if isinstance(statement, Match | Check)
         for setting in statement.settings
         if folded(setting.name) == "abstraction"
     )

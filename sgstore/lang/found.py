@@ -7,11 +7,21 @@ pattern had just been searched for (:class:`Told`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
 
+from sgstore.lang.bound import (
+    Column,
+    NodeAttribute,
+    NodeValue,
+    Result,
+    Scope,
+    TraceAttribute,
+)
+from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Type
 from sgstore.lang.formulas import expression_text, leaves, nested, quoted
 from sgstore.lang.frames import Frames, column_of
-from sgstore.lang.results import Statement
+from sgstore.lang.results import Statement, rows
 from sgstore.lang.rewrite import rewritten
 
 if TYPE_CHECKING:
@@ -21,7 +31,7 @@ if TYPE_CHECKING:
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.phases import Window
 
-FRAME: str = "frame_id"
+FRAME: Final = "frame_id"
 
 
 def relation(
@@ -70,3 +80,37 @@ def relation(
     sql = f"WITH {', '.join(before)}\n{body}" if before else body
     names = (FRAME, *nodes, *edges, *(f":{number}" for number in range(len(values))))
     return Statement(sql, tuple(writer.values.items), names)
+
+
+CLOCK: Final = """SELECT "frame_id", "seq", "time_ns", "log_time_ns" FROM "frame"
+WHERE "frame_id" >= $1 AND "frame_id" < $2 ORDER BY "frame_id" """
+"""The frames of a range, in order."""
+
+TRACES: Final = 'SELECT "trace_id", "name", "start_ns", coalesce("period_ns", 0) FROM "trace"'
+"""All traces: what the times of their frames are counted by."""
+
+
+def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -> Statement:
+    """The statement for the nodes of some kinds that are in a trace in any frame.
+
+    Parameters
+    ----------
+    query : Query
+        Whose node it is.
+    node : str
+        Its key.
+
+    Returns
+    -------
+    Statement
+        Columns: ``trace_id``, ``node_id``, ``name``; each node of a trace once.
+    """
+    scope = Scope({node: replace(query.scope.nodes[node], role="named")}, {}, (), (), frozenset())
+    columns = (
+        Column("trace_id", TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)),
+        Column("node_id", NodeValue(node)),
+        Column("name", NodeAttribute(node, NODE_ATTRIBUTES["name"], Type.text)),
+    )
+    result = Result(columns=columns, whole=False, distinct=True)
+    asked = replace(query, scope=scope, result=result, steps=(), links=())
+    return rows(rewritten(asked, catalog), catalog, window)

@@ -12,17 +12,20 @@ from sgstore.lang.bound import (
     BlockValue,
     Bound,
     Choices,
+    Course,
     EdgeAttribute,
     EdgeRelation,
     FrameAttribute,
     Kinds,
     LabelTest,
+    Moment,
     NodeAttribute,
     NodeValue,
     Operation,
     PairNumber,
     Query,
     Scope,
+    Tense,
     TraceAttribute,
     Value,
 )
@@ -117,7 +120,7 @@ def _kinds(kinds: frozenset[str]) -> str:
     return "|".join(kind for kind in KINDS if kind in kinds) or "nothing"
 
 
-def value_text(value: Bound, indent: str = "") -> str:
+def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each
     """An expression, nearly as one would write it."""
     match value:
         case Value(value=constant):
@@ -128,11 +131,40 @@ def value_text(value: Bound, indent: str = "") -> str:
             return _operation(value, indent)
         case BlockValue():
             return _block(value, indent)
+        case Tense() | Course() | Moment():
+            return _over_time(value, indent)
         case Aggregate(word=word, operand=operand, distinct=distinct):
             inner = "*" if operand is None else value_text(operand, indent)
             return f"{word}({'DISTINCT ' * distinct}{inner})"
         case _:
             return _leaf(value)
+
+
+def _over_time(value: Tense | Course | Moment, indent: str) -> str:
+    match value:
+        case Tense(word=word, operands=operands):
+            bound = _bound(value)
+            if len(operands) == 1:
+                return f"{word}{bound} {value_text(operands[0], indent)}"
+            left, right = (value_text(operand, indent) for operand in operands)
+            return f"({left} {word}{bound} {right})"
+        case Course(word=word, operand=operand):
+            by = f", {_length(value.by, frames=value.frames)}" if word == "delta" else ""
+            counted = " in frames" if word in {"run_length", "since_true"} and value.frames else ""
+            return f"{word}({value_text(operand, indent)}{by}){counted}"
+        case Moment(step=step):
+            return f"t(step {step + 1})"
+
+
+def _bound(tense: Tense) -> str:
+    if not tense.low and tense.high is None:
+        return ""
+    high = "INF" if tense.high is None else _length(tense.high, frames=tense.frames)
+    return f"[{_length(tense.low, frames=tense.frames)}, {high}]"
+
+
+def _length(amount: int, *, frames: bool) -> str:
+    return f"{amount}frames" if frames else f"{amount / 1e9:g}s"
 
 
 def _leaf(value: Bound) -> str:
