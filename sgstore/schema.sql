@@ -127,6 +127,9 @@ CREATE TABLE derived_edge (                                    -- as edge
   set_name VARCHAR, relation relation, src_is_ego BOOLEAN, dst_is_ego BOOLEAN, src_kind kind, dst_kind kind,
   bucket BIGINT, src INTEGER, dst INTEGER, mask BIGINT);
 
+CREATE TABLE derived_gap (                                     -- as lane_gap
+  set_name VARCHAR, frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);
+
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
   bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
   chunk_offset BIGINT, "offset" BIGINT, length BIGINT);

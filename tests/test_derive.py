@@ -59,6 +59,9 @@ def same(derived, name, ingested) -> None:
     assert made == set(ingested.sql(EDGES).values)
     assert made
     assert set(derived.sql(DERIVED_NODES.format(name)).values) == set(ingested.sql(NODES).values)
+    gaps = "SELECT frame_id, src, dst, gap FROM "
+    kept = derived.sql(f"{gaps} derived_gap WHERE set_name = '{name}'").values
+    assert set(kept) == set(ingested.sql(f"{gaps} lane_gap").values)
     (one,) = [s for s in derived.file.deriving.sets() if s.name == name]
     assert one.answers == ingested.info()[0].answers
 
@@ -89,6 +92,23 @@ def test_real_traces_derive_to_what_ingesting_gives(data, tmp_path, path) -> Non
     derive(store.file.path, config, "other")
 
     same(store, "other", stored(tmp_path / "b.sgstore", trace, config))
+
+
+def test_who_follows_farther_off_under_other_settings_has_a_gap_too(data, tmp_path) -> None:
+    trace = data / "traces/esmini/highway_merge.mcap"
+    near, far = ({"lanes": {"ahead": ahead}} for ahead in (15.0, 90.0))
+    store = stored(tmp_path / "near.sgstore", trace, configured(**near))
+    derive(store.file.path, configured(**far), "far")
+    ingested = stored(tmp_path / "far.sgstore", trace, configured(**far))
+    pattern = "MATCH (a)-[f:follows]->(b) RETURN frame.id, a.id, b.id, f.gap"
+
+    gaps = set(ingested.find(pattern).rows())
+
+    assert set(store.find(f"USING ABSTRACTION far {pattern}").rows()) == gaps
+    assert len(gaps) > len(store.find(pattern).rows())
+    (frame, *_, gap) = max(gaps, key=lambda row: row[-1])[-4:]
+    graph = store.graph(frame, abstraction="far")
+    assert gap in {about.get("gap") for *_, about in graph.edges(data=True)}
 
 
 def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path) -> None:
@@ -164,5 +184,12 @@ def test_a_trace_that_is_removed_takes_its_sets_with_it(tmp_path) -> None:
     store.file.remove("town")
 
     assert store.file.deriving.sets() == ()
-    for table in ("derived_node", "derived_edge", "later_class", "frame_class", "manifest"):
+    for table in (
+        "derived_node",
+        "derived_edge",
+        "derived_gap",
+        "later_class",
+        "frame_class",
+        "manifest",
+    ):
         assert not store.file.rows(f"SELECT 1 FROM {table} LIMIT 1").values

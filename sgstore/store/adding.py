@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sgstore.store.access import spill_folder
 from sgstore.store.checksums import Checksum, expressions
-from sgstore.store.packing import BUCKET_BITS
+from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
 from sgstore.store.staging import Staging, quoted, scratch
 
 if TYPE_CHECKING:
@@ -72,14 +72,21 @@ def _ranges(
         "SELECT column_name FROM duckdb_columns() WHERE database_name = 'store' AND table_name = ?",
         [table],
     ).fetchall()
-    if ("bucket",) not in columns:
+    bits = {"bucket": 0, "frame_id": FRAME_BITS}
+    column = next((name for name in bits if (name,) in columns), None)
+    if column is None:
         return [("trace_id = ?", [trace_id])]
+    bit = bits[column]
     low, high = trace_id << BUCKET_BITS, (trace_id + 1) << BUCKET_BITS
     (last,) = connection.execute(
-        f"SELECT max(bucket) FROM store.{table} WHERE bucket >= ? AND bucket < ?", [low, high]
+        f"SELECT max({column} >> {bit}) FROM store.{table} WHERE {column} >= ? AND {column} < ?",
+        [low << bit, high << bit],
     ).fetchall()[0]
     end = low if last is None else last + 1
     return [
-        ("bucket >= ? AND bucket < ?", [first, min(first + _WINDOW, end)])
+        (
+            f"{column} >= ? AND {column} < ?",
+            [first << bit, min(first + _WINDOW, end) << bit],
+        )
         for first in range(low, end, _WINDOW)
     ]

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sgstore.store.packing import Columns
     from sgstore.world import Ints
 
-TABLES: Final = ("derived", "derived_node", "derived_edge")
+TABLES: Final = ("derived", "derived_node", "derived_edge", "derived_gap")
 _BUCKETS: Final = 2
 """Buckets of a block: as many as at ingest."""
 
@@ -175,6 +175,7 @@ class Deriving:
                 "name": found,
                 "bucket": whole.frame_id >> FRAME_BITS,
                 "bit": 1 << whole.frame_id % (1 << FRAME_BITS),
+                "frame": whole.frame_id,
             }
 
             def rows(sql: str) -> list[tuple[Any, ...]]:
@@ -185,8 +186,14 @@ class Deriving:
             ends = "SELECT src, relation::VARCHAR, dst FROM"
             drawn = rows(f"{ends} derived_edge WHERE {_HERE} AND set_name = $name ORDER BY ALL")
             before = rows(f"{ends} edge WHERE {_HERE}")
+            gaps = rows(
+                "SELECT src, dst, gap FROM derived_gap"
+                " WHERE frame_id = $frame AND set_name = $name AND gap IS NOT NULL"
+            )
         nodes = {node: whole.nodes[node] for (node,) in present if node in whole.nodes}
         about = {(src, relation, dst): more for src, relation, dst, more in whole.edges}
+        about |= {(src, "follows", dst): {"gap": gap} for src, dst, gap in gaps}
+        about |= {(dst, "leads", src): {"gap": gap} for src, dst, gap in gaps}
         edges = [(a, r, b, dict(about.get((a, r, b), {}))) for a, r, b in drawn]
         # What is left is edges of the map.
         old = set(before)
@@ -261,6 +268,7 @@ class Building:
         }
         self._insert("derived_node", moving)
         self._insert("derived_edge", packing.edge_columns(graph, self._trace_id, self._kinds))
+        self._insert("derived_gap", packing.gap_columns(graph, self._trace_id))
 
     def append_labelled(self, seq: Ints, seen: Seen, graphs: Labelled) -> None:
         """Add the next frames as an abstraction has them: those of its nodes and edges that a store can hold.
@@ -308,7 +316,8 @@ class Building:
 
     def _insert(self, table: str, columns: Columns) -> None:
         named = texts([self._name])
-        self._staging.insert(table, columns | {"set_name": named.repeat(len(columns["mask"]))})
+        count = len(next(iter(columns.values())))
+        self._staging.insert(table, columns | {"set_name": named.repeat(count)})
 
     def publish(self, settings: Mapping[str, Any], digest: str, answers: tuple[str, ...]) -> None:
         """Bring the set into the store, in one transaction; one of the same name goes.
@@ -348,9 +357,13 @@ def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
     connection.execute(
         "DELETE FROM store.derived WHERE name = ? AND trace_id = ?", [name, trace_id]
     )
-    for table in ("derived_node", "derived_edge"):
+    for table, trace in (
+        ("derived_node", "bucket >> 18"),
+        ("derived_edge", "bucket >> 18"),
+        ("derived_gap", "frame_id >> 24"),
+    ):
         connection.execute(
-            f"DELETE FROM store.{table} WHERE set_name = ? AND bucket >> 18 = ?", [name, trace_id]
+            f"DELETE FROM store.{table} WHERE set_name = ? AND {trace} = ?", [name, trace_id]
         )
 
 

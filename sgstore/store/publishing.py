@@ -224,6 +224,7 @@ FROM store.edge GROUP BY ALL ORDER BY ALL""",
     "later_class": "SELECT * FROM store.later_class ORDER BY ALL",
     "derived_node": "SELECT * FROM store.derived_node ORDER BY ALL",
     "derived_edge": "SELECT * FROM store.derived_edge ORDER BY ALL",
+    "derived_gap": "SELECT * FROM store.derived_gap ORDER BY ALL",
 }
 """The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
 

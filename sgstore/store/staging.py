@@ -69,6 +69,7 @@ SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, m
     "later_class": "SELECT * FROM later_class ORDER BY ALL",
     "derived_node": "SELECT * FROM derived_node ORDER BY ALL",
     "derived_edge": "SELECT * FROM derived_edge ORDER BY ALL",
+    "derived_gap": "SELECT * FROM derived_gap ORDER BY ALL",
     "message": "SELECT * FROM message",
 }
 """The tables that grow with a trace, sorted as they are published."""
