@@ -62,7 +62,7 @@ def _node(label: str) -> str | None:
 
 _PATTERN: Final = re.compile(r"\s*MATCH\b(?P<body>.*)", re.IGNORECASE | re.DOTALL)
 _BEYOND: Final = re.compile(
-    r"\b(RETURN|ORDER\s+BY|LIMIT|SAMPLE|THEN|UNTIL|FOR|CHECK|USING|DEFINE)\b|;|--|/\*",
+    r"\b(RETURN|ORDER\s+BY|LIMIT|SAMPLE|THEN|UNTIL|FOR|CHECK|USING|DEFINE)\b|;|(?<!<)--(?!\(|>\s*\()|/\*",
     re.IGNORECASE,
 )
 _TEXT: Final = re.compile(r"'(?:[^'\\]|\\.|'')*'")

@@ -203,7 +203,7 @@ class _Held:
         return self._known[pattern]
 
     def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
-        """(slot, value) → in which frames, of those that count, it has this value; bits of eight frames a byte."""
+        """(slot, value) → in which frames, of those that count, it has this value."""
         counts = self.of(specification.where)
         held: dict[tuple[str, str], Bits] = {}
         for slot in specification.slots:
