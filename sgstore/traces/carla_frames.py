@@ -289,8 +289,8 @@ class FrameDecoder:
             for row in np.flatnonzero(~usable).tolist():
                 self._unuse("object {} has no usable pose", int(node[row]), frame)
             node, values = node[usable], values[usable]
-        first = np.unique(node, return_index=True)[1]
-        if len(first) < len(node):
+        if len(set(node.tolist())) < len(node):
+            first = np.unique(node, return_index=True)[1]
             for row in np.setdiff1d(np.arange(len(node)), first).tolist():
                 self._unuse("object {} comes more than once in a frame", int(node[row]), frame)
             first.sort()
