@@ -21,7 +21,7 @@ from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import networkx as nx
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from sgstore.lang.pattern import Pattern
     from sgstore.lang.whynot import WhyNot
     from sgstore.store import Rows, StoredTrace
+    from sgstore.store.likeness import Like
 
 
 class Store:
@@ -218,6 +219,61 @@ class Store:
             There is no such trace, or others keep the store for too long.
         """
         return self.file.abstracted.classes(abstraction, trace)
+
+    def like(
+        self,
+        frame: int | str | FrameRef,
+        *,
+        abstraction: str = "RSV",
+        ignore: Sequence[str] = (),
+        limit: int = 10,
+    ) -> list[Like]:
+        """Frames like one that is given: first those of the same class, then the most like, in runs.
+
+        Two frames are compared by their graphs in an abstraction, as multisets of nodes by label and of edges
+        by the labels of edge and ends, with the weighted Jaccard index. Each answer says what is shared, and
+        what is not.
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it. It is like itself, so the first answer holds it or is as good.
+        abstraction : str
+            As :meth:`classes` takes it.
+        ignore : sequence of str
+            Labels, kinds, words for several kinds, and relations that do not count.
+        limit : int
+            How many runs of consecutive frames to give.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame.
+        AbstractionError
+            There is no such abstraction, or nothing is called as what is to be ignored.
+        """
+        return self.file.like(_ref(frame), abstraction, ignore, limit)
+
+    def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
+        """The text of a pattern that describes a frame around its ego, and matches it.
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+        ignore : sequence of str
+            Relations and kinds that it leaves out.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame.
+        QueryError
+            It has no ego, or nothing is called as what is to be ignored.
+        """
+        from sgstore.lang.example import pattern_of
+
+        return pattern_of(self.file.graph(_ref(frame)), ignore)
 
     def payload(self, frame: int | str | FrameRef, channel: str) -> bytes:
         """The data of the sensor message of a channel that belongs to a frame, read from the recording.

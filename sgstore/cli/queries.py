@@ -134,6 +134,72 @@ def why_not(
     return 0
 
 
+@app.command()
+def like(
+    store: StorePath,
+    frame: FrameName,
+    ignore: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ignore", metavar="NAME", help="A relation or a kind that does not count; repeatable."
+        ),
+    ] = None,
+    abstraction: Annotated[
+        str, typer.Option("--abstraction", metavar="NAME", help="Whose graphs are compared.")
+    ] = "RSV",
+    limit: Annotated[int, typer.Option("--limit", min=1, help="How many runs of frames.")] = 10,
+    pattern: Annotated[
+        bool, typer.Option("--pattern", help="Print a pattern that describes the frame instead.")
+    ] = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+) -> int:
+    """Find frames like another: of the same class, or the most like by what they have in common.
+
+    One row for consecutive frames that are as like as each other: the first one, how many, how like, whether
+    the graphs are the same, and what the example has that they have not, and they that it has not.
+    """
+    opened = open_store(store)
+    if pattern:
+        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", output)
+        return 0
+    found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
+    form = form_for(form, output, as_json=as_json)
+    if form is Format.table:
+        columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
+        rows = (
+            (
+                f"{one.frame.trace}#{one.frame.seq}",
+                round(one.frame.t, 3),
+                one.frames,
+                round(one.similarity, 3),
+                one.same,
+                _counted(one.missing),
+                _counted(one.extra),
+            )
+            for one in found
+        )
+        write_rows(columns, rows, form, output)
+        return 0
+    columns = ("frame_id", "trace", "seq", "time_ns", "t", "frames", "similarity", "same")
+    columns += ("shared", "missing", "extra")
+    rows = (
+        (
+            *(getattr(one.frame, name) for name in columns[:5]),
+            *(getattr(one, name) for name in columns[5:]),
+        )
+        for one in found
+    )
+    write_rows(columns, rows, form, output)
+    return 0
+
+
+def _counted(features: dict[str, int]) -> str:
+    """Features with how often, as one text."""
+    return ", ".join(f"{n} x {text}" if n > 1 else text for text, n in features.items())
+
+
 class Language(StrEnum):
     """Languages that are translated."""
 

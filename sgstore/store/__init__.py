@@ -11,11 +11,11 @@ users' own tables beside the store.
 
 from sgstore.store.file import StoreFile
 from sgstore.store.folder import Folder
+from sgstore.store.joining import UserTables
 from sgstore.store.parquet import write_parquet
 from sgstore.store.rows import Batches, Rows
 from sgstore.store.sealed import Sealed
 from sgstore.store.segment import Segment, new_segment
-from sgstore.store.joining import UserTables
 from sgstore.store.traces import FrameRef, StoredTrace
 
 __all__ = [

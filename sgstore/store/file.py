@@ -41,7 +41,7 @@ from sgstore.store.traces import (
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable
+    from collections.abc import Callable, Generator, Iterable, Sequence
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
@@ -50,9 +50,10 @@ if TYPE_CHECKING:
     from sgstore.graph import SceneGraph
     from sgstore.lang import Catalog
     from sgstore.roads import RoadMap
+    from sgstore.store.joining import Joined, UserTables
+    from sgstore.store.likeness import Like
     from sgstore.store.rows import Parameters
     from sgstore.store.sealed import Sealed
-    from sgstore.store.joining import Joined, UserTables
     from sgstore.store.verifying import Fault, Verification
     from sgstore.traces.carried import Carried
     from sgstore.world import TraceInfo
@@ -487,6 +488,15 @@ class StoreFile:
         if self._abstracted is None:
             self._abstracted = Abstracted(self.path, self._access)
         return self._abstracted
+
+    def like(
+        self, ref: int | str, abstraction: str, ignored: Sequence[str], limit: int
+    ) -> list[Like]:
+        """Frames like another; see :func:`sgstore.store.likeness.frames_like`."""
+        from sgstore.store.likeness import frames_like
+
+        with translated(self.path):
+            return frames_like(self._access, ref, abstraction, ignored, limit)
 
     @property
     def deriving(self) -> Deriving:
