@@ -25,13 +25,20 @@ from sgstore.lang.bound import (
     walk,
 )
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Catalog, Type
-from sgstore.lang.formulas import Select, columns_of, expression_text, leaves, nested, quoted
+from sgstore.lang.formulas import (
+    Leaf,
+    Select,
+    columns_of,
+    expression_text,
+    leaves,
+    nested,
+    quoted,
+)
 from sgstore.lang.frames import Frames, column_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from sgstore.lang.formulas import Leaf
     from sgstore.lang.phases import Window
 
 GAP: Final = 2.5
@@ -69,16 +76,39 @@ class Output:
     text: str
 
 
-def rows(query: Query, catalog: Catalog, window: Window | None = None) -> Statement:
-    """The statement for what a query returns, whatever its form."""
+Span = tuple[Leaf, Leaf]
+"""Of a match over several frames: the values that are its first and its last ``frame_id``."""
+
+
+def rows(
+    query: Query,
+    catalog: Catalog,
+    window: Window | None = None,
+    writer: Frames | None = None,
+    span: Span | None = None,
+) -> Statement:
+    """The statement for what a query returns, whatever its form.
+
+    Parameters
+    ----------
+    query : Query
+    catalog : Catalog
+    window : Window, optional
+    writer : Frames, optional
+        Says what matches; by default what the pattern finds.
+    span : Span, optional
+        Of a query whose matches are intervals themselves.
+    """
     if query.result.form in {"intervals", "clips"}:
-        return intervals(query, catalog, window)
-    return _Rows(query, catalog, window).statement()
+        return intervals(query, catalog, window, writer, span)
+    return _Rows(query, writer or Frames(query, catalog, window)).statement()
 
 
-def frames(query: Query, catalog: Catalog, window: Window | None = None) -> Statement:
+def frames(
+    query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
+) -> Statement:
     """The frames that match, each once, with their log times."""
-    writer = Frames(query, catalog, window)
+    writer = writer or Frames(query, catalog, window)
     relation = writer.frames(query.scope, None, frozenset())
     outputs = [*_frame_columns(), (LOG_TIME, f'{_FRAME}."{LOG_TIME}"')]
     select = Select([_named(text, name) for name, text in outputs])
@@ -87,11 +117,13 @@ def frames(query: Query, catalog: Catalog, window: Window | None = None) -> Stat
     return _finished(writer, select.text(), [name for name, _ in outputs])
 
 
-def count(query: Query, catalog: Catalog, window: Window | None = None) -> Statement:
+def count(
+    query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
+) -> Statement:
     """How many frames match."""
-    writer = Frames(query, catalog, window)
+    told, writer = writer is not None, writer or Frames(query, catalog, window)
     parts = writer.phases(query.scope)
-    if parts.rest or parts.late:
+    if parts.rest or parts.late or told:
         relation = writer.frames(query.scope, None, frozenset())
         text = Select(['count(*) AS "frames"'], [nested(relation, ":rows")]).text()
     else:
@@ -99,9 +131,15 @@ def count(query: Query, catalog: Catalog, window: Window | None = None) -> State
     return _finished(writer, text, ("frames",))
 
 
-def intervals(query: Query, catalog: Catalog, window: Window | None = None) -> Statement:
+def intervals(
+    query: Query,
+    catalog: Catalog,
+    window: Window | None = None,
+    writer: Frames | None = None,
+    span: Span | None = None,
+) -> Statement:
     """Intervals in which what is returned (nothing but a match, if nothing is) stays the same."""
-    return _Intervals(query, catalog, window).statement()
+    return _Intervals(query, writer or Frames(query, catalog, window), span).statement()
 
 
 def with_bindings(query: Query) -> Query:
@@ -118,9 +156,9 @@ def with_bindings(query: Query) -> Query:
 class _Rows:
     """Writes the statement of a query whose results are rows."""
 
-    def __init__(self, query: Query, catalog: Catalog, window: Window | None) -> None:
+    def __init__(self, query: Query, writer: Frames) -> None:
         self.query, self.result = query, query.result
-        self.writer = Frames(query, catalog, window)
+        self.writer = writer
         scope = query.scope
         counted = not self.result.distinct and not self.result.framed
         roles = {"named", "unnamed"} if counted and not self.result.whole else {"named"}
@@ -211,16 +249,20 @@ class _Rows:
 class _Intervals:
     """Writes the statement of a query whose results are intervals, or the clips around them."""
 
-    def __init__(self, query: Query, catalog: Catalog, window: Window | None) -> None:
+    def __init__(self, query: Query, writer: Frames, span: Span | None) -> None:
         self.query, self.result = query, query.result
-        self.writer = Frames(query, catalog, window)
+        self.writer, self.span = writer, span
 
     def statement(self) -> Statement:
         columns = self.result.columns
         keys = [quoted(f"key {number}") for number in range(len(columns))]
         wanted = [leaf for column in columns for leaf in leaves(column.value)]
+        wanted += self.span or ()
         relation = self.writer.frames(self.query.scope, None, frozenset(), frozenset(), wanted)
-        runs = self._runs(self._steps(relation, keys), keys)
+        if self.span is None:
+            runs = self._runs(self._steps(relation, keys), keys)
+        else:
+            runs = self._spans(relation, keys, self.span)
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
         named = [f"{key} AS {quoted(c.name)}" for key, c in zip(keys, columns, strict=True)]
@@ -243,11 +285,7 @@ class _Intervals:
     def _steps(self, relation: str, keys: list[str]) -> str:
         """Frames and keys, with the number and the time of the frame before that has the same keys."""
         inner = Select(['"frame_id"'], [nested(relation, ":rows")], distinct=True)
-        for key, column in zip(keys, self.result.columns, strict=True):
-            text = expression_text(
-                column.value, lambda leaf: f"{_ROWS}.{quoted(column_of(leaf))}", self.writer.values
-            )
-            inner.columns.append(f"{text} AS {key}")
+        inner.columns += self._keys(keys)
         times = ["frame_id", "trace_id", "seq", "time_ns", "log_time_ns"]
         select = Select([f"{_FRAME}.{quoted(name)}" for name in times] + keys)
         same = ", ".join([f'{_FRAME}."trace_id"', *keys])
@@ -258,6 +296,33 @@ class _Intervals:
             f'coalesce({_TRACE}."period_ns", 0) * {GAP} AS "longest gap"',
         ]
         _from_frames(select, inner.text())
+        return select.text()
+
+    def _keys(self, keys: list[str]) -> list[str]:
+        """The values that stay the same, under their keys."""
+        texts = [
+            expression_text(
+                column.value, lambda leaf: f"{_ROWS}.{quoted(column_of(leaf))}", self.writer.values
+            )
+            for column in self.result.columns
+        ]
+        return [f"{text} AS {key}" for text, key in zip(texts, keys, strict=True)]
+
+    def _spans(self, relation: str, keys: list[str], span: Span) -> str:
+        """Matches that are intervals themselves, each as one row."""
+        ends = [f"{_ROWS}.{quoted(column_of(leaf))}" for leaf in span]
+        inner = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"', *self._keys(keys)])
+        inner.join(nested(relation, ":rows"), [])
+        inner.distinct = True
+        select = Select(['":from"."trace_id" AS "trace_id"', *keys])
+        select.columns += ['":from"."frame_id" AS "first"']
+        select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
+        for column, name in (("seq", "seq"), ("time_ns", "time"), ("log_time_ns", "log")):
+            select.columns += [f'":from".{quoted(column)} AS {quoted(f"min {name}")}']
+            select.columns += [f'":to".{quoted(column)} AS {quoted(f"max {name}")}']
+        select.join(nested(inner.text(), ":spans"), [])
+        select.join('"frame" AS ":from"', ['":from"."frame_id" = ":spans".":from"'])
+        select.join('"frame" AS ":to"', ['":to"."frame_id" = ":spans".":to"'])
         return select.text()
 
     def _runs(self, steps: str, keys: list[str]) -> str:
