@@ -308,7 +308,7 @@ SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.iden
        e.parked
 FROM entity e JOIN trace t ON t.trace_id = e.trace_id;
 
-COMMENT ON VIEW entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
+COMMENT ON VIEW entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
 
 CREATE VIEW payloads AS
 SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, t.uri AS file,
