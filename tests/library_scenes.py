@@ -597,7 +597,7 @@ SCENES |= {
         FIRST_COME.with_actor("v", speed=[(0, 4), (4.1, 4), (4.9, 0), (10.5, 0), (11, 1)]),
     ),
     "yield_right_820": (AT_ONCE, AT_ONCE.with_actor("ego", speed=WAITING, start=119.0)),
-    "yield_emergency_829": (SIREN, SIREN.with_actor("ego", route=aside(60, RIGHT, LEFT))),
+    "yield_emergency_829": (SIREN, SIREN.with_actor("ego", route=aside(45, RIGHT, LEFT, 15))),
     "turn_lanes_846": (
         Scene(WIDE, ego(through("s", "e", 2, out=1), 6, start=115), seconds=8, drawn=(0.0, 6.0)),
         Scene(WIDE, ego(through("s", "e", 2, out=2), 6, start=115), seconds=8),

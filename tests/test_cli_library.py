@@ -110,6 +110,16 @@ def test_run_ends_with_a_code_of_its_own_where_nothing_matches(
     assert said(capsys, "run", store, "emergency_vehicle_near", "--json") == "[]\n"
 
 
+def test_run_tells_whether_a_property_is_kept(
+    capsys: pytest.CaptureFixture[str], store: str
+) -> None:
+    (row,) = json.loads(said(capsys, "run", store, "phi2", "--json"))
+
+    assert (row["check"], row["trace"], row["verdict"]) == ("phi2", "town", "true")
+    assert run(["patterns", "run", store, "phi4", "S=0", "--require"]) == NO_MATCH
+    assert "phi4" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
@@ -118,6 +128,7 @@ def test_run_ends_with_a_code_of_its_own_where_nothing_matches(
         (["run", "{}", "cut_in", "within=soon"], "expected a duration such as 4s"),
         (["run", "{}", "cut_in", "soon"], "expected NAME=VALUE"),
         (["run", "{}", "stopped"], "stopped is a condition"),
+        (["run", "{}", "phi1", "--clips"], "phi1 is a property"),
         (["list", "--kind", "recipe"], "recipe"),
     ],
 )

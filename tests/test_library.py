@@ -246,3 +246,30 @@ def test_a_pattern_finds_its_drawn_example_and_not_its_counter_example(
 @pytest.mark.parametrize("name", [n for n in FOUND if patterns()[n].kind == "concept"])
 def test_a_concept_has_a_counter_example(name: str) -> None:
     assert len(PLACES[name]) == 2
+
+
+# Rules ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_rule_is_violated_in_its_example_and_kept_in_the_other(scenes: Store, name: str) -> None:
+    verdicts = {one.trace: one.verdict for one in scenes.check(patterns()[name].text)}
+    (violated, _), (kept, _) = PLACES[name]
+
+    assert verdicts[violated] == "false"
+    assert verdicts[kept] == "true"
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_rule_has_a_verdict_for_the_sample(sample: Store, name: str) -> None:
+    (verdict,) = sample.check(patterns()[name].text)
+
+    assert verdict.trace == "town"
+    assert verdict.verdict in {"true", "false"}
+
+
+@pytest.mark.parametrize("name", [n for n, one in EXAMPLES.items() if one.is_check])
+def test_a_rule_of_the_literature_has_a_verdict_for_the_sample(sample: Store, name: str) -> None:
+    (verdict,) = sample.check(EXAMPLES[name].text)
+
+    assert verdict.verdict in {"true", "false"}

@@ -21,6 +21,7 @@ from sgstore.cli.arguments import (
     say_left_out,
     seconds_of,
 )
+from sgstore.cli.checks import check
 from sgstore.cli.output import Format, say, write_document, write_rows, write_text
 
 if TYPE_CHECKING:
@@ -127,6 +128,18 @@ def run_pattern(
     if found.kind == "predicate":
         hint = f"a condition: ask 'sgstore find STORE \"MATCH … WHERE {found.name}(…)\"'"
         raise typer.BadParameter(f"{found.name} is {hint}")
+    if found.is_check:
+        if clips:
+            raise typer.BadParameter(f"{found.name} is a property, which has verdicts and no clips")
+        return check(
+            store,
+            name=found.name,
+            parameters=chosen,
+            require=require,
+            form=form,
+            as_json=as_json,
+            output=output,
+        )
     text = found.written(**parameters_of(chosen))
     form = form_of(form, as_json=as_json)
     matches = open_store(store).find(text)
