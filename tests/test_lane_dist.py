@@ -193,3 +193,33 @@ def test_lanes_without_sections_have_no_places_so_that_nothing_is_known(data: Pa
     road_map = read_map(path.read_text(), "Town02")
     assert len(road_map.reach[0]) > len(road_map.ribbons)
     assert not len(road_map.without_sections.reach[0])
+
+
+def test_it_stands_in_conditions_blocks_orders_and_counts_and_under_an_abstraction(
+    store: Store,
+) -> None:
+    rows = "SELECT frame_id, src, dst, lane_dist FROM pairs WHERE lane_dist BETWEEN 0 AND 60"
+    expected = {row[:3] for row in store.sql(rows).values}
+    near = "lane_dist(a, b) >= 0 AND lane_dist(a, b) <= 60"
+    told = "RETURN frame.id, a.id, b.id"
+    moving = {
+        row[0] for row in store.sql("SELECT DISTINCT node_id FROM nodes WHERE speed > -1").values
+    }
+
+    def found(query: str) -> list[tuple[int, ...]]:
+        found = [tuple(row[-3:]) for row in store.find(query).rows()]
+        return [row for row in found if {row[1], row[2]} <= moving]
+
+    everyone = found(f"MATCH (a:Entity), (b:Entity) WHERE {near} {told}")
+    assert set(everyone) == {row for row in expected if {row[1], row[2]} <= moving}
+    assert len(everyone) > 10
+    ordered = found(f"MATCH (a:Entity), (b:Entity) WHERE {near} {told} ORDER BY lane_dist(a, b)")
+    assert sorted(ordered) == sorted(everyone)
+    # E has no scenery, and kinds are drawn at random here.
+    some = set(found(f"USING ABSTRACTION E MATCH (a:Entity), (b:Entity) WHERE {near} {told}"))
+    assert some
+    assert some < set(everyone)
+    block = f"MATCH (a:Entity) WHERE EXISTS {{(b:Entity) WHERE {near}}} RETURN frame.id, a.id"
+    assert {tuple(row[-2:]) for row in store.find(block).rows()} >= {row[:2] for row in everyone}
+    count = store.find(f"MATCH (a:Entity), (b:Entity) WHERE {near} RETURN COUNT(*) AS n").rows()
+    assert count[0][-1] >= len(everyone)
