@@ -93,19 +93,24 @@ def _ground(scene: Scene, columns: range, rows: range) -> list[list[str]]:
 def _put(
     canvas: list[list[str]], of: Actor, at: dict[str, Any], time: float, left: int, low: int
 ) -> None:
+    """An actor: its letter, and an arrow before it that covers no other letter."""
     column, row = int(at["x"] // CELL) - left, int(at["y"] // LANE) - low
     label = _label(of, time)
     while 0 < column < len(canvas[row]) and canvas[row][column].isalnum():
         column -= len(label)  # two in one cell stand beside one another
-    moves = np.hypot(at["vx"], at["vy"]) > 0.1
-    way = round(np.arctan2(at["vy"], at["vx"]) / (np.pi / 2)) % 4 if moves else -1
-    marks = {(column + i, row): sign for i, sign in enumerate(label)}
-    step = {0: (len(label), 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}.get(way)
-    if step is not None:
-        marks[column + step[0], row + step[1]] = ARROWS[way]
-    for (c, r), sign in marks.items():
-        if 0 <= r < len(canvas) and 0 <= c < len(canvas[r]):
-            canvas[r][c] = sign
+    for i, sign in enumerate(label):
+        _mark(canvas, column + i, row, sign)
+    if np.hypot(at["vx"], at["vy"]) > 0.1:
+        way = round(np.arctan2(at["vy"], at["vx"]) / (np.pi / 2)) % 4
+        right, up = ((len(label), 0), (0, 1), (-1, 0), (0, -1))[way]
+        _mark(canvas, column + right, row + up, ARROWS[way])
+
+
+def _mark(canvas: list[list[str]], column: int, row: int, sign: str) -> None:
+    if not (0 <= row < len(canvas) and 0 <= column < len(canvas[row])):
+        return
+    if sign.isalnum() or not canvas[row][column].isalnum():
+        canvas[row][column] = sign
 
 
 def _label(of: Actor, time: float) -> str:
@@ -120,9 +125,7 @@ def _signs(canvas: list[list[str]], scene: Scene, left: int, low: int) -> None:
     nodes = scene.road.nodes
     for name, x, y in zip(nodes.name, nodes.x.tolist(), nodes.y.tolist(), strict=True):
         if name.startswith("stop-"):
-            c, r = int(x // CELL) - left, int(y // LANE) - low
-            if 0 <= r < len(canvas) and 0 <= c < len(canvas[r]):
-                canvas[r][c] = "S"
+            _mark(canvas, int(x // CELL) - left, int(y // LANE) - low, "S")
 
 
 def _trimmed(lines: list[str]) -> list[str]:

@@ -68,7 +68,7 @@ CUT_IN = Scene(
     WAYS,
     ego(along(RIGHT), 15),
     actor("v", aside(40, LEFT, RIGHT), 15, start=12),
-    drawn=(0.0, 2.0, 4.0),
+    drawn=(0.0, 4.0),
 )
 CUT_OUT = Scene(
     WAYS,
@@ -409,7 +409,11 @@ SCENES |= {
             drawn=(1.5, 5.0),
         ),
         "InvadingTurn": Scene(
-            TWO_WAY, ego(along(RIGHT), 8), actor("v", along(0.6, 60, -100), 6), seconds=4
+            TWO_WAY,
+            ego(along(RIGHT), 8),
+            actor("v", along(0.6, 60, -100), 6),
+            seconds=4,
+            drawn=(2.0,),
         ),
         "MergerIntoSlowTraffic": Scene(
             PLAIN,
