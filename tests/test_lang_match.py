@@ -17,6 +17,7 @@ from sgstore.errors import QueryError
 from sgstore.graph import SceneGraph
 from sgstore.ingest import ingest
 from sgstore.lang import compile_query
+from sgstore.lang.catalog import Catalog
 from sgstore.lang.evaluation import FrameView
 from sgstore.lang.match import Matcher
 from sgstore.lang.whynot import why_not
@@ -191,3 +192,25 @@ def _sorted(rows: list[Any]) -> list[list[tuple[str, int]]]:
     return sorted(
         sorted(dict(row).items()) for row in {tuple(sorted(r.items())): r for r in rows}.values()
     )
+
+
+def test_the_class_of_a_frame_is_asked_for_only_where_a_query_asks_and_once() -> None:
+    asked: list[str] = []
+
+    def classes(name: str) -> str:
+        asked.append(name)
+        return f"of {name}"
+
+    nodes = {n: {"kind": "car", "is_ego": n == 0} for n in range(4)}
+    view = FrameView(SceneGraph(1, "t", 0, 0, 0, nodes, []), classes=classes)
+
+    def count(condition: str, of: FrameView) -> int:
+        query = compile_query(f"MATCH (c:Car) WHERE {condition}", Catalog(classed=("E", "RSV")))
+        return sum(1 for _ in Matcher(query.bound).matches(of))
+
+    assert count("c.is_ego OR NOT c.is_ego", view) == 4
+    assert asked == []
+    assert count("frame.class = 'of RSV'", view) == 4
+    assert count("frame.class('E') = 'of RSV'", view) == 0
+    assert asked == ["RSV", "E"]
+    assert count("frame.class IS NULL", FrameView(view.graph)) == 4
