@@ -1,0 +1,60 @@
+"""Scenarios that a simulator played, found by the names of the library."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sgstore.ingest import ingest
+from sgstore.lang import patterns
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from sgstore.matches import Interval
+
+pytestmark = pytest.mark.data
+
+RECORDINGS = ("cut-in", "highway_merge", "pedestrian", "traffic_lights")
+
+
+@pytest.fixture(scope="module")
+def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A store of what esmini played."""
+    path = tmp_path_factory.mktemp("esmini") / "esmini.sgstore"
+    ingest(path, [data / "traces" / "esmini" / f"{name}.mcap" for name in RECORDINGS])
+    return Store(path)
+
+
+def found(store: Store, name: str) -> list[Interval]:
+    return list(store.find(patterns()[name].text).intervals())
+
+
+def who(interval: Interval, variable: str) -> str:
+    return interval.values[f"{variable}.name"]
+
+
+def test_people_who_cross_are_found_by_name(store: Store) -> None:
+    crossings = found(store, "crossing_pedestrian")
+
+    assert {(c.trace, who(c, "p")) for c in crossings} == {
+        ("pedestrian", "person 1"),
+        ("traffic_lights", "person 1"),
+        ("traffic_lights", "person 2"),
+    }
+    assert {c.trace for c in found(store, "PedestrianCrossing")} == {"traffic_lights"}
+
+
+def test_red_phases_are_those_of_the_lights(store: Store) -> None:
+    rows = store.sql(
+        "SELECT n.name, n.frame_id FROM nodes n JOIN edges e ON e.frame_id = n.frame_id AND e.src = n.node_id "
+        "WHERE n.light_state = 'red' AND e.relation = 'controlsTrafficOf' GROUP BY ALL"
+    )
+    phases = found(store, "red_phase")
+    told = {(who(p, "t"), seq) for p in phases for seq in range(p.start_seq, p.end_seq + 1)}
+
+    assert {p.trace for p in phases} == {"traffic_lights"}
+    assert {who(p, "t") for p in phases} == {f"traffic_light {number}" for number in (5, 6, 7)}
+    assert told == {(name, frame_id & 0xFFFFFF) for name, frame_id in rows.values}
