@@ -15,6 +15,7 @@ TITLES = {
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
     "patterns": "Patterns over a million frames",
+    "coverage": "Coverage of a million frames",
 }
 
 names = [name for name in sys.argv[1:] if not name.startswith("-")] or list(TITLES)
