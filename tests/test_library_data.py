@@ -49,12 +49,13 @@ def test_people_who_cross_are_found_by_name(store: Store) -> None:
 
 def test_red_phases_are_those_of_the_lights(store: Store) -> None:
     rows = store.sql(
-        "SELECT n.name, n.frame_id FROM nodes n JOIN edges e ON e.frame_id = n.frame_id AND e.src = n.node_id "
-        "WHERE n.light_state = 'red' AND e.relation = 'controlsTrafficOf' GROUP BY ALL"
+        "SELECT DISTINCT n.name, f.seq FROM nodes n JOIN frames f USING (frame_id) "
+        "JOIN edges e ON e.frame_id = n.frame_id AND e.src = n.node_id "
+        "WHERE n.light_state = 'red' AND e.relation = 'controlsTrafficOf'"
     )
     phases = found(store, "red_phase")
     told = {(who(p, "t"), seq) for p in phases for seq in range(p.start_seq, p.end_seq + 1)}
 
     assert {p.trace for p in phases} == {"traffic_lights"}
     assert {who(p, "t") for p in phases} == {f"traffic_light {number}" for number in (5, 6, 7)}
-    assert told == {(name, frame_id & 0xFFFFFF) for name, frame_id in rows.values}
+    assert told == {tuple(row) for row in rows.values}
