@@ -22,6 +22,7 @@ VIEWS = {
     "lanes": "map node_id name lane_type road section lane junction turn x y z heading length width",
     "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",
     "events": "frame_id trace_id trace kind time_ns t log_time_ns node_id other value detail ident other_ident",
+    "imports": "frame_id graph place images",
     "payloads": "frame_id channel log_time_ns offset_s schema file chunk_offset message_offset length",
 }
 
