@@ -34,6 +34,7 @@ from sgstore.exporters.clips import (
     write_manifest,
 )
 from sgstore.exporters.mcap_graphs import Added, Waiting, is_added
+from sgstore.exporters.mcap_rules import examine
 from sgstore.exporters.mcap_writer import McapWriter
 from sgstore.traces import open_recording
 from sgstore.traces.fetch import digest_of
@@ -358,7 +359,7 @@ def _moved(clip: WrittenClip, to: Path) -> WrittenClip:
 
 
 def _validate(file: Path, counts: dict[int, int]) -> None:
-    """Read a clip with the official reader, in order and by its indexes, all checksums with it.
+    """Read a clip with the official reader, in order and by its indexes, and by the rules of its doctor.
 
     Raises
     ------
@@ -373,6 +374,10 @@ def _validate(file: Path, counts: dict[int, int]) -> None:
     except (McapError, struct.error, ValueError, LookupError, RuntimeError) as error:
         reason = f"{file.name}: what was written cannot be read back: {error!r}"
         raise ExportError(reason) from error
+    found = examine(file)
+    wrong = [error for error in found.errors if error not in found.of_definitions]
+    if wrong:  # what is wrong with the source's own definitions is kept as it is
+        raise ExportError(f"{file.name}: what was written breaks a rule of MCAP: {wrong[0]}")
     expected = {channel: count for channel, count in counts.items() if count}
     if not in_order == by_index == expected:
         raise ExportError(

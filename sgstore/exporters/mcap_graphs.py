@@ -22,6 +22,7 @@ from sgstore.errors import ExportError
 from sgstore.exporters import foxglove_scene
 from sgstore.exporters.export import WINDOW, ClipFrames
 from sgstore.exporters.scenes import graphs_of
+from sgstore.traces.foxglove_messages import DERIVED
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -33,9 +34,6 @@ if TYPE_CHECKING:
 GRAPH: Final = "/sgstore/graph"
 SCENE: Final = "/sgstore/scene"
 LABELS: Final = "/sgstore/labels"
-
-MARK: Final = {"sgstore": "derived"}
-"""Metadata of the channels that are made here."""
 
 _LABEL_VALUES: Final[dict[str, Any]] = {
     "type": "object",
@@ -119,7 +117,7 @@ class _Kind:
 
 def is_added(channel: Channel) -> bool:
     """Whether a channel was made by an export, and is no part of the recording."""
-    return all(channel.metadata.get(key) == value for key, value in MARK.items())
+    return all(channel.metadata.get(key) == value for key, value in DERIVED.items())
 
 
 class Added:
@@ -158,7 +156,7 @@ class Added:
         for i, kind in enumerate(self._kinds, 1):
             kind.number = channel + i
             yield Schema(schema + i, kind.schema_data, kind.schema_encoding, kind.schema)
-            yield Channel(kind.number, kind.topic, kind.encoding, dict(MARK), schema + i)
+            yield Channel(kind.number, kind.topic, kind.encoding, dict(DERIVED), schema + i)
 
     def channels(self) -> list[tuple[int, str, str]]:
         """Number, topic and schema of each, as they were defined last."""

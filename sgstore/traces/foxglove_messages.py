@@ -109,9 +109,15 @@ class Transform:
     pose: Pose | None
 
 
+DERIVED: Final = {"sgstore": "derived"}
+"""Metadata of channels that an export made of a recording, scene graphs to be drawn among them."""
+
+
 def encoding_of(recording: Recording, channel: int) -> str:
     """``protobuf`` or ``json`` for a channel whose messages are read here, else the empty string."""
     record = recording.channels[channel]
+    if DERIVED.items() <= record.metadata.items():
+        return ""
     schema = recording.schemas.get(record.schema_id)
     if schema is None or schema.name not in READ:
         return ""
