@@ -341,6 +341,7 @@ def test_clips_of_recordings_of_all_producers_keep_to_the_rules(
 
 
 SCHEMA = Schema(1, b"{}", "jsonschema", "Thing")
+EMPTY = {"data": b"", "encoding": ""}
 CHANNEL = Channel(1, "things", "json", {}, 1)
 
 
@@ -452,7 +453,7 @@ def test_a_file_that_breaks_a_rule_is_found_out(
         ({"header": [{"profile": "mine"}]}, "not well known: 'mine'"),
         ({"schema": [{}, {}]}, "schema 1 is defined twice"),
         ({"channel": [{}, {}]}, "channel 1 is defined twice"),
-        (dict.fromkeys(("schema", "schema_again"), [{"data": b"", "encoding": ""}]), "is empty"),
+        ({"schema": [EMPTY], "schema_again": [EMPTY]}, "is empty"),
         ({"times": (10, 30, 20)}, "a message at 20 comes after one at 30"),
         ({"index": []}, "no message index for a chunk"),
         ({"index": [{}, {}]}, "two message indexes of channel 1"),

@@ -175,7 +175,7 @@ def _of_record(record: Record) -> Sensed:
             return _of_pixels(data, record)
         if "fields" in record and ("point_step" in record or "point_stride" in record):
             return Cloud(_points(data, record))
-    except (ValueError, TypeError, OverflowError) as error:
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
         raise TraceError(f"not what it says: {error}") from error
     return None
 
