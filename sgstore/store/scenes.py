@@ -132,7 +132,11 @@ class Scenes:
                 src=-1 - edges["src"].astype(np.int64),
                 dst=-1 - edges["dst"].astype(np.int64),
                 relation=edges["relation"].tolist(),
-                reach=Reach(reach["src"], reach["dst"], reach["start"]),
+                reach=Reach(
+                    reach["src"].astype(np.int64),
+                    reach["dst"].astype(np.int64),
+                    reach["start"].astype(np.float64),
+                ),
             )
             while len(self._maps) > _MAPS:
                 self._maps.popitem(last=False)
