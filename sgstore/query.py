@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, overload
 from sgstore.abstractions import abstractions
 from sgstore.graph import named_graph
 from sgstore.lang import compile_query
-from sgstore.matches import Matches
 from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import folded
 
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from sgstore.lang.evaluation import FrameView
     from sgstore.lang.pattern import Pattern
     from sgstore.lang.whynot import WhyNot
+    from sgstore.matches import Matches
     from sgstore.store import Rows, StoredTrace
     from sgstore.store.likeness import Like
 
@@ -98,12 +98,17 @@ class Store:
             The text is no query, or names what the store does not know; it says where, and what would be right.
         """
         if isinstance(query, str):
-            return Matches(self.file, self.catalog, query, parameters)
+            return self._matches(query, parameters)
         from sgstore.lang.pattern import Pattern
 
         pattern = query if isinstance(query, Pattern) else Pattern.of(query)
         given = {**pattern.parameters, **parameters}
-        return Matches(self.file, self.catalog, str(pattern), given)
+        return self._matches(str(pattern), given)
+
+    def _matches(self, text: str, parameters: Mapping[str, object]) -> Matches:
+        from sgstore.history.stories import Stories
+
+        return Stories(self.file, self.catalog, text, parameters)
 
     def check(
         self,
@@ -314,10 +319,12 @@ class Store:
         StoreError
             There is no such frame.
         """
+        from sgstore.history.stories import refuse_over_time
         from sgstore.lang.whynot import WhyNot, why_not  # with numpy: only for who asks
 
         with self.file.snapshot():
             compiled = compile_query(text, self.catalog(), parameters)
+            refuse_over_time(compiled)
             ref = self.file.frame(_ref(frame))
             if ref.trace in compiled.left_out:
                 answers = self.file.trace(ref.trace_id).answers

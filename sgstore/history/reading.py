@@ -15,6 +15,7 @@ from sgstore.matches import windows
 from sgstore.temporal.columns import evaluate_rows
 from sgstore.temporal.formulas import Formula, propositions
 from sgstore.temporal.measures import Clock, Column, Measured
+from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -33,17 +34,39 @@ if TYPE_CHECKING:
 TRACE_SHIFT: Final = 24
 """``frame_id >> 24`` is the trace of a frame."""
 
+WORDS: Final = np.array(sorted(RELATIONS))
+"""Relations in alphabetical order."""
+
 CELLS: Final = 4_000_000
 """Bindings times frames that are worked on at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """A relation that is asked of a store: a pattern, its variables, and values of each match."""
+    """A relation that is asked of a store.
+
+    Attributes
+    ----------
+    query : Query
+        The pattern.
+    variables : tuple of str
+        Keys of its nodes that are bound: the columns of the relation's keys.
+    values : tuple of Bound
+        Asked of each match.
+    edges : tuple of str
+        Keys of its edges that are bound: further columns of the keys, places in :data:`WORDS`.
+    """
 
     query: Query
     variables: tuple[str, ...]
     values: tuple[Bound, ...] = ()
+    edges: tuple[str, ...] = ()
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it asks nothing, and so holds in every frame."""
+        scope = self.query.scope
+        return not (scope.nodes or scope.edges or scope.where)
 
 
 @dataclass(slots=True)
@@ -235,10 +258,17 @@ def _relate(
     found: Mapping[int, Trace],
 ) -> int:
     """Ask one relation, and give each trace its part."""
-    statement = relation(ask.query, catalog, window, ask.values)
+    if ask.everywhere:
+        for trace in found.values():
+            every = np.arange(len(trace))
+            trace.relations[name] = Relation.of(every, np.zeros((len(trace), 0), np.int64))
+        return 0
+    bound = {*ask.variables, *ask.edges}
+    statement = relation(ask.query, catalog, window, ask.values, bound)
     arrays = file.arrays(statement.sql, statement.values)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
     columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
+    columns += [np.searchsorted(WORDS, np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
     keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
     values = [arrays[f":{number}"] for number in range(len(ask.values))]
     order = np.argsort(ids, kind="stable")

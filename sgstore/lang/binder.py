@@ -114,7 +114,8 @@ def _of_steps(match: s.Match, session: Session) -> b.Query:
 def _told(scope: b.Scope) -> b.Scope:
     """What is known of a match once it is found: its nodes, and its edges that have names."""
     edges = tuple(edge for edge in scope.edges if edge.named)
-    return replace(scope, edges=edges, where=())
+    nodes = {k: n for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other}
+    return replace(scope, nodes=nodes, edges=edges, where=(), distinct=frozenset())
 
 
 def values_of(result: b.Result) -> tuple[b.Bound, ...]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from sgstore.errors import QueryError
 from sgstore.lang import results
 from sgstore.lang.binder import bind_query
 from sgstore.lang.bound import Column, FrameAttribute, Result
 from sgstore.lang.catalog import FRAME_ATTRIBUTES, Type
 from sgstore.lang.checks import bind_checks
+from sgstore.lang.found import SPAN, Told, nothing, with_places
 from sgstore.lang.parser import parse
 from sgstore.lang.phases import traces_of
 from sgstore.lang.printing import query_text, statements_text
@@ -20,11 +20,12 @@ from sgstore.lang.syntax import Check, Match
 from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from sgstore.lang.bound import Query
+    from sgstore.lang.bound import Bound, Query
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.checks import BoundCheck
+    from sgstore.lang.found import Found
     from sgstore.lang.phases import Window
     from sgstore.lang.results import Statement
 
@@ -45,6 +46,9 @@ class Compiled:
         What it was compiled against: that of the abstraction which it names, or of the store.
     stored : Catalog, optional
         Of the store.
+    finder : function, optional
+        Of a query with steps: gives what matches, with what is worked out for each match, in the whole traces
+        of a window.
     """
 
     text: str
@@ -52,6 +56,7 @@ class Compiled:
     query: Query
     catalog: Catalog
     stored: Catalog | None = None
+    finder: Callable[[tuple[Bound, ...], Window | None], Found] | None = None
 
     @property
     def layout(self) -> Layout | None:
@@ -61,7 +66,9 @@ class Compiled:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of what it returns."""
-        return self.rows().columns if self.layout is None else self.layout.columns
+        if self.layout is not None:
+            return self.layout.columns
+        return replace(self, finder=None).rows().columns
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -72,15 +79,33 @@ class Compiled:
 
     def rows(self, window: Window | None = None) -> Statement:
         """What it returns."""
-        return results.rows(self.query, self.catalog, window)
+        return self._rows(self.query, window)
+
+    def _rows(self, query: Query, window: Window | None) -> Statement:
+        query, writer, span = self._told(query, window)
+        return results.rows(query, self.catalog, window, writer, span)
+
+    def _told(
+        self, query: Query, window: Window | None
+    ) -> tuple[Query, Told | None, results.Span | None]:
+        """What says the matches of a query that looks at several frames; of any other nothing does."""
+        if not query.steps:
+            return query, None, None
+        query, places = with_places(query)
+        span = SPAN if len(query.steps) > 1 else None
+        told = (*places.values(), *(span or ()))
+        find = self.finder
+        found = nothing(query, len(told)) if find is None else find(tuple(places), window)
+        return query, Told(query, self.catalog, found, told), span
 
     def frames(self, window: Window | None = None) -> Statement:
         """The frames that match, each once, with their log times."""
-        return results.frames(self.query, self.catalog, window)
+        query, writer, _ = self._told(replace(self.query, result=Result()), window)
+        return results.frames(query, self.catalog, window, writer)
 
     def bindings(self, window: Window | None = None) -> Statement:
         """Frames and what the variables are bound to, whatever ``RETURN`` says."""
-        return results.rows(replace(self.query, result=Result()), self.catalog, window)
+        return self._rows(replace(self.query, result=Result()), window)
 
     def intervals(self, window: Window | None = None) -> Statement:
         """Intervals in which what it returns stays the same; without ``RETURN``, what it binds.
@@ -90,10 +115,10 @@ class Compiled:
         query, result = self.query, self.query.result
         if result.whole or result.aggregated or self.layout is not None:
             query = results.with_bindings(query)
-        elif result.form == "rows":
+        elif result.form != "intervals":
             result = Result(form="intervals", columns=result.columns, whole=False)
             query = replace(query, result=result)
-        return results.intervals(query, self.catalog, window)
+        return self._rows(query, window)
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> Statement:
         """Clips around the frames that match; the offsets of ``RETURN CLIPS`` win over those given.
@@ -107,7 +132,7 @@ class Compiled:
         result = self.query.result
         if result.form != "clips":
             result = Result(form="clips", whole=False, before=-before_ns, after=after_ns)
-        return results.intervals(replace(self.query, result=result), self.catalog, window)
+        return self._rows(replace(self.query, result=result), window)
 
     @property
     def in_windows(self) -> bool:
@@ -143,7 +168,8 @@ class Compiled:
 
     def count(self, window: Window | None = None) -> Statement:
         """How many frames match."""
-        return results.count(self.query, self.catalog, window)
+        query, writer, _ = self._told(replace(self.query, result=Result()), window)
+        return results.count(query, self.catalog, window, writer)
 
 
 def compile_query(
@@ -172,10 +198,9 @@ def compile_query(
     statements = parse(text)
     seen = _seen(statements, catalog, parameters or {})
     bound = bind_query(text, statements, seen, parameters or {})
-    if bound.steps:
-        raise QueryError("sequences are bound, and cannot be asked yet", text=text)
     whole = Layout.of(bound).query if bound.result.form == "subgraphs" else bound
-    return Compiled(text, bound, rewritten(whole, seen), seen, catalog)
+    query = whole if whole.steps else rewritten(whole, seen)
+    return Compiled(text, bound, query, seen, catalog)
 
 
 def compile_checks(

@@ -7,47 +7,63 @@ pattern had just been searched for (:class:`Told`).
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang.bound import (
+    Aggregate,
+    BlockValue,
     Column,
+    Course,
+    FrameAttribute,
+    Moment,
     NodeAttribute,
     NodeValue,
+    Operation,
     Result,
     Scope,
+    Tense,
     TraceAttribute,
 )
-from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Type
-from sgstore.lang.formulas import expression_text, leaves, nested, quoted
-from sgstore.lang.frames import Frames, column_of
+from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Attribute, Type, Unit
+from sgstore.lang.counting import folded
+from sgstore.lang.formulas import Select, columns_of, expression_text, leaves, nested, quoted
+from sgstore.lang.frames import PATTERN, Frames, Join, column_of
+from sgstore.lang.phases import Given, Phases
 from sgstore.lang.results import Statement, rows
 from sgstore.lang.rewrite import rewritten
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from sgstore.lang.bound import Bound, Query
     from sgstore.lang.catalog import Catalog
+    from sgstore.lang.formulas import Leaf
     from sgstore.lang.phases import Window
 
 FRAME: Final = "frame_id"
 
 
 def relation(
-    query: Query, catalog: Catalog, window: Window | None, values: Iterable[Bound] = ()
+    query: Query,
+    catalog: Catalog,
+    window: Window | None,
+    values: Iterable[Bound] = (),
+    bound: Iterable[str] | None = None,
 ) -> Statement:
     """The statement for the frames and bindings in which a pattern holds.
 
     Parameters
     ----------
     query : Query
-        Its result does not matter. All nodes are bound, and the edges that have names.
+        Its result does not matter.
     catalog : Catalog
     window : Window or None
         The buckets to look at; ``None``: all.
     values : iterable of Bound
         Asked of each match.
+    bound : iterable of str, optional
+        Keys of the nodes and edges that are bound, the others being asked to exist; ``None``: all nodes.
 
     Returns
     -------
@@ -55,11 +71,12 @@ def relation(
         Columns: ``frame_id``, the keys of the nodes in alphabetical order, those of the edges, then the values,
         as ``:0``, ``:1``, … Rows have no order.
     """
+    keys = set(query.scope.nodes if bound is None else bound)
+    nodes = sorted(keys & set(query.scope.nodes))
+    edges = sorted(keys & {edge.key for edge in query.scope.edges})
     query = rewritten(query, catalog)
     values = list(values)
     writer = Frames(query, catalog, window)
-    nodes = sorted(query.scope.nodes)
-    edges = sorted(edge.key for edge in query.scope.edges if edge.named)
     wanted = [leaf for value in values for leaf in leaves(value)]
     text = writer.frames(query.scope, None, frozenset(nodes), frozenset(edges), wanted)
     columns = [f'":rows"."{FRAME}" AS "{FRAME}"']
@@ -114,3 +131,156 @@ def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -
     result = Result(columns=columns, whole=False, distinct=True)
     asked = replace(query, scope=scope, result=result, steps=(), links=())
     return rows(rewritten(asked, catalog), catalog, window)
+
+
+# What is found already ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Matches that are known, as columns.
+
+    Attributes
+    ----------
+    first, last : list of int
+        Of runs of ``frame_id``: the same is matched in each of them.
+    nodes : dict of str to list of int
+        Node ids by key.
+    edges : dict of str to list of str
+        Relations by the keys of the edges that have names.
+    values : list of lists
+        What was worked out for each match: in the order of the places of :class:`Told`.
+    """
+
+    first: list[int]
+    last: list[int]
+    nodes: dict[str, list[int]]
+    edges: dict[str, list[str]]
+    values: list[list[Any]]
+
+
+def nothing(query: Query, values: int) -> Found:
+    """No matches of a query."""
+    nodes: dict[str, list[int]] = {key: [] for key in query.scope.nodes}
+    edges: dict[str, list[str]] = {edge.key: [] for edge in query.scope.edges}
+    return Found([], [], nodes, edges, [[] for _ in range(values)])
+
+
+_TYPES: Final = {Type.number: "DOUBLE", Type.text: "VARCHAR", Type.boolean: "BOOLEAN"}
+FROM: Final = FrameAttribute(Attribute(":from", Type.number, {}, "", Unit.whole), Type.number)
+TO: Final = FrameAttribute(Attribute(":to", Type.number, {}, "", Unit.whole), Type.number)
+SPAN: Final = (FROM, TO)
+"""The first and the last ``frame_id`` of a match over several frames."""
+
+
+class Told(Frames):
+    """Writes relations of a query whose matches are known; what is returned of them is asked of the store.
+
+    Parameters
+    ----------
+    query : Query
+        Of which :func:`with_places` made that its values speak of what is told.
+    catalog : Catalog
+    found : Found
+    told : sequence of FrameAttribute
+        What stands for the values of ``found``.
+    """
+
+    def __init__(
+        self, query: Query, catalog: Catalog, found: Found, told: Sequence[FrameAttribute]
+    ) -> None:
+        super().__init__(query, catalog, None)
+        self._found = found
+        self._told = {leaf: f":value {number}" for number, leaf in enumerate(told)}
+        self._table = ""
+
+    def phases(self, scope: Scope) -> Phases:
+        """Of the pattern itself nothing is left to be tested."""
+        return Phases() if scope is self.query.scope else super().phases(scope)
+
+    def _first_phase(
+        self,
+        join: Join,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        bound: frozenset[str],
+        ties: frozenset[str],
+        needed: list[Leaf],
+    ) -> Given | None:
+        if scope is not self.query.scope:
+            return super()._first_phase(join, scope, parts, given, bound, ties, needed)
+        if not self._table:
+            self._table = self.share(self._told_rows(), "found")
+        join.select = _Lenient()
+        join.select.join(f"{quoted(self._table)} AS {PATTERN}", [])
+        join.frame = f'{PATTERN}."frame_id"'
+        join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in bound}
+        join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
+        if not any(isinstance(leaf, BlockValue) for leaf in needed):
+            return None
+        keys = columns_of(bound)
+        rows = Select(['"frame_id"', *keys], [quoted(self._table)], distinct=True)
+        return Given(self.share(folded(rows.text(), keys), "pattern"), bound, frozenset())
+
+    def _say(self, join: Join, scope: Scope, given: Given | None, leaf: Leaf) -> None:
+        if isinstance(leaf, FrameAttribute) and leaf in self._told:
+            join.texts[leaf] = f"{PATTERN}.{quoted(self._told[leaf])}"
+        else:
+            super()._say(join, scope, given, leaf)
+
+    def _told_rows(self) -> str:
+        """What is found, one row a frame."""
+        found, add = self._found, self.values.add
+        columns = [("first", "BIGINT", found.first), ("last", "BIGINT", found.last)]
+        columns += [(f"{key}.id", "BIGINT", ids) for key, ids in found.nodes.items()]
+        columns += [(f"{key}.type", "VARCHAR", words) for key, words in found.edges.items()]
+        for leaf, values in zip(self._told, found.values, strict=True):
+            kind = "BIGINT" if leaf in SPAN else _TYPES[leaf.type]
+            columns.append((self._told[leaf], kind, values))
+        parts = [
+            f"unnest(CAST({add(rows)} AS {kind}[])) AS {quoted(n)}" for n, kind, rows in columns
+        ]
+        kept = [quoted(name) for name, *_ in columns[2:]]
+        select = Select(['unnest(range("first", "last" + 1)) AS "frame_id"', *kept])
+        select.join(nested("SELECT " + ",\n  ".join(parts), ":runs"), [])
+        return select.text()
+
+
+class _Lenient(Select):
+    """A statement that keeps its rows: what is not there in the frame is unknown."""
+
+    def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
+        super().join(table, conditions, "LEFT JOIN" if conditions else how)
+
+
+def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
+    """A query whose values over time are places for what is worked out elsewhere, and what they are for."""
+    places: dict[Bound, FrameAttribute] = {}
+
+    def placed(value: Bound) -> Bound:
+        match value:
+            case Tense() | Course() | Moment():
+                if value not in places:
+                    name = f":value {len(places)}"
+                    attribute = Attribute(name, value.type, {}, "", Unit.whole)
+                    places[value] = FrameAttribute(attribute, value.type)
+                return places[value]
+            case Operation(operands=operands):
+                return replace(value, operands=tuple(placed(operand) for operand in operands))
+            case Aggregate(operand=operand) if operand is not None:
+                return replace(value, operand=placed(operand))
+            case _:
+                return value
+
+    def key(value: Bound | str) -> Bound | str:
+        return value if isinstance(value, str) else placed(value)
+
+    result, sample = query.result, query.result.sample
+    result = replace(
+        result,
+        columns=tuple(replace(c, value=placed(c.value)) for c in result.columns),
+        order=tuple(replace(k, value=key(k.value)) for k in result.order),
+        sample=sample and replace(sample, per=sample.per and key(sample.per)),
+    )
+    return replace(query, result=result), places

@@ -68,8 +68,6 @@ class Sequence:
     session : Session
     known : dict of str to Node
         The nodes that steps have bound and that others may speak of: those with names, and the ego.
-    unnamed : dict of str to Node
-        The others, of the steps that must happen.
     edges : list of Edge
         Those with names.
     meanings : dict of str to Meaning
@@ -79,16 +77,14 @@ class Sequence:
 
     session: Session
     known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
-    unnamed: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
     edges: list[b.Edge] = field(default_factory=list[b.Edge])
     meanings: dict[str, Meaning] = field(default_factory=dict[str, Meaning])
     steps: list[o.Step] = field(default_factory=list[o.Step])
     links: list[o.Link] = field(default_factory=list[o.Link])
 
     def scope(self) -> ScopeBuilder:
-        """What values of a match speak of: all nodes, and the edges that have names."""
-        nodes = self.known | (self.unnamed if len(self.steps) == 1 else {})
-        return ScopeBuilder(self.session, nodes=dict(nodes), edges=list(self.edges))
+        """What values of a match speak of: nodes and edges that have names, and the ego."""
+        return ScopeBuilder(self.session, nodes=dict(self.known), edges=list(self.edges))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +235,6 @@ def _bind_step(
         return
     shared = {k: n for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other}
     found.known |= {k: n for k, n in shared.items() if k not in found.known}
-    found.unnamed |= {k: n for k, n in scope.nodes.items() if k not in found.known}
     found.edges += [edge for edge in scope.edges if edge.named]
     found.meanings |= names.meanings
     _name_step(step, found)

@@ -21,18 +21,21 @@ from sgstore.temporal.formulas import (
 )
 
 if TYPE_CHECKING:
-    from sgstore.lang.bound import Query
     from sgstore.lang.catalog import Catalog
+    from sgstore.lang.over_time import Hold, Length, Link
+    from sgstore.lang.results import Statement
     from sgstore.temporal.plans import Plan
 
 
-def formula_text(formula: Formula) -> str:  # noqa: PLR0911 - a case each
+def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
     """A formula as one would write it, with the names of its propositions."""
     match formula:
         case Constant(value=value):
             return str(value).upper()
         case Proposition(name=name):
             return name
+        case Not(operand=Not(operand=operand)):
+            return formula_text(operand)
         case Not(operand=operand):
             return f"NOT {formula_text(operand)}"
         case And(operands=operands):
@@ -77,11 +80,12 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
     for atom in plan.atoms.values():
         where = " AND ".join(value_text(part) for part in atom.query.scope.where) or "TRUE"
         lines.append(f"atom {atom.name}({', '.join(atom.variables)}) = {where}")
-        lines += _sql(atom.query, catalog)
+        lines += [] if catalog is None else sql_text(relation(atom.query, catalog, None))
     for signal in plan.signals.values():
         told = value_text(signal.value)
         lines.append(f"signal {signal.name}({', '.join(signal.variables)}) = {told}")
-        lines += _sql(signal.query, catalog)
+        if catalog is not None:
+            lines += sql_text(relation(signal.query, catalog, None, (signal.value,)))
     for test in plan.tests.values():
         lines.append(
             f"test {test.name}({', '.join(test.variables)}) = {value_text(test.expression)}"
@@ -89,9 +93,25 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
     return lines
 
 
-def _sql(query: Query, catalog: Catalog | None) -> list[str]:
-    if catalog is None:
-        return []
-    statement = relation(query, catalog, None)
+def sql_text(statement: Statement) -> list[str]:
+    """A statement, indented, with the values that it binds."""
     lines = [f"    {line}" for line in statement.sql.splitlines()]
     return lines + [f"    ${n} = {value!r}" for n, value in enumerate(statement.values, start=1)]
+
+
+def hold_text(hold: Hold) -> str:
+    """How long a step must last."""
+    inclusive = " INCLUSIVE" if hold.inclusive else ""
+    return f"for {hold.comparison} {length_text(hold.length)}{inclusive}"
+
+
+def link_text(link: Link) -> str:
+    """When a step comes after the one before."""
+    after = f" after {length_text(link.after)}" if link.after else ""
+    within = f" within {length_text(link.within)}" if link.within else ""
+    return f"{link.kind}{after}{within}"
+
+
+def length_text(length: Length) -> str:
+    """A length of time."""
+    return f"{length.amount}frames" if length.frames else f"{length.amount / 1e9:g}s"
