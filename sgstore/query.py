@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, overload
 from sgstore.abstractions import abstractions
 from sgstore.graph import named_graph
 from sgstore.lang import compile_query
+from sgstore.lang.results import about_frame
 from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import folded
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from sgstore.history import CheckRun
     from sgstore.lang import Catalog
+    from sgstore.lang.bound import FrameAttribute
     from sgstore.lang.evaluation import FrameView
     from sgstore.lang.pattern import Pattern
     from sgstore.lang.whynot import WhyNot
@@ -320,7 +322,7 @@ class Store:
             There is no such frame.
         """
         from sgstore.history.stories import refuse_over_time
-        from sgstore.lang.whynot import WhyNot, why_not  # with numpy: only for who asks
+        from sgstore.lang.whynot import WhyNot, looked_up, why_not  # with numpy: only for who asks
 
         with self.file.snapshot():
             compiled = compile_query(text, self.catalog(), parameters)
@@ -335,15 +337,17 @@ class Store:
                     {},
                     "such relations are unknown of it (no road map, perhaps)",
                 )
-            return why_not(compiled.bound, self._view(ref))
+            return why_not(compiled.bound, self._view(ref, looked_up(compiled.bound)))
 
-    def _view(self, frame: FrameRef) -> FrameView:
-        """A frame as patterns in memory see it."""
+    def _view(self, frame: FrameRef, asked: Sequence[FrameAttribute]) -> FrameView:
+        """A frame as patterns in memory see it, with what they ask that only the store can tell."""
         from sgstore.lang.evaluation import FrameView
 
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
-        about |= self.file.labels(frame.frame_id)
+        if asked:
+            rows = self.file.rows(about_frame(asked), [frame.frame_id])
+            about |= {one.attribute.name: v for one, v in zip(asked, rows.values[0], strict=True)}
         whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
         whole |= {"id": trace.trace_id, "uri": str(trace.path), "ego": trace.ego or None}
         whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}

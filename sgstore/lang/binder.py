@@ -14,6 +14,7 @@ from sgstore.lang import over_time as o
 from sgstore.lang import syntax as s
 from sgstore.lang.catalog import Catalog, Type
 from sgstore.lang.conditions import bind, condition, edge_attribute, node_attribute, parameter
+from sgstore.lang.datasets import asked
 from sgstore.lang.names import RESERVED, Meaning, Names, ScopeBuilder, Session
 from sgstore.lang.steps import bind_sequence
 from sgstore.lang.tenses import settled
@@ -30,7 +31,7 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-SETTINGS: Final = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION", "MATCHES", "GAPS", "END")
+SETTINGS: Final = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION", "DATASET", "MATCHES", "GAPS", "END")
 """What may stand after ``USING``."""
 
 
@@ -57,7 +58,8 @@ def bind_query(
     QueryError
         Types do not fit, or a part belongs to the temporal layer.
     """
-    session = Session(text, parameters, classed=catalog.classed, tables=catalog.tables)
+    session = Session(text, parameters)
+    session.ask(catalog)
     match = _only_match(statements, session)
     settings = chosen(match.settings, session, catalog)
     if settings.end is not None:
@@ -177,6 +179,8 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
             if value not in egos:
                 session.unknown("ego", value, setting.span, egos)
             found.ego = value
+        elif name == "dataset":
+            asked(value, setting.span, session)
         elif name == "abstraction":
             if folded(value) not in catalog.sets:
                 known = [one.name for one in catalog.sets.values()]

@@ -78,6 +78,14 @@ class Unit(StrEnum):
     """A time in nanoseconds; seen as seconds since the trace began."""
     classed = "classed"
     """The class of a frame's graph in an abstraction; the column is the name of that."""
+    weather = "weather"
+    """What the last event of weather and light up to the frame says; the column is its word."""
+    clock = "clock"
+    """The time of day that such an event says, and what has passed since; hours."""
+    counted = "counted"
+    """How many frames of the store are of the class of the frame, in an abstraction; the column is its name."""
+    seen = "seen"
+    """Whether the class of the frame, in an abstraction, is that of a frame of a dataset."""
     span = "span"
     """A length of time in nanoseconds; seen in seconds."""
 
@@ -123,7 +131,9 @@ class Attribute:
     meaning : str
         For the documentation; with unit.
     table : str
-        The user's own table that it is a column of; empty for all others.
+        The user's own table that it is a column of, or whose frames it is about; empty for all others.
+    traces : tuple of int
+        Ids of the traces that it is about.
     """
 
     name: str
@@ -134,6 +144,13 @@ class Attribute:
     kinds: frozenset[str] = _EVERY
     values: tuple[str, ...] = ()
     table: str = ""
+    traces: tuple[int, ...] = ()
+
+    @property
+    def of_store(self) -> bool:
+        """Whether it is told by what the store holds beside the graph of the frame."""
+        other = {Unit.seen, Unit.counted, Unit.weather, Unit.clock}
+        return bool(self.table) or self.unit in other
 
 
 def _state(name: str, meaning: str, unit: Unit = Unit.plain) -> Attribute:
@@ -399,6 +416,44 @@ FRAME_ATTRIBUTES: Final = _named(
 )
 """Attributes of ``frame`` by folded name (table ``frame``)."""
 
+_RAIN: Final = (
+    "none",
+    "very_light",
+    "light",
+    "moderate",
+    "heavy",
+    "very_heavy",
+    "extreme",
+    "other",
+)
+_FOG: Final = (
+    *("none", "excellent_visibility", "good_visibility", "moderate_visibility", "poor_visibility"),
+    *("mist", "light", "thick", "dense", "other"),
+)
+_LIGHT: Final = (*(f"level{number}" for number in range(1, 10)), "other")
+_OKTAS: Final = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight")
+_CLOUDS: Final = (*(f"{number}_oktas" for number in _OKTAS), "sky_obscured", "other")
+
+
+def _weather(name: str, meaning: str, values: tuple[str, ...] = ()) -> Attribute:
+    kind = Type.text if values else Type.number
+    unit = Unit.clock if name == "time_of_day" else Unit.weather
+    return Attribute(f"env.{name}", kind, {Home.state: name}, meaning, unit, values=values)
+
+
+ENV_ATTRIBUTES: Final = {
+    folded(attribute.name.removeprefix("env.")): attribute
+    for attribute in (
+        _weather("precipitation", "how hard it rains", _RAIN),
+        _weather("fog", "how far one sees", _FOG),
+        _weather("illumination", "how bright it is: level1 is night, level9 full sun", _LIGHT),
+        _weather("clouds", "how much of the sky they cover", _CLOUDS),
+        _weather("temperature", "K"),
+        _weather("time_of_day", "hours since midnight"),
+    )
+}
+"""Attributes of ``env``, weather and light, by folded name (view ``events``); their words are those of OSI."""
+
 TRACE_ATTRIBUTES: Final = _named(
     (
         _plain("id", Type.number, "trace_id", "unique in every store"),
@@ -451,11 +506,17 @@ class TableFacts:
     columns : mapping of str to Type
     refused : str or None
         Why its columns are not attributes of frames; ``None`` if they are: it has one row a frame.
+    traces : frozenset of int or None
+        If its rows are of whole traces: their ids.
+    joins : bool
+        Whether its rows belong to frames.
     """
 
     name: str
     columns: Mapping[str, Type]
     refused: str | None = None
+    traces: frozenset[int] | None = None
+    joins: bool = True
 
     def attribute(self, column: str) -> Attribute | None:
         """The attribute of frames that a column is, whatever the case of letters; ``None``: no such column."""
@@ -488,6 +549,8 @@ class Catalog:
         Those that the abstraction has; ``None``: all.
     shadows : tuple of (str, str)
         Tables that are others under the abstraction, and what they are there.
+    only : frozenset of int or None
+        The traces that are asked, of those that are there; ``None``: all.
     tables : mapping of str to TableFacts
         Tables of users' own that are joined.
     sets : mapping of str to Catalog
@@ -504,5 +567,6 @@ class Catalog:
     name: str = ""
     relations: frozenset[str] | None = None
     shadows: tuple[tuple[str, str], ...] = ()
+    only: frozenset[int] | None = None
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, TableFacts])
     sets: Mapping[str, Catalog] = field(default_factory=dict[str, "Catalog"])

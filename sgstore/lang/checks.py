@@ -67,7 +67,7 @@ def bind_checks(
             session.refuse("a MATCH has matches, and no verdict", statement.span, "ask it by find")
         else:
             catalog = seen(statement)
-            session.classed = catalog.classed
+            session.ask(catalog)
             name = statement.name or f"check {len(found) + 1}"
             if name in {one.check.name for one in found}:
                 session.refuse(f"two checks are called '{name}'", statement.span)

@@ -10,6 +10,7 @@ from sgstore.lang.binder import bind_query
 from sgstore.lang.bound import Column, FrameAttribute, Result
 from sgstore.lang.catalog import FRAME_ATTRIBUTES, Type
 from sgstore.lang.checks import bind_checks
+from sgstore.lang.datasets import traces_in
 from sgstore.lang.found import SPAN, Told, nothing, with_places
 from sgstore.lang.parser import parse
 from sgstore.lang.phases import traces_of
@@ -74,7 +75,9 @@ class Compiled:
     def left_out(self) -> tuple[str, ...]:
         """Names of the traces that cannot answer it."""
         _, left = traces_of(self.query, self.catalog)
-        chosen = [t for t in self.catalog.traces if self.query.ego in {None, t.ego}]
+        only, ego = self.catalog.only, self.query.ego
+        chosen = [t for t in self.catalog.traces if ego in {None, t.ego}]
+        chosen = [t for t in chosen if only is None or t.trace_id in only]
         return tuple(trace.name for trace in chosen if trace.trace_id in left)
 
     def rows(self, window: Window | None = None) -> Statement:
@@ -225,18 +228,15 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """The catalog of the abstraction that a query names, if it is known; else that of the store."""
-    settings = (
-        setting
-        for statement in statements
-        if isinstance(statement, Match | Check)
-        for setting in statement.settings
-        if folded(setting.name) == "abstraction"
-    )
-    found = next(settings, None)
-    if found is None:
-        return catalog
-    value = found.value
-    name = value if isinstance(value, str) else str(parameters.get(value.name, ""))
-    seen = catalog.sets.get(folded(name), catalog)
-    return replace(seen, sets=catalog.sets)
+    """The catalog of the abstraction that a query names and of its dataset, if they are known."""
+    seen = catalog
+    for statement in statements:
+        for setting in statement.settings if isinstance(statement, Match | Check) else ():
+            value = setting.value
+            name = value if isinstance(value, str) else str(parameters.get(value.name, ""))
+            if folded(setting.name) == "abstraction":
+                chosen = catalog.sets.get(folded(name), catalog)
+                seen = replace(chosen, sets=catalog.sets, only=seen.only)
+            elif folded(setting.name) == "dataset":
+                seen = replace(seen, only=traces_in(name, catalog.traces, catalog.tables))
+    return seen

@@ -11,14 +11,17 @@ from sgstore.lang import syntax as s
 from sgstore.lang.catalog import (
     EDGE_ALIASES,
     EDGE_ATTRIBUTES,
+    ENV_ATTRIBUTES,
     FOLLOWING,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
     TRACE_ATTRIBUTES,
     Attribute,
     Type,
+    Unit,
     class_attribute,
 )
+from sgstore.lang.datasets import CLASSES, abstraction_named, seen_in
 from sgstore.lang.names import RESERVED, Names, hint_at
 from sgstore.vocabulary import KINDS, folded, kinds_labelled
 
@@ -135,7 +138,7 @@ def _attribute(e: s.AttributeOf, names: Names) -> b.Bound:
         if found is None and owner == "frame":
             found = _class_attribute(e.name, names)
         if found is None:
-            known_names = [attribute.name for attribute in known.values()]
+            known_names = [attribute.name.removeprefix("env.") for attribute in known.values()]
             if owner == "frame":
                 known_names += [f"class_{name}" for name in names.session.classed]
             names.session.unknown(f"attribute of {owner}", e.name, _tail(e), known_names)
@@ -171,6 +174,7 @@ def _class_attribute(name: str, names: Names) -> Attribute | None:
 
 
 _OF_RESERVED: Final[dict[str, tuple[Mapping[str, Attribute], Callable[..., b.Bound]]]] = {
+    "env": (ENV_ATTRIBUTES, b.FrameAttribute),
     "frame": (FRAME_ATTRIBUTES, b.FrameAttribute),
     "trace": (TRACE_ATTRIBUTES, b.TraceAttribute),
 }
@@ -300,7 +304,7 @@ def _canonical(value: b.Bound, other: b.Bound, span: Span, names: Names) -> b.Bo
 
 def _vocabulary(expression: b.Bound) -> tuple[str, ...]:
     match expression:
-        case b.NodeAttribute(attribute=attribute):
+        case b.NodeAttribute(attribute=attribute) | b.FrameAttribute(attribute=attribute):
             return attribute.values
         case b.EdgeRelation():
             return tuple(sorted(b.ANY_RELATION))
@@ -309,7 +313,8 @@ def _vocabulary(expression: b.Bound) -> tuple[str, ...]:
 
 
 def _what(expression: b.Bound) -> str:
-    return expression.attribute.name if isinstance(expression, b.NodeAttribute) else "relation"
+    named = isinstance(expression, b.NodeAttribute | b.FrameAttribute)
+    return expression.attribute.name if named else "relation"
 
 
 def _kind(word: str, span: Span, names: Names) -> str | None:
@@ -356,8 +361,12 @@ def _null_test(e: s.NullTest, names: Names) -> b.Operation:
     return b.Operation(word, (operand,), Type.boolean)
 
 
-def _membership(e: s.Membership, names: Names) -> b.Operation:
-    operand, choices = bind(e.operand, names), bind(e.choices, names)
+def _membership(e: s.Membership, names: Names) -> b.Bound:
+    operand = bind(e.operand, names)
+    if isinstance(e.choices, s.Call) and folded(e.choices.name) == CLASSES:
+        found = _in_dataset(operand, e.choices, names)
+        return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
+    choices = bind(e.choices, names)
     if not isinstance(choices, b.Choices):
         names.session.refuse("expected a list after IN", e.choices.span, "write IN ['a', 'b']")
     for item in choices.items:
@@ -371,6 +380,28 @@ def _membership(e: s.Membership, names: Names) -> b.Operation:
     canonical = b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
     found = b.Operation("IN", (operand, canonical), Type.boolean)
     return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
+
+
+def _in_dataset(operand: b.Bound, e: s.Call, names: Names) -> b.FrameAttribute:
+    """``frame.class IN dataset_classes('train')``; a second argument names the abstraction again."""
+    session = names.session
+    if not isinstance(operand, b.FrameAttribute) or operand.attribute.unit is not Unit.classed:
+        session.refuse("only classes of frames are in it", e.span, "write frame.class IN …")
+    texts = [bind(argument, names) for argument in e.arguments]
+    words = [t.value for t in texts if isinstance(t, b.Value) and isinstance(t.value, str)]
+    if not 1 <= len(words) == len(texts) <= 2:
+        session.refuse(
+            f"{e.name}() takes the name of a dataset and, if wanted, of an abstraction", e.span
+        )
+    if len(words) == 2:
+        (mine,) = operand.attribute.columns.values()
+        if abstraction_named(words[1], e.arguments[1].span, session) != mine:
+            session.refuse(
+                f"classes of {mine} are not those of {words[1]}",
+                e.span,
+                f"write frame.class('{words[1]}')",
+            )
+    return seen_in(operand, words[0], e.arguments[0].span, session)
 
 
 # Numbers ------------------------------------------------------------------------------------------

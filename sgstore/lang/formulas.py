@@ -200,6 +200,8 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
     """The value of an attribute of the frame or of the trace."""
     attribute = leaf.attribute
     home, column = next(iter(attribute.columns.items()))
+    if attribute.unit in {Unit.seen, Unit.counted, Unit.weather, Unit.clock}:
+        return _looked_up(attribute, frame)
     if attribute.table:
         value = as_type(f'"u".{quoted(column)}', attribute.type)
         on = [f'"u"."frame_id" = {frame}."frame_id"']
@@ -213,11 +215,61 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
         case Unit.span:
             return f"(CAST({value} AS DOUBLE) / 1e9)"
         case Unit.classed:
-            on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {word(column)}']
-            classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
-            return f"({classes.text()})"
+            return _class_text(column, frame)
         case _:
             return value
+
+
+def _class_text(abstraction: str, frame: str) -> str:
+    """The class of a frame in an abstraction."""
+    on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {word(abstraction)}']
+    classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
+    return f"({classes.text()})"
+
+
+def _looked_up(attribute: Attribute, frame: str) -> str:
+    """What other frames, or events, say of a frame."""
+    column = next(iter(attribute.columns.values()))
+    if attribute.unit in {Unit.weather, Unit.clock}:
+        return _weather_text(column, frame)
+    held = f'"k"."abstraction" = {word(column)}'
+    if attribute.unit is Unit.seen:
+        classes = Select(['"k"."class"'], ['"classes" AS "k"'], [held, '"k"."class" IS NOT NULL'])
+        if attribute.table:
+            frames = Select(['"u"."frame_id"'], [f'{quoted(attribute.table)} AS "u"'])
+            classes.where.append(f'"k"."frame_id" IN ({frames.text()})')
+        else:
+            classes.where.append(among('"k"."frame_id" >> 24', list(attribute.traces)))
+        return f"({_class_text(column, frame)} IN ({classes.text()}))"
+    counts = Select(['"k"."class"', 'count(*) AS "frames"'], ['"classes" AS "k"'], [held])
+    counts.group = ['"k"."class"']
+    number = Select(['any_value("n"."frames")'], [nested(counts.text(), "n")])
+    number.where = [f'"n"."class" = {_class_text(column, frame)}']
+    return f"({number.text()})"
+
+
+def _weather_text(word_: str, frame: str) -> str:
+    """A word of the last event of weather and light of a trace, up to the frame."""
+    told = f'regexp_extract("v"."detail", \'(^|, ){word_}=([^,]*)\', 2)'
+    if word_ == "time_of_day":
+        parts = [
+            f"CAST(split_part({told}, ':', {n}) AS DOUBLE) / {60 ** (n - 1)}" for n in (1, 2, 3)
+        ]
+        since = f'({frame}."time_ns" - "v"."time_ns") / 3.6e12'
+        value = f"({' + '.join(parts)} + {since}) % 24"
+        said = f"{told} <> ''"
+    elif word_ == "temperature":
+        value, said = f"CAST(split_part({told}, ' ', 1) AS DOUBLE)", f"{told} <> ''"
+    else:
+        value, said = f"nullif({told}, '')", "TRUE"
+    on = [
+        f'"v"."trace_id" = {frame}."trace_id"',
+        '"v"."kind" = \'environment\'',
+        f'"v"."frame_id" <= {frame}."frame_id"',
+        said,
+    ]
+    last = Select([f'arg_max({value}, "v"."time_ns")'], ['"events" AS "v"'], on)
+    return f"({last.text()})"
 
 
 # Expressions ---------------------------------------------------------------------------------------

@@ -164,7 +164,7 @@ class Frames(Masks):
         The many states are then looked up in the few rows of the first phase, rather than these, one row a
         frame, among the states. Only where a query chooses traces it is better to say which frames are asked.
         """
-        if parts.trace or (scope is self.query.scope and self.query.ego is not None):
+        if parts.trace or (scope is self.query.scope and self.chooses_traces):
             return None
         moving = [
             key

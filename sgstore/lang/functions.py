@@ -9,6 +9,7 @@ from sgstore.lang import bound as b
 from sgstore.lang import syntax as s
 from sgstore.lang.catalog import Type
 from sgstore.lang.conditions import bind, number
+from sgstore.lang.datasets import CLASSES, abstraction_named, class_count
 from sgstore.lang.names import Meaning, Names
 from sgstore.lang.standard import predicates
 from sgstore.vocabulary import ENTITY_KINDS, folded
@@ -38,7 +39,9 @@ _PAIR_ALIASES: Final = {"distance": "dist", "thw": "headway"}
 _NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
 _EXTREME: Final = frozenset({"min", "max"})
 _AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
-_OTHERS: Final = frozenset({"coalesce", "known", "type", "lower", "upper"})
+_OTHERS: Final = frozenset(
+    {"class_count", "coalesce", "dataset_classes", "known", "type", "lower", "upper"}
+)
 _COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
 _TEMPORAL: Final = frozenset(map(folded, _COURSES))
 FUNCTIONS: Final = frozenset(
@@ -160,6 +163,22 @@ def _text_function(e: s.Call, names: Names) -> b.Operation:
     return b.Operation(folded(e.name), (found,), Type.text)
 
 
+def _class_count(e: s.Call, names: Names) -> b.FrameAttribute:
+    _expect(e, 0, 1, names)
+    if not e.arguments:
+        return class_count("RSV")
+    found = bind(e.arguments[0], names)
+    if not isinstance(found, b.Value) or not isinstance(found.value, str):
+        names.session.refuse(f"{e.name}() takes the name of an abstraction", e.arguments[0].span)
+    return class_count(abstraction_named(found.value, e.arguments[0].span, names.session))
+
+
+def _after_in(e: s.Call, names: Names) -> b.Bound:
+    names.session.refuse(
+        f"{e.name}() may stand after IN only", e.span, f"write frame.class IN {e.name}('train')"
+    )
+
+
 def _aggregate(name: str, e: s.Call, names: Names) -> b.Aggregate:
     inner = Names(names.session, names.scope, names.meanings, names.parent)
     if name in {"avg", "sum"}:
@@ -208,7 +227,9 @@ _FUNCTIONS: Final[dict[str, Callable[[s.Call, Names], b.Bound]]] = {
     **dict.fromkeys(_PAIRS, _pair),
     **dict.fromkeys(_NUMERIC, _numeric),
     **dict.fromkeys(_EXTREME, _extreme),
+    "classcount": _class_count,
     "coalesce": _coalesce,
+    CLASSES: _after_in,
     "known": _known,
     "type": _type,
     "lower": _text_function,

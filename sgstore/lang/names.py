@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.errors import Span
-    from sgstore.lang.catalog import TableFacts
+    from sgstore.lang.catalog import Catalog, TableFacts, TraceFacts
     from sgstore.lang.syntax import Define
 
 MANY: Final = 16
@@ -39,7 +39,7 @@ def hint_at(name: str, known: Iterable[str]) -> str | None:
 THE_EGO: Final = "ego"
 """The name that is always bound: to the ego of the frame."""
 
-RESERVED: Final = frozenset({"frame", "trace"})
+RESERVED: Final = frozenset({"env", "frame", "trace"})
 """Names of what is not a node but has attributes all the same."""
 
 
@@ -77,6 +77,8 @@ class Session:
         Abstractions in which the store has the classes of frames.
     tables : mapping of str to TableFacts
         Tables of users' own that are joined, by name.
+    traces : tuple of TraceFacts
+        Of the store.
     numbers, blocks : int
         Unnamed nodes and edges, and blocks, so far.
     """
@@ -91,8 +93,13 @@ class Session:
     calls: list[str] = field(default_factory=list[str])
     classed: tuple[str, ...] = ()
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, "TableFacts"])
+    traces: tuple[TraceFacts, ...] = ()
     numbers: int = 0
     blocks: int = 0
+
+    def ask(self, catalog: Catalog) -> None:
+        """Take over what a catalog says of the store that is asked."""
+        self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
 
     def key(self, name: str | None) -> str:
         """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""

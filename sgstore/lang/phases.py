@@ -178,6 +178,8 @@ def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]
     chosen = None
     if query.ego is not None:
         chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
+    if catalog.only is not None:
+        chosen = set(catalog.only) if chosen is None else chosen & catalog.only
     left: set[int] = set()
     if not query.unknown_is_false:
         left = {t.trace_id for t in catalog.traces if not query.relations <= t.answers}

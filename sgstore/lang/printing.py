@@ -173,7 +173,7 @@ def _leaf(value: Bound) -> str:
             text = node
         case NodeAttribute(node=owner) | EdgeAttribute(edge=owner):
             text = f"{owner}.{value.attribute.name}"
-        case FrameAttribute(attribute=attribute) if attribute.table:
+        case FrameAttribute(attribute=attribute) if attribute.of_store:
             text = attribute.name
         case FrameAttribute(attribute=attribute):
             text = f"frame.{attribute.name}"

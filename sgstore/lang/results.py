@@ -18,6 +18,7 @@ from sgstore.lang.bound import (
     Bound,
     Column,
     EdgeRelation,
+    FrameAttribute,
     NodeAttribute,
     NodeValue,
     Query,
@@ -30,6 +31,7 @@ from sgstore.lang.formulas import (
     Select,
     columns_of,
     expression_text,
+    frame_text,
     leaves,
     nested,
     quoted,
@@ -37,7 +39,7 @@ from sgstore.lang.formulas import (
 from sgstore.lang.frames import Frames, column_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from sgstore.lang.phases import Window
 
@@ -140,6 +142,17 @@ def intervals(
 ) -> Statement:
     """Intervals in which what is returned (nothing but a match, if nothing is) stays the same."""
     return _Intervals(query, writer or Frames(query, catalog, window), span).statement()
+
+
+def about_frame(attributes: Sequence[FrameAttribute]) -> str:
+    """The statement for what is told of one frame, given its id: one row, a column each."""
+    texts = [frame_text(one, _FRAME, _TRACE, '":map"') for one in attributes]
+    select = Select(
+        [f"{text} AS {quoted(column_of(a))}" for text, a in zip(texts, attributes, strict=True)]
+    )
+    select.join(f'"frame" AS {_FRAME}', [])
+    select.where.append(f'{_FRAME}."frame_id" = ?')
+    return select.text()
 
 
 def with_bindings(query: Query) -> Query:

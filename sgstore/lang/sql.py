@@ -226,6 +226,11 @@ class Masks(Presence, ABC):
         select.group = ['"bucket"', *columns_of(keys)]
         return select.text()
 
+    @property
+    def chooses_traces(self) -> bool:
+        """Whether the query chooses some of the traces, by their ego or by a dataset."""
+        return self.query.ego is not None or self.catalog.only is not None
+
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
         """Conditions on a trace id that keep the traces that are asked, in the outermost scope."""
         if scope is not self.query.scope:

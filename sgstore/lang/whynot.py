@@ -84,6 +84,22 @@ def why_not(query: b.Query, view: FrameView) -> WhyNot:
     return WhyNot(tuple(held), "", _named(at, scope) if at else {}, "")
 
 
+def looked_up(query: b.Query) -> list[b.FrameAttribute]:
+    """What a pattern asks of a frame that only the store can tell: its weather, tables of users' own."""
+    found: dict[str, b.FrameAttribute] = {}
+
+    def look(scope: b.Scope) -> None:
+        for condition in scope.where:
+            for leaf in leaves(condition):
+                if isinstance(leaf, b.BlockValue):
+                    look(leaf.scope)
+                elif isinstance(leaf, b.FrameAttribute) and leaf.attribute.of_store:
+                    found[leaf.attribute.name] = leaf
+
+    look(query.scope)
+    return list(found.values())
+
+
 _Part = b.Node | b.Edge | b.Bound
 
 

@@ -202,11 +202,6 @@ class StoreFile:
         with self._reading() as connection:
             return {} if self.tables is None else self.tables.joined(connection)
 
-    def labels(self, frame_id: int) -> dict[str, Any]:
-        """What users' own tables say of a frame, by ``TABLE.COLUMN``, if they have one row for it."""
-        with self._reading() as connection:
-            return {} if self.tables is None else self.tables.labels(connection, frame_id)
-
     def catalog(self) -> Catalog:
         """What the store holds, as the compiler of queries wants to know it."""
         from sgstore.store.cataloguing import (

@@ -6,8 +6,8 @@ there and nowhere else, and each of them has the table as a view. So memory does
 
 A row belongs to a frame by its ``frame_id``, or by ``trace`` and one of ``seq``, ``time_ns``, ``t`` (seconds
 since the trace began): by time, to the frame that is nearest, if it is no further than half a period of
-the trace. Such a table has the column ``frame_id``, NULL where there is no such frame. A table without
-these columns is joined by whatever it has.
+the trace. With nothing but ``trace`` it belongs to all frames of the trace. Such a table has the column
+``frame_id``, NULL where there is no such frame. A table without these columns is joined by whatever it has.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ import duckdb
 
 from sgstore.errors import StoreError
 from sgstore.lang.catalog import TableFacts, Type
-from sgstore.lang.formulas import as_type
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
@@ -63,6 +62,9 @@ _BY_NUMBER: Final = """
 SELECT f.frame_id, u.* FROM {0} u
 LEFT JOIN frames f ON f.trace = CAST(u.trace AS VARCHAR) AND f.seq = TRY_CAST(u.seq AS BIGINT)
 """
+_BY_TRACE: Final = """
+SELECT f.frame_id, u.* FROM {0} u LEFT JOIN frames f ON f.trace = CAST(u.trace AS VARCHAR)
+"""
 _BY_TIME: Final = """
 SELECT CASE WHEN u.":ns" <= f.until THEN f.frame_id END AS frame_id, u.* EXCLUDE (":ns")
 FROM (
@@ -94,7 +96,8 @@ class UserTable:
     columns : mapping of str to str
         Its columns, with their types in the database.
     key : str
-        How its rows belong to frames: ``frame_id``, ``seq``, ``time_ns``, ``t``; empty: they do not.
+        How its rows belong to frames: ``frame_id``, ``seq``, ``time_ns``, ``t``, ``trace`` (all frames of it);
+        empty: they do not.
     """
 
     name: str
@@ -112,6 +115,8 @@ class UserTable:
                 return _BY_FRAME.format(rows)
             case "seq":
                 return _BY_NUMBER.format(rows)
+            case "trace":
+                return _BY_TRACE.format(rows)
             case "time_ns" | "t":
                 return _BY_TIME.format(rows, _NANOSECONDS[self.key])
             case _:
@@ -205,11 +210,20 @@ class UserTables:
                 table.name,
                 {column: type_of(declared) for column, declared in table.columns.items()},
                 single.get(table.name, "no rows that belong to frames"),
+                self._traces(connection, table),
+                joins=bool(table.key),
             )
             for table in self.tables
         }
         sets = {name: replace(one, tables=found) for name, one in catalog.sets.items()}
         return replace(catalog, tables=found, sets=sets)
+
+    def _traces(self, connection: DuckDBPyConnection, table: UserTable) -> frozenset[int] | None:
+        """Ids of the traces of a table whose rows are of traces."""
+        if table.key != "trace":
+            return None
+        sql = f'SELECT DISTINCT frame_id >> 24 FROM "{table.name}" WHERE frame_id IS NOT NULL'
+        return frozenset(row[0] for row in connection.execute(sql).fetchall())
 
     def joined(self, connection: DuckDBPyConnection) -> dict[str, Joined]:
         """How the rows of each table that can belong to frames do so."""
@@ -221,23 +235,6 @@ class UserTables:
                     f' FROM "{table.name}" u LEFT JOIN frame f ON f.frame_id = u.frame_id'
                 )
                 found[table.name] = Joined(*connection.execute(sql).fetchall()[0])
-        return found
-
-    def labels(self, connection: DuckDBPyConnection, frame_id: int) -> dict[str, Any]:
-        """What the tables say of a frame, by ``TABLE.COLUMN``; nothing of one with several rows for it."""
-        found: dict[str, Any] = {}
-        for table in self.tables:
-            if not table.key:
-                continue
-            columns = ", ".join(
-                f"{as_type(_quoted(name), type_of(declared))}"
-                for name, declared in table.columns.items()
-            )
-            sql = f'SELECT {columns} FROM "{table.name}" WHERE frame_id = ?'
-            rows = connection.execute(sql, [frame_id]).fetchmany(2)
-            if len(rows) == 1:
-                names = (f"{table.name}.{column}" for column in table.columns)
-                found |= dict(zip(names, rows[0], strict=True))
         return found
 
 
@@ -314,11 +311,7 @@ def _key_of(columns: Mapping[str, Any]) -> str:
         return "frame_id"
     if "trace" not in names:
         return ""
-    return next((key for key in ("seq", "time_ns", "t") if key in names), "")
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'
+    return next((key for key in ("seq", "time_ns", "t") if key in names), "trace")
 
 
 def _escaped(text: str) -> str:
