@@ -59,3 +59,32 @@ def test_red_phases_are_those_of_the_lights(store: Store) -> None:
     assert {p.trace for p in phases} == {"traffic_lights"}
     assert {who(p, "t") for p in phases} == {f"traffic_light {number}" for number in (5, 6, 7)}
     assert told == {tuple(row) for row in rows.values}
+
+
+def test_cut_ins_are_found_by_name_where_somebody_cuts_in(store: Store) -> None:
+    cut_ins = found(store, "cut_in")
+    (first,) = (c for c in cut_ins if c.trace == "cut-in")
+
+    assert (who(first, "e"), who(first, "v")) == ("car 0", "car 1")
+    assert first.start < 8 < first.end
+    assert {c.trace for c in cut_ins} == {"cut-in", "highway_merge"}
+    assert {(c.trace, who(c, "v")) for c in found(store, "CutIn")} >= {("cut-in", "car 1")}
+
+
+def test_who_cuts_in_and_brakes_is_found_by_name(store: Store) -> None:
+    assert {(b.trace, who(b, "v")) for b in found(store, "lead_hard_braking")} == {
+        ("cut-in", "car 1")
+    }
+
+
+def test_the_ego_waits_at_red_where_there_are_lights(store: Store) -> None:
+    (waiting,) = found(store, "waiting_at_red")
+
+    assert waiting.trace == "traffic_lights"
+
+
+def test_people_who_walk_on_the_road_are_found_by_name(store: Store) -> None:
+    walkers = {(w.trace, who(w, "p")) for w in found(store, "jaywalking")}
+
+    assert ("pedestrian", "person 1") in walkers
+    assert {trace for trace, _ in walkers} == {"pedestrian", "traffic_lights"}
