@@ -677,3 +677,37 @@ def test_a_recording_that_was_replaced_is_refused(recording: Path, tmp_path: Pat
     for form in ("mcap", "frames"):
         with pytest.raises((ExportError, TraceError)):
             write_export(export, tmp_path / form, form)
+
+
+# Out and in again ------------------------------------------------------------------------------------
+
+
+def test_rows_of_s3c_come_in_again_as_the_same_classes(store: Store, tmp_path: Path) -> None:
+    from sgstore.importing import import_graphs
+
+    export = Export(store, (Clip("town", 5 * S, 8 * S), Clip("town", 24 * S, 24 * S)))
+    write_export(export, tmp_path / "out", "s3c")
+    import_graphs(tmp_path / "again.sgstore", [tmp_path / "out" / "graphs.csv"], "s3c")
+    ids = [frame_id for _, frame_id in frames_in(export)]
+    # A node without any edge stands in no row.
+    whole = [all(dict(store.graph(i, "RSV").degree()).values()) for i in ids]
+
+    classes = dict(zip(*store.classes("RSV").values(), strict=True))
+    found = sgstore.open(tmp_path / "again.sgstore").classes("RSV")["class"].tolist()
+
+    assert 20 < sum(whole) < len(whole)
+    assert [classes[i] == mine for i, mine in zip(ids, found, strict=True)] == whole
+
+
+def test_lines_of_networkx_come_in_again_as_the_same_graphs(
+    export: Export, written: Callable[..., Path], tmp_path: Path
+) -> None:
+    from sgstore.importing import import_graphs
+
+    import_graphs(tmp_path / "again.sgstore", [written("nx") / "town_001.jsonl"], "nodelink")
+    again = sgstore.open(tmp_path / "again.sgstore")
+    ids = [frame_id for clip, frame_id in frames_in(export) if clip == 1]
+
+    for abstraction in ("E", "SG"):
+        classes = dict(zip(*export.store.classes(abstraction).values(), strict=True))
+        assert again.classes(abstraction)["class"].tolist() == [classes[i] for i in ids]
