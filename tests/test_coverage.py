@@ -42,7 +42,7 @@ from sgstore.coverage.asking import block_of
 from sgstore.coverage.classed import Classed
 from sgstore.coverage.estimates import estimate, expected_classes
 from sgstore.coverage.explain import tree
-from sgstore.coverage.features import covered_combinations, features, matrix
+from sgstore.coverage.features import features
 from sgstore.errors import ConfigError, QueryError, StoreError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
@@ -324,7 +324,8 @@ def test_combinations_are_those_of_brute_force_and_their_queries_find_as_many_fr
     one, other = (classed(selection_of(text), "ER") for text in (a, b))
     names = sorted(set().union(*sets))
     wanted = {some: sum(set(some) <= one for one in sets) for some in combinations(names, k)}
-    shares, missing, found = combos(one, "ER", k)
+    combined = combos(one, "ER", k)
+    shares, missing, found = combined.shares, combined.missing, combined.found
     store = sgstore.open(a)
 
     assert shares.rows[0][1:3] == (sum(n > 0 for n in wanted.values()), len(wanted))
@@ -336,15 +337,32 @@ def test_combinations_are_those_of_brute_force_and_their_queries_find_as_many_fr
         " & ".join(" ".join(name) for name in some) for some, n in wanted.items() if n == 0
     }
     assert all(store.find(query).count() == 0 for query in missing.column("query")[:8])
-    listed = covered_combinations(found)
+    listed = combined.covered()
     assert listed.column("frames") == sorted((n for n in wanted.values() if n), reverse=True)
     of_theirs = {some for one_set in theirs for some in combinations(sorted(one_set), k)}
     of_ours = {some for one_set in sets for some in combinations(sorted(one_set), k)}
     measured = combos(one, "ER", k, other)
-    assert measured[0].rows[0][1:3] == (len(of_ours & of_theirs), len(of_theirs))
-    assert sum(measured[1].column("frames_in_reference")) == sum(
+    assert measured.shares.rows[0][1:3] == (len(of_ours & of_theirs), len(of_theirs))
+    assert sum(measured.missing.column("frames_in_reference")) == sum(
         sum(set(some) <= one_set for one_set in theirs) for some in of_theirs - of_ours
     )
+
+
+def test_only_features_of_the_ego_count_where_that_is_asked(town: str) -> None:
+    frames = classed(selection_of(town), "ER")
+    whole, own = combos(frames, "ER", 1), combos(frames, "ER", 1, of_ego=True)
+    wanted = {name for name in whole.found.features.names if "ego" in (name[0], name[2])}
+
+    assert set(own.found.features.names) == wanted
+    assert 0 < len(wanted) < len(whole.found.features.names)
+    store = sgstore.open(town)
+    for row in own.covered().rows[:6]:
+        a, relation, b = (part for part in row[0].split(" "))
+        ends = [
+            f"(:{'Ego' if x == 'ego' else x.replace('_', '').capitalize() + '&!Ego'})"
+            for x in (a, b)
+        ]
+        assert store.find(f"MATCH {ends[0]}-[:{relation}]->{ends[1]}").count() == row[1]
 
 
 def test_too_many_combinations_are_an_error_and_not_a_part_of_them(worlds, monkeypatch) -> None:
@@ -361,7 +379,7 @@ def test_too_many_combinations_are_an_error_and_not_a_part_of_them(worlds, monke
 def test_the_matrix_shows_frames_with_both_and_what_is_wanted(worlds) -> None:
     a, b, of_a, of_b = worlds
     one, other = (classed(selection_of(text), "ER") for text in (a, b))
-    names, frames, wanted = matrix(one, "ER", other)
+    names, frames, wanted = combos(one, "ER", 1, other).matrix()
     sets, theirs = ([triples(s) for t in of for s in t] for of in (of_a, of_b))
     pair = {" ".join(name): name for name in set().union(*sets, *theirs)}
     for (i, x), (j, y) in product(enumerate(names), repeat=2):

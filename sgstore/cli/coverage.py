@@ -214,6 +214,9 @@ def combos_(
         typer.Option("--by", metavar="B", help="Measured by what occurs in B; by default by all."),
     ] = None,
     abstraction: Abstraction = "RSV",
+    of_ego: Annotated[
+        bool, typer.Option("--ego", help="Only features of the ego, and of lanes as it has them.")
+    ] = False,
     slots: Slots = None,
     missing: Missing = False,
     covered: Covered = False,
@@ -225,30 +228,27 @@ def combos_(
 ) -> None:
     """Count the combinations of k features, such as (car near ego), or of values of declared slots."""
     from sgstore.coverage import combos
-    from sgstore.coverage.features import covered_combinations
 
     form = form_of(form, as_json=as_json)
     if slots is not None:
-        if by or picture:
-            raise typer.BadParameter("--slots declares what there is: not with --by or --picture")
+        if by or picture or of_ego:
+            raise typer.BadParameter(
+                "--slots declares what there is: not with --by, --ego or --picture"
+            )
         _write_slots(a, slots, k, (covered, missing), limit, form, output)
         return
-    one = _classed(a, abstraction)
     reference = None if by is None else _classed(by, abstraction)
-    shares, gaps, found = combos(one, abstraction, k, reference)
-    listed = gaps if missing else covered_combinations(found) if covered else shares
-    for text in shares.said if listed is not shares else ():
+    found = combos(_classed(a, abstraction), abstraction, k, reference, of_ego=of_ego)
+    listed = found.missing if missing else found.covered() if covered else found.shares
+    for text in found.shares.said if listed is not found.shares else ():
         say(text)
     _write(listed, limit, form, output)
     if picture is not None:
-        from sgstore.coverage.features import matrix
         from sgstore.draw.coverage import draw_matrix
 
-        names, frames, wanted = matrix(one, abstraction, reference)
+        names, frames, wanted = found.matrix()
         title = f"Pairs of features in {abstraction} of {_short(a)}"
-        (row,) = combos(one, abstraction, 2, reference)[0].rows
-        below = f"{row[1]} of {row[2]} pairs occur"
-        draw_matrix(names, frames, wanted, picture, title=title, below=below)
+        draw_matrix(names, frames, wanted, picture, title=title)
         say(f"drawn: {picture}")
 
 

@@ -22,7 +22,7 @@ from sgstore.coverage.compare import (
 )
 from sgstore.coverage.explain import explain
 from sgstore.coverage.failures import S3C_THRESHOLD, Outcomes, failures
-from sgstore.coverage.features import combos
+from sgstore.coverage.features import Combos, combos
 from sgstore.coverage.frames import Chosen, selection_of
 from sgstore.coverage.slots import read_specifications, slot_coverage
 from sgstore.coverage.tables import Table
@@ -31,6 +31,7 @@ __all__ = [
     "S3C_THRESHOLD",
     "Chosen",
     "Classed",
+    "Combos",
     "Missing",
     "Outcomes",
     "Table",

@@ -39,6 +39,11 @@ def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
     return f"MATCH {known[0]}{' WHERE ' if rest else ''}{rest} RETURN FRAMES"
 
 
+def is_of_ego(feature: Sequence[str]) -> bool:
+    """Whether a feature speaks of the ego, or of a lane by how it lies to the ego."""
+    return any(label in _EGOS or _ROLE.fullmatch(label) for label in feature[::2])
+
+
 def _pattern(feature: Sequence[str]) -> str | None:
     nodes = [_node(label) for label in feature[::2]]
     if any(node is None for node in nodes):

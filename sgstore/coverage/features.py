@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.coverage.asking import query_of_features
+from sgstore.coverage.asking import is_of_ego, query_of_features
 from sgstore.coverage.tables import SHARES, Table, of_unknown, share
 from sgstore.errors import ConfigError
 
@@ -139,12 +139,52 @@ def _counted(found: Features, members: Ints) -> Iterator[int]:
         yield int(found.frames[classes].sum())
 
 
+@dataclass(frozen=True)
+class Combos:
+    """How many combinations a selection has, and which ones it lacks.
+
+    Attributes
+    ----------
+    shares : Table
+    missing : Table
+        ``combination``, ``frames_in_reference`` (``None`` without one), and the ``query`` that would find it.
+    found : Combinations
+        Of the selection, over the features of both.
+    reference : Features or None
+        Of the reference, over the features of both.
+    """
+
+    shares: Table
+    missing: Table
+    found: Combinations
+    reference: Features | None
+
+    def covered(self) -> Table:
+        """The combinations that occur, the most frequent first: ``combination``, ``frames``."""
+        found = self.found
+        rows = np.flatnonzero(found.frames)
+        rows = rows[np.argsort(-found.frames[rows], kind="stable")]
+        listed = zip(found.texts(rows), found.frames[rows].tolist(), strict=True)
+        return Table(("combination", "frames"), list(listed))
+
+    def matrix(self) -> tuple[list[str], Ints, Bools]:
+        """Pairs of features, whatever k: names, frames with both (F, F), and which pairs should be (F, F)."""
+        own = self.found.features
+        frames = _together(own)
+        wanted = np.ones(frames.shape, np.bool_)
+        if self.reference is not None:
+            wanted = _together(self.reference) > 0
+        return [" ".join(name) for name in own.names], frames, wanted
+
+
 def combos(
     a: Classed,
     abstraction: str,
     k: int,
     reference: Classed | None = None,
-) -> tuple[Table, Table, Combinations]:
+    *,
+    of_ego: bool = False,
+) -> Combos:
     """How many combinations of k features a selection has, and which ones it lacks.
 
     Parameters
@@ -154,26 +194,30 @@ def combos(
     k : int
     reference : Classed, optional
         What it is measured by: combinations that occur there. By default all combinations of features of ``a``.
+    of_ego : bool
+        Whether only features count that speak of the ego, or of a lane by how it lies to the ego.
 
-    Returns
-    -------
-    shares : Table
-    missing : Table
-        ``combination``, ``frames`` in the reference (``None`` without one), and the ``query`` that would find
-        it.
-    found : Combinations
-        Of ``a``, over the features of both.
+    Raises
+    ------
+    ConfigError
+        There are more combinations than can be gone through.
     """
     own = features(a, abstraction)
     other = None if reference is None else features(reference, abstraction)
     names = tuple(sorted({*own.names, *(other.names if other else ())}))
+    if of_ego:
+        names = tuple(name for name in names if is_of_ego(name))
+    other = None if other is None else _over(other, names)
     found = combined(_over(own, names), k)
-    name, kinds = a.chosen.text, f"combinations of {k} of the {len(names)} features"
+    name, kinds = (
+        a.chosen.text,
+        f"combinations of {k} of the {len(names)} features{' of the ego' if of_ego else ''}",
+    )
     if other is None or reference is None:
         wanted, there = np.ones(len(found.frames), np.bool_), None
         denominator = f"all {kinds} of {name}, whether they can be or not (product)"
     else:
-        theirs = combined(_over(other, names), k)
+        theirs = combined(other, k)
         there = theirs.frames
         wanted = there > 0
         denominator = f"{kinds} that occur in {reference.chosen.text} (observed)"
@@ -195,43 +239,17 @@ def combos(
         for row, text in zip(gaps.tolist(), found.texts(gaps), strict=True)
     ]
     missing = Table(("combination", "frames_in_reference", "query"), rows)
-    return shares, missing, found
+    return Combos(shares, missing, found, other)
 
 
 def _over(own: Features, names: tuple[Feature, ...]) -> Features:
-    """The same over more features."""
+    """The same over other features."""
     place = {name: i for i, name in enumerate(names)}
     counts = np.zeros((len(own.codes), len(names)), np.int64)
-    counts[:, [place[name] for name in own.names]] = own.counts
+    for column, name in enumerate(own.names):
+        if name in place:
+            counts[:, place[name]] = own.counts[:, column]
     return Features(names, own.codes, counts, own.frames)
-
-
-def covered_combinations(found: Combinations) -> Table:
-    """The combinations that occur, the most frequent first: ``combination``, ``frames``."""
-    rows = np.flatnonzero(found.frames)
-    rows = rows[np.argsort(-found.frames[rows], kind="stable")]
-    listed = zip(found.texts(rows), found.frames[rows].tolist(), strict=True)
-    return Table(("combination", "frames"), list(listed))
-
-
-def matrix(
-    a: Classed, abstraction: str, reference: Classed | None = None
-) -> tuple[list[str], Ints, Bools]:
-    """Which pairs of features occur together: names, frames with both (F, F), and which pairs should (F, F).
-
-    Parameters
-    ----------
-    a, abstraction, reference
-        As :func:`combos` takes them.
-    """
-    own = features(a, abstraction)
-    other = None if reference is None else features(reference, abstraction)
-    names = tuple(sorted({*own.names, *(other.names if other else ())}))
-    frames = _together(_over(own, names))
-    wanted = np.ones(frames.shape, np.bool_)
-    if other is not None:
-        wanted = _together(_over(other, names)) > 0
-    return [" ".join(name) for name in names], frames, wanted
 
 
 def _together(found: Features) -> Ints:

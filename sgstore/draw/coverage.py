@@ -229,7 +229,6 @@ def draw_matrix(
     to: Path,
     *,
     title: str,
-    below: str = "",
 ) -> None:
     """Draw which pairs of features occur together, and mark the gaps: pairs that are wanted and do not.
 
@@ -244,8 +243,6 @@ def draw_matrix(
     to : Path
         As in :func:`draw_rank_sizes`.
     title : str
-    below : str
-        A sentence under the title.
 
     Raises
     ------
@@ -263,6 +260,8 @@ def draw_matrix(
 
     shown = np.arange(len(names))
     gaps = wanted & (frames == 0)
+    pairs = np.triu(wanted, 1)
+    below = f"{int((pairs & (frames > 0)).sum())} of {int(pairs.sum())} pairs occur"
     if len(names) > MOST_FEATURES:
         shown = np.sort(np.argsort(-gaps.sum(axis=0), kind="stable")[:MOST_FEATURES])
         below += f"; the {MOST_FEATURES} of {len(names)} features with the most gaps"
