@@ -12,6 +12,7 @@ from test_lang_golden import CATALOG
 
 from sgstore.errors import QueryError
 from sgstore.lang import catalog, compile_query
+from sgstore.lang.compiler import compile_checks
 from sgstore.lang.functions import FUNCTIONS, PAIR_FUNCTIONS
 from sgstore.lang.standard import patterns, predicates
 from sgstore.vocabulary import KINDS, RELATIONS
@@ -29,6 +30,11 @@ def test_a_query_of_the_page_compiles_and_runs(text: str) -> None:
     statement = compile_query(text, CATALOG).rows()
 
     assert connection.execute(statement.sql, list(statement.values)).fetchall() == []
+
+
+@pytest.mark.parametrize("text", re.findall(r"```sgql-check\n(.*?)```", PAGE, re.DOTALL))
+def test_a_check_of_the_page_is_bound(text: str) -> None:
+    assert len(compile_checks(text, CATALOG)) == text.count("CHECK")
 
 
 def test_there_are_queries_on_the_page() -> None:
