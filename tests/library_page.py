@@ -146,8 +146,7 @@ PARTS: Final = (
     (
         "concepts",
         "Concepts",
-        "What practitioners look for. `sgstore patterns run STORE cut_in` finds one, and in a query it is a "
-        "step: `MATCH cut_in(within = 2s)`.",
+        "What practitioners look for. `sgstore patterns run STORE cut_in` finds one.",
     ),
     (
         "leaderboard",
