@@ -14,7 +14,7 @@ from sgstore.lang import syntax as s
 from sgstore.lang import tables
 from sgstore.lang.builders import BUILDERS
 from sgstore.lang.parser import MAX_DEPTH, MAX_LENGTH, parse
-from sgstore.lang.printing import tree_text
+from sgstore.lang.printing import statements_text, tree_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -195,3 +195,21 @@ def lark() -> Lark:
 
 
 PARSERS: list[Lark] = []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (e:Ego) WHERE e.speed < 1.5 -- metres, a second\n AND e.x > 1",
+        "MATCH (e:Ego) WHERE e.speed --, of the ego\n < 1.5 AND e.x > -- east\n 1",
+        "MATCH (e:Ego) -- comment, here\n WHERE e.speed < 1.5 AND e.x > 1 --, no more",
+    ],
+)
+def test_two_dashes_in_an_expression_begin_a_comment(text: str) -> None:
+    plain = "MATCH (e:Ego) WHERE e.speed < 1.5 AND e.x > 1"
+
+    assert statements_text(parse(text)) == statements_text(parse(plain))
+
+
+def test_two_dashes_between_nodes_are_an_edge() -> None:
+    assert statements_text(parse("MATCH (a)--(b)")) != statements_text(parse("MATCH (a), (b)"))

@@ -79,10 +79,12 @@ def _read(machine: Tables, stack: list[_Entry], text: str, position: int) -> Tok
         if blank := _BLANK.match(text, position):
             position = blank.end()
         best = max(allowed, key=partial(_rank, text, position), default=None)
-        if best and (length := best.length_at(text, position)):
+        comment = _COMMENT.match(text, position)
+        # Between nodes two dashes are an edge; in an expression they begin a comment.
+        signs = comment is not None and best is not None and best.name == "SIGN"
+        if best and not signs and (length := best.length_at(text, position)):
             span = Span(position, position + length)
             return Token(best.name, text[position : position + length], span)
-        comment = _COMMENT.match(text, position)
         if not comment:
             break
         position = comment.end()

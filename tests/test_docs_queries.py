@@ -1,0 +1,110 @@
+"""Every query that stands anywhere in the documentation is asked of a store: patterns, checks and SQL."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from itertools import islice
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+
+import sgstore
+from sgstore.config import Config
+from sgstore.demo import RECORDING
+from sgstore.graphs import derive
+from sgstore.ingest import ingest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BEGINS = re.compile(r"\s*(MATCH|USING|DEFINE|CHECK|SELECT|WITH|DESCRIBE|FROM)\b")
+ASKS = re.compile(r"MATCH\s*\(|^CHECK\s|\bCHECK\s.*\bALWAYS|FROM\s|^DESCRIBE\s", re.MULTILINE)
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+INDENTED = re.compile(r"(?:^    .*\n)+", re.MULTILINE)
+ROWS = 3
+
+
+def queries_of(page: str) -> list[str]:
+    """All texts of a page that begin as a query does: blocks, arguments of commands, strings, code."""
+    found: list[str] = []
+    for language, block in FENCE.findall(page):
+        if language in {"sgql", "sql", ""}:
+            found += statements(block)
+        elif language in {"sh", "console"}:
+            found += arguments(block)
+        elif language == "python":
+            strings = (n.value for n in ast.walk(ast.parse(block)) if isinstance(n, ast.Constant))
+            found += [s for s in strings if isinstance(s, str)]
+    rest = FENCE.sub("", page)
+    for block in INDENTED.findall(rest):
+        found += statements(dedent(block))
+    found += re.findall(r"`([^`\n]+)`", rest)
+    whole = [text.strip() for text in found if BEGINS.match(text) and "…" not in text]
+    return [text for text in dict.fromkeys(whole) if ASKS.search(text)]
+
+
+def statements(block: str) -> list[str]:
+    """A block as one query; or as several, one for each line that begins one with no definition before it."""
+    if "DEFINE" in block or re.search(r"\b(THEN|UNTIL|WHILE)\b", block):
+        return [block]
+    return re.split(r"\n(?=MATCH\b)", block) if BEGINS.match(block) else []
+
+
+def arguments(block: str) -> list[str]:
+    lines = re.sub(r"\\\n", " ", block).splitlines()
+    commands = [line.removeprefix("$ ") for line in lines]
+    tokens = (shlex.split(line, comments=True) for line in commands if "sgstore " in line)
+    return [
+        token.split("=", 1)[-1] if "=MATCH" in token else token for line in tokens for token in line
+    ]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> sgstore.Store:
+    folder = tmp_path_factory.mktemp("docs")
+    path = folder / "drives.sgstore"
+    assert ingest(path, [RECORDING])[0].error is None
+    derive(path, Config(), "near")
+    frames = sgstore.open(path).sql(
+        "SELECT frame_id, seq % 5 AS score, 2.0 AS error_deg FROM frames"
+    )
+    frames.csv(folder / "labels.csv")
+    return sgstore.open(path, tables={"labels": folder / "labels.csv"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_queries_of_a_page_are_answered(page: Path, store: sgstore.Store) -> None:
+    for text in queries_of(page.read_text(encoding="utf-8")):
+        if text.startswith(("SELECT", "WITH", "DESCRIBE", "FROM")):
+            store.sql(text, max_rows=ROWS)
+        elif re.search(r"^CHECK\b", text, re.MULTILINE):
+            assert store.check(text)
+        else:
+            list(islice(store.find(text), ROWS))
+
+
+def test_queries_are_found_wherever_they_stand() -> None:
+    page = (
+        "# Page\n\n    MATCH (a)\n    WHERE a.x > 1\n\n```sgql\nMATCH (b)\n```\n\n```sh\n"
+        "sgstore find s 'MATCH (c)' --json  # MATCH (no)\n```\n\n"
+        '```python\nstore.find("MATCH (d)")\n```\n\nInline `MATCH (e) RETURN FRAMES`, `MATCH …`, `MATCH`.\n'
+        '```console\n$ sgstore sql s "SELECT 1 FROM frames"\n```\n'
+    )
+
+    assert sorted(queries_of(page)) == [
+        "MATCH (a)\nWHERE a.x > 1",
+        "MATCH (b)",
+        "MATCH (c)",
+        "MATCH (d)",
+        "MATCH (e) RETURN FRAMES",
+        "SELECT 1 FROM frames",
+    ]
+
+
+def test_most_pages_with_queries_are_among_them() -> None:
+    numbers = {page.stem: len(queries_of(page.read_text(encoding="utf-8"))) for page in PAGES}
+
+    assert numbers["language"] > 14
+    assert numbers["README"] > 5
