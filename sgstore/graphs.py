@@ -203,6 +203,10 @@ def _settings(trace: StoredTrace, wanted: Config) -> Config:
     ------
     ConfigError
     """
+    if "imported" in trace.report:
+        raise ConfigError(
+            f"{trace.name!r} was imported as graphs: there is no geometry to derive others from"
+        )
     old = from_dict(trace.settings)
     new = replace(wanted, **{name: getattr(old, name) for name in _NOT_RELATIONS})
 

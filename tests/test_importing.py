@@ -1,4 +1,4 @@
-"""Graphs from elsewhere: what a file holds is in the store, and what is wrong with it is said, with its place."""
+"""Graphs from elsewhere: what a file holds is in the store; what is wrong with it is said, with its place."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import sgstore
 from sgstore.cli import run
 from sgstore.errors import ConfigError, TraceError
 from sgstore.importing import Words, import_graphs
+from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
 HEADER = "ds,sg,n_img,t_id,node1,edge,node2\n"
@@ -150,8 +151,6 @@ def test_what_networkx_writes_comes_back_with_its_attributes(tmp_path: Path) -> 
 
 def test_graphs_of_this_house_have_the_same_classes_when_they_come_back(tmp_path: Path) -> None:
     """Entities and their relations: what is known without a map."""
-    from sgstore.ingest import ingest
-
     sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
     ingest(tmp_path / "town.sgstore", [sample], rate=1, until=20)
     town = sgstore.open(tmp_path / "town.sgstore")
@@ -371,6 +370,57 @@ def test_a_graph_of_more_than_a_bucket_of_frames_keeps_entities_and_order(tmp_pa
 
     assert (done.frames, done.entities) == (300, 8)
     assert found.values == [(f"g{i}", f"car_{i % 7}") for i in range(300)]
+
+
+@pytest.mark.parametrize("what", ["imported", "ingested"])
+def test_what_is_exported_as_s3c_comes_back_with_the_same_classes(
+    tmp_path: Path, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = tmp_path / "first.sgstore"
+    if what == "imported":
+        (tmp_path / "two.csv").write_text(TWO)
+        import_graphs(first, [tmp_path / "two.csv"], "s3c")
+    else:
+        sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+        ingest(first, [sample], rate=1, until=15)
+    command = [
+        "export",
+        str(first),
+        "MATCH (:Ego)",
+        "--format",
+        "s3c",
+        "--to",
+        str(tmp_path / "out"),
+    ]
+    code = run(command)
+    lost = re.findall(r"lost: (\d+) nodes without an edge", capsys.readouterr().err)
+    (done,) = import_graphs(tmp_path / "again.sgstore", [tmp_path / "out" / "graphs.csv"], "s3c")
+    one, other = sgstore.open(first), sgstore.open(tmp_path / "again.sgstore")
+
+    assert done.error is None
+    assert (code == 3) == bool(lost)  # what stands alone is in no row
+    for abstraction in ("E", "EL", "ER", "RSV"):
+        found, wanted = (store.classes(abstraction)["class"].tolist() for store in (other, one))
+        assert sum(a != b for a, b in zip(found, wanted, strict=True)) <= sum(map(int, lost))
+        assert len(set(found)) > 1
+
+
+def test_what_was_imported_is_looked_at_and_nothing_is_derived_from_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imported(tmp_path, TWO, "s3c")
+    store, picture = str(tmp_path / "x.sgstore"), tmp_path / "graph.png"
+    codes = [
+        run(["info", store, "--trace", "graphs"]),
+        run(["show", store, "graphs#0", "--graph", "-o", str(picture)]),
+        run(["derive", store, "--as", "other"]),
+    ]
+    out, err = capsys.readouterr()
+
+    assert codes == [0, 0, 2]
+    assert "truck" in out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "was imported as graphs" in err
 
 
 def test_the_verb_imports_and_its_exit_code_says_what_was_lost(

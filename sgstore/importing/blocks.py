@@ -35,13 +35,13 @@ _LEADS: Final = RELATION_CODE["leads"]
 _LANE_COLUMNS: Final = ("overlap", "offset", "heading_error", "along")
 
 
-def parts_map(name: str, text: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
+def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
     """A road map of named parts, without any geometry and without edges: these are in the frames.
 
     Parameters
     ----------
-    name, text : str
-        As :class:`sgstore.roads.RoadMap` has them.
+    name, variant : str
+        As :class:`sgstore.roads.RoadMap` has them; there is no text.
     parts : mapping
         Kind and name of each part → what is known of it; ``off_road`` is the first.
     """
@@ -70,7 +70,8 @@ def parts_map(name: str, text: str, parts: Mapping[Part, Mapping[str, Any]]) -> 
     empty = Ribbons(np.zeros(1, np.int64), *(np.zeros(0) for _ in range(8)))
     return RoadMap(
         name=name,
-        text=text,
+        text="",
+        variant=variant,
         nodes=MapNodes(**(columns | texts)),
         edges=MapEdges(none.astype(np.int8), none, none),
         ribbons=empty,

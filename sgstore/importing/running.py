@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -20,12 +21,13 @@ from sgstore.importing.tables import read_csv, read_s3c
 from sgstore.importing.words import Words
 from sgstore.store import Folder, StoreFile, new_segment
 from sgstore.traces import digest_of, mark_of
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY, RELATIONS
+from sgstore.vocabulary import DIRECTIONS, KINDS, PROXIMITY, RELATIONS
 from sgstore.world import BUCKET_FRAMES, Loss, MessageRefs, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from sgstore.graph import GraphBlock
     from sgstore.importing.meant import Meant, Survey
     from sgstore.roads import RoadMap
     from sgstore.store import Sealed, Segment
@@ -159,7 +161,7 @@ class _Run:
             map_name="",
             context=MessageRefs(*(np.zeros(0, np.int64) for _ in range(5))),
         )
-        road_map = parts_map(f"{stem_of(path)} (parts)", self._text(found), found.parts)
+        road_map = parts_map(f"{stem_of(path)} (parts)", self._variant(found), found.parts)
         if self._store is not None and not self.force:
             known = self._store.stored(info, Config(), road_map)
             if known is not None:
@@ -187,16 +189,18 @@ class _Run:
         with new_segment(
             self._path, info, Config(), road_map=road_map, answers=answers, folder=folder
         ) as segment:
+            kinds: Counter[str] = Counter()
             while some := list(islice(graphs, _BLOCK)):
-                self._append(segment, blocks, some, done)
+                graph = self._append(segment, blocks, some, done)
+                kinds.update(KINDS[code] for code in graph.frames.entities.kind.tolist())
                 if self.on_frames is not None:
                     self.on_frames(info.path, done.frames)
             report = TraceReport(frames=done.frames, losses=_losses(done.lost))
-            return segment.seal(report, {"imported": self._form, "entities": done.entities})
+            return segment.seal(report, {"imported": self._form, "entities": dict(kinds)})
 
     def _append(
         self, segment: Segment, blocks: Blocks, graphs: Sequence[Meant], done: Imported
-    ) -> None:
+    ) -> GraphBlock:
         graph = blocks.block(graphs)
         segment.append(graph)
         segment.name_frames(
@@ -211,12 +215,11 @@ class _Run:
         for one in graphs:
             for what, often in one.graph.lost.items():
                 done.lost[what] = done.lost.get(what, 0) + often
+        return graph
 
-    def _text(self, found: Survey) -> str:
+    def _variant(self, found: Survey) -> str:
         """What the parts of the road are, and how the file was understood: it identifies the map."""
         about = {
-            "format": "sgstore parts",
-            "version": 1,
             "of": self._form,
             "words": self._words.as_dict(),
             "answers": sorted(set(self._answers)),

@@ -262,7 +262,7 @@ class StoreFile:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
                 "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
-                " WHERE t.trace_id = ?"
+                " WHERE t.trace_id = ? AND m.text IS NOT NULL"  # one of named parts has none
             )
             return connection.execute(sql, [trace_id]).fetchone()
 
