@@ -616,22 +616,24 @@ SCENES |= {
 # All of them as traces --------------------------------------------------------------------------------------
 
 
-def is_rule(name: str) -> bool:
-    return patterns()[name].is_check
+def is_of_the_ego(name: str) -> bool:
+    """Whether it is a rule about the ego, with one verdict for a trace; others tell who breaks them."""
+    one = patterns()[name]
+    return one.is_check and "FORALL" not in one.query
 
 
 def traces() -> tuple[dict[str, list[Scene]], dict[str, tuple[tuple[str, int], ...]]]:
     """Scenes by the name of their trace, and of each pattern where its scenes are: (trace, number in it).
 
     Those of one road follow one another in one trace, unless things in them never move. The scenes of a rule
-    are traces of their own: its verdict is one for the whole trace.
+    about the ego are traces of their own: its verdict is one for the whole trace.
     """
     found: dict[str, list[Scene]] = {}
     places: dict[Scene, tuple[str, int]] = {}
     alone: dict[Scene, tuple[str, int]] = {}
     of: dict[str, tuple[tuple[str, int], ...]] = {}
     for name, scenes in SCENES.items():
-        own = is_rule(name)
+        own = is_of_the_ego(name)
         known = alone if own else places
         for number, scene in enumerate(filter(None, scenes)):
             if scene in known:
