@@ -353,7 +353,8 @@ class Store:
         whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}
         whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
         classes = partial(self.file.abstracted.class_of, frame.frame_id)
-        return FrameView(self.file.graph(frame.frame_id), about, whole, classes)
+        roles = partial(self.file.abstracted.roles_of, frame.frame_id)
+        return FrameView(self.file.graph(frame.frame_id), about, whole, classes, roles)
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

@@ -13,7 +13,7 @@
 -- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
 --
 -- Changes
---   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; pairs.lane_dist, by lane_state.is_own and map_reach.
+--   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; lane_dists, by lane_state.is_own and map_reach. roles, by lane_role.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
 --     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
 --   * map_id, channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
@@ -111,6 +111,9 @@ CREATE TABLE lane_gap (                                        -- attribute of t
 
 CREATE TABLE frame_class (                                     -- ordered by all columns; made at ingest
   abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);  -- class: NULL where too symmetric to be told
+
+CREATE TABLE lane_role (                                       -- ordered by all columns; what lanes are to the ego in RSV
+  role VARCHAR, bucket BIGINT, node_id INTEGER, mask BIGINT);
 
 CREATE TABLE later_class (                                     -- the same of abstractions that were asked for later
   abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);
@@ -228,7 +231,7 @@ CREATE VIEW lane_states AS
 SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary, along, is_own
 FROM lane_state;
 
-COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which pairs.lane_dist is told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
+COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which lane_dists are told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
 
 CREATE VIEW lane_gaps AS
 SELECT frame_id, src, dst, gap FROM lane_gap;
@@ -244,10 +247,9 @@ SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * 
        turned - 360 * ceil((turned - 180) / 360) AS rel_heading, px AS lon, py AS lat, closing_speed,
        CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS ttc,
        CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
-       src_kind, dst_kind, of_ego = true AS src_is_ego, to_ego = true AS dst_is_ego,
+       src_kind, dst_kind, src_is_ego, dst_is_ego,
        CASE WHEN s1 < 0 THEN 0 ELSE s1 END AS lon_gap, CASE WHEN s2 < 0 THEN 0 ELSE s2 END AS lat_gap,
-       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading,
-       CASE WHEN behind IS NULL OR ahead <= -behind THEN ahead ELSE behind END AS lane_dist
+       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading
 FROM (
   SELECT *, CASE WHEN la + wa + lb + wb IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
       CASE WHEN s1 > 0 THEN s1 * s1 + greatest(t1, 0) * greatest(t1, 0) END, CASE WHEN s2 > 0 THEN s2 * s2 + greatest(t2, 0) * greatest(t2, 0) END,
@@ -266,26 +268,31 @@ FROM (
         SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd,
             CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned, degrees(hb - atan2(dy, dx)) AS sighted
         FROM (
-          SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS of_ego, b.is_ego AS to_ego,
+          SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
               b.x::DOUBLE - a.x AS dx, b.y::DOUBLE - a.y AS dy, b.z::DOUBLE - a.z AS dz, b.vx::DOUBLE - a.vx AS dvx, b.vy::DOUBLE - a.vy AS dvy,
               a.heading::DOUBLE AS ha, b.heading::DOUBLE AS hb,
               cos(a.heading::DOUBLE) AS ca, sin(a.heading::DOUBLE) AS sa, cos(b.heading::DOUBLE) AS cb, sin(b.heading::DOUBLE) AS sb,
               a.length::DOUBLE / 2 AS la, a.width::DOUBLE / 2 AS wa, b.length::DOUBLE / 2 AS lb, b.width::DOUBLE / 2 AS wb,
               sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
-          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))))
-LEFT JOIN (  -- ways along the lanes. A filter on a column of ON reaches these tables too if it compares: hence "= true" above
-  SELECT at_frame, a_node, b_node, a_kind, b_kind, a_ego, b_ego, min(CASE WHEN way >= 0 THEN way END) AS ahead, max(CASE WHEN way < 0 THEN way END) AS behind
+          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))));
+
+COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; for how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+
+-- A view of its own, and no column of pairs: who asks for other numbers should not pay for these joins.
+CREATE VIEW lane_dists AS
+SELECT frame_id, src, dst, CASE WHEN behind IS NULL OR ahead <= -behind THEN ahead ELSE behind END AS lane_dist, src_kind, dst_kind, src_is_ego, dst_is_ego
+FROM (
+  SELECT frame_id, src, dst, src_kind, dst_kind, src_is_ego, dst_is_ego, min(CASE WHEN way >= 0 THEN way END) AS ahead, max(CASE WHEN way < 0 THEN way END) AS behind
   FROM (
-    SELECT a.frame_id AS at_frame, a.node_id AS a_node, b.node_id AS b_node, a.kind AS a_kind, b.kind AS b_kind,
-        a.is_ego AS a_ego, b.is_ego AS b_ego, r.start + (b.along::DOUBLE - a.along::DOUBLE) AS way
+    SELECT a.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
+        r.start + (b.along::DOUBLE - a.along::DOUBLE) AS way
     FROM lane_state a JOIN lane_state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id JOIN frame f ON f.frame_id = a.frame_id
          JOIN map_reach r ON r.map_id = f.map_id AND r.src = a.lane AND r.dst = b.lane
     WHERE a.is_own AND b.is_own)
   WHERE way BETWEEN -200 AND 200
-  GROUP BY at_frame, a_node, b_node, a_kind, b_kind, a_ego, b_ego)
-ON at_frame = frame_id AND a_node = src AND b_node = dst AND a_kind = src_kind AND b_kind = dst_kind AND a_ego = of_ego AND b_ego = to_ego;
+  GROUP BY ALL);
 
-COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; lane_dist: from centre to centre along the lanes, positive where one drives from src to dst, negative where one drives from dst to src, NULL where there is no way of 200 m or less (lane changes are none), m.';
+COMMENT ON VIEW lane_dists IS 'How far it is along the lanes: one row for each ordered pair of entities that a way of at most 200 m joins (lane changes are none). lane_dist: from centre to centre, positive where one drives from src to dst, negative where one drives from dst to src; the shorter one counts, m.';
 
 CREATE VIEW classes AS
 SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class
@@ -293,6 +300,12 @@ FROM frame f JOIN (SELECT * FROM frame_class UNION ALL SELECT * FROM later_class
      ON c.bucket = f.bucket AND (c.mask & (1::BIGINT << f.bit)) <> 0;
 
 COMMENT ON VIEW classes IS 'One row a frame and abstraction (E, EL, ER, RSV, junction; others once they were asked for). class: equal exactly where the labelled graphs are the same but for which node is which (isomorphic), in every store; 32 hexadecimal digits, NULL where a graph is so symmetric that it was given up.';
+
+CREATE VIEW roles AS
+SELECT f.frame_id, r.node_id, r.role
+FROM frame f JOIN lane_role r ON r.bucket = f.bucket AND (r.mask & (1::BIGINT << f.bit)) <> 0;
+
+COMMENT ON VIEW roles IS 'What lanes are to the ego: one row a frame and lane that is in range or that traffic is in, as far as it can be said. role: Ego Lane; Left 1 of Ego Lane, Right 2 of Ego Lane … for lanes beside it that run the same way; Opposing Lane 0, 1 … for any other that traffic is in, the nearest first. Lanes one behind the other are one and have the same role (as in the abstraction RSV).';
 
 CREATE VIEW lanes AS
 SELECT m.name AS map, n.node_id, n.name, n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.x, n.y, n.z, degrees(n.heading) AS heading,

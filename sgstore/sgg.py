@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.abstractions import Classes, Grounds, Seen, abstraction_named
+from sgstore.abstractions import Classes, Grounds, Seen, abstraction_named, lane_roles
 from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
 from sgstore.online import Online
 from sgstore.relations import RELATIONS
@@ -250,15 +250,40 @@ class SceneGraphGenerator:
         ValueError
             There was no step yet.
         """
+        seen = self._seen(number)
+        (found,) = self._classes.of(abstraction_named(abstraction).function(seen))
+        return found or None
+
+    def roles_of(self, number: int = 0) -> dict[int, str]:
+        """What the lanes of the last step are to an ego: ``Ego Lane``, ``Left 1 of Ego Lane`` and so on.
+
+        Parameters
+        ----------
+        number : int
+            Which of the egos, from 0.
+
+        Returns
+        -------
+        dict
+            By node id, of the lanes of which it can be said; see :func:`sgstore.abstractions.lane_roles`.
+
+        Raises
+        ------
+        ValueError
+            There was no step yet.
+        """
+        _, lanes, roles = lane_roles(self._seen(number))
+        return dict(zip(lanes.tolist(), roles, strict=True))
+
+    def _seen(self, number: int) -> Seen:
+        """A graph of the last step as abstractions see it."""
         if self._online is None or self._online.last is None:
             raise ValueError("there was no step yet")
         graphs, kinds = self._online.last
         if self._grounds is None and self._road_map is not None:
             shown = map_of_graphs(self._road_map, self._config)
             self._grounds = None if shown is None else Grounds.of(shown)
-        seen = Seen.of(graphs[number], kinds, self._grounds)
-        (found,) = self._classes.of(abstraction_named(abstraction).function(seen))
-        return found or None
+        return Seen.of(graphs[number], kinds, self._grounds)
 
     @property
     def kinds(self) -> Codes:

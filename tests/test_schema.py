@@ -17,7 +17,9 @@ VIEWS = {
     "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary along is_own",
     "lane_gaps": "frame_id src dst gap",
     "pairs": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
-    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading lane_dist",
+    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading",
+    "lane_dists": "frame_id src dst lane_dist src_kind dst_kind src_is_ego dst_is_ego",
+    "roles": "frame_id node_id role",
     "classes": "frame_id abstraction class",
     "lanes": "map node_id name lane_type road section lane junction turn x y z heading length width",
     "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",

@@ -17,6 +17,7 @@ from sgstore.abstractions.literature import (
     entities,
     in_lanes,
     junction,
+    lane_roles,
     related,
     road_scene,
     whole,
@@ -39,6 +40,7 @@ __all__ = [
     "abstraction_named",
     "abstractions",
     "classes_of",
+    "lane_roles",
     "register",
 ]
 

@@ -311,10 +311,7 @@ def _lanes(seen: Seen, first: int) -> tuple[list[Part], list[Part], list[str]]:
     assert seen.grounds is not None  # noqa: S101 - the caller has looked
     is_in = len(_KIND_LABELS) + _IS_IN
     strands = seen.grounds.strands
-    rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
-    entity = seen.row_of(seen.frame[rows], seen.src[rows])
-    rows = rows[(entity >= 0) & seen.is_traffic[entity]]
-    frame, src, dst = seen.frame[rows], seen.src[rows], seen.dst[rows]
+    frame, src, dst = _inside(seen)
     off = dst == _OFF_ROAD
     strand = strands.of[-1 - dst]
     on = np.flatnonzero(strand != 0)
@@ -339,6 +336,46 @@ def _lanes(seen: Seen, first: int) -> tuple[list[Part], list[Part], list[str]]:
         (frame[off], src[off], np.full(int(off.sum()), is_in), dst[off]),
     ]
     return nodes, edges, names
+
+
+def lane_roles(seen: Seen) -> tuple[Ints, Ints, list[str]]:
+    """What the lanes of each frame are to the ego in ``RSV``, as far as that can be said.
+
+    Returns
+    -------
+    frame, node : (N,) int64
+        Frame, counted from 0, and lane: one that is in range or that somebody is in. Ascending.
+    role : list of str
+        ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on.
+    """
+    if seen.grounds is None:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), []
+    strands = seen.grounds.strands
+    frame, src, dst = _inside(seen)
+    on = np.flatnonzero(strands.of[-1 - dst] != 0)
+    frame, src, dst = frame[on], src[on], dst[on]
+    role_frame, strand, role = _roles(seen, strands, (frame, src, strands.of[-1 - dst]))
+    said = role != _NAMELESS
+    span = len(strands.of) + 1  # node ids of lanes are below zero, and above -span
+    known = role_frame[said] * span - strand[said]
+    order = np.argsort(known)
+    known, role = known[order], role[said][order]
+    present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
+    in_range = seen.node_frame[present] * span - seen.node[present]
+    lane_frame, lane = np.divmod(np.union1d(in_range, frame * span - dst), span)
+    wanted = lane_frame * span - strands.of[lane - 1]
+    at = np.searchsorted(known, wanted)
+    hit = np.flatnonzero(np.append(known, -1)[at] == wanted)
+    names = [role_name(one) for one in role[at[hit]].tolist()]
+    return lane_frame[hit], -lane[hit], names
+
+
+def _inside(seen: Seen) -> tuple[Ints, Ints, Ints]:
+    """Frames, traffic, and the lanes that it is in."""
+    rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
+    entity = seen.row_of(seen.frame[rows], seen.src[rows])
+    rows = rows[(entity >= 0) & seen.is_traffic[entity]]
+    return seen.frame[rows], seen.src[rows], seen.dst[rows]
 
 
 _NAMELESS: Final = -(1 << 20)

@@ -86,6 +86,8 @@ class Unit(StrEnum):
     """How many frames of the store are of the class of the frame, in an abstraction; the column is its name."""
     seen = "seen"
     """Whether the class of the frame, in an abstraction, is that of a frame of a dataset."""
+    role = "role"
+    """What a lane is to the ego, frame by frame: in the view ``roles``."""
     span = "span"
     """A length of time in nanoseconds; seen in seconds."""
 
@@ -312,6 +314,14 @@ NODE_ATTRIBUTES: Final = _named(
             "where a lane in a junction leads",
             kinds=_LANES,
             values=("left", "right", "straight"),
+        ),
+        Attribute(
+            "role",
+            Type.text,
+            {},
+            "what a lane is to the ego: 'Ego Lane', 'Left 1 of Ego Lane', 'Opposing Lane 0'",
+            Unit.role,
+            _LANES,
         ),
         _of_map("speed_limit", Type.number, "m/s", _LANES | {"road"}),
         _of_map(

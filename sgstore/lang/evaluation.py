@@ -40,12 +40,15 @@ class FrameView:
     classes : callable, optional
         Gives the class of the graph in an abstraction, by its name; asked only where a query asks, and once.
         Without it classes are not known.
+    roles : callable, optional
+        Gives what lanes are to the ego, by node id; asked as classes are.
     """
 
     graph: SceneGraph
     frame: Attributes = field(default_factory=dict[str, Any])
     trace: Attributes = field(default_factory=dict[str, Any])
     classes: Callable[[str], str | None] | None = None
+    roles: Callable[[], Mapping[int, str]] | None = None
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:
@@ -93,6 +96,14 @@ class FrameView:
     @cached_property
     def _classes(self) -> dict[str, str | None]:
         return {}
+
+    def role_of(self, node: int) -> str | None:
+        """What a lane is to the ego; ``None`` where it is not known."""
+        return self._roles.get(node)
+
+    @cached_property
+    def _roles(self) -> Mapping[int, str]:
+        return self.roles() if self.roles else {}
 
     def is_one(self, node: int, kinds: b.Kinds) -> bool:
         """Whether a node is of these kinds."""
@@ -196,6 +207,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
         case b.NodeAttribute(node=node, attribute=attribute):
             if attribute.unit is Unit.binding:
                 return lambda at: at.nodes[node]
+            if attribute.unit is Unit.role:
+                return lambda at: at.view.role_of(at.nodes[node])
             if attribute is NODE_ATTRIBUTES["type"]:
                 return lambda at: _type_of(at.view.nodes[at.nodes[node]])
             name = attribute.name

@@ -150,6 +150,13 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
 
 
+def role_text(frame: str, node: str) -> str:
+    """What a lane is to the ego in a frame."""
+    on = [f'"r"."frame_id" = {frame}', f'"r"."node_id" = {node}']
+    role = Select(['any_value("r"."role")'], ['"roles" AS "r"'], on)
+    return f"({role.text()})"
+
+
 def _part(attribute: Attribute, home: Home, column: str, alias: str, trace: str | None) -> str:
     number = f"CAST({column} AS DOUBLE)"
     unit = attribute.unit

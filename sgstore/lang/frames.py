@@ -35,6 +35,7 @@ from sgstore.lang.formulas import (
     leaves,
     nested,
     quoted,
+    role_text,
 )
 from sgstore.lang.kinds import Profile, homes_of, kind_conditions
 from sgstore.lang.lasting import HELD, join_lasting
@@ -45,6 +46,8 @@ from sgstore.lang.sql import Masks
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from sgstore.lang.catalog import Attribute
 
 PATTERN: Final = '":pattern"'
 FRAME: Final = '":frame"'
@@ -281,9 +284,7 @@ class Frames(Masks):
             case NodeValue(node=node):
                 join.texts[leaf] = join.nodes[node]
             case NodeAttribute(node=node, attribute=attribute):
-                bare = attribute.unit is Unit.binding
-                text = join.nodes[node] if bare else attribute_text(attribute, join.at[node])
-                join.texts[leaf] = text
+                join.texts[leaf] = self._of_node(join, node, attribute)
             case EdgeRelation(edge=edge):
                 join.texts[leaf] = f"CAST({join.edges[edge]} AS VARCHAR)"
             case EdgeAttribute(edge=edge):
@@ -297,6 +298,13 @@ class Frames(Masks):
             case PairNumber(function=function, a=a, b=b):
                 if function == WAY:  # the others are computed in layers
                     join.texts[leaf] = self._of_ways(join, scope, a, b)
+
+    def _of_node(self, join: Join, node: str, attribute: Attribute) -> str:
+        if attribute.unit is Unit.binding:
+            return join.nodes[node]
+        if attribute.unit is Unit.role:
+            return role_text(join.frame, join.nodes[node])
+        return attribute_text(attribute, join.at[node])
 
     def _of_lane(self, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
         alias = quoted(f"{key}:in")
@@ -362,7 +370,8 @@ def _valued(leaf: Leaf) -> frozenset[str]:
     """Nodes whose tables a value needs."""
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
-            return frozenset() if attribute.unit is Unit.binding else frozenset({node})
+            bare = attribute.unit in {Unit.binding, Unit.role}
+            return frozenset() if bare else frozenset({node})
         case PairNumber(function=function, a=a, b=b):
             return frozenset() if function == WAY else frozenset({a, b})
         case _:

@@ -45,6 +45,8 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
             if attribute.unit is Unit.binding or is_constant(leaf):
                 return True
             profile = Profile.of(scope.kinds(node), catalog)
+            if attribute.unit is Unit.role:
+                return False
             return not profile.moving and not profile.fixed
         case _:
             return False

@@ -105,6 +105,10 @@ def _file(condition: Bound, parts: Phases) -> None:
     found = set(leaves(condition))
     if all(_is_direct(leaf) for leaf in found):
         parts.direct.append(condition)
+    elif any(
+        isinstance(leaf, NodeAttribute) and leaf.attribute.unit is Unit.role for leaf in found
+    ):
+        parts.rest.append(condition)
     elif all(isinstance(leaf, NodeAttribute) for leaf in found) and len(nodes_of(condition)) == 1:
         parts.single.setdefault(next(iter(nodes_of(condition))), []).append(condition)
     elif all(isinstance(leaf, TraceAttribute) for leaf in found):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.abstractions import AT_INGEST, Classes, Grounds, Seen, abstraction_named
+from sgstore.abstractions import AT_INGEST, Classes, Grounds, Seen, abstraction_named, lane_roles
 from sgstore.store.adding import add_files, note, writing
 from sgstore.store.covering import (
     CodedClasses,
@@ -85,16 +85,34 @@ class TraceClasses:
 
 
 class IngestedClasses:
-    """The classes of a trace that is being ingested on a map, if it has one."""
+    """The classes of a trace that is being ingested on a map, if it has one; and the roles of its lanes."""
 
     def __init__(self, road_map: RoadMap | None) -> None:
         self._grounds = None if road_map is None else Grounds.of(road_map)
         self._classes = TraceClasses()
 
-    def columns(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> Columns:
-        """Table ``frame_class``; ``kinds`` are those of the entities so far, by node id."""
+    def tables(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> dict[str, Columns]:
+        """Tables ``frame_class`` and ``lane_role``; ``kinds`` are those of the entities so far, by node id."""
         seen = Seen.of(graph, kinds, self._grounds)
-        return self._classes.columns(seen, trace_id, graph.frames.seq)
+        seq = graph.frames.seq
+        return {
+            "frame_class": self._classes.columns(seen, trace_id, seq),
+            "lane_role": _role_columns(seen, trace_id, seq),
+        }
+
+
+def _role_columns(seen: Seen, trace_id: int, seq: Ints) -> Columns:
+    frame, lane, roles = lane_roles(seen)
+    number = {role: i for i, role in enumerate(dict.fromkeys(roles))}
+    code = np.array([number[role] for role in roles], np.int64)
+    bucket = trace_bucket(trace_id, seq[frame])
+    first, mask = masks_of((code, bucket, lane), seq[frame] % BUCKET_FRAMES)
+    return {
+        "role": texts(roles[row] for row in first.tolist()),
+        "bucket": bucket[first],
+        "node_id": lane[first],
+        "mask": mask,
+    }
 
 
 class Abstracted:
@@ -183,6 +201,14 @@ class Abstracted:
                 [frame_id, name],
             ).fetchone()
         return found[0] if found else None
+
+    def roles_of(self, frame_id: int) -> dict[int, str]:
+        """What lanes are to the ego of a frame, by node id: :func:`sgstore.abstractions.lane_roles`."""
+        with self._access.reading() as connection:
+            found = connection.execute(
+                "SELECT node_id, role FROM roles WHERE frame_id = ?", [frame_id]
+            ).fetchall()
+        return dict(found)
 
     def coded(self, name: str) -> CodedClasses:
         """The class of each frame as a number, computed where it was not.

@@ -221,6 +221,7 @@ SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, b
 FROM store.edge GROUP BY ALL ORDER BY ALL""",
     "frame": "SELECT * FROM store.frame ORDER BY frame_id",
     "frame_class": "SELECT * FROM store.frame_class ORDER BY ALL",
+    "lane_role": "SELECT * FROM store.lane_role ORDER BY ALL",
     "later_class": "SELECT * FROM store.later_class ORDER BY ALL",
     "derived_node": "SELECT * FROM store.derived_node ORDER BY ALL",
     "derived_edge": "SELECT * FROM store.derived_edge ORDER BY ALL",

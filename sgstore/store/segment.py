@@ -257,7 +257,8 @@ class Segment:
         insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
         insert("lane_gap", packing.gap_columns(graph, trace_id))
         insert("event", self._owned(self._happenings.of(graph.frames)))
-        insert("frame_class", self._classes.columns(graph, trace_id, kinds.entities))
+        for table, columns in self._classes.tables(graph, trace_id, kinds.entities).items():
+            insert(table, columns)
 
     def _owned(self, columns: Columns) -> Columns:
         """The columns, and whose they are."""

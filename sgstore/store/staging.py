@@ -66,6 +66,7 @@ ORDER BY s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
     "edge": """
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask FROM edge ORDER BY ALL""",
     "frame_class": "SELECT * FROM frame_class ORDER BY ALL",
+    "lane_role": "SELECT * FROM lane_role ORDER BY ALL",
     "later_class": "SELECT * FROM later_class ORDER BY ALL",
     "derived_node": "SELECT * FROM derived_node ORDER BY ALL",
     "derived_edge": "SELECT * FROM derived_edge ORDER BY ALL",
@@ -81,6 +82,7 @@ SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, b
 FROM edge GROUP BY ALL ORDER BY ALL""",
     "frame_class": """
 SELECT abstraction, class, bucket, bit_or(mask) AS mask FROM frame_class GROUP BY ALL ORDER BY ALL""",
+    "lane_role": "SELECT role, bucket, node_id, bit_or(mask) AS mask FROM lane_role GROUP BY ALL ORDER BY ALL",
 }
 """The same where blocks split buckets: the pieces of a mask become one row again."""
 
