@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import subprocess
 import sys
 import tempfile
@@ -124,6 +125,11 @@ class Sandbox:
         with self._turn:
             self._kill()
 
+    @property
+    def folder(self) -> Path | None:
+        """Where the process keeps the tables that it has read; ``None`` while there is no process."""
+        return None if self._folder is None else Path(self._folder.name)
+
     def sql(self, text: str) -> Answer:
         """The rows of one statement that only reads.
 
@@ -180,49 +186,66 @@ class Sandbox:
         return self._child
 
     def _exchange(self, child: subprocess.Popen[bytes], line: str, timeout_s: float) -> Any:
-        """Send a line and wait for one; the process does not outlive the deadline."""
-        late = threading.Event()
+        """Send a line and wait for one; the process does not outlive the deadline.
 
-        def stop() -> None:
-            late.set()
-            child.kill()
-
-        watch = threading.Timer(timeout_s, stop)
-        watch.start()
+        Nobody waits for its end then: a process with much memory takes its time to go.
+        """
+        replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        talk = threading.Thread(
+            target=_sent_and_read, args=(child, line.encode(), replies), daemon=True
+        )
+        talk.start()
         try:
-            reply = _sent_and_read(child, line.encode())
+            reply = replies.get(timeout=timeout_s)
+        except queue.Empty:
+            self._abandon()
+            raise SqlError(f"stopped after {timeout_s:g} s") from None
         except BaseException:
             self._kill()
             raise
-        finally:
-            watch.cancel()
         if reply.endswith(b"\n"):
             return json.loads(reply)
         self._kill()
-        if late.is_set():
-            raise SqlError(f"stopped after {timeout_s:g} s")
         if len(reply) > MAX_BYTES:
             raise SqlError(f"stopped: the answer is longer than {MAX_BYTES} bytes")
         raise SqlError("stopped: it took more memory than is allowed")
 
+    def _abandon(self) -> None:
+        """Kill the process; what it leaves is cleared away beside what comes next."""
+        child, folder = self._child, self._folder
+        self._child = self._folder = None
+        if child is not None:
+            child.kill()
+            threading.Thread(target=_bury, args=(child, folder)).start()
+
     def _kill(self) -> None:
-        if self._child is not None:
-            with self._child as child:  # which waits for its end and closes the pipes
-                child.kill()
-            self._child = None
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
+        child, folder = self._child, self._folder
+        self._child = self._folder = None
+        if child is not None:
+            child.kill()
+            _bury(child, folder)
 
 
-def _sent_and_read(child: subprocess.Popen[bytes], line: bytes) -> bytes:
-    """The line that a process answers with; one without an end if it died or says too much."""
-    if child.stdin is None or child.stdout is None:
-        raise ValueError("a process without pipes")
-    with suppress(BrokenPipeError):
-        child.stdin.write(line + b"\n")
-        child.stdin.flush()
-    return child.stdout.readline(MAX_BYTES + 1)
+def _bury(child: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str] | None) -> None:
+    """Wait for the end of a process, and clear away what it leaves."""
+    with child:  # which closes the pipes, too
+        pass
+    if folder is not None:
+        folder.cleanup()
+
+
+def _sent_and_read(
+    child: subprocess.Popen[bytes], line: bytes, replies: queue.SimpleQueue[bytes]
+) -> None:
+    """Put the line that a process answers with; one without an end if it died or says too much."""
+    reply = b""
+    # Whoever kills the process may close its pipes while they are used here.
+    with suppress(OSError, ValueError):
+        if child.stdin is not None and child.stdout is not None:
+            child.stdin.write(line + b"\n")
+            child.stdin.flush()
+            reply = child.stdout.readline(MAX_BYTES + 1)
+    replies.put(reply)
 
 
 _ERRORS: Final = {"sql": SqlError, "store": StoreError}

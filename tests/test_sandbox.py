@@ -33,7 +33,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def box(path: Path) -> Iterator[Sandbox]:
-    with Sandbox(path, timeout_s=20) as box:
+    """With a table of the host's, which opens a folder to the process."""
+    table = path.with_name("labels.csv")
+    Store(path).sql("SELECT frame_id, seq % 3 AS score FROM frames").csv(table)
+    with Sandbox(path, timeout_s=20, tables={"labels": table}) as box:
+        assert box.sql("SELECT count(*) FROM labels").rows == [(750,)]
         yield box
 
 
@@ -112,6 +116,16 @@ def test_a_mistake_in_a_pattern_is_shown_with_carets(box: Sandbox, path: Path) -
         ("SELECT getenv('HOME')", "does not exist"),
         ("SELECT getvariable('x') FROM query('COPY frames TO ''{out}''')", "SELECT|COPY"),
         ("EXPLAIN ANALYZE COPY frames TO '{out}'", "disabled by configuration|read-only"),
+        (
+            "EXPLAIN ANALYZE COPY frames TO '{folder}/out.parquet'",
+            "File too large|Could not write|Cannot open|read-only|IO Error",
+        ),
+        ("COPY labels TO '{folder}/out.parquet'", "COPY is not allowed"),
+        ("SELECT * FROM read_text('{folder}/../secret.csv')", "disabled by configuration"),
+        ("SELECT * FROM glob('{folder}/../*')", "disabled by configuration"),
+        ("ATTACH '{folder}/x.duckdb' AS x", "ATTACH is not allowed"),
+        ("CREATE TEMP TABLE t AS SELECT * FROM labels", "CREATE is not allowed"),
+        ("DROP VIEW labels", "DROP is not allowed"),
     ],
 )
 def test_nothing_but_the_store_is_reached(box: Sandbox, path: Path, tmp_path, sql, reason) -> None:
@@ -119,10 +133,17 @@ def test_nothing_but_the_store_is_reached(box: Sandbox, path: Path, tmp_path, sq
     secret.write_text("a,b\n1,2\n")
     before = path.read_bytes()
 
+    assert box.sql("SELECT 1").rows == [(1,)]  # one that died is started again
+    assert box.folder is not None
+    (folder,) = box.folder.glob("sgstore-tables-*")
+    for name, value in (("secret", secret), ("out", out), ("folder", folder)):
+        sql = sql.replace(f"{{{name}}}", str(value))
+
     with pytest.raises(SqlError, match=reason):
-        box.sql(sql.replace("{secret}", str(secret)).replace("{out}", str(out)))
+        box.sql(sql)
 
     assert not out.exists()
+    assert [file.suffix for file in folder.rglob("*") if file.is_file()] == [".parquet"]
     assert path.read_bytes() == before
 
 
@@ -158,13 +179,15 @@ def test_a_runaway_statement_does_not_outlive_its_deadline(path: Path, sql: str)
             box.sql(sql)
         spent = time.perf_counter() - start
 
-        assert spent < 2
+        assert (
+            spent < 1.5
+        )  # a few milliseconds after 0.5 s, on a machine that has nothing else to do
         assert box.sql("SELECT 1").rows == [(1,)]
 
 
 def test_a_runaway_pattern_does_not_outlive_its_deadline(path: Path) -> None:
-    with Sandbox(path, timeout_s=0.3) as box:
-        with pytest.raises(SqlError, match=r"stopped after 0\.3 s"):
+    with Sandbox(path, timeout_s=1.5) as box:
+        with pytest.raises(SqlError, match=r"stopped after 1\.5 s"):
             box.find("MATCH (a), (b), (c), (d), (e), (f) RETURN COUNT(*)")
 
         assert len(box.find(f"{NEAR} RETURN FRAMES").rows) > 0
