@@ -466,6 +466,34 @@ def test_values_of_slots_are_combined_as_loops_combine_them(worlds, tmp_path: Pa
     assert all(store.find(query).count() == 0 for query in missing.column("query")[:6])
 
 
+@pytest.mark.parametrize("width", [1, 2])
+def test_slots_are_classes_too(worlds, tmp_path: Path, width: int) -> None:
+    a, b, of_a, of_b = worlds
+    file = tmp_path / "slots.toml"
+    file.write_text(SLOTS)
+    (slots,) = read_specifications(file)
+    one, other = (classed(selection_of(text), "RSV", width, slots=slots) for text in (a, b))
+
+    def counted(traces) -> Counter:
+        found: Counter = Counter()
+        for trace in traces:
+            kinds = [tuple(frozenset(v) for v in slots_of(scene).values()) for scene in trace]
+            found.update(
+                tuple(kinds[j] if j >= 0 else None for j in range(i - width + 1, i + 1))
+                for i in range(len(kinds))
+            )
+        return found
+
+    in_a, in_b = counted(of_a), counted(of_b)
+    both = in_a.keys() & in_b.keys()
+
+    assert classes(one).column("frames") == sorted(in_a.values(), reverse=True)
+    assert covered(one, other).rows[0][1:3] == (len(both), len(in_a))
+    assert width > 1 or "person=near+seen, truck=none, car=none" in one.names
+    people = selection_of(f"{a}:MATCH (:Person)")
+    assert len(classed(people, slots=slots).frame_id) == len(people.frame_id)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -90,6 +90,7 @@ def classes_(
     abstraction: Abstraction = "RSV",
     window: Window = 1,
     incomplete: WhenIncomplete = Incomplete.equal,
+    slots: Slots = None,
     unit: Unit = CountedUnit.frame,
     picture: Picture = None,
     limit: Limit = None,
@@ -101,7 +102,7 @@ def classes_(
     from sgstore.coverage import Unit, classes
     from sgstore.coverage.compare import rank_sizes
 
-    frames = _classed(a, abstraction, window, incomplete)
+    frames = _classed(a, abstraction, window, incomplete, slots)
     counted = Unit(unit)
     _write(classes(frames, counted), limit, form_of(form, as_json=as_json), output)
     if picture is not None:
@@ -121,6 +122,7 @@ def of_(
     abstraction: Abstraction = "RSV",
     window: Window = 1,
     incomplete: WhenIncomplete = Incomplete.equal,
+    slots: Slots = None,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
     output: Output = None,
@@ -128,7 +130,7 @@ def of_(
     """Say how much of A is covered by B: of its classes, and of its frames."""
     from sgstore.coverage import covered
 
-    of, other = (_classed(one, abstraction, window, incomplete) for one in (a, by))
+    of, other = (_classed(one, abstraction, window, incomplete, slots) for one in (a, by))
     _write(covered(of, other), 0, form_of(form, as_json=as_json), output)
 
 
@@ -142,6 +144,7 @@ def novel_(
     abstraction: Abstraction = "RSV",
     window: Window = 1,
     incomplete: WhenIncomplete = Incomplete.equal,
+    slots: Slots = None,
     limit: Limit = None,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
@@ -150,7 +153,7 @@ def novel_(
     """List the scenes of A that are not in B, the rarest first."""
     from sgstore.coverage import novel, novel_clips, novel_frames
 
-    of, other = (_classed(one, abstraction, window, incomplete) for one in (a, than))
+    of, other = (_classed(one, abstraction, window, incomplete, slots) for one in (a, than))
     listed = {
         Listing.classes: novel,
         Listing.frames: novel_frames,
@@ -166,6 +169,7 @@ def venn_(
     abstraction: Abstraction = "RSV",
     window: Window = 1,
     incomplete: WhenIncomplete = Incomplete.equal,
+    slots: Slots = None,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
     output: Output = None,
@@ -173,7 +177,7 @@ def venn_(
     """Count what A and B share, and what only one of them has."""
     from sgstore.coverage import venn
 
-    one, other = (_classed(text, abstraction, window, incomplete) for text in (a, b))
+    one, other = (_classed(text, abstraction, window, incomplete, slots) for text in (a, b))
     _write(venn(one, other), 0, form_of(form, as_json=as_json), output)
 
 
@@ -183,6 +187,7 @@ def growth_(
     abstraction: Abstraction = "RSV",
     window: Window = 1,
     incomplete: WhenIncomplete = Incomplete.equal,
+    slots: Slots = None,
     unit: Unit = CountedUnit.frame,
     points: Annotated[int, typer.Option("--points", min=2, help="Rows of the curve.")] = 40,
     picture: Picture = None,
@@ -193,7 +198,7 @@ def growth_(
     """Say how the number of classes grew, beside frames at random; whether more of the same helps."""
     from sgstore.coverage import Unit, growth
 
-    frames = _classed(a, abstraction, window, incomplete)
+    frames = _classed(a, abstraction, window, incomplete, slots)
     table = growth(frames, Unit(unit), points)
     _write(table, 0, form_of(form, as_json=as_json), output)
     if picture is not None and table.rows:
@@ -386,16 +391,25 @@ def _fraction(text: str) -> float:
 
 
 def _classed(
-    text: str, abstraction: str, window: int = 1, incomplete: Incomplete = Incomplete.equal
+    text: str,
+    abstraction: str,
+    window: int = 1,
+    incomplete: Incomplete = Incomplete.equal,
+    slots: Path | None = None,
 ) -> Classed:
     """The frames that a text means, with their classes; says which traces cannot answer a query."""
-    from sgstore.coverage import Missing, classed, selection_of
+    from sgstore.coverage import Missing, classed, read_specifications, selection_of
 
     chosen = selection_of(text)
     if chosen.left_out:
         names = ", ".join(chosen.left_out)
         say(f"left out, because they cannot answer this query (no road map, perhaps): {names}")
-    return classed(chosen, abstraction, window, Missing(incomplete))
+    declared = None
+    if slots is not None:
+        declared, *more = read_specifications(slots)
+        if more:
+            raise typer.BadParameter(f"--slots {slots}: several specifications; expected one here")
+    return classed(chosen, abstraction, window, Missing(incomplete), declared)
 
 
 def _write_slots(

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.coverage.frames import Chosen
+from sgstore.coverage.slots import slot_sets
 from sgstore.store.covering import seq_of, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sgstore.coverage.frames import Chosen
+    from sgstore.coverage.slots import Specification
     from sgstore.world import Bools, Ints
 
 UNKNOWN: Final = -1
@@ -119,7 +121,11 @@ class Classed:
 
 
 def classed(
-    chosen: Chosen, abstraction: str = "RSV", window: int = 1, missing: Missing = Missing.equal
+    chosen: Chosen,
+    abstraction: str = "RSV",
+    window: int = 1,
+    missing: Missing = Missing.equal,
+    slots: Specification | None = None,
 ) -> Classed:
     """The frames of a selection with their classes.
 
@@ -127,18 +133,28 @@ def classed(
     ----------
     chosen : Chosen
     abstraction : str
+        Whose classes.
     window : int
         Frames that are seen together: a frame and those recorded before it in its trace.
     missing : Missing
         How a window counts in which frames are missing.
+    slots : Specification, optional
+        Instead of an abstraction: a class is what a frame has of all declared slots. Frames that do not count
+        are missing.
 
     Raises
     ------
     AbstractionError
         There is no such abstraction.
+    QueryError
+        A pattern of a slot is none.
     """
-    coded = chosen.store.file.abstracted.coded(abstraction)
-    whole = Classed(chosen, coded.names, coded.frame_id, coded.code)
+    if slots is not None:
+        frame_id, names, code = slot_sets(Chosen(chosen.text, chosen.store), slots)
+        whole = Classed(chosen, tuple(names), frame_id, code)
+    else:
+        coded = chosen.store.file.abstracted.coded(abstraction)
+        whole = Classed(chosen, coded.names, coded.frame_id, coded.code)
     if window > 1:
         whole = _windows(whole, window, missing)
     rows = chosen.rows_of(whole.frame_id)
@@ -179,8 +195,8 @@ def _begins(whole: Classed) -> Bools:
     ids, time_ns = whole.chosen.store.file.abstracted.times()
     time_ns = time_ns[np.searchsorted(ids, whole.frame_id)]
     begins = np.ones(len(time_ns), np.bool_)
-    trace = trace_of(whole.frame_id)
-    begins[1:] = trace[1:] != trace[:-1]
+    trace, seq = trace_of(whole.frame_id), seq_of(whole.frame_id)
+    begins[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
     periods = {one.trace_id: one.period_ns for one in whole.chosen.store.info()}
     period = np.array([periods.get(one, 0) for one in np.unique(trace).tolist()], np.float64)
     number = np.unique(trace, return_inverse=True)[1]

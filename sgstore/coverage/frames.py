@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sgstore.coverage.asking import block_of
 from sgstore.errors import StoreError
 from sgstore.query import Store
 
@@ -74,8 +75,11 @@ def selection_of(text: str) -> Chosen:
 
 def frames_of(store: Store, query: str) -> Ints:
     """Ids of the frames in which a query holds, ascending."""
-    found = np.fromiter((frame.frame_id for frame in store.find(query).frames()), np.int64)
-    return np.unique(found)
+    if block_of(query) is not None:  # in columns
+        found = store.find(f"{query} RETURN FRAMES").numpy()["frame_id"]
+        return np.unique(found.astype(np.int64))
+    rows = (frame.frame_id for frame in store.find(query).frames())
+    return np.unique(np.fromiter(rows, np.int64))
 
 
 def names_of(store: Store, frame_id: Sequence[int] | Ints) -> list[str]:

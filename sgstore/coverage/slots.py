@@ -215,6 +215,49 @@ class _Held:
             held[slot.name, NONE] = np.packbits(none)
         return held
 
+    def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
+        """Frames that count, names of what they have of all slots, and the number of the name of each."""
+        rows = np.flatnonzero(self.of(specification.where))
+        names, code = [""], np.zeros(len(rows), np.int64)
+        for slot in specification.slots:
+            own = np.zeros(len(rows), np.int64)
+            bits: list[str] = []
+            for value, pattern in slot.values.items():
+                found, own = np.unique(own * 2 + self.of(pattern)[rows], return_inverse=True)
+                bits = [
+                    "+".join(filter(None, (bits[n >> 1] if bits else "", value if n & 1 else "")))
+                    for n in found.tolist()
+                ]
+            both, code = np.unique(code * len(bits) + own, return_inverse=True)
+            names = [
+                f"{names[n // len(bits)]}, {slot.name}={bits[n % len(bits)] or NONE}".removeprefix(
+                    ", "
+                )
+                for n in both.tolist()
+            ]
+        return self._ids[rows], names, code.astype(np.int64)
+
+
+def slot_sets(chosen: Chosen, specification: Specification) -> tuple[Ints, list[str], Ints]:
+    """What each frame has of declared slots, as a class of its own.
+
+    Returns
+    -------
+    frame_id : int64
+        The frames of the selection that count, ascending.
+    names : list of str
+        ``close=person+vehicle, light=none``: of a slot all values that hold.
+    code : int64
+        Of each frame, an index into ``names``.
+
+    Raises
+    ------
+    QueryError
+        A pattern is none.
+    """
+    with chosen.store.file.snapshot():
+        return _Held(chosen).sets(specification)
+
 
 def tuples(
     chosen: Chosen, specification: Specification, k: int = 0, held: _Held | None = None
