@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test lint format bench fuzz pyg oracle sample clean
+.PHONY: help demo test lint format bench fuzz pyg oracle sample clean duckdb-versions
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -16,6 +16,7 @@ help:
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
+	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -75,6 +76,9 @@ oracle: $(VENV)/.dev
 	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py
 	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
+
+duckdb-versions: $(VENV)/.dev
+	$(BIN)/python tests/duckdb_versions.py
 
 sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py

@@ -17,6 +17,7 @@ import duckdb
 import networkx as nx
 
 from sgstore.lang import Catalog, TraceFacts
+from sgstore.store.access import without_faults
 
 SCHEMA = (Path(__file__).parents[1] / "sgstore" / "schema.sql").read_text(encoding="utf-8")
 
@@ -204,6 +205,7 @@ def random_world(
     rng = random.Random(seed)
     made = [random_trace(rng, number + 1, frames, static=static) for number in range(traces)]
     connection = duckdb.connect(str(path or ":memory:"))
+    without_faults(connection)
     if path is None:
         connection.execute(SCHEMA)
     store_all(connection, made, rng)

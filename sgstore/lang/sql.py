@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from itertools import combinations, count
+from itertools import combinations, count, product
 from operator import eq, ge, gt, le, lt, ne
 from typing import TYPE_CHECKING, Final
 
@@ -71,6 +71,9 @@ OUTSIDE: Final = '":outside"'
 BUCKET: Final = '":bucket"'
 _MANY: Final = 5
 """Up to so many masks are compared in pairs, so that each join sheds what it can."""
+
+_BRANCHES: Final = 8
+"""A pattern with paths is joined so many times at most, once for each length of its paths."""
 
 _COMPARED: Final = {"=": eq, "<>": ne, "<": lt, "<=": le, ">": gt, ">=": ge}
 
@@ -250,6 +253,9 @@ class Masks(Presence, ABC):
         nodes: frozenset[str],
         edges: frozenset[str],
     ) -> str:
+        unfolded = self._unfolded(scope, parts, given, nodes, edges)
+        if unfolded:
+            return unfolded
         base = Base()
         if given is not None and scope.outer:
             self._join_given(base, scope, given)
@@ -350,6 +356,38 @@ class Masks(Presence, ABC):
             self.catalog, scope, edge, '"m"', moving=False, swapped=swapped
         )
         select.where += [f"({mask}) <> 0", *self.within('"b"."bucket"')]
+        return select.text()
+
+    def _unfolded(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+    ) -> str:
+        """The join, once for each length that its paths may have; empty if that is no use, or too often.
+
+        So a path begins where other edges lead, rather than anywhere.
+        """
+        paths = [edge for edge in scope.edges if edge.high > 1]
+        lengths = list(product(*(range(path.low, path.high + 1) for path in paths)))
+        wanted = any(path.key in edges for path in paths)
+        if not paths or wanted or len(paths) == len(scope.edges) or len(lengths) > _BRANCHES:
+            return ""
+        branches: list[str] = []
+        for chosen in lengths:
+            inner = scope
+            for path, length in zip(paths, chosen, strict=True):
+                inner = chain(inner, path, length, self._numbers, injective=self.query.injective)
+            inner = ordered(narrowed(inner, self.catalog), self.catalog)
+            if inner.where != (FALSE,):
+                branches.append(self._base(inner, parts, given, nodes, edges))
+        if not branches:
+            return ""
+        columns = ['"bucket"', *columns_of(nodes, edges)]
+        select = Select([*columns, 'bit_or("mask") AS "mask"'], group=columns)
+        select.join(nested("\nUNION ALL\n".join(branches), ":lengths"), [])
         return select.text()
 
     def _paths(self, scope: Scope, edge: Edge) -> str:

@@ -53,6 +53,16 @@ _PAUSE: Final = 0.005, 0.1
 """First and longest pause between two attempts; s."""
 
 
+def without_faults(connection: DuckDBPyConnection) -> None:
+    """Turn off what this version of DuckDB does wrong.
+
+    Before 2.0 its optimizer *compressed_materialization* loses a column of some joins of grouped relations, and
+    ends in an internal error ("Failed to bind column reference").
+    """
+    if duckdb.__version__.startswith("1."):
+        connection.execute("SET disabled_optimizers = 'compressed_materialization'")
+
+
 def default_memory() -> int:
     """A quarter of the machine's memory, 1 GiB at most; bytes."""
     try:
@@ -179,6 +189,7 @@ class Access:
                     connection = duckdb.connect(str(self.path), read_only=True, config=config)
                     # Among the settings above DuckDB might take these before the folder, and refuse that.
                     connection.execute("SET allowed_directories = [?]", [str(tables_folder())])
+                    without_faults(connection)
                     connection.execute("SET enable_external_access = false")
                     connection.execute("SET lock_configuration = true")
                     return connection

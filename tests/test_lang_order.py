@@ -1,0 +1,102 @@
+"""Edges are joined in the order of exact counts: with other counts it is another order, and the same answer."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import permutations
+from typing import TYPE_CHECKING
+
+import pytest
+from oracle import disagreement
+from oracle_worlds import World, random_world
+
+from sgstore.lang import Catalog, compile_query, sql
+from sgstore.store.cataloguing import catalog_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+TEXT = "MATCH (a:Car)-[:near]->(b), (b)-[:visible]->(c), (a)-[:inDFrontOf]->(c) RETURN frame.id, a, b, c"
+RELATIONS = ("near", "visible", "inDFrontOf")
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return random_world(23, traces=3, frames=20)
+
+
+def counted(catalog: Catalog, counts: Mapping[str, int]) -> Catalog:
+    """A catalog in which every triple of a relation has a count of our own."""
+    edges = {triple: counts.get(triple[0], n) for triple, n in catalog.edges.items()}
+    return replace(catalog, edges=edges)
+
+
+def order(text: str) -> list[str]:
+    """The relations of the joined edges, first to last."""
+    return re.findall(r'"edge" AS "#\d+:(\w+)"', text)
+
+
+def test_the_order_follows_the_counts_and_the_answer_does_not(world: World) -> None:
+    found: dict[tuple[str, ...], list[tuple[int, ...]]] = {}
+    for rare, more, most in permutations(RELATIONS):
+        counts = {rare: 1, more: 100, most: 10_000}
+        statement = compile_query(TEXT, counted(world.catalog, counts)).rows()
+        rows = world.connection.execute(statement.sql, list(statement.values)).fetchall()
+        assert order(statement.sql) == [rare, more, most]
+        found[tuple(order(statement.sql))] = rows
+
+    assert len(found) == 6
+    (first, *others) = found.values()
+    assert first
+    assert all(rows == first for rows in others)
+
+
+def test_a_rare_edge_waits_for_one_that_leads_to_it(world: World) -> None:
+    """After the rarest comes the rarest that is connected, lest everything be joined with everything."""
+    text = (
+        "MATCH (a:Car)-[:near]->(b)-[:visible]->(c)-[:inDFrontOf]->(d) RETURN frame.id, a, b, c, d"
+    )
+    catalog = counted(world.catalog, {"near": 1, "visible": 500, "inDFrontOf": 2})
+
+    statement = compile_query(text, catalog).rows()
+
+    assert order(statement.sql) == ["near", "visible", "inDFrontOf"]
+
+
+def test_the_catalog_of_a_store_counts_its_rows_exactly(world: World) -> None:
+    catalog = catalog_of(world.connection)
+
+    for table, counts in (("edge", catalog.edges), ("map_edge", catalog.map_edges)):
+        sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM {table} GROUP BY ALL"
+        rows = world.connection.execute(sql).fetchall()
+        assert dict(counts) == {(r, s, d): n for r, s, d, n in rows}
+        assert len(rows) > 3
+
+
+PATHS = [
+    "MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo*1..2]->(m:Lane)<-[:isIn]-(b)",
+    "MATCH (a:Car)-[:near|visible*1..3]->(b)-[r:isIn]->(l:Lane)",
+    "USING NODES any MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo|opposes*2..4]->(l)",
+    "MATCH (a)-[:near*1..2]->(b)-[:visible*1..2]->(c), (a)-[:isIn]->(:Lane)",
+    "MATCH (a:Car) WHERE COUNT {(a)-[:isIn]->(l:Lane)-[:travelsTo*1..3]->(m)} >= 2",
+    "MATCH (a:Person)-[:isIn]->(l:Lane)-[:near*1..2]->(m:Lane)",
+]
+
+
+@pytest.mark.parametrize("text", PATHS)
+def test_paths_begin_where_other_edges_lead_and_find_the_same(
+    text: str, world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rows() -> tuple[str, list[tuple[object, ...]]]:
+        statement = compile_query(text, world.catalog).rows()
+        return statement.sql, world.connection.execute(statement.sql, statement.values).fetchall()
+
+    unfolded, found = rows()
+    monkeypatch.setattr(sql, "_BRANCHES", 0)
+    at_once, same = rows()
+
+    assert found == same
+    assert ":lengths" not in at_once
+    assert ":lengths" in unfolded or not found
+    assert disagreement(text, world)[0] == ""
