@@ -369,8 +369,8 @@ def test_places_along_the_lanes_of_a_town_are_those_of_shapely(data: Path) -> No
 # Signals ----------------------------------------------------------------------------------------
 
 
-def affected(things: list[Thing], config: Config) -> set[tuple[str, str]]:
-    of = edges(graph_of(frames(things), FORK, config), 0, FORK)
+def affected(things: list[Thing], config: Config, town: PaperMap = FORK) -> set[tuple[str, str]]:
+    of = edges(graph_of(frames(things), town, config), 0, town)
     return {(src, dst) for src, relation, dst in of if relation == "mayAffect"}
 
 
@@ -380,6 +380,19 @@ def test_a_signal_may_affect_its_lanes_and_those_from_which_it_lies_ahead() -> N
 
     assert affected([ego], WIDE) == {("s1", "straight"), ("s1", "in")}
     assert affected([ego, light], WIDE) == {("light", "straight"), ("light", "in")}
+
+
+def test_a_light_that_the_map_lacks_may_affect_what_leads_to_its_lanes() -> None:
+    town = PaperMap(
+        *FORK.patches
+    )  # its lanes are told, as by a trigger box, and no signal is there
+    ego, light = thing("ego", -30, -2), thing("light", 0, -5, kind="traffic_light", map_ref="s1")
+    other = thing("light", 0, -5, kind="traffic_light", map_ref="s2")
+    none = Config(range=Range(400), lanes=Lanes(ahead=0))
+
+    assert affected([ego, light], WIDE, town) == {("light", "straight"), ("light", "in")}
+    assert affected([ego, light], none, town) == set()
+    assert affected([ego, other], WIDE, town) == set()
 
 
 def test_how_far_a_signal_is_ahead_counts_from_the_end_of_the_lane() -> None:

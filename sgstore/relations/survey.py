@@ -93,12 +93,13 @@ class Survey:
             if not ref:
                 continue
             node, is_signal = entities.first + row, bool(IS_SIGNAL[entities.kind[row]])
-            column = self._column((is_signal, ref), places.get(node, (np.nan, np.nan)))
+            place = places.get(node, (np.nan, np.nan))
+            column = self._column((is_signal, ref), place)
             if column is not None:
                 twins.append((node, column))
             if is_signal:
                 controls += [(node, lane) for lane in self._map.lanes_of_signal(ref).tolist()]
-                affects += [(node, lane) for lane in self._reach.of(ref).tolist()]
+                affects += [(node, lane) for lane in self._reach.of(ref, place).tolist()]
         self._twins = _appended(self._twins, twins)
         self._controls = _appended(self._controls, controls)
         self._affects = _appended(self._affects, affects)

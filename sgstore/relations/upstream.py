@@ -32,7 +32,8 @@ class SignalReach:
     """
 
     def __init__(self, road_map: RoadMap, net: LaneNet, lines: Centrelines, ahead: float) -> None:
-        self._nodes, self._net, self._lines, self._ahead = road_map.nodes, net, lines, ahead
+        self._map, self._nodes = road_map, road_map.nodes
+        self._net, self._lines, self._ahead = net, lines, ahead
         edges = road_map.edges
         controls = (edges.relation == RELATION_CODE["controlsTrafficOf"]) & (ahead > 0)
         self._src, self._dst = edges.src[controls], edges.dst[controls]
@@ -41,10 +42,22 @@ class SignalReach:
         self._of = {road_map.nodes.name[column]: column for column in self._columns.tolist()}
         self._known: dict[int, Ints] = {}
 
-    def of(self, signal: str) -> Ints:
-        """Node ids of the lanes that a signal of the map may affect; none for one that is not there."""
+    def of(self, signal: str, place: tuple[float, float]) -> Ints:
+        """Node ids of the lanes that a signal may affect; none for one whose lanes nobody knows.
+
+        Parameters
+        ----------
+        signal : str
+            Its id in the map, or what :func:`sgstore.roads.lanes_ref` makes of its lanes.
+        place : (float, float)
+            Where it stands, if the map does not have it; m, NaN if unknown.
+        """
         column = self._of.get(signal)
-        return np.zeros(0, np.int64) if column is None else self._lanes(column)
+        if column is not None:
+            return self._lanes(column)
+        if not self._ahead:
+            return np.zeros(0, np.int64)
+        return self._upstream(-2 - self._map.lanes_of_signal(signal), *place)
 
     def of_map(self, present: Bools) -> tuple[Ints, Ints]:
         """Node ids of the signals of the map that are present in any frame, and of lanes that they may affect.
@@ -63,17 +76,21 @@ class SignalReach:
 
     def _lanes(self, column: int) -> Ints:
         if column not in self._known:
-            x, y = self._nodes.x[column], self._nodes.y[column]
             controlled = -2 - self._dst[self._src == -1 - column]
-            places = np.zeros(len(controlled))
-            if np.isfinite(x) and np.isfinite(y):
-                here = np.ones(len(controlled))
-                places = self._lines.along(controlled, x * here, y * here)
-                places = np.clip(places, 0, self._net.lengths[controlled])
-            lanes = {
-                lane
-                for at, along in zip(controlled.tolist(), places.tolist(), strict=True)
-                for lane in self._net.upstream(at, along, self._ahead).tolist()
-            }
-            self._known[column] = -2 - np.array(sorted(lanes), np.int64)
+            x, y = self._nodes.x[column], self._nodes.y[column]
+            self._known[column] = self._upstream(controlled, float(x), float(y))
         return self._known[column]
+
+    def _upstream(self, controlled: Ints, x: float, y: float) -> Ints:
+        """Node ids of lanes, and of those before them; both given as rows of the lanes."""
+        places = np.zeros(len(controlled))
+        if np.isfinite(x) and np.isfinite(y):
+            here = np.ones(len(controlled))
+            places = self._lines.along(controlled, x * here, y * here)
+            places = np.clip(places, 0, self._net.lengths[controlled])
+        lanes = {
+            lane
+            for at, along in zip(controlled.tolist(), places.tolist(), strict=True)
+            for lane in self._net.upstream(at, along, self._ahead).tolist()
+        }
+        return -2 - np.array(sorted(lanes), np.int64)
