@@ -75,6 +75,7 @@ oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle.py 100000
 	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py
 	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
+	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
 
 duckdb-versions: $(VENV)/.dev

@@ -6,6 +6,7 @@ import csv
 import gzip
 import json
 import lzma
+import os
 import random
 import re
 from pathlib import Path
@@ -16,7 +17,9 @@ import pytest
 import sgstore
 from sgstore.cli import run
 from sgstore.errors import ConfigError, TraceError
-from sgstore.importing import Words, import_graphs
+from sgstore.importing import FORMATS, Words, import_graphs
+from sgstore.importing.blocks import Blocks, parts_map
+from sgstore.importing.meant import Understanding, survey
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
@@ -279,6 +282,74 @@ def test_what_is_wrong_with_a_file_is_said_and_nothing_comes_into_the_store(
     assert "graphs." in str(error.value)
     assert not (tmp_path / "x.sgstore").exists()
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def mutated(text: str, rng: random.Random) -> bytes:
+    """A text that was hurt in a few places."""
+    raw = bytearray(text.encode())
+    for _ in range(rng.randrange(1, 6)):
+        at = rng.randrange(len(raw) or 1)
+        match rng.randrange(4):
+            case 0:
+                raw[at : at + 1] = bytes([rng.randrange(256)])
+            case 1:
+                del raw[at : at + rng.randrange(1, 9)]
+            case 2:
+                raw[at:at] = rng.choice(
+                    [b",", b'"', b"\n", b"{", b"]", b"null", b"1e999", b"NaN", b"\0"]
+                )
+            case _:
+                raw[at:at] = raw[at : at + 30] * rng.randrange(1, 4)
+    return bytes(raw)
+
+
+HURT = int(os.environ.get("SGSTORE_HURT_GRAPHS", "400"))
+"""Files that are hurt; ``make oracle`` takes 20,000."""
+
+
+@pytest.mark.parametrize("form", ["s3c", "csv", "nodelink"])
+def test_a_hurt_file_is_read_or_refused_and_nothing_else_happens(tmp_path: Path, form: str) -> None:
+    rng = random.Random(form)
+    graphs = [
+        {
+            "directed": True,
+            "graph": {"t": i / 2, "ego": "ego"},
+            "nodes": [
+                {"id": "ego", "kind": "car", "x": 1.5, "heading": 90.0, "light_brake": True},
+                {"id": 2, "label": "person", "speed": 1},
+                {"id": "l", "kind": "lane", "lane_type": "driving", "section": 0},
+            ],
+            "links": [
+                {"source": "ego", "target": "l", "key": "isIn", "overlap": 0.5},
+                {"source": 2, "target": "ego", "relation": "follows", "gap": 3},
+            ],
+        }
+        for i in range(3)
+    ]
+    text = {
+        "s3c": TWO,
+        "csv": CSV.replace("dst", "dst,t")
+        + "g,ego,near,car_1,0\ng,car_1,isIn,Lane 1,0\nh,ego,,,1\n",
+        "nodelink": "\n".join(map(json.dumps, graphs)),
+    }[form]
+    file = tmp_path / "hurt"
+    good, said = 0, list[str]()
+    for _ in range(HURT):
+        file.write_bytes(mutated(text, rng))
+        words = Words(unknown_as=rng.choice(["", "other"]))
+        try:
+            found = survey(file, FORMATS[form](file), words)
+            understanding = Understanding(file, words)
+            blocks = Blocks(file, parts_map("m", "", found.parts), 10**9)
+            block = blocks.block([understanding.of(graph) for graph in FORMATS[form](file)])
+            assert len(block) == found.graphs
+            good += 1
+        except TraceError as error:
+            said.append(str(error))
+
+    assert good > 0
+    assert good + len(said) == HURT
+    assert all(str(file) in one for one in said)
 
 
 def test_text_that_is_no_utf_8_and_a_broken_archive_are_errors_with_their_line(
