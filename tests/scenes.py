@@ -333,7 +333,7 @@ class Scene:
         road: RoadMap,
         *actors: Actor,
         seconds: float = 8.0,
-        rate: float = 10.0,
+        rate: float = 5.0,
         drawn: tuple[float, ...] = (0.0,),
     ) -> None:
         for name, value in (
