@@ -38,7 +38,7 @@ from sgstore.coverage import (
     specification,
     venn,
 )
-from sgstore.coverage.asking import block_of
+from sgstore.coverage.asking import block_of, query_of_features
 from sgstore.coverage.classed import Classed
 from sgstore.coverage.estimates import estimate, expected_classes
 from sgstore.coverage.explain import tree
@@ -363,6 +363,23 @@ def test_only_features_of_the_ego_count_where_that_is_asked(town: str) -> None:
             for x in (a, b)
         ]
         assert store.find(f"MATCH {ends[0]}-[:{relation}]->{ends[1]}").count() == row[1]
+
+
+@pytest.mark.parametrize("abstraction", ["E", "EL", "RSV"])
+def test_each_feature_has_a_query_that_finds_the_frames_that_have_it(
+    town: str, abstraction: str
+) -> None:
+    """Lanes are asked for by their role: in recordings and in graphs that were imported."""
+    frames = classed(selection_of(town), abstraction)
+    found = combos(frames, abstraction, 1)
+    names = found.found.features.names
+    some = random.Random(4).sample(range(len(names)), min(25, len(names)))
+    store = sgstore.open(town)
+    with store.file.snapshot():
+        for row in some:
+            query = query_of_features([names[row]])
+            assert query is not None
+            assert (query, store.find(query).count()) == (query, found.found.frames[row])
 
 
 def test_too_many_combinations_are_an_error_and_not_a_part_of_them(worlds, monkeypatch) -> None:

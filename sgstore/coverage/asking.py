@@ -11,9 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _EGOS: Final = ("ego", "ego_car")
-_ROLE: Final = re.compile(
-    r"Ego Lane|(Left|Right) \d+ of Ego Lane|Opposing Lane \d+|(Left|Middle|Right) Lane"
-)
+_ROLE: Final = re.compile(r"Ego Lane|(Left|Right) \d+ of Ego Lane|Opposing Lane \d+")
 _PARTS: Final = {
     "Lane": ":Lane",
     "Off Road": ":OffRoad",
@@ -58,7 +56,7 @@ def _node(label: str) -> str | None:
     if label in _PARTS:
         return f"({_PARTS[label]})"
     if _ROLE.fullmatch(label):
-        return f"(:Lane {{name: '{label}'}})"
+        return f"(:Lane {{role: '{label}'}})"
     if label in KINDS:
         name = "".join(part.capitalize() for part in label.split("_"))
         return f"(:{name}&!Ego)"
