@@ -50,7 +50,8 @@ OURS = {"/sgstore/graph", "/sgstore/scene", "/sgstore/labels"}
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     folder = tmp_path_factory.mktemp("town")
-    ingest(folder / "town.sgstore", [Path(shutil.copy(RECORDING, folder / "town.mcap"))])
+    recording = Path(shutil.copy(RECORDING, folder / "town.mcap"))
+    ingest(folder / "town.sgstore", [recording], until=27)
     return sgstore.open(folder / "town.sgstore")
 
 

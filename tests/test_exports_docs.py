@@ -38,8 +38,9 @@ PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("page")
-    ingest(place / "drives.sgstore", [Path(shutil.copy(RECORDING, place / "town.mcap"))])
-    (place / "frames.txt").write_text("town#100\ntown@30.5s\n")
+    recording = Path(shutil.copy(RECORDING, place / "town.mcap"))
+    ingest(place / "drives.sgstore", [recording], since=48, until=60)
+    (place / "frames.txt").write_text("town#50\ntown@10.5s\n")
     return place
 
 
@@ -120,7 +121,9 @@ def test_the_format_of_the_page_can_be_exported(
     monkeypatch.setattr("sgstore.exporters.entry_points", lambda group: [Point()])
     store = sgstore.open(folder / "drives.sgstore")
 
-    (written,) = write_export(Export(store, (Clip("town", 0, 10**9),)), tmp_path / "out", "ids")
+    (written,) = write_export(
+        Export(store, (Clip("town", 50 * 10**9, 51 * 10**9),)), tmp_path / "out", "ids"
+    )
 
     assert (tmp_path / "out" / "ids.txt").read_text().count("\n") == 10
     assert written.as_row()["count"] == 11
