@@ -198,6 +198,21 @@ class Told(Frames):
         """Of the pattern itself nothing is left to be tested."""
         return Phases() if scope is self.query.scope else super().phases(scope)
 
+    def frames(
+        self,
+        scope: Scope,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+        columns: Iterable[Leaf] = (),
+    ) -> str:
+        """As of any pattern; matches that differ in nothing that is asked come once."""
+        text = super().frames(scope, given, nodes, edges, columns)
+        whole = set(self._found.nodes) <= nodes and set(self._found.edges) <= edges
+        if whole or scope is not self.query.scope or text.startswith("SELECT DISTINCT"):
+            return text
+        return "SELECT DISTINCT" + text.removeprefix("SELECT")
+
     def _first_phase(
         self,
         join: Join,

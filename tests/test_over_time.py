@@ -1,0 +1,370 @@
+"""Sequences, operators of time and checks over a store, against their definitions and as people use them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from oracle_over_time import (
+    compare_check,
+    compare_condition,
+    compare_sequence,
+    random_sequence,
+    worlds,
+)
+from oracle_temporal import random_formula
+
+from sgstore.cli import run as run_verb
+from sgstore.errors import QueryError
+from sgstore.lang.over_time import Hold, Length
+from sgstore.temporal import Online, formula_of, prefix_verdicts
+from sgstore.temporal.measures import Clock
+from sgstore.temporal.sequences import Leg, Line, matches_of
+from sgstore.temporal.verdicts import STATUS, Settled
+
+if TYPE_CHECKING:
+    from oracle_worlds import World
+
+    from sgstore.query import Store
+
+PAIR = "MATCH (e:Ego)-[:near|visible]-(v:Entity)"
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> tuple[World, Store]:
+    return worlds(7, tmp_path_factory.mktemp("worlds"))
+
+
+@pytest.fixture
+def store(asked: tuple[World, Store]) -> Store:
+    return asked[1]
+
+
+# Against the definitions
+
+
+def test_sequences_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
+    rng = random.Random(1)
+    policies = itertools.cycle(("all", "first", "longest"))
+
+    found = [compare_sequence(*asked, random_sequence(rng), next(policies)) for _ in range(12)]
+
+    assert sum(found) > 3
+
+
+def test_conditions_over_time_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
+    rng = random.Random(2)
+
+    found = [compare_condition(*asked, rng) for _ in range(12)]
+
+    assert sum(found) > 10
+
+
+def test_checks_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
+    rng = random.Random(3)
+
+    violated = [compare_check(*asked, rng) for _ in range(12)]
+
+    assert 0 < sum(violated) < 36
+
+
+def test_the_matches_of_random_columns_are_the_earliest_of_all_tuples() -> None:
+    rng = random.Random(5)
+    found = 0
+    for _ in range(300):
+        found += compare_columns(rng)
+
+    assert found > 200
+
+
+def compare_columns(rng: random.Random) -> int:
+    """Random columns of a random sequence, with every tuple of frames tried; how many matches there are."""
+    frames = rng.randint(1, 9)
+    times = np.cumsum([rng.choice((1, 1, 1, 5)) for _ in range(frames)])
+    clock = Clock.of(times, np.arange(frames), 1, 2.5)
+    line = Line(clock)
+    bindings = rng.randint(1, 3)
+    steps = [random_places(rng, line, bindings) for _ in range(rng.randint(2, 4))]
+    links = [random_leg(rng, line, bindings, places) for places in steps[1:]]
+    policy = rng.choice(("all", "first", "longest"))
+
+    told = matches_of(line, steps[0], links, policy)
+
+    expected: list[list[int]] = []
+    for binding in range(bindings):
+        base = binding * line.stride
+        own = [[int(p - base) for p in places if base <= p < base + frames] for places in steps]
+        runs = itertools.groupby(own[0], key=lambda i: (int(clock.runs[i]), i - own[0].index(i)))
+        for _, run in runs:
+            tuples = [t for i in run for t in tuples_of([i], own, links, base, clock)]
+            if not tuples:
+                continue
+            best = min(tuples)
+            if policy == "longest":
+                best = max(t for t in tuples if t[0] == best[0])
+            expected.append([base + i for i in best])
+            if policy == "first":
+                break
+    assert told.tolist() == expected
+    return len(expected)
+
+
+def random_places(rng: random.Random, line: Line, bindings: int) -> Any:
+    chosen = [
+        b * line.stride + i
+        for b in range(bindings)
+        for i in range(line.frames)
+        if rng.random() < 0.5
+    ]
+    return np.array(chosen, np.int64)
+
+
+def random_leg(rng: random.Random, line: Line, bindings: int, places: Any) -> Leg:
+    kind = rng.choice(("then", "then", "then", "immediately", "until", "while"))
+    if kind != "then":
+        return Leg(kind, None, None, None, places)
+    after = Length(rng.randint(0, 2), frames=rng.random() < 0.5) if rng.random() < 0.4 else None
+    within = Length(rng.randint(2, 6), frames=after.frames if after else rng.random() < 0.5)
+    absent = random_places(rng, line, bindings)[::3] if rng.random() < 0.3 else None
+    return Leg(kind, after, within if rng.random() < 0.6 else None, absent, places)
+
+
+def tuples_of(
+    so_far: list[int], own: list[list[int]], legs: list[Leg], base: int, clock: Clock
+) -> list[list[int]]:
+    number = len(so_far)
+    if number == len(own):
+        return [so_far]
+    i, leg = so_far[-1], legs[number - 1]
+    between = [] if leg.absent is None else [int(p - base) for p in leg.absent]
+    return [
+        whole
+        for j in own[number]
+        if follows(leg, i, j, own[number - 1], clock) and not any(i < k < j for k in between)
+        for whole in tuples_of([*so_far, j], own, legs, base, clock)
+    ]
+
+
+def follows(leg: Leg, i: int, j: int, before: list[int], clock: Clock) -> bool:
+    if leg.kind == "while":
+        return i == j
+    together = j > i and clock.runs[i] == clock.runs[j]
+    if leg.kind == "immediately":
+        return bool(together) and j == i + 1
+    if leg.kind == "until":
+        return bool(together) and all(k in before for k in range(i, j))
+
+    def apart(length: Length) -> int:
+        return j - i if length.frames else int(clock.times[j] - clock.times[i])
+
+    early = leg.after is not None and apart(leg.after) < leg.after.amount
+    late = leg.within is not None and apart(leg.within) > leg.within.amount
+    return j > i and not early and not late
+
+
+@pytest.mark.parametrize("comparison", [">=", ">", "<", "<=", "="])
+def test_a_run_lasts_from_its_first_frame_to_its_last(comparison: str) -> None:
+    clock = Clock.of(np.array([0, 1, 2, 9, 10, 12]), np.arange(6), 1, 2.5)
+    line = Line(clock)
+    places = np.array([0, 1, 2, 3, 4, 5])
+
+    held = line.held(places, Hold(comparison, Length(2, frames=False), inclusive=False))
+
+    runs = {(0, 1, 2): 2, (3, 4, 5): 3}
+    fits = {">=": [2, 3], ">": [3], "<": [], "<=": [2], "=": [2]}[comparison]
+    assert held.tolist() == [i for run, length in runs.items() if length in fits for i in run]
+
+
+# Verdicts
+
+
+def test_status_and_traps_are_those_of_the_engine_that_reads_frame_by_frame() -> None:
+    rng = random.Random(11)
+    certain = 0
+    for _ in range(400):
+        formula = random_formula(rng, 3)
+        frames = rng.randint(1, 12)
+        times = np.cumsum([rng.choice((1, 2, 7)) for _ in range(frames)])
+        columns = {name: np.array([rng.random() < 0.6 for _ in range(frames)]) for name in "abc"}
+        engine = Online(formula)
+        told: list[int] = []
+        for i in range(frames):
+            engine.step({name: bool(column[i]) for name, column in columns.items()}, int(times[i]))
+            told.append(3 * engine.certain if engine.verdict else 0 if engine.certain else 1)
+            told[-1] = told[-1] or (2 if engine.verdict else 0)
+
+        settled = Settled(formula, columns, times)
+
+        status = settled.statuses()
+        verdicts = prefix_verdicts(formula, columns, times)
+        assert (status >= 2).tolist() == verdicts.tolist()
+        if status[-1] == 0:
+            trap = settled.trap(0)
+            assert trap is not None
+            assert trap <= told.index(0)
+            certain += 1
+
+    assert certain > 50
+    assert STATUS[0] == "false"
+
+
+def test_a_violation_lasts_to_its_reset_and_the_formula_is_asked_anew() -> None:
+    bad = np.array([0, 1, 0, 0, 1, 1, 0, 1], np.bool_)
+    fine = np.array([0, 0, 1, 0, 0, 0, 1, 0], np.bool_)
+    settled = Settled(formula_of("ALWAYS NOT bad"), {"bad": bad}, np.arange(8))
+
+    assert [(v.start, v.end) for v in settled.violations(fine)] == [(1, 2), (4, 6), (7, 7)]
+    assert [(v.start, v.end) for v in settled.violations(None)] == [(1, 7)]
+
+
+def test_what_only_the_end_refutes_is_violated_in_the_last_frame_or_forgiven() -> None:
+    never = np.zeros(5, np.bool_)
+    settled = Settled(formula_of("EVENTUALLY p"), {"p": never}, np.arange(5))
+
+    (violation,) = settled.violations(None)
+
+    assert (violation.start, violation.end, violation.at_end) == (4, 4, True)
+    assert settled.violations(None, weak=True) == []
+
+
+# As people use them
+
+
+def test_all_ways_to_ask_speak_of_the_same_matches(store: Store) -> None:
+    text = f"USING UNKNOWN false {PAIR} THEN WITHIN 1s MATCH (e) WHERE e.speed > 0.5"
+
+    matches = store.find(text)
+
+    rows = matches.rows()
+    assert rows
+    assert matches.columns[:5] == ("frame_id", "trace", "seq", "time_ns", "t")
+    assert matches.count() == len(list(matches.frames())) == len({row[0] for row in rows})
+    assert len(list(matches.intervals())) == len(rows)
+    assert list(matches.clips(1, 1))
+    frame = next(matches.frames())
+    assert {"e", "v"} <= set(matches.bindings(frame)[0])
+    assert len(matches.numpy()["frame_id"]) == len(rows)
+
+
+def test_limits_orders_and_samples_hold_for_sequences(store: Store) -> None:
+    text = (
+        f"USING UNKNOWN false {PAIR} AS s THEN MATCH (e) WHERE e.speed > 0.5 RETURN v, t(s) AS at"
+    )
+
+    rows = store.find(f"{text} ORDER BY at DESC, v LIMIT 3").rows()
+
+    every = store.find(text).rows()
+    assert rows == sorted(every, key=lambda row: (-row[1], row[0]))[:3]
+    assert len(store.find(f"{text} SAMPLE 1 PER v").rows()) == len({row[0] for row in every})
+
+
+def test_a_scenario_is_the_sequence_that_it_stands_for(store: Store) -> None:
+    steps = f"{PAIR} THEN WITHIN {{}} MATCH (e) WHERE e.speed > 0.5"
+    define = f"DEFINE SCENARIO meet(within = 4s) AS {steps.format('$within')};"
+
+    assert store.find(f"{define} MATCH meet()").rows() == store.find(steps.format("4s")).rows()
+    given = store.find(f"{define} MATCH meet(within = $w)", w=0.2).rows()
+    assert given == store.find(steps.format("200ms")).rows()
+
+
+def test_explain_tells_steps_and_atoms(store: Store) -> None:
+    text = store.explain(
+        f"{PAIR} THEN WITHIN 1s MATCH (e) WHERE EVENTUALLY e.speed > 0.5 FOR >= 1s"
+    )
+
+    assert "step 1(e, v)" in text
+    assert "then within 1s" in text
+    assert "atom a1(e) = (e.speed > 0.5)" in text
+    assert "for >= 1s" in text
+
+
+def test_a_check_tells_who_violates_it_and_when(store: Store) -> None:
+    check = "FORALL (v:Entity) ALWAYS NOT v.speed > 0.5 RESET WHEN NOT v.speed > 0.5"
+    text = f"USING UNKNOWN false CHECK slow: {check}"
+
+    verdicts = list(store.check(text, status=True))
+
+    assert {verdict.check for verdict in verdicts} == {"slow"}
+    violated = [verdict for verdict in verdicts if verdict.violated]
+    assert violated
+    for verdict in violated:
+        first = verdict.first_violation
+        assert first is not None
+        assert first.start == min(i.start for w in verdict.witnesses for i in w.violations)
+        assert verdict.statuses[-1] == "false"
+        at = verdict.statuses.index("false")
+        assert verdict.statuses[at - 1] == "presumably_true" or at == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (
+            "MATCH (e:Ego) WHERE EXISTS {(e)-[:near]->(v) WHERE EVENTUALLY v.speed > 1}",
+            "inside braces",
+        ),
+        ("MATCH (e:Ego) WHERE e.speed > 10frames", "a number of frames is compared"),
+        ("MATCH (e:Ego) THEN NOT MATCH (e) WHERE e.speed > 1", "says for how long"),
+        ("NOT MATCH (e:Ego) THEN MATCH (e)", "begins with something that happens"),
+        ("MATCH (e:Ego) THEN AFTER 4s WITHIN 2s MATCH (e)", "ends before it begins"),
+        ("MATCH (e:Ego) WHERE EVENTUALLY[2s, 1s] e.speed > 1", "ends before it begins"),
+        ("MATCH (e:Ego) RETURN t(e)", "takes the name of a step"),
+        ("MATCH (e:Ego) WHERE run_length(NEXT e.speed > 1) > 2frames", "looks ahead"),
+        ("MATCH nothing()", "unknown scenario"),
+        ("DEFINE SCENARIO f(w) AS MATCH (e:Ego) FOR >= $w; MATCH f()", "needs a value of w"),
+        ("DEFINE SCENARIO f() AS MATCH f(); MATCH f()", "defined by itself"),
+        ("CHECK ALWAYS ego.speed > 1", "a CHECK has a verdict"),
+        ("USING END weak MATCH (e:Ego)", "USING END belongs to CHECK"),
+    ],
+)
+def test_what_has_no_meaning_is_refused_with_its_place(
+    store: Store, text: str, complaint: str
+) -> None:
+    with pytest.raises(QueryError, match=complaint) as refused:
+        store.find(text).rows()
+
+    assert refused.value.span is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("MATCH (e:Ego)", "a MATCH has matches"),
+        ("DEFINE PREDICATE p(x) AS x.speed > 1", "nothing is checked"),
+        ("CHECK a: ALWAYS ego.speed > 1; CHECK a: ALWAYS ego.speed > 2", "two checks are called"),
+        ("CHECK FORALL (ego:Car, v:Car) ALWAYS v.sped > 1", "unknown attribute"),
+        ("USING MATCHES first CHECK ALWAYS ego.speed > 1", "belongs to sequences"),
+    ],
+)
+def test_what_is_no_check_is_refused(store: Store, text: str, complaint: str) -> None:
+    with pytest.raises(QueryError, match=complaint):
+        store.check(text)
+
+
+def test_why_not_says_that_it_speaks_of_one_frame(store: Store) -> None:
+    frame = next(store.find("MATCH (e:Ego)").frames())
+
+    with pytest.raises(QueryError, match="speaks of one frame"):
+        store.why_not(frame, "MATCH (e:Ego) THEN MATCH (e)")
+
+
+def test_the_verb_ends_with_4_only_if_something_is_violated(
+    store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(store.file.path)
+
+    broken = run_verb(
+        ["check", path, "-e", "CHECK c: ALWAYS ego.speed > 100", "--require", "--json"]
+    )
+    rows = json.loads(capsys.readouterr().out)
+    kept = run_verb(["check", path, "-e", "CHECK c: ALWAYS NOT ego.speed > 100", "--require"])
+
+    assert (broken, kept) == (4, 0)
+    assert {row["verdict"] for row in rows} == {"false"}
+    assert all(
+        row["first_violation"]["start_seq"] == row["violations"][0]["start_seq"] for row in rows
+    )
