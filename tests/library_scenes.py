@@ -276,7 +276,7 @@ SCENES: dict[str, tuple[Scene, Scene | None]] = {
     ),
     "low_ttc": (
         Scene(WAYS, ego(along(RIGHT), 15), actor("v", (60, RIGHT)), seconds=3.4, drawn=(3.0,)),
-        Scene(WAYS, ego(along(RIGHT), braking(15, 0.5, 3)), actor("v", (65, RIGHT)), seconds=6),
+        Scene(TWO_WAY, ego(along(RIGHT), 15), actor("v", along(1.75, 100, -100), 15), seconds=6),
     ),
     "red_phase": (PHASES, PHASES.with_actor("light-s", shows=[(0, "green"), (2, "yellow")])),
     "waiting_at_red": (PHASES, PHASES.with_actor("light-s", shows=[(0, "green")])),
