@@ -31,6 +31,16 @@ if TYPE_CHECKING:
 class SgstoreError(Exception):
     """Anything that sgstore refuses to do; the message says what is wrong and what would be right."""
 
+    def as_dict(self) -> dict[str, object]:
+        """The error as data: ``error``, the name of its class, ``reason``, and what it knows of the place."""
+        reason = getattr(self, "reason", str(self))
+        about: dict[str, object] = {"error": type(self).__name__, "reason": reason}
+        for name in ("path", "channel", "time_ns", "offset", "road", "element", "extra"):
+            value = getattr(self, name, None)
+            if value is not None:
+                about[name] = value if isinstance(value, int) else str(value)
+        return about
+
 
 class TraceError(SgstoreError):
     """A recording cannot be read, in whole or in part.

@@ -23,7 +23,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
-from sgstore.errors import QueryError, SgstoreError, Span, SqlError, StoreError
+from sgstore.errors import (
+    QueryError,
+    QueryNameError,
+    QuerySyntaxError,
+    SgstoreError,
+    Span,
+    SqlError,
+    StoreError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -248,13 +256,15 @@ def _sent_and_read(
     replies.put(reply)
 
 
+_QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
 _ERRORS: Final = {"sql": SqlError, "store": StoreError}
 
 
 def _answer(reply: Any) -> Answer:
     if "query" in reply:
         span = Span(*reply["span"]) if reply["span"] else None
-        raise QueryError(reply["reason"], text=reply["query"], span=span, hint=reply["hint"])
+        kind = _QUERY_ERRORS.get(reply["kind"], QueryError)
+        raise kind(reply["reason"], text=reply["query"], span=span, hint=reply["hint"])
     if "error" in reply:
         raise _ERRORS[reply["kind"]](reply["error"])
     rows = [tuple(row) for row in reply["rows"]]
@@ -328,7 +338,8 @@ def _plain(value: Any) -> Any:
 def _refusal(error: SgstoreError) -> dict[str, Any]:
     if isinstance(error, QueryError):
         span = (error.span.start, error.span.end) if error.span else None
-        return {"query": error.text, "reason": error.reason, "span": span, "hint": error.hint}
+        about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
+        return {**about, "span": span, "hint": error.hint}
     kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "sql")
     return {"kind": kind, "error": str(error)}
 

@@ -81,5 +81,18 @@ def outcome(query: str, empty: duckdb.DuckDBPyConnection) -> str:
     return f"sql\n{statement.sql}{values}"
 
 
+TO_IMPROVE = sorted((FOLDER / "to_improve").glob("*.txt"))
+"""Errors that should be better: queries with the message that they give, and the one that is wanted."""
+
+
+@pytest.mark.parametrize("path", TO_IMPROVE, ids=lambda path: path.stem)
+def test_errors_that_should_be_better_are_no_better_yet(path: Path, empty) -> None:
+    for case in path.read_text("utf-8").split("====\n"):
+        query, now, wanted = case.strip("\n").split("\n---- ")
+
+        assert outcome(query, empty) == now, "move the case to a golden file if it is good now"
+        assert wanted.removeprefix("wanted\n").strip() not in now
+
+
 def test_there_are_golden_files() -> None:
     assert {path.stem for path in FILES} >= {"patterns", "blocks", "results", "syntax_errors"}

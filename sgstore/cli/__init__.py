@@ -1,13 +1,15 @@
 """The command line: each verb parses, calls one function of the library, and prints.
 
-Results go to stdout, everything else to stderr. Exit codes: 0 done; 1 error; 2 wrong usage, the language of
-queries and SQL included; 3 done, but something in a recording was lost; 4 nothing matched (with ``--require``).
+Results go to stdout, everything else to stderr; with ``--json`` an error is one line of JSON there.
+Exit codes: 0 done; 1 error; 2 wrong usage, the language of queries and SQL included; 3 done, but something in a
+recording was lost; 4 nothing matched (with ``--require``).
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from itertools import pairwise
 
 import typer
 
@@ -29,7 +31,7 @@ from sgstore.cli import (
     traces,
 )
 from sgstore.cli.arguments import ERROR, INTERRUPTED, USAGE, app
-from sgstore.cli.output import say
+from sgstore.cli.output import say, write_error
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
 __all__ = ["app", "main"]
@@ -63,6 +65,13 @@ def main() -> None:
     sys.exit(run(sys.argv[1:]))
 
 
+def _wants_json(arguments: list[str]) -> bool:
+    """Whether what is printed is for machines, errors too."""
+    forms = {"--format=json", "--format=ndjson"}
+    named = {value for name, value in pairwise(arguments) if name == "--format"}
+    return "--json" in arguments or bool(forms & set(arguments)) or bool(named & {"json", "ndjson"})
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line.
 
@@ -76,7 +85,10 @@ def run(arguments: list[str]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except SgstoreError as error:
-        say(str(error))
+        if _wants_json(arguments):
+            write_error(error.as_dict())
+        else:
+            say(str(error))
         return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR
     except BrokenPipeError:
         # The reader of our output went away (`| head`): nothing to say, and nothing more to flush.

@@ -102,6 +102,11 @@ def say(message: str) -> None:
     sys.stderr.write(f"sgstore: {message}\n")
 
 
+def write_error(about: dict[str, Any]) -> None:
+    """Tell an error as data: one line of JSON on stderr."""
+    sys.stderr.write(f"{json.dumps(_json_object(about), ensure_ascii=False)}\n")
+
+
 def write_text(text: str, output: Path | None = None) -> None:
     """Print a text as it is, on stdout or into a file.
 

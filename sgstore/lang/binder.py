@@ -416,7 +416,11 @@ def _related(label: s.Label, session: Session) -> frozenset[str]:
     relation = relation_named(label.name)
     if relation is None:
         if kinds_labelled(label.name):
-            session.refuse(f"'{label.name}' is a label of nodes, not a relation", label.span)
+            session.refuse(
+                f"'{label.name}' is a label of nodes, not a relation",
+                label.span,
+                f"write (x:{label.name})",
+            )
         session.unknown("relation", label.name, label.span, (*RELATIONS, *RELATION_ALIASES))
     session.relations.add(relation)
     return frozenset({relation})

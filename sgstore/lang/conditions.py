@@ -22,8 +22,9 @@ from sgstore.lang.catalog import (
     class_attribute,
 )
 from sgstore.lang.datasets import CLASSES, abstraction_named, seen_in
-from sgstore.lang.names import RESERVED, Names, hint_at
-from sgstore.vocabulary import KINDS, folded, kinds_labelled
+from sgstore.lang.hints import comparison_hint, hint_at
+from sgstore.lang.names import RESERVED, Names
+from sgstore.vocabulary import KINDS, LANE_TYPES, folded, kinds_labelled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -212,6 +213,9 @@ def node_attribute(key: str, name: str, span: Span, names: Names) -> b.NodeAttri
     return b.NodeAttribute(key, found, found.type)
 
 
+_OF_PAIRS: Final = frozenset(
+    {"dist", "distance", "bearing", "ttc", "lon", "lat", "headway", "relspeed"}
+)
 FOLLOWED: Final = tuple(frozenset({relation}) for relation in FOLLOWING)
 
 
@@ -228,7 +232,8 @@ def edge_attribute(key: str, name: str, span: Span, names: Names) -> b.EdgeAttri
     found = EDGE_ATTRIBUTES.get(EDGE_ALIASES.get(folded(name), folded(name)))
     if found is None:
         known = [attribute.name for attribute in EDGE_ATTRIBUTES.values()]
-        names.session.unknown("attribute of an edge", name, span, known)
+        hint = f"{name}(a, b) is a number of two nodes" if folded(name) in _OF_PAIRS else None
+        names.session.unknown("attribute of an edge", name, span, known, hint)
     edge = next((edge for edge in names.scope.edges if edge.key == key), None)
     if edge is None:
         names.session.refuse("an edge is known only in the pattern that binds it", span)
@@ -276,8 +281,11 @@ def _comparison(e: s.Comparison, names: Names) -> b.Operation:
         if side.type is Type.list:
             names.session.refuse("a list cannot be compared", written.span, "write IN")
     if left.type is not right.type:
+        texts = [side.value for side in (left, right) if isinstance(side, b.Value)]
         names.session.refuse(
-            f"a {left.type.value} cannot be compared with a {right.type.value}", e.span
+            f"a {left.type.value} cannot be compared with a {right.type.value}",
+            e.span,
+            comparison_hint(left.type, right.type, texts),
         )
     if e.word in _ORDERED and left.type in {Type.node, Type.boolean}:
         names.session.refuse(f"a {left.type.value} is not more or less than another", e.span)
@@ -298,7 +306,8 @@ def _canonical(value: b.Bound, other: b.Bound, span: Span, names: Names) -> b.Bo
     if word is None and isinstance(other, b.NodeAttribute) and other.attribute.name == "kind":
         word = _kind(value.value, span, names)
     if word is None:
-        names.session.unknown(_what(other), value.value, span, known)
+        lane = "of a lane it is the type: l.type" if value.value in LANE_TYPES else None
+        names.session.unknown(_what(other), value.value, span, known, lane)
     return b.Value(word, Type.text, closed=True)
 
 

@@ -108,12 +108,15 @@ def _pair(e: s.Call, names: Names) -> b.PairNumber:
 def _entity(function: str, argument: s.Expression, names: Names) -> str:
     found = bind(argument, names)
     if not isinstance(found, b.NodeValue):
-        names.session.refuse(f"{function}() takes two entities", argument.span)
+        names.session.refuse(
+            f"{function}() takes two entities", argument.span, f"write {function}(a, b)"
+        )
     kinds = names.scope.kinds(found.node).every
     if not kinds & frozenset(ENTITY_KINDS):
         names.session.refuse(
             f"{function}() takes two entities, and this is a {' or '.join(sorted(kinds))}",
             argument.span,
+            "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along",
         )
     return found.node
 

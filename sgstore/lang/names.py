@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.bound import EGO, Bound, Edge, Kinds, Node, Scope
-from sgstore.vocabulary import suggestion
+from sgstore.lang.hints import hint_at, variable_hint
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -21,20 +21,6 @@ if TYPE_CHECKING:
     from sgstore.errors import Span
     from sgstore.lang.catalog import Catalog, TableFacts, TraceFacts
     from sgstore.lang.syntax import Define
-
-MANY: Final = 16
-"""So many names are listed in a hint."""
-
-
-def hint_at(name: str, known: Iterable[str]) -> str | None:
-    """What a name may have meant: that which is most like it, or else all that is known."""
-    names = sorted(known, key=str.lower)
-    like = suggestion(name, names)
-    if like:
-        return f"did you mean '{like}'?"
-    more = f", … ({len(names)} in all)" if len(names) > MANY else ""
-    return f"known: {', '.join(names[:MANY])}{more}" if names else None
-
 
 THE_EGO: Final = "ego"
 """The name that is always bound: to the ego of the frame."""
@@ -115,11 +101,12 @@ class Session:
         """Raise a :class:`QueryError` about a part of the text."""
         raise QueryError(reason, text=self.text, span=span, hint=hint)
 
-    def unknown(self, what: str, name: str, span: Span, known: Iterable[str]) -> NoReturn:
+    def unknown(
+        self, what: str, name: str, span: Span, known: Iterable[str], hint: str | None = None
+    ) -> NoReturn:
         """Raise a :class:`QueryNameError` about a name, with what is most like it or else all that is known."""
-        raise QueryNameError(
-            f"unknown {what} '{name}'", text=self.text, span=span, hint=hint_at(name, known)
-        )
+        hint = hint or hint_at(name, known)
+        raise QueryNameError(f"unknown {what} '{name}'", text=self.text, span=span, hint=hint)
 
     def temporal(self, word: str, span: Span) -> NoReturn:
         """Raise the one error about the temporal layer."""
@@ -254,7 +241,9 @@ class Names:
             key = self.scope.top.the_ego(span)
         elif meaning is None:
             known = {*self.visible(), *self.session.tables}
-            self.session.unknown("variable", name, span, known)
+            elsewhere = name.lower() in self.session.keys
+            hint = variable_hint(name, self.visible(), elsewhere)
+            self.session.unknown("variable", name, span, known, hint)
         elif meaning.node is None:
             self.session.refuse(f"'{name}' is not a node", span)
         else:

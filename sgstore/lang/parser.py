@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QuerySyntaxError, Span
 from sgstore.lang.builders import BUILDERS, BuildError
+from sgstore.lang.hints import SYNTAX
 from sgstore.lang.tables import Rule, Tables, Terminal, tables
 from sgstore.vocabulary import suggestion
 
@@ -195,23 +196,6 @@ _SAID: Final = {
     "DIRECTION": "ASC or DESC",
     _END: "the end",
 }
-_HINTS: Final = (
-    (re.compile(r"==$"), "equality is written '='"),
-    (re.compile(r"&&?$"), "write AND"),
-    (re.compile(r"\|\|?$"), "write OR"),
-    (re.compile(r"!$"), "write NOT before a condition"),
-    (re.compile(r"""['"]$"""), "the text in quotes has no end"),
-    (re.compile(r"EXISTS\s*\($", re.IGNORECASE), "write EXISTS {(a)-[:near]->(b)}, in braces"),
-    (
-        re.compile(r"\)\s*<?-\[\s*\w*:$"),
-        "in a condition, a pattern stands in braces: EXISTS {(a)-[:near]->(b)}",
-    ),
-    (re.compile(r"\)\s*-\($"), "an edge is written -[:near]-> or -->"),
-    (re.compile(r"\]\s*>$"), "an edge ends in ]->"),
-    (re.compile(r"CLIPS\s*\(\s*[+-]?\d+$", re.IGNORECASE), "write CLIPS(-3s, +5s)"),
-    (re.compile(r"\)\s*MATCH$", re.IGNORECASE), "separate patterns by commas"),
-)
-"""What the text up to and with the unexpected part looks like, and what would be right."""
 _MANY: Final = 8
 
 
@@ -274,7 +258,7 @@ def _said(machine: Tables, name: str) -> str:
 
 def _hint(machine: Tables, names: list[str], text: str, span: Span) -> str | None:
     before = text[max(span.start - 80, 0) : span.end]
-    for looks, hint in _HINTS:
+    for looks, hint in SYNTAX:
         if looks.search(before):
             return hint
     word = text[span.start : span.end].upper()
