@@ -363,6 +363,23 @@ def test_a_label_is_unknown_in_traces_that_cannot_answer(tmp_path: Path) -> None
     assert labels.values["known"].tolist() == [True] * 4
 
 
+def test_a_label_may_look_ahead_beyond_its_clip(store: Store) -> None:
+    text = "EXISTS {(ego)-[:near|very_near]->(:Person)}"
+    export = labelled(
+        Export(store, (Clip("town", 3 * S, 6 * S),)),
+        {"now": text, "soon": f"EVENTUALLY[0s, 2s] {text}", "always": f"ALWAYS[0s, 1s] {text}"},
+    )
+    whole = labelled(Export(store, (Clip("town", 3 * S, 8 * S),)), {"now": text}).labels
+
+    assert export.labels is not None
+    assert whole is not None
+    now = whole.values["now"].tolist()
+    assert export.labels.values["now"].tolist() == now[:31]
+    assert export.labels.values["soon"].tolist() == [any(now[i : i + 21]) for i in range(31)]
+    assert export.labels.values["always"].tolist() == [all(now[i : i + 11]) for i in range(31)]
+    assert 0 < sum(now) < len(now)
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [

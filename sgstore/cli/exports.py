@@ -105,10 +105,12 @@ def export(
     networkx (nx), PyTorch Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s)
     in the query wins over --before and --after.
     """
+    from sgstore.exporters import exporter_named
     from sgstore.exporters.export import Export
     from sgstore.exporters.labels import parse_labels
     from sgstore.exporters.stored import labelled, write_export
 
+    exporter_named(form)  # before anything is searched
     texts = parse_labels(labels or [])
     opened = open_store(store)
     values = parameters_of(parameters)
