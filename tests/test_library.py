@@ -10,7 +10,7 @@ import library_page
 import pytest
 from library_scenes import SCENES, is_of_the_ego, traces
 from scenes import APART, store_of
-from test_temporal import FORMULAS, never, property_named
+from test_temporal import FORMULAS, FORMULAS_OF_TIME, never, property_named
 
 from sgstore.demo import RECORDING
 from sgstore.errors import QueryError, QueryNameError
@@ -176,8 +176,13 @@ def test_predicates_are_looked_up_without_regard_to_case() -> None:
 
 
 def published(name: str) -> Formula:
-    """A rule as coded, as a formula over the propositions that SGSM published under the names of its atoms."""
-    text = pattern(f"{name.lower()}_as_coded").text.split(":", 1)[1]
+    """A rule as coded, as a formula over the propositions that SGSM published under the names of its atoms.
+
+    ``name`` is that of the published file: ``Phi7_T_10`` are 10 s at 2 Hz.
+    """
+    number, *of = name.lower().split("_")
+    value = {} if not of else {"N": f"{2 * int(of[1])}frames"} if of[0] == "t" else {"S": of[1]}
+    text = pattern(f"{number}_as_coded").written(**value).split(":", 1)[1]
     view = pattern("nothing_in_view").query.split(" AS", 1)[1]
     text = text.replace("nothing_in_view()", f"({view})")
     text = re.sub(r"ego_is_faster_than\(\d+\)", "ego_is_faster_than_s", text)
@@ -189,11 +194,9 @@ def published(name: str) -> Formula:
     return formula_of(text)
 
 
-@pytest.mark.parametrize("name", [*sorted({n.split("_")[0] for n in FORMULAS}), "Phi7", "Phi8"])
+@pytest.mark.parametrize("name", [*FORMULAS, *FORMULAS_OF_TIME])
 def test_a_rule_of_sgsm_is_the_formula_whose_published_verdicts_are_met(name: str) -> None:
-    known = {"Phi4": "Phi4_S_15", "Phi7": "Phi7_T_5", "Phi8": "Phi8_T_5"}.get(name, name)
-
-    assert published(name) == property_named(known)
+    assert published(name) == property_named(name)
 
 
 # Examples of the literature ---------------------------------------------------------------------------------
