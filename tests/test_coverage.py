@@ -667,6 +667,7 @@ def test_outcomes_are_told_by_numbers_too_and_the_threshold_is_that_of_s3cs_code
         ("frame,error\nx,y\n", "row 2: expected numbers"),
         ("frame,failed\nx\n", "row 2: 1 columns"),
         ("frame,failed\nnone#1,1\n", "none of the 1 outcomes is about"),
+        (f"frame,failed\n{'9' * 5000},1\n²,1\n", "none of the 2 outcomes is about"),
     ],
 )
 def test_outcomes_that_are_none_are_told(worlds, tmp_path: Path, text: str, said: str) -> None:

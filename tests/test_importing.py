@@ -233,6 +233,8 @@ WRONG = [
     ("nodelink", "{", "no JSON"),
     ("nodelink", "[" * 100_000, "nested too deeply"),
     ("nodelink", "3", "no node-link graph"),
+    ("nodelink", '{"nodes": [], "graph": {"t": "²"}}', "line 1: expected a time in 't'"),
+    ("nodelink", '{"nodes": [], "graph": {"time_ns": "--5"}}', "expected a time in 'time_ns'"),
     ("nodelink", '{"nodes": [], "edges": {}}', "expected a list 'edges'"),
     ("nodelink", '{"directed": false, "nodes": []}', "an undirected graph"),
     ("nodelink", '{"nodes": [{"id": 1}, {"id": 1}]}', "line 1, node 1: the id '1' comes twice"),

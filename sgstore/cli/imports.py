@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sgstore.cli.arguments import ERROR, LOSS, AsJson, StorePath, app, form_of
+from sgstore.cli.arguments import ERROR, LOSS, AsJson, StorePath, app, form_of, seconds_of
 from sgstore.cli.output import Format, say, write_rows
 
 if TYPE_CHECKING:
@@ -23,62 +23,65 @@ class GraphFormat(StrEnum):
     csv = "csv"
 
 
+Files = Annotated[
+    list[Path],
+    typer.Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
+]
+WrittenIn = Annotated[
+    GraphFormat,
+    typer.Option(
+        "--format", help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx."
+    ),
+]
+Kinds = Annotated[
+    list[str] | None,
+    typer.Option("--kind", metavar="LABEL=KIND", help="What a label means; repeatable."),
+]
+Relations = Annotated[
+    list[str] | None,
+    typer.Option("--relation", metavar="NAME=RELATION", help="What a relation means; repeatable."),
+]
+UnknownAs = Annotated[
+    str,
+    typer.Option(
+        "--unknown-as",
+        metavar="KIND",
+        help="Take labels that nobody knows for this kind ('other': unknown), leave out relations.",
+    ),
+]
+Answers = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--answers",
+        metavar="RELATION",
+        help="The graphs can hold it, though none of them may; repeatable.",
+    ),
+]
+Period = Annotated[
+    str,
+    typer.Option("--period", metavar="TIME", help="From frame to frame, where no time is told."),
+]
+Force = Annotated[
+    bool, typer.Option("--force", help="Read anew, and replace, what is in the store already.")
+]
+Rows = Annotated[Format, typer.Option("--rows", help="How rows are printed.")]
+
+
 @app.command("import")
 def import_(
     store: StorePath,
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."
-        ),
-    ],
-    form_of_graphs: Annotated[
-        GraphFormat,
-        typer.Option(
-            "--format",
-            help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx.",
-        ),
-    ],
-    kind: Annotated[
-        list[str] | None,
-        typer.Option("--kind", metavar="LABEL=KIND", help="What a label means; repeatable."),
-    ] = None,
-    relation: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--relation", metavar="NAME=RELATION", help="What a relation means; repeatable."
-        ),
-    ] = None,
-    unknown_as: Annotated[
-        str,
-        typer.Option(
-            "--unknown-as",
-            metavar="KIND",
-            help="Take labels that nobody knows for this kind ('other': unknown), and leave out relations.",
-        ),
-    ] = "",
-    answers: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--answers",
-            metavar="RELATION",
-            help="The graphs can hold it, though none of them may; repeatable.",
-        ),
-    ] = None,
-    period: Annotated[
-        str,
-        typer.Option(
-            "--period", metavar="TIME", help="From frame to frame, where no time is told."
-        ),
-    ] = "1s",
-    force: Annotated[
-        bool, typer.Option("--force", help="Read anew, and replace, what is in the store already.")
-    ] = False,
-    form: Annotated[Format, typer.Option("--rows", help="How rows are printed.")] = Format.table,
+    files: Files,
+    form_of_graphs: WrittenIn,
+    kind: Kinds = None,
+    relation: Relations = None,
+    unknown_as: UnknownAs = "",
+    answers: Answers = None,
+    period: Period = "1s",
+    force: Force = False,
+    form: Rows = Format.table,
     as_json: AsJson = False,
 ) -> int:
     """Bring graphs that other tools made into a store: each becomes a frame."""
-    from sgstore.cli.arguments import seconds_of
     from sgstore.importing import Words, import_graphs
     from sgstore.vocabulary import relation_named
 

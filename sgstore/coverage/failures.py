@@ -8,6 +8,7 @@ failures whose class has no training input at all: failures that coverage would 
 from __future__ import annotations
 
 import csv
+import re
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -23,14 +24,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.coverage.classed import Classed
+    from sgstore.coverage.tables import Row
     from sgstore.query import Store
-    from sgstore.world import Bools
+    from sgstore.world import Bools, Ints
 
 S3C_THRESHOLD: Final = 5 / 140
 """The error beyond which S3C's code counts a steering angle, -1 … 1 for ±70°, as a failure: 2.5°, though its
 paper says 5°."""
 
-_MAX_LINE: Final = 1 << 20
+_ID: Final = re.compile(r"[0-9]{1,18}")
 
 
 class Outcomes:
@@ -75,16 +77,12 @@ class Outcomes:
         """(N,): which frames of a selection failed, and of which an outcome is known."""
         failed, known = (np.zeros(len(a.frame_id), np.bool_) for _ in range(2))
         place = {int(frame): row for row, frame in enumerate(a.frame_id.tolist())}
-        names = _names(a.chosen.store)
+        names = _Names(a.chosen.store)
         for name, fails in self.failed.items():
-            row = place.get(names.get(name, int(name) if name.isdigit() else -1))
+            row = place.get(names.get(name, int(name) if _ID.fullmatch(name) else -1))
             if row is not None:
                 failed[row], known[row] = fails, True
         return failed, known
-
-
-def _names(store: Store) -> _Names:
-    return _Names(store)
 
 
 class _Names(dict[str, int]):
@@ -167,13 +165,13 @@ def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[Table, 
             f"none of the {len(outcomes.failed)} outcomes is about a frame of {test.chosen.text}"
         )
     failed &= test.known
-    inputs = np.append(train.sizes(), 0)
-    fails = np.bincount(train.code[failed_train & train.known], minlength=len(inputs))
+    inputs = np.append(train.sizes(), 0)[
+        test.code
+    ]  # training inputs of the class of each test input
+    fails = np.bincount(train.code[failed_train & train.known], minlength=len(train.names) + 1)
     novel = failed & (fails[test.code] == 0)
-    foretold = novel & (inputs[test.code] == 0)
     ours, theirs = test.chosen.text, train.chosen.text
-    classes = np.unique(test.code[novel])
-    seen_once = inputs[test.code] == 1
+    counted = int((known_train & train.known).sum())
     rows = [
         share(
             "failures",
@@ -184,7 +182,7 @@ def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[Table, 
         share(
             "failures in training",
             int((failed_train & train.known).sum()),
-            int((known_train & train.known).sum()),
+            counted,
             f"frames of {theirs} with an outcome",
         ),
         share(
@@ -193,40 +191,48 @@ def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[Table, 
             int(failed.sum()),
             f"failures of {ours}: no failing frame of their class in {theirs}",
         ),
+        *_foretold(test, novel, inputs, theirs),
+        share(
+            "test inputs not covered",
+            int((test.known & (inputs == 0)).sum()),
+            int(test.known.sum()),
+            f"frames of {ours} with a class",
+        ),
+    ]
+    said = of_unknown(test.unknown, ours) + of_unknown(train.unknown, theirs)
+    said += [f"{int((~known).sum())} frames of {ours} have no outcome"] if (~known).any() else []
+    return Table(SHARES, rows, said), _listed(test, novel, inputs)
+
+
+def _foretold(test: Classed, novel: Bools, inputs: Ints, theirs: str) -> list[Row]:
+    """How many novel failures are of classes that training lacks, or has once."""
+    classes, first = np.unique(test.code[novel], return_index=True)
+    lacking = inputs[novel][first] == 0
+    return [
         share(
             "PNFNC",
-            int(foretold.sum()),
+            int((novel & (inputs == 0)).sum()),
             int(novel.sum()),
             f"novel failures: their class does not occur in {theirs}",
         ),
         share(
             "classes of novel failures that are not covered",
-            int((inputs[classes] == 0).sum()),
+            int(lacking.sum()),
             len(classes),
             "distinct classes of novel failures",
         ),
         share(
             "novel failures of a class seen once",
-            int((novel & seen_once).sum()),
+            int((novel & (inputs == 1)).sum()),
             int(novel.sum()),
             f"novel failures: their class has one frame in {theirs}",
         ),
-        share(
-            "test inputs not covered",
-            int((test.known & (inputs[test.code] == 0)).sum()),
-            int(test.known.sum()),
-            f"frames of {ours} with a class",
-        ),
     ]
-    order = np.flatnonzero(novel)
-    listed = [
-        (frame, test.names[code], int(inputs[code]))
-        for frame, code in zip(
-            names_of(test.chosen.store, test.frame_id[order]),
-            test.code[order].tolist(),
-            strict=True,
-        )
-    ]
-    said = of_unknown(test.unknown, ours) + of_unknown(train.unknown, theirs)
-    said += [f"{int((~known).sum())} frames of {ours} have no outcome"] if (~known).any() else []
-    return Table(SHARES, rows, said), Table(("frame", "class", "in_training"), listed)
+
+
+def _listed(test: Classed, novel: Bools, inputs: Ints) -> Table:
+    rows = np.flatnonzero(novel)
+    frames = names_of(test.chosen.store, test.frame_id[rows])
+    columns = zip(frames, test.code[rows].tolist(), inputs[rows].tolist(), strict=True)
+    listed = [(frame, test.names[code], many) for frame, code, many in columns]
+    return Table(("frame", "class", "in_training"), listed)

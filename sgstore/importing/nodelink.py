@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,6 +23,8 @@ MAX_EDGES: Final = 2_000_000
 
 _LONGEST: Final = 1_000
 """Longest name; characters."""
+
+_WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
 
 _LABELS: Final = ("kind", "base_class", "label")
 """Attributes that say what a node is; the first that is there. (sgstore, CARLASGG, networkx.)"""
@@ -153,7 +156,7 @@ def _time(path: Path, where: str, about: dict[str, Any]) -> int | None:
         value = about.get(key)
         if value is None:
             continue
-        if isinstance(value, str) and value.lstrip("-").isdigit() and len(value) < 20:
+        if isinstance(value, str) and _WHOLE.fullmatch(value):
             value = int(value)  # 64-bit numbers come as texts, because JSON readers round them
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= most:
             raise wrong(path, where, f"expected a time in {key!r}, found {str(value)[:80]}")
