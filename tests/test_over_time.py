@@ -21,10 +21,10 @@ from oracle_temporal import random_formula
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang.over_time import Hold, Length
-from sgstore.temporal import Online, formula_of, prefix_verdicts
+from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
 from sgstore.temporal.measures import Clock
 from sgstore.temporal.sequences import Leg, Line, matches_of
-from sgstore.temporal.verdicts import STATUS, Settled
+from sgstore.temporal.verdicts import STATUS, Settled, within_bounds
 
 if TYPE_CHECKING:
     from oracle_worlds import World
@@ -231,6 +231,41 @@ def test_what_only_the_end_refutes_is_violated_in_the_last_frame_or_forgiven() -
     assert settled.violations(None, weak=True) == []
 
 
+def test_what_depends_on_a_gap_is_not_known() -> None:
+    times, gaps = np.array([0, 10, 90, 100]), np.array([0, 0, 1, 0], np.bool_)
+    columns = {"p": np.array([[1, 1, 1, 1], [1, 1, 1, 0], [0, 1, 1, 1]], np.bool_)}
+
+    least, most = within_bounds(formula_of("ALWAYS p"), columns, times, gaps, 3)
+    some = within_bounds(formula_of("EVENTUALLY p"), columns, times, gaps, 3)
+    bounded = within_bounds(formula_of("ALWAYS[0s, 10s] NOT p"), columns, times, gaps, 3)
+
+    assert (least.tolist(), most.tolist()) == ([False] * 3, [True, False, False])
+    assert some[0].all()
+    assert some[1].all()
+    assert not bounded[1].any()
+
+
+def test_the_bounds_of_a_verdict_hold_whatever_happened_in_the_gap() -> None:
+    rng = random.Random(17)
+    for _ in range(300):
+        formula = random_formula(rng, 3)
+        frames = rng.randint(2, 7)
+        times = np.cumsum([rng.choice((2, 4, 20)) for _ in range(frames)])
+        gaps = np.concatenate(([False], np.diff(times) == 20))
+        columns = {name: np.array([[rng.random() < 0.6 for _ in range(frames)]]) for name in "abc"}
+        least, most = within_bounds(formula, columns, times, gaps, 1)
+        at = np.flatnonzero(gaps)
+        longer = np.insert(times, at, times[at - 1] + (times[at] - times[at - 1]) // 2)
+        for _ in range(4):
+            filled = {
+                name: np.insert(column[0], at, [rng.random() < 0.5 for _ in at])
+                for name, column in columns.items()
+            }
+            value = evaluate(formula, filled, longer)[0]
+
+            assert least[0] <= value <= most[0]
+
+
 # As people use them
 
 
@@ -269,6 +304,22 @@ def test_a_scenario_is_the_sequence_that_it_stands_for(store: Store) -> None:
     assert store.find(f"{define} MATCH meet()").rows() == store.find(steps.format("4s")).rows()
     given = store.find(f"{define} MATCH meet(within = $w)", w=0.2).rows()
     assert given == store.find(steps.format("200ms")).rows()
+
+
+def test_edges_with_names_are_told_with_what_they_are(store: Store) -> None:
+    text = (
+        "USING UNKNOWN false MATCH (e:Ego)-[r:isIn]->(:Lane) THEN MATCH (e)-[d:near|visible]->(v)"
+    )
+
+    rows = store.find(f"{text} RETURN type(d) AS d, r.overlap AS o, v").rows()
+    alone = store.find(
+        "MATCH (e:Ego)-[r:isIn]->(:Lane) WHERE ONCE e.speed > 0.5 RETURN r.overlap AS o"
+    )
+
+    assert rows
+    assert {row[0] for row in rows} <= {"near", "visible"}
+    assert any(row[0] is not None for row in alone.rows())
+    assert list(store.find(f"{text} RETURN SUBGRAPHS").subgraphs())
 
 
 def test_explain_tells_steps_and_atoms(store: Store) -> None:

@@ -21,6 +21,7 @@ from sgstore.temporal.verdicts import (
     STATUS,
     Settled,
     Violation,
+    within_bounds,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ class Verdict:
         Their names.
     verdict : str
         ``true`` or ``false``; with ``USING END pending`` also ``presumably_true``, ``presumably_false``; and
-        ``unknown`` of a trace that cannot answer it.
+        ``unknown`` of a trace that cannot answer it, or, with ``USING GAPS unknown``, if it depends on what
+        happened in a gap.
     first_violation : Interval or None
         The first of the violations.
     violations : tuple of Interval
@@ -240,7 +242,25 @@ class _Check:
             part = slice(low, low + size)
             values[part], told[part] = self._evaluated(trace, kinds[part])
         truths = folded_values(levels, values[members])
+        if self._check.gaps == "unknown" and trace.clock.gap_before.any():
+            least, most = self._bounds(trace, kinds)
+            ends = [folded_values(levels, end[members])[0][0] for end in (least, most)]
+            if ends[0] != ends[1]:
+                return Verdict(self._check.name, trace.name, "unknown")
         return self._reported(trace, levels, truths, [told[i] for i in members.tolist()])
+
+    def _bounds(self, trace: Trace, bindings: Keys) -> tuple[Bools, Bools]:
+        """The verdict of some bindings, at least and at most, whatever happened in the gaps."""
+        size = max(CELLS // max(len(trace), 1), 1)
+        parts: list[tuple[Bools, Bools]] = []
+        for low in range(0, len(bindings), size):
+            some = bindings[low : low + size]
+            columns = Values(self._plan, trace, self._variables, some).columns(self._formula)
+            times, gaps = trace.clock.times, trace.clock.gap_before
+            parts.append(within_bounds(self._formula, columns, times, gaps, len(some)))
+        nothing = np.zeros(0, np.bool_)
+        least = np.concatenate([nothing, *(part[0] for part in parts)])
+        return least, np.concatenate([nothing, *(part[1] for part in parts)])
 
     def _levels(self, trace: Trace) -> list[Level]:
         people = self._people.get(trace.trace_id, {})

@@ -114,9 +114,13 @@ def _of_steps(match: s.Match, session: Session) -> b.Query:
 
 
 def _told(scope: b.Scope) -> b.Scope:
-    """What is known of a match once it is found: its nodes, and its edges that have names."""
+    """What is known of a match once it is found: nodes and edges that have names, ends of these, the ego."""
     edges = tuple(edge for edge in scope.edges if edge.named)
-    nodes = {k: n for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other}
+    ends = {end for edge in edges for end in (edge.src, edge.dst)}
+    told = {
+        k for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other or k in ends
+    }
+    nodes = {key: node for key, node in scope.nodes.items() if key in told}
     return replace(scope, nodes=nodes, edges=edges, where=(), distinct=frozenset())
 
 

@@ -70,6 +70,8 @@ class Sequence:
         The nodes that steps have bound and that others may speak of: those with names, and the ego.
     edges : list of Edge
         Those with names.
+    ends : dict of str to Node
+        The nodes at their ends, named or not.
     meanings : dict of str to Meaning
         What names mean after all steps.
     steps, links : list
@@ -78,13 +80,14 @@ class Sequence:
     session: Session
     known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
     edges: list[b.Edge] = field(default_factory=list[b.Edge])
+    ends: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
     meanings: dict[str, Meaning] = field(default_factory=dict[str, Meaning])
     steps: list[o.Step] = field(default_factory=list[o.Step])
     links: list[o.Link] = field(default_factory=list[o.Link])
 
     def scope(self) -> ScopeBuilder:
         """What values of a match speak of: nodes and edges that have names, and the ego."""
-        return ScopeBuilder(self.session, nodes=dict(self.known), edges=list(self.edges))
+        return ScopeBuilder(self.session, nodes=self.ends | self.known, edges=list(self.edges))
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +238,9 @@ def _bind_step(
         return
     shared = {k: n for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other}
     found.known |= {k: n for k, n in shared.items() if k not in found.known}
-    found.edges += [edge for edge in scope.edges if edge.named]
+    named = [edge for edge in scope.edges if edge.named]
+    found.edges += named
+    found.ends |= {end: scope.nodes[end] for edge in named for end in (edge.src, edge.dst)}
     found.meanings |= names.meanings
     _name_step(step, found)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.temporal.columns import evaluate
+from sgstore.temporal.columns import evaluate, evaluate_rows
 from sgstore.temporal.formulas import (
     TRUE,
     WHOLE,
@@ -207,6 +207,68 @@ class Settled:
             found.append(Violation(trap, int(trap + after)))
             start = int(trap + after) + 1
         return found
+
+
+def within_bounds(
+    formula: Formula, columns: Mapping[str, Bools], times: Ints, gaps: Bools, rows: int
+) -> tuple[Bools, Bools]:
+    """The value of a formula at the first frame, at least and at most, if nothing is known of gaps.
+
+    In each gap one frame more is thought, of which every proposition may be true or false. What the formula
+    asks to be true is taken to be false for the one, and true for the other.
+
+    Parameters
+    ----------
+    formula : Formula
+    columns : mapping of str to (B, F) bool, or (1, F)
+    times : (F,) int64
+        Ascending; ns. A gap is longer than a nanosecond.
+    gaps : (F,) bool
+        Whether a gap ends at a frame.
+    rows : int
+        B.
+
+    Returns
+    -------
+    least, most : (B,) bool
+        Where they differ, the value depends on what is not known.
+    """
+    at = np.flatnonzero(gaps)
+    between = times[at - 1] + (times[at] - times[at - 1]) // 2
+    longer = np.insert(times, at, between)
+    both = {
+        name + suffix: np.insert(column, at, value, axis=1)
+        for name, column in columns.items()
+        for suffix, value in (("+", True), ("-", False))
+    }
+    least, most = (
+        evaluate_rows(_taken(formula, upper=upper), both, longer, rows)[:, 0]
+        for upper in (False, True)
+    )
+    return least, most
+
+
+def _taken(formula: Formula, *, upper: bool) -> Formula:  # noqa: PLR0911 - a case each
+    """A formula whose propositions are those that make it true most easily, or least."""
+    match formula:
+        case Proposition(name=name):
+            return Proposition(name + ("+" if upper else "-"))
+        case Not(operand=operand):
+            return Not(_taken(operand, upper=not upper))
+        case And(operands=operands):
+            return And(tuple(_taken(operand, upper=upper) for operand in operands))
+        case Or(operands=operands):
+            return Or(tuple(_taken(operand, upper=upper) for operand in operands))
+        case Next(operand=operand, weak=weak):
+            return Next(_taken(operand, upper=upper), weak)
+        case Previous(operand=operand):
+            return Previous(_taken(operand, upper=upper))
+        case Until(left=left, right=right, bound=bound):
+            return Until(_taken(left, upper=upper), _taken(right, upper=upper), bound)
+        case Since(left=left, right=right, bound=bound):
+            return Since(_taken(left, upper=upper), _taken(right, upper=upper), bound)
+        case _:
+            return formula
 
 
 def always_true(formula: Formula) -> Formula | None:
