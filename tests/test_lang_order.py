@@ -100,3 +100,17 @@ def test_paths_begin_where_other_edges_lead_and_find_the_same(
     assert ":lengths" not in at_once
     assert ":lengths" in unfolded or not found
     assert disagreement(text, world)[0] == ""
+
+
+def test_paths_are_looked_for_in_traces_that_can_answer(world: World) -> None:
+    text = PATHS[0]
+    silent, *others = world.catalog.traces
+    catalog = replace(world.catalog, traces=(replace(silent, answers=frozenset()), *others))
+
+    def traces(of: Catalog) -> set[int]:
+        statement = compile_query(f"{text} RETURN trace.id", of).rows()
+        rows = world.connection.execute(statement.sql, statement.values).fetchall()
+        return {trace for (trace,) in rows}
+
+    assert silent.trace_id in traces(world.catalog)
+    assert traces(catalog) == traces(world.catalog) - {silent.trace_id}

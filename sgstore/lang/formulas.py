@@ -131,6 +131,8 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
     """The value of an attribute of a node that lives in one of some places."""
     if attribute.unit is Unit.label:
         return _label(at)
+    if attribute.name == "kind" and at.state and not (at.entity or at.map):
+        return f"{at.state}.{quoted('kind')}"
     parts = [
         _part(attribute, home, f"{alias}.{quoted(attribute.columns[home])}", alias, at.trace)
         for home, alias in (
@@ -187,9 +189,10 @@ def _label(at: Aliases) -> str:
     parts: list[str] = []
     if at.map:
         parts.append(f"{at.map}.{quoted('name')}")
-    if at.entity:
-        kind = f"CAST({at.entity}.{quoted('kind')} AS VARCHAR)"
-        parts.append(f"{kind} || ' ' || CAST({at.entity}.{quoted('node_id')} AS VARCHAR)")
+    told = at.entity or (None if at.map else at.state)
+    if told:
+        kind = f"CAST({told}.{quoted('kind')} AS VARCHAR)"
+        parts.append(f"{kind} || ' ' || CAST({told}.{quoted('node_id')} AS VARCHAR)")
     if not parts:
         return _ABSENT[Type.text]
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"

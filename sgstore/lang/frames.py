@@ -191,15 +191,24 @@ class Frames(Masks):
         join.at[key] = Aliases(state=alias)
 
     def _of_kinds(self, scope: Scope, key: str, state: str) -> list[str]:
-        """Conditions that keep states to what a node may be."""
+        """Conditions that keep states to what a node may be; of the ego's states it is enough that they are."""
+        if not scope.kinds(key).other and key not in self.phases(scope).late:
+            return [f'{state}."is_ego"']
         return kind_conditions(
             scope.kinds(key), f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
         )
 
-    def _homes(self, scope: Scope, key: str, needed: list[Leaf]) -> set[Home]:
-        """Where the values of a node that are needed live."""
+    def _homes(
+        self, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
+    ) -> set[Home]:
+        """Where the values of a node that are needed live; ``stated``: its state is joined anyway."""
+        profile = Profile.of(scope.kinds(key), self.catalog)
         of_it = [leaf for leaf in needed if key in _valued(leaf)]
-        return _homes(of_it, Profile.of(scope.kinds(key), self.catalog))
+        homes = _homes(of_it, profile)
+        if profile.places == 1 and profile.moving and (stated or Home.state in homes):
+            # Its state says its kind as well, and so its name.
+            homes = {Home.state} | _homes([leaf for leaf in of_it if not _of_kind(leaf)], profile)
+        return homes
 
     def _second_phase(
         self, join: Join, scope: Scope, parts: Phases, given: Given | None, needed: list[Leaf]
@@ -215,7 +224,9 @@ class Frames(Masks):
             join.select.where += self.of_traces(f"{join.frame} >> 24", scope)
         self._join_rows(join, scope, parts, needed)
         for key in sorted({key for leaf in needed for key in _valued(leaf)}):
-            self._join_values(join, scope, key, self._homes(scope, key, needed))
+            stated = key in join.at and join.at[key].state is not None
+            homes = self._homes(scope, key, needed, stated=stated)
+            self._join_values(join, scope, key, homes)
         for leaf in needed:
             self._say(join, scope, given, leaf)
 
@@ -387,6 +398,12 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
         elif isinstance(leaf, NodeAttribute):
             homes |= homes_of(leaf.attribute, profile)
     return {home for home in homes if profile.has(home)}
+
+
+def _of_kind(leaf: Leaf) -> bool:
+    """Whether a value is made of the kind, and the id, of a node."""
+    attribute = leaf.attribute if isinstance(leaf, NodeAttribute) else None
+    return attribute is not None and (attribute.unit is Unit.label or attribute.name == "kind")
 
 
 def _of_frame(leaf: Leaf) -> bool:

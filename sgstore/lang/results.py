@@ -21,6 +21,7 @@ from sgstore.lang.bound import (
     FrameAttribute,
     NodeAttribute,
     NodeValue,
+    Operation,
     Query,
     Result,
     walk,
@@ -297,7 +298,9 @@ class _Intervals:
 
     def _steps(self, relation: str, keys: list[str]) -> str:
         """Frames and keys, with the number and the time of the frame before that has the same keys."""
-        inner = Select(['"frame_id"'], [nested(relation, ":rows")], distinct=True)
+        # The relation has a frame with the same values once; what is made of different values may be the same.
+        made = any(isinstance(column.value, Operation) for column in self.result.columns)
+        inner = Select(['"frame_id"'], [nested(relation, ":rows")], distinct=made)
         inner.columns += self._keys(keys)
         times = ["frame_id", "trace_id", "seq", "time_ns", "log_time_ns"]
         select = Select([f"{_FRAME}.{quoted(name)}" for name in times] + keys)

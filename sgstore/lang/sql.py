@@ -388,6 +388,7 @@ class Masks(Presence, ABC):
         columns = ['"bucket"', *columns_of(nodes, edges)]
         select = Select([*columns, 'bit_or("mask") AS "mask"'], group=columns)
         select.join(nested("\nUNION ALL\n".join(branches), ":lengths"), [])
+        select.where = self.of_traces('"bucket" >> 18', scope)
         return select.text()
 
     def _paths(self, scope: Scope, edge: Edge) -> str:
