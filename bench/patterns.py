@@ -197,7 +197,9 @@ def asked(store: Store, question: Question, times: int) -> tuple[float, float, o
     for _ in range(times):
         start, before = time.perf_counter(), time.process_time()
         matches = store.find(question.pattern)
-        if "RETURN" in question.pattern and "RETURN FRAMES" not in question.pattern:
+        if "LIMIT" in question.pattern:
+            answer = len(matches.rows())  # few: as a stream, window by window
+        elif "RETURN" in question.pattern and "RETURN FRAMES" not in question.pattern:
             answer = len(matches.numpy()[matches.columns[0]])
         else:
             answer = matches.count()
