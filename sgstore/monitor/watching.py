@@ -1,0 +1,407 @@
+"""One ``CHECK``, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sgstore.errors import QueryError
+from sgstore.history.bindings import Level, folded_values, levels_of
+from sgstore.history.checks import Verdict, Witness
+from sgstore.lang.bound import Query, Result
+from sgstore.matches import Interval
+from sgstore.monitor.bindings import Known, Lattice, Partial
+from sgstore.monitor.duties import Automaton, State, Step
+from sgstore.monitor.events import Event, Moment
+from sgstore.temporal.courses import Courses, Memory, column_of
+from sgstore.temporal.plans import Plan
+from sgstore.temporal.verdicts import (
+    CERTAINLY_TRUE,
+    FALSE,
+    PRESUMABLY_FALSE,
+    PRESUMABLY_TRUE,
+    STATUS,
+    looks_ahead,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang.over_time import Check, Quantifier
+    from sgstore.monitor.asking import Key, People, Questions
+    from sgstore.temporal.courses import Pulse
+    from sgstore.temporal.measures import Column
+    from sgstore.temporal.plans import Signal
+    from sgstore.world import Bools
+
+    Keys = NDArray[np.int64]
+    Span = tuple[Moment, Moment]
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """What is known of a binding.
+
+    Attributes
+    ----------
+    state : State
+    counted : int
+        Guards that were true in some frame, a bit each.
+    since : Moment or None
+        From when on the check is violated.
+    over : tuple of (Moment, Moment)
+        Violations that have ended.
+    memory : Memory
+        What values over time need of former frames.
+    """
+
+    state: State
+    counted: int
+    since: Moment | None
+    over: tuple[Span, ...]
+    memory: Memory
+
+
+def _same(one: _Entry, other: _Entry) -> bool:
+    return (
+        one.state is other.state
+        and one.counted == other.counted
+        and one.since is other.since
+        and one.over == other.over
+        and one.memory == other.memory
+    )
+
+
+class Watch:
+    """A check, while a trace comes.
+
+    Parameters
+    ----------
+    check : Check
+    questions : Questions
+        What is asked of each frame; those of the check become part of them.
+    pulse : Pulse
+        Told of each frame before this is.
+
+    Raises
+    ------
+    QueryError
+        What is to be known at once depends on later frames.
+    """
+
+    def __init__(self, check: Check, questions: Questions, pulse: Pulse) -> None:
+        self._check, self._pulse, self._questions = check, pulse, questions
+        self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
+        whole = Query(check.scope, Result(), check.relations, check.injective, check.ego)
+        whole = replace(whole, unknown_is_false=check.unknown_is_false)
+        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
+        plan = Plan(whole, frozenset(self._variables), absent)
+        formula = plan.formula(check.formula)
+        reset = plan.formula(check.reset) if check.reset is not None else None
+        if reset is not None and looks_ahead(reset):
+            raise QueryError(
+                f"RESET WHEN of {check.name} looks ahead",
+                hint="a monitor begins anew in the next frame, so what resets it must be known by then",
+            )
+        guards = {q: plan.formula(q.where) for q in check.quantifiers if q.where is not None}
+        self._guards: dict[Quantifier, int] = {q: 1 << n for n, q in enumerate(guards)}
+        self._courses = Courses(plan, pulse, bridge=check.gaps == "bridge")
+        names = [*plan.atoms, *plan.tests]
+        self._bits = {name: 1 << number for number, name in enumerate(names)}
+        self._automaton = Automaton(formula, reset, tuple(guards.values()), self._bits)
+        self._atoms = [
+            (self._bits[name], questions.add(atom.query, atom.variables), self._places(atom.variables))
+            for name, atom in plan.atoms.items()
+        ]
+        self._signals = {
+            name: (questions.add(s.query, s.variables, s.value), self._places(s.variables))
+            for name, s in plan.signals.items()
+        }
+        strangers = _Entry(self._automaton.begun, 0, None, (), self._courses.begun)
+        self._known = Known(Lattice(len(self._variables)), strangers)
+        self._domains: dict[str, dict[int, str]] = {node: {} for node in check.scope.nodes}
+        self._told: dict[Key, tuple[int, int]] = {}
+        self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
+
+    @property
+    def name(self) -> str:
+        """Of the check."""
+        return self._check.name
+
+    def _places(self, variables: tuple[str, ...]) -> tuple[int, ...]:
+        return tuple(self._variables.index(name) for name in variables)
+
+    # Frame by frame
+
+    def step(self, here: Moment, people: People) -> list[Event]:
+        """A frame has come, and the questions were asked of it: what is known from it on."""
+        self._meet(people)
+        known, lattice = self._known, self._known.lattice
+        letters = self._letters()
+        rows = lattice.closed([*known.held, *letters, *self._told_signals()])
+        if lattice.size < 2:
+            base = letters.get(lattice.stranger, 0)
+            full = {row: base | letters.get(row, 0) for row in rows}
+        else:
+            full = {row: self._letter(row, letters) for row in rows}
+        memories: Mapping[Partial, Memory] = {}
+        if self._courses:
+            memories = self._measure(list(rows), full)
+        found: dict[Partial, _Entry] = {}
+        seen: dict[tuple[State, int], Step] = {}
+        tick, automaton, mask = self._pulse.tick, self._automaton, self._automaton.mask
+        for row in rows:
+            entry = known.of(row)
+            step = automaton.step(entry.state, full[row] & mask, tick, seen)
+            found[row] = _stepped(entry, step, here, memories.get(row, ()))
+        known.keep(found, _same)
+        return list(self._events(here)) if self._immediate else []
+
+    def _meet(self, people: People) -> None:
+        for key, node in self._check.scope.nodes.items():
+            domain = self._domains[key]
+            for new in people.of(node.kinds) - domain.keys():
+                domain[new] = people.name(new)
+
+    def _letters(self) -> dict[Partial, int]:
+        """The atoms that are true of bindings, of those that say no more than the atom asks."""
+        answers, placed = self._questions.answers, self._known.lattice.placed
+        letters: dict[Partial, int] = {}
+        for bit, number, places in self._atoms:
+            for key in answers[number]:
+                row = placed(key, places)
+                letters[row] = letters.get(row, 0) | bit
+        return letters
+
+    def _letter(self, row: Partial, letters: Mapping[Partial, int]) -> int:
+        found = 0
+        for wider in self._known.lattice.wider(row):
+            found |= letters.get(wider, 0)
+        return found
+
+    def _told_signals(self) -> Iterator[Partial]:
+        placed = self._known.lattice.placed
+        for number, places in self._signals.values():
+            for key, value in self._questions.answers[number].items():
+                if value is not None:
+                    yield placed(key, places)
+
+    def _measure(self, rows: list[Partial], letters: dict[Partial, int]) -> dict[Partial, Memory]:
+        """Tell letters the tests that are true; what bindings remember from now on."""
+        self._courses.step()
+        columns: dict[str, Bools] = {}
+
+        def atom(name: str) -> Bools:
+            if name not in columns:
+                bit = self._bits[name]
+                columns[name] = np.array([bool(letters[row] & bit) for row in rows], np.bool_)
+            return columns[name]
+
+        def signal(one: Signal) -> Column:
+            number, places = self._signals[one.name]
+            answers = self._questions.answers[number]
+            keys = [tuple(row[place] for place in places) for row in rows]
+            return column_of([answers.get(key) for key in keys])  # type: ignore[arg-type]
+
+        memories = [self._known.of(row).memory for row in rows]
+        tests, memories = self._courses.values(memories, atom, signal)
+        for name, column in tests.items():
+            bit = self._bits[name]
+            true = np.broadcast_to(column.true[:, 0], len(rows)).tolist()
+            for row, flag in zip(rows, true, strict=True):
+                if flag:
+                    letters[row] |= bit
+        return dict(zip(rows, memories, strict=True))
+
+    # What is known
+
+    def _events(self, here: Moment) -> Iterator[Event]:
+        for row, entry in list(self._known.held.items()):
+            if entry.since is None and not entry.over:
+                continue
+            for key in self._covered(row, entry):
+                begun, ended = self._told.get(key, (0, 0))
+                spans = entry.over if entry.since is None else (*entry.over, (entry.since, None))
+                if (begun, ended) == (len(spans), len(entry.over)) or not self._counts(key, entry):
+                    continue
+                self._told[key] = len(spans), len(entry.over)
+                for number in range(ended, len(spans)):
+                    start, end = spans[number]
+                    if number >= begun:
+                        yield self._event("violated", here, key, start, start)
+                    if end is not None:
+                        yield self._event("kept again", here, key, start, end)
+
+    def _covered(self, row: Partial, entry: _Entry) -> Iterator[Key]:
+        """The bindings of entities that were met of which no more is known than this."""
+        if None not in row:
+            yield row  # type: ignore[misc]
+            return
+        keys: list[Partial] = [()]
+        for node, name in zip(row, self._variables, strict=True):
+            some = self._domains[name] if node is None else (node,)
+            keys = [(*key, one) for key in keys for one in some]
+        for key in keys:
+            if self._known.of(key) is entry:
+                yield key  # type: ignore[misc]
+
+    def _counts(self, key: Key, entry: _Entry) -> bool:
+        """Whether a binding is one that the check is about."""
+        if entry.counted != (1 << len(self._guards)) - 1:
+            return False
+        if any(n not in self._domains[v] for n, v in zip(key, self._variables, strict=True)):
+            return False
+        return not self._check.injective or (
+            len(set(key)) == len(key) and not any(node in self._others for node in key)
+        )
+
+    @property
+    def _others(self) -> set[int]:
+        """What the nodes that no quantifier binds were: the egos."""
+        rest = [n for n in self._domains if n not in self._variables]
+        return {node for name in rest for node in self._domains[name]}
+
+    def _event(
+        self, kind: str, here: Moment, key: Key, start: Moment, end: Moment, *, at_end: bool = False
+    ) -> Event:
+        nodes = dict(zip(self._variables, key, strict=True))
+        names = {name: self._domains[name][node] for name, node in nodes.items()}
+        return Event(kind, self.name, here, start, end, nodes, names, at_end=at_end)
+
+    # The end
+
+    def status(self) -> str:
+        """What is known of the check, for the entities that were met: one of ``STATUS``."""
+        levels = self._levels()
+        bindings = levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+        return STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]
+
+    def _of(self, key: list[int]) -> _Entry:
+        return self._known.of(tuple(key))
+
+    def _levels(self) -> list[Level]:
+        domains = {n: np.array(sorted(met), np.int64) for n, met in self._domains.items()}
+        size = len(self._variables)
+
+        def counts(quantifier: Quantifier, variables: tuple[str, ...], bindings: Keys) -> Bools:
+            bit = self._guards.get(quantifier, 0)
+            rest = (None,) * (size - len(variables))
+            told = [self._known.of((*key, *rest)).counted & bit == bit for key in bindings.tolist()]
+            return np.array(told, np.bool_)
+
+        apart = np.array(sorted(self._others), np.int64) if self._check.injective else None
+        return levels_of(self._check.quantifiers, domains, apart=apart, counts=counts)
+
+    def _folded_codes(self, levels: list[Level], entries: list[_Entry]) -> int:
+        rows = [_code(entry) for entry in entries]
+        for number in range(len(levels) - 1, -1, -1):
+            level = levels[number]
+            every = level.word == "FORALL"
+            outer = len(levels[number - 1].bindings) if number else 1
+            joined = [CERTAINLY_TRUE if every else FALSE] * outer
+            for parent, row in zip(level.parents.tolist(), rows, strict=True):
+                joined[parent] = (min if every else max)(joined[parent], row)
+            rows = joined
+        return rows[0]
+
+    def finish(self, trace: str, last: Moment) -> tuple[Verdict, list[Event]]:
+        """The trace has ended: the verdict, and what only the end makes known."""
+        levels = self._levels()
+        bindings = levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+        entries = [self._of(key) for key in bindings.tolist()]
+        weak = self._check.end == "weak"
+        spans = [_spans(entry, last, weak=weak) for entry in entries]
+        truths = folded_values(levels, np.array([not one for one in spans], np.bool_))
+        holds = bool(truths[0][0])
+        verdict = "true" if holds else "false"
+        if self._check.end == "pending":
+            verdict = STATUS[self._folded_codes(levels, entries)]
+        if not levels:
+            own = tuple(_interval(trace, span, {}) for span in spans[0])
+            found = Verdict(self.name, trace, verdict, own)
+        else:
+            witnesses = self._witnesses(trace, levels, truths, spans)
+            violations: tuple[Interval, ...] = ()
+            if not holds:
+                every = {(i.start_seq, i.end_seq): i for w in witnesses for i in w.violations}
+                violations = tuple(every[key] for key in sorted(every))
+                violations = violations or (_interval(trace, (last, last), {}),)
+            found = Verdict(self.name, trace, verdict, violations, witnesses)
+        return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
+
+    def _at_end(
+        self, last: Moment, *, holds: bool, bindings: Keys, spans: list[list[Span]]
+    ) -> Iterator[Event]:
+        """Violations that were not told yet."""
+        if holds:
+            return
+        if not self._immediate:
+            yield Event("violated", self.name, last, last, last, {}, {}, at_end=True)
+            return
+        for key, found in zip(bindings.tolist(), spans, strict=True):
+            begun, _ = self._told.get(tuple(key), (0, 0))
+            for start, _ in found[begun:]:
+                yield self._event("violated", last, tuple(key), start, start, at_end=True)
+
+    def _witnesses(
+        self,
+        trace: str,
+        levels: list[Level],
+        truths: list[Bools],
+        spans: list[list[Span]],
+    ) -> tuple[Witness, ...]:
+        """Those of the outermost quantifiers that are of one word."""
+        word = levels[0].word
+        depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
+        level, values = levels[depth - 1], truths[depth]
+        names = [n for q in self._check.quantifiers[:depth] for n in q.nodes]
+        found: list[Witness] = []
+        for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
+            nodes = dict(zip(names, level.bindings[row].tolist(), strict=True))
+            called = {name: self._domains[name][node] for name, node in nodes.items()}
+            inner = spans[row] if depth == len(levels) else []
+            violations = tuple(_interval(trace, span, called) for span in inner)
+            found.append(Witness(nodes, called, bool(values[row]), violations))
+        return tuple(found)
+
+
+def _stepped(entry: _Entry, step: Step, here: Moment, memory: Memory) -> _Entry:
+    counted = entry.counted | step.guards
+    plain = not (step.started or step.ended or memory)
+    if plain and step.state is entry.state and counted == entry.counted:
+        return entry
+    since, over = entry.since, entry.over
+    if step.started:
+        since = here
+    if step.ended and since is not None:
+        since, over = None, (*over, (since, here))
+    return _Entry(step.state, counted, since, over, memory)
+
+
+def _code(entry: _Entry) -> int:
+    if entry.since is not None or entry.over:
+        return FALSE
+    if entry.state.word == "kept":
+        return CERTAINLY_TRUE
+    return PRESUMABLY_TRUE if entry.state.ended else PRESUMABLY_FALSE
+
+
+def _spans(entry: _Entry, last: Moment, *, weak: bool) -> list[Span]:
+    """The violations of a binding in a trace that has ended."""
+    found = list(entry.over)
+    if entry.since is not None:
+        found.append((entry.since, last))
+    elif not (weak or entry.state.ended):
+        found.append((last, last))
+    return found
+
+
+def _interval(trace: str, span: Span, names: Mapping[str, str]) -> Interval:
+    start, end = span
+    times = start.time_ns, end.time_ns, start.t, end.t
+    return Interval(trace, start.seq, end.seq, *times, end.seq - start.seq + 1, dict(names))
+
