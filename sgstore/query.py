@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, overload
 from sgstore.abstractions import abstractions
 from sgstore.graph import named_graph
 from sgstore.lang import compile_query
-from sgstore.lang.results import about_frame
+from sgstore.lang.results import CONSTANTS, about_frame
 from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import folded
 
@@ -354,7 +354,12 @@ class Store:
         whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
         classes = partial(self.file.abstracted.class_of, frame.frame_id)
         roles = partial(self.file.abstracted.roles_of, frame.frame_id)
-        return FrameView(self.file.graph(frame.frame_id), about, whole, classes, roles)
+        graph = self.file.graph(frame.frame_id)
+        constants = self.file.rows(CONSTANTS, [frame.trace_id])
+        for node, *values in constants.values:
+            if node in graph.nodes:
+                graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
+        return FrameView(graph, about, whole, classes, roles)
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

@@ -478,7 +478,7 @@ TRACE_ATTRIBUTES: Final = _named(
             Type.number,
             {Home.state: "period_ns"},
             "median, between frames; s",
-            Unit.given,
+            Unit.span,
         ),
         Attribute("map", Type.text, {Home.map: "name"}, "name of the road map"),
     )

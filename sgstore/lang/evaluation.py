@@ -209,6 +209,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
                 return lambda at: at.nodes[node]
             if attribute.unit is Unit.role:
                 return lambda at: at.view.role_of(at.nodes[node])
+            if attribute is NODE_ATTRIBUTES["injunction"]:
+                return lambda at: _in_junction(at, at.nodes[node])
             if attribute is NODE_ATTRIBUTES["type"]:
                 return lambda at: _type_of(at.view.nodes[at.nodes[node]])
             name = attribute.name
@@ -237,6 +239,11 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return _operation(expression, blocks)
         case b.Choices() | b.Aggregate() | b.Tense() | b.Course() | b.Moment():
             raise TypeError(f"{expression} has no value of its own")
+
+
+def _in_junction(at: Binding, node: int) -> bool | None:
+    """Whether a part of the map, whose id is below zero, belongs to a junction."""
+    return "junction" in at.view.nodes[node] if node < 0 else None
 
 
 def _type_of(attributes: Attributes) -> Any:

@@ -53,6 +53,9 @@ GROUP BY trace_id ORDER BY first
 """
 """First bucket and number of buckets of each trace, in the order of rows."""
 
+CONSTANTS: Final = "SELECT node_id, ident, type_name, parked FROM entities WHERE trace_id = ?"
+"""What does not change about the entities of a trace, and stands in no frame."""
+
 LOG_TIME: Final = "log_time_ns"
 
 _NAME: Final = NODE_ATTRIBUTES["name"]
