@@ -21,6 +21,7 @@ from oracle_temporal import random_formula
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang.over_time import Hold, Length
+from sgstore.lang.standard import pattern
 from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
 from sgstore.temporal.measures import Clock
 from sgstore.temporal.sequences import Leg, Line, matches_of
@@ -304,6 +305,17 @@ def test_a_scenario_is_the_sequence_that_it_stands_for(store: Store) -> None:
     assert store.find(f"{define} MATCH meet()").rows() == store.find(steps.format("4s")).rows()
     given = store.find(f"{define} MATCH meet(within = $w)", w=0.2).rows()
     assert given == store.find(steps.format("200ms")).rows()
+
+
+def test_patterns_of_the_library_are_steps_by_their_names(store: Store) -> None:
+    text = pattern("hard_braking").written(decel=0.1, hold=0)
+
+    rows = store.find("MATCH hard_braking(decel = 0.1, hold = 0s) THEN MATCH (e)").rows()
+
+    assert rows == store.find(f"{text} THEN MATCH (e)").rows()
+    with pytest.raises(QueryError, match="no parameter 'hardness'") as refused:
+        store.find("MATCH hard_braking(hardness = 1)")
+    assert refused.value.span is not None
 
 
 def test_edges_with_names_are_told_with_what_they_are(store: Store) -> None:

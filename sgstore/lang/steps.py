@@ -15,6 +15,8 @@ from sgstore.lang import over_time as o
 from sgstore.lang import syntax as s
 from sgstore.lang.conditions import condition, parameter
 from sgstore.lang.names import RESERVED, Meaning, Names, ScopeBuilder, Session
+from sgstore.lang.parser import parse
+from sgstore.lang.standard import patterns
 from sgstore.lang.tenses import length, settled
 from sgstore.vocabulary import folded
 
@@ -26,7 +28,8 @@ if TYPE_CHECKING:
 MAX_STEPS: Final = 50
 """Most steps that a sequence may have, those of scenarios in it included."""
 
-BindBlock = "Callable[[s.Block, Names], None]"
+SEQUENCES: Final = frozenset({"concept", "scenario"})
+"""Kinds of patterns of the library that stand for steps."""
 
 
 @dataclass(slots=True)
@@ -92,11 +95,15 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """A step as it stands in the text, with the values of the scenario that it belongs to."""
+    """A step as it stands in the text, with the values of the scenario that it belongs to.
+
+    ``called`` is where that is named, if its own text is in the library.
+    """
 
     step: s.Step
     values: Mapping[str, Any] | None
     name: str
+    called: Span | None = None
 
 
 def bind_sequence(
@@ -139,6 +146,12 @@ def _spelled_out(
         if isinstance(step, s.Step):
             steps.append(_Written(step, None, ""))
             continue
+        shipped = _shipped(step, session)
+        if shipped is not None:
+            inner, between = _spelled_out(shipped, session, depth + 1)
+            steps += [replace(w, name=step.name, called=step.name_span) for w in inner]
+            links += [(link, {}) for link, _ in between]
+            continue
         definition = _scenario(step, session)
         if depth >= MAX_STEPS:
             session.refuse(f"{definition.name}() is defined by itself", step.name_span)
@@ -153,11 +166,41 @@ def _spelled_out(
     return steps, links
 
 
+def _shipped(step: s.ScenarioStep, session: Session) -> s.Sequence | None:
+    """The sequence of a pattern of the library; ``None`` if the text defines the name, or nothing has it."""
+    name = folded(step.name)
+    if name in session.predicates:
+        return None
+    entry = next((p for p in patterns().values() if folded(p.name) == name), None)
+    if entry is None or entry.kind not in SEQUENCES:
+        return None
+    names = Names(session, ScopeBuilder(session))
+    values = {given.name: _given_text(given.value, names) for given in step.given}
+    try:
+        statements = parse(entry.written(**values))
+    except QueryError as error:
+        session.refuse(error.reason, step.span, error.hint)
+    found: s.Sequence | None = None
+    for statement in statements:
+        if isinstance(statement, s.Define):
+            session.predicates.setdefault(folded(statement.name), statement)
+        elif isinstance(statement, s.Match):
+            found = statement.sequence
+    return found
+
+
+def _given_text(value: s.Constant | s.Duration | s.Parameter, names: Names) -> Any:
+    if isinstance(value, s.Parameter):
+        return parameter(value, names)
+    return value.value if isinstance(value, s.Constant) else f"{value.amount:g}{value.unit}"
+
+
 def _scenario(step: s.ScenarioStep, session: Session) -> s.Define:
     known = {k: d for k, d in session.predicates.items() if isinstance(d.body, s.Sequence)}
     found = known.get(folded(step.name))
     if found is None:
         names = [definition.name for definition in known.values()]
+        names += [entry.name for entry in patterns().values() if entry.kind in SEQUENCES]
         session.unknown("scenario", step.name, step.name_span, names)
     return found
 
@@ -298,6 +341,6 @@ class _Values:
             raise type(error)(
                 f"in {self._written.name}(): {error.reason}",
                 text=self._session.text,
-                span=error.span,
+                span=self._written.called or error.span,
                 hint=error.hint,
             ) from None
