@@ -19,6 +19,8 @@ from sgstore.lang.catalog import (
     Unit,
 )
 from sgstore.lang.evaluation import Binding, evaluator
+from sgstore.lang.functions import PAIR_FUNCTIONS
+from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from sgstore.lang.evaluation import FrameView
@@ -60,6 +62,29 @@ def test_an_attribute_of_nodes(attribute: Attribute, store: Store, view: FrameVi
     assert {row[0] for row in rows} == set(view.nodes)
     for node, value in rows:
         assert same(value, in_memory(leaf, view, node)), view.nodes[node]
+
+
+@pytest.mark.parametrize("function", PAIR_FUNCTIONS)
+def test_a_number_of_pairs(function: str, store: Store, view: FrameView) -> None:
+    query = f"MATCH (e:Ego), (n) WHERE frame.seq = {SEQ} RETURN n.id, {function}(e, n), {function}(n, e)"
+    (ego,) = [node for node, about in view.nodes.items() if about["is_ego"]]
+
+    rows = store.find(query).rows()
+
+    assert len(rows) > 50
+    for node, there, back in rows:
+        assert same(there, view.pair(function, ego, node)), view.nodes[node]
+        assert same(back, view.pair(function, node, ego)), view.nodes[node]
+    known = {view.nodes[node]["kind"] for node, there, _ in rows if there is not None}
+    assert not known & set(MAP_KINDS)
+
+
+def test_without_labels_numbers_of_pairs_are_of_entities(store: Store) -> None:
+    plain = store.find("MATCH (a), (b) WHERE dist(a, b) < 10 RETURN FRAMES")
+    labelled = store.find("MATCH (a:Entity), (b:Entity) WHERE dist(a, b) < 10 RETURN FRAMES")
+
+    assert plain.count() == labelled.count() > 100
+    assert store.find("MATCH (a) WHERE NOT dist(ego, a) >= 10 OR a.id = ego.id").count() > 100
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,18 @@ from sgstore.lang.bound import (
     TraceAttribute,
 )
 from sgstore.lang.catalog import Type
-from sgstore.lang.formulas import Aliases, Leaf, Select, expression_text, leaves, nested, quoted
+from sgstore.lang.formulas import (
+    Aliases,
+    Leaf,
+    Select,
+    expression_text,
+    leaves,
+    nested,
+    quoted,
+    word,
+)
 from sgstore.lang.pairs import WAY, needed_for, pair_column, pair_text, parts_of, stage_of
+from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -179,6 +189,9 @@ class Layers:
         return columns
 
 
+_PLACES: Final = ", ".join(word(kind) for kind in MAP_KINDS)
+
+
 def _raw_text(name: str, at: Aliases) -> str:
     """A raw column of a node, wherever it lives; positions about the trace's origin."""
     parts: list[str] = []
@@ -188,7 +201,9 @@ def _raw_text(name: str, at: Aliases) -> str:
         parts.append(f"CAST({at.entity}.{quoted(name)} AS DOUBLE)")
     if at.map and name not in {"vx", "vy"}:
         value = f"{at.map}.{quoted(name)}"
-        parts.append(f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value)
+        value = f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value
+        # Signs and lights of a map are entities; of lanes and roads there are no numbers of pairs.
+        parts.append(f'CASE WHEN {at.map}."kind" NOT IN ({_PLACES}) THEN {value} END')
     if not parts:
         return "CAST(NULL AS DOUBLE)"
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"

@@ -30,6 +30,7 @@ from sgstore.lang.bound import (
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Catalog, Triple, Type
 from sgstore.lang.formulas import leaves
 from sgstore.lang.lasting import HELD, is_lasting
+from sgstore.lang.narrowing import entities_of_pairs
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -291,6 +292,11 @@ def _merged(scope: Scope, block: BlockValue) -> Scope:
     )
 
 
+def pairs_of_entities(query: Query, _: Catalog) -> Query:
+    """Nodes whose pair is compared are entities; see :mod:`sgstore.lang.narrowing`."""
+    return _scopes(entities_of_pairs, query)
+
+
 # What the store holds ------------------------------------------------------------------------------
 
 
@@ -447,6 +453,7 @@ RULES: Final[tuple[Callable[[Query, Catalog], Query], ...]] = (
     open_exists,
     labels_from_conditions,
     labels_to_conditions,
+    pairs_of_entities,
     narrow_kinds,
     order_edges,
     count_by_buckets,

@@ -101,9 +101,7 @@ class Questions:
     _all: list[Question] = field(default_factory=list["Question"])
     answers: list[Mapping[Key, Any]] = field(default_factory=list["Mapping[Key, Any]"])
 
-    def add(
-        self, query: b.Query, variables: tuple[str, ...], value: b.Bound | None = None
-    ) -> int:
+    def add(self, query: b.Query, variables: tuple[str, ...], value: b.Bound | None = None) -> int:
         """The number of a question; the same for those that ask the same."""
         key = _told(query), variables, None if value is None else _text(value)
         if key not in self._known:

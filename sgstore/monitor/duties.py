@@ -121,7 +121,9 @@ class Automaton:
         self._steps = 0
         self.begun = self._state("begins", self._progression.begun, ())
 
-    def step(self, state: State, letter: int, tick: Tick, seen: dict[tuple[State, int], Step]) -> Step:
+    def step(
+        self, state: State, letter: int, tick: Tick, seen: dict[tuple[State, int], Step]
+    ) -> Step:
         """What a frame makes of a state.
 
         Parameters

@@ -114,7 +114,11 @@ class Watch:
         self._bits = {name: 1 << number for number, name in enumerate(names)}
         self._automaton = Automaton(formula, reset, tuple(guards.values()), self._bits)
         self._atoms = [
-            (self._bits[name], questions.add(atom.query, atom.variables), self._places(atom.variables))
+            (
+                self._bits[name],
+                questions.add(atom.query, atom.variables),
+                self._places(atom.variables),
+            )
             for name, atom in plan.atoms.items()
         ]
         self._signals = {
@@ -404,4 +408,3 @@ def _interval(trace: str, span: Span, names: Mapping[str, str]) -> Interval:
     start, end = span
     times = start.time_ns, end.time_ns, start.t, end.t
     return Interval(trace, start.seq, end.seq, *times, end.seq - start.seq + 1, dict(names))
-
