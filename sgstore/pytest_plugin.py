@@ -128,12 +128,12 @@ class Scene:
 
     def graphs(self) -> Iterator[nx.MultiDiGraph[int]]:
         """The scene graphs of all frames, in order."""
-        from sgstore.exporters.export import Export
+        from sgstore.exporters.export import FEW, Export
         from sgstore.exporters.scenes import graphs_of
         from sgstore.world import Clip
 
         export = Export(self.store, (Clip(self.trace, self.case.start_ns, self.case.end_ns),))
-        for frames in export.windows():
+        for frames in export.windows(FEW):
             for graph in graphs_of(export, frames):
                 yield graph.to_networkx()
 

@@ -563,3 +563,44 @@ def test_windows_of_few_frames_make_the_same_files(
         return {file.relative_to(folder).as_posix(): file.read_bytes() for file in found}
 
     assert content(tmp_path / "many") == content(tmp_path / "one")
+
+
+def test_messages_that_are_hurt_at_random_are_read_or_refused() -> None:
+    ways = {
+        "image": (ros("sensor_msgs/msg/Image", IMAGE), ros_image(DEEP, "mono16", step=12)),
+        "cloud": (
+            ros("sensor_msgs/msg/PointCloud2", CLOUD),
+            ros_cloud(POINTS, height=2, padding=3),
+        ),
+        "foxglove": (
+            sensor_of(
+                Channel(1, "/t", "protobuf", {}, 1),
+                Schema(1, foxglove.schema(), "protobuf", "foxglove.PointCloud"),
+            ),
+            foxglove.cloud(np.ones(3, [("x", "<f4"), ("y", "<u4")]), 5, "lidar"),
+        ),
+        "json": (
+            as_json(),
+            json.dumps(
+                {"width": 5, "height": 6, "step": 15, "encoding": "rgb8", "data": "AAAA" * 30}
+            ).encode(),
+        ),
+    }
+    rng = np.random.default_rng(13)
+    outcomes: set[str] = set()
+    for read, message in ways.values():
+        for _ in range(600):
+            hurt = bytearray(message)
+            for at in rng.integers(0, len(hurt), rng.integers(1, 4)):
+                hurt[at] = rng.integers(0, 256)
+            try:
+                found = read(bytes(hurt[: rng.integers(len(hurt) // 2, len(hurt) + 1)]))
+            except (TraceError, ExportError):
+                outcomes.add("refused")
+                continue
+            outcomes.add(type(found).__name__)
+            if isinstance(found, Cloud):
+                assert all(
+                    cloud_file(found.points, form) is not None for form in ("pcd", "npy", "bin")
+                )
+    assert outcomes >= {"refused", "Picture", "Cloud"}

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from sgstore.world import Clip, Ints
 
 WINDOW: Final = 240
-"""Frames that are read from the store at once."""
+"""Frames that are read from the store at once, as columns."""
+FEW: Final = 60
+"""The same, where single graphs are made of them: records take ten times the space of columns."""
 
 _FRAMES: Final = """
 SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames
@@ -91,10 +93,10 @@ class Export:
                 )
             yield frames
 
-    def windows(self) -> Iterator[ClipFrames]:
-        """The frames of the clips, at most :data:`WINDOW` at a time, of one clip each; tells the progress."""
+    def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
+        """The frames of the clips, at most ``size`` at a time, of one clip each; tells the progress."""
         for frames in self.frames():
-            yield from frames.windows()
+            yield from frames.windows(size)
             self.tell(frames.number, len(self.clips))
 
     def fresh_windows(self) -> Iterator[ClipFrames]:
@@ -189,10 +191,10 @@ class ClipFrames:
         columns = ("frame_id", "seq", "time_ns", "log_time_ns", "t")
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
-    def windows(self) -> Iterator[ClipFrames]:
-        """All of them, at most :data:`WINDOW` at a time."""
-        for start in range(0, len(self), WINDOW):
-            yield self.take(slice(start, start + WINDOW))
+    def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
+        """All of them, ``size`` at a time."""
+        for start in range(0, len(self), size):
+            yield self.take(slice(start, start + size))
 
     @property
     def bounds(self) -> dict[str, int]:

@@ -20,7 +20,7 @@ from mcap.records import Channel, Schema
 
 from sgstore.errors import ExportError
 from sgstore.exporters import foxglove_scene
-from sgstore.exporters.export import WINDOW, ClipFrames
+from sgstore.exporters.export import FEW, ClipFrames
 from sgstore.exporters.scenes import graphs_of
 from sgstore.traces.foxglove_messages import DERIVED
 
@@ -167,9 +167,9 @@ class Added:
         frames = ClipFrames.of(self._export, number, self._export.clips[number - 1])
         order = frames.log_time_ns.argsort(kind="stable")
         sequence = 0
-        for start in range(0, len(frames), WINDOW):
+        for start in range(0, len(frames), FEW):
             # Graphs are read by ranges of frames: those of a window are near each other.
-            rows = order[start : start + WINDOW]
+            rows = order[start : start + FEW]
             rows.sort()
             window = frames.take(rows)
             found = list(self._of_window(window))

@@ -19,6 +19,7 @@ import networkx as nx
 from sgstore.abstractions import abstractions
 from sgstore.errors import ExportError
 from sgstore.exporters.clips import WrittenFile, clip_name
+from sgstore.exporters.export import FEW
 from sgstore.exporters.scenes import graphs_of
 from sgstore.graph import named_graph
 from sgstore.store.spans import Spans
@@ -67,7 +68,7 @@ def _is_derived(export: Export) -> bool:
 
 
 def _graphs(export: Export, frames: ClipFrames, spans: Spans | None) -> Iterator[Graph]:
-    for window in frames.windows():
+    for window in frames.windows(FEW):
         columns = export.label_columns(window.frame_id)
         for row, graph in enumerate(_of_window(export, window, spans)):
             labels = {f"label_{name}": values[row] for name, values in columns.items()}
