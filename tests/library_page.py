@@ -146,7 +146,13 @@ PARTS: Final = (
     (
         "concepts",
         "Concepts",
-        "What practitioners look for. `sgstore patterns run STORE cut_in` finds one.",
+        "What practitioners look for. `sgstore patterns run STORE cut_in` finds one, and in a query it is a "
+        "step: `MATCH cut_in(within = 2s)`.",
+    ),
+    (
+        "nuplan",
+        "Scenarios of nuPlan",
+        "The scenarios of the nuPlan challenge, by their tags.",
     ),
     (
         "leaderboard",

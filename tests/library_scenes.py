@@ -5,6 +5,7 @@ Of a property, the first is a scene that violates it and the second one that kee
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from scenes import (
@@ -527,6 +528,49 @@ SCENES |= {
             drawn=(0.0, 7.0),
         ),
     }.items()
+}
+
+# Scenarios of nuPlan ----------------------------------------------------------------------------------------
+
+QUEUE = Scene(
+    WAYS,
+    ego(along(RIGHT), start=20),
+    actor("v1", along(RIGHT), start=27),
+    actor("v2", along(RIGHT), start=13),
+    actor("v3", along(LEFT), start=19),
+    seconds=4,
+)
+AT_ZEBRA = Scene(
+    TOWN,
+    ego(along(RIGHT), [(0, 0), (5, 0), (6, 5)], start=54),
+    actor("p", over(60, -4, 6), 1.4, "person"),
+    drawn=(2.0, 7.5),
+)
+CREEPING = Scene(WAYS, ego(along(RIGHT), 0.8), seconds=4)
+BEHIND_TRUCK = Scene(
+    WAYS, ego(along(RIGHT), 8), actor("v", along(RIGHT), 8, "truck", start=14), seconds=4
+)
+
+SCENES |= {
+    "starting_left_turn": (TURN_LEFT, TURN_RIGHT),
+    "starting_right_turn": (TURN_RIGHT, TURN_LEFT),
+    "starting_straight_traffic_light_intersection_traversal": (
+        SCENES["PriorityAtJunction"][0],
+        TURN_LEFT,
+    ),
+    "stopping_with_lead": (SCENES["FollowLeadingVehicle"][0], CREEPING),
+    "high_lateral_acceleration": (TURN_RIGHT, CREEPING),
+    "high_magnitude_speed": (CUT_IN, CREEPING),
+    "low_magnitude_speed": (CREEPING, CUT_IN),
+    "waiting_for_pedestrian_to_cross": (AT_ZEBRA, AT_ZEBRA.without("p")),
+    "behind_long_vehicle": (BEHIND_TRUCK, BEHIND_TRUCK.with_actor("v", kind="car")),
+    "stationary_in_traffic": (QUEUE, QUEUE.without("v3")),
+    "near_multiple_vehicles": (
+        Scene(WAYS, *(replace(a, speed=8.0) for a in QUEUE.actors), seconds=3),
+        QUEUE,
+    ),
+    "changing_lane": (SCENES["lane_change_without_indicator"][0], CREEPING),
+    "following_lane_with_lead": (BEHIND_TRUCK, BEHIND_TRUCK.with_actor("v", start=40.0)),
 }
 
 # Rules of SGSM and SceneFlow: violated, kept ----------------------------------------------------------------
