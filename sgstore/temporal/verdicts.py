@@ -126,13 +126,19 @@ class Settled:
         broken = start + np.flatnonzero(~self.value(body)[start:])
         if not looks_ahead(body):
             return int(broken[0]) if len(broken) else None
-        best: int | None = None
-        for frame in broken.tolist():
-            if best is not None and frame >= best:
-                break
-            found = self._certain(body, frame, len(self._times) if best is None else best)
-            best = found if best is None or found is None else min(best, found)
-        return best
+        if not len(broken):
+            return None
+        # One engine tells of all frames from the first that is broken on; the first that it calls false is it.
+        first = int(broken[0])
+        engine = Online(body)
+        names = sorted(propositions(body))
+        rows = zip(*(self._columns[name][first:].tolist() for name in names), strict=True)
+        letters = rows if names else iter([()] * (len(self._times) - first))
+        for number, letter in enumerate(letters, start=first):
+            known = engine.step(dict(zip(names, letter, strict=True)), int(self._times[number]))
+            if any(not value for _, value in known):
+                return number
+        return None
 
     def _certain(self, formula: Formula, start: int, end: int) -> int | None:
         """The first frame before ``end`` at which the value of a formula at ``start`` is certain."""
