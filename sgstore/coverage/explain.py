@@ -57,7 +57,7 @@ class Leaf:
 
 
 def tree(
-    counts: NDArray[np.int64],
+    counts: NDArray[np.integer[Any]],
     names: tuple[Feature, ...],
     ours: Bools,
     weight: Floats,
@@ -67,7 +67,7 @@ def tree(
 
     Parameters
     ----------
-    counts : (C, F) int64
+    counts : (C, F) int
         How often each feature occurs in each case.
     names : tuple of Feature
     ours : (C,) bool
@@ -86,7 +86,7 @@ def tree(
 
 
 def _grow(
-    counts: NDArray[np.int64],
+    counts: NDArray[np.integer[Any]],
     names: tuple[Feature, ...],
     ours: Bools,
     weight: Floats,
@@ -114,7 +114,7 @@ def _grow(
         )
 
 
-def _best(counts: NDArray[np.int64], ours: Bools, weight: Floats) -> tuple[int, int] | None:
+def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
     """The question that makes both sides purest; ``None`` if none makes them purer."""
     good = np.where(ours, weight, 0.0)
     total, positive = float(weight.sum()), float(good.sum())

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -30,6 +30,11 @@ Feature = tuple[str, ...]
 MOST: Final = 5_000_000
 """Most combinations that are gone through: more are an error, not a part of the answer."""
 
+_NONE: Final = np.zeros(0, np.int64)
+
+_ROWS: Final = 8_192
+"""Classes that are multiplied at once."""
+
 
 @dataclass(frozen=True)
 class Features:
@@ -41,7 +46,7 @@ class Features:
         In alphabetical order.
     codes : (C,) int64
         The classes, ascending.
-    counts : (C, F) int64
+    counts : (C, F) unsigned
         How often each class has each feature.
     frames : (C,) int64
         How many frames each class has.
@@ -49,7 +54,7 @@ class Features:
 
     names: tuple[Feature, ...]
     codes: Ints
-    counts: NDArray[np.int64]
+    counts: NDArray[np.unsignedinteger[Any]]
     frames: Ints
 
     @property
@@ -70,16 +75,23 @@ def features(a: Classed, abstraction: str, names: Sequence[Feature] | None = Non
     """
     codes, first = a.present(), a.first()
     order = np.argsort(first[codes], kind="stable")
-    bags = list(a.chosen.store.file.abstracted.features(abstraction, first[codes[order]]))
-    if any(len(name) == 3 for bag in bags for name in bag):
-        bags = [{name: n for name, n in bag.items() if len(name) == 3} for bag in bags]
-    names = tuple(sorted({name for bag in bags for name in bag}) if names is None else names)
+    number: dict[Feature, int] = {}
+    parts: list[tuple[Ints, Ints, Ints]] = [(_NONE, _NONE, _NONE)]
+    done = 0
+    for some in a.chosen.store.file.abstracted.features(abstraction, first[codes[order]]):
+        own = np.array([number.setdefault(name, len(number)) for name in some.names] or [0])
+        parts.append((order[done + some.frame], own[some.feature], some.often))
+        done += some.frames
+    rows, columns, often = (np.concatenate(part) for part in zip(*parts, strict=True))
+    edges = any(len(name) == 3 for name in number)
+    known = {name for name in number if len(name) == 3 or not edges}
+    names = tuple(sorted(known) if names is None else names)
     place = {name: i for i, name in enumerate(names)}
-    counts = np.zeros((len(codes), len(names)), np.int64)
-    for row, bag in zip(order.tolist(), bags, strict=True):
-        for name, often in bag.items():
-            if name in place:
-                counts[row, place[name]] = often
+    at = np.array([place.get(name, -1) if name in known else -1 for name in number] or [-1])
+    counts = np.zeros((len(codes), len(names)), np.min_scalar_type(int(often.max(initial=0))))
+    column = at[columns]
+    kept = np.flatnonzero(column >= 0)
+    counts[rows[kept], column[kept]] = often[kept]
     return Features(names, codes, counts, a.sizes()[codes])
 
 
@@ -245,7 +257,7 @@ def combos(
 def _over(own: Features, names: tuple[Feature, ...]) -> Features:
     """The same over other features."""
     place = {name: i for i, name in enumerate(names)}
-    counts = np.zeros((len(own.codes), len(names)), np.int64)
+    counts = np.zeros((len(own.codes), len(names)), own.counts.dtype)
     for column, name in enumerate(own.names):
         if name in place:
             counts[:, place[name]] = own.counts[:, column]
@@ -254,5 +266,8 @@ def _over(own: Features, names: tuple[Feature, ...]) -> Features:
 
 def _together(found: Features) -> Ints:
     """(F, F): frames in which two features occur."""
-    there = found.there.astype(np.float64)
-    return ((there * found.frames[:, None]).T @ there).astype(np.int64)
+    total = np.zeros((len(found.names), len(found.names)))
+    for first in range(0, len(found.codes), _ROWS):
+        there = found.there[first : first + _ROWS].astype(np.float64)
+        total += (there * found.frames[first : first + _ROWS, None]).T @ there
+    return total.astype(np.int64)

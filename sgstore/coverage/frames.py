@@ -11,6 +11,8 @@ import numpy as np
 
 from sgstore.coverage.asking import block_of
 from sgstore.errors import StoreError
+from sgstore.locks import frames_of_lock, read_lock, store_beside
+from sgstore.locks.lock import ENDING as LOCK
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -50,26 +52,38 @@ class Chosen:
 
 
 def selection_of(text: str) -> Chosen:
-    """The frames that a text means: ``STORE``, or ``STORE:QUERY`` for those in which the query holds.
+    """The frames that a text means: a store, those of it in which a query holds, or those of a lock.
+
+    Parameters
+    ----------
+    text : str
+        ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A lock
+        is a file that is called ``….lock``.
 
     Raises
     ------
     StoreError
-        There is no such store.
+        There is no such store, the lock cannot be read, or the store lacks what it names.
     QueryError
         The query is none.
     """
     whole = Path(text)
+    if whole.suffix == LOCK and whole.is_file():
+        lock = read_lock(whole)
+        store = Store(store_beside(whole, lock))
+        return Chosen(text, store, frames_of_lock(lock, store))
     if whole.exists():
         return Chosen(text, Store(whole))
     for colon in re.finditer(":", text):
         path, query = Path(text[: colon.start()]), text[colon.end() :]
         if path.is_file():
             store = Store(path)
+            if Path(query).suffix == LOCK and Path(query).is_file():
+                return Chosen(text, store, frames_of_lock(read_lock(Path(query)), store))
             found = frames_of(store, query)
             return Chosen(text, store, found, store.find(query).left_out)
     raise StoreError(
-        f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)'"
+        f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)', nor a lock"
     )
 
 

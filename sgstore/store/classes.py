@@ -14,6 +14,7 @@ from sgstore.abstractions import AT_INGEST, Classes, Grounds, Seen, abstraction_
 from sgstore.store.adding import add_files, note, writing
 from sgstore.store.covering import (
     CodedClasses,
+    Triples,
     coded_classes,
     imported_names,
     seen_of,
@@ -234,8 +235,8 @@ class Abstracted:
         with self._access.reading() as connection:
             return imported_names(connection)
 
-    def features(self, name: str, frame_id: Ints) -> Iterator[dict[tuple[str, ...], int]]:
-        """What the graphs of frames are made of in an abstraction: :func:`sgstore.store.covering.triples`.
+    def features(self, name: str, frame_id: Ints) -> Iterator[Triples]:
+        """What the graphs of frames are made of in an abstraction, some frames at a time, in their order.
 
         Parameters
         ----------
@@ -250,8 +251,8 @@ class Abstracted:
         """
         function = abstraction_named(name).function
         with self._access.reading() as connection:
-            for _, row, seen in seen_of(connection, self._graphs, frame_id):
-                yield from triples(function(seen), row)
+            for row, seen in seen_of(connection, self._graphs, frame_id):
+                yield triples(function(seen), row)
 
     def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
         """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.abstractions.columns import found
 from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
-from sgstore.store.seen import WINDOW
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ SELECT k.bucket, k.mask, coalesce(n.code, -1) AS code FROM kept k LEFT JOIN numb
 """
 _IMPORTED: Final = "SELECT graph, frame_id FROM imports"
 _TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
+
+WINDOW: Final = 32
+"""Buckets that are read at once: for a few frames of each, a question costs more than its rows."""
 
 SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
 """Bits of a frame's id below those of its trace."""
@@ -114,15 +117,13 @@ def imported_names(connection: DuckDBPyConnection) -> dict[str, int]:
 
 def seen_of(
     connection: DuckDBPyConnection, graphs: Graphs, frame_id: Ints
-) -> Iterator[tuple[Ints, NDArray[np.intp], Seen]]:
+) -> Iterator[tuple[NDArray[np.intp], Seen]]:
     """The graphs of frames, whose ids ascend, some buckets at a time.
 
     Yields
     ------
-    ids : int64
-        Those of the frames that are in these buckets.
     row : intp
-        Their rows in what was seen.
+        The frames that are in these buckets, in what was seen.
     seen : Seen
         Which may hold frames between them, too.
     """
@@ -134,11 +135,36 @@ def seen_of(
         end = min(end, int(np.searchsorted(trace_of(frame_id), same_trace, side="right")))
         ids = frame_id[first:end]
         seq, seen = graphs.of_frames(connection, int(ids[0]), int(ids[-1]))
-        yield ids, np.searchsorted(seq, seq_of(ids)), seen
+        yield np.searchsorted(seq, seq_of(ids)), seen
         first = end
 
 
-def triples(graphs: Labelled, rows: NDArray[np.intp]) -> list[dict[tuple[str, ...], int]]:
+@dataclass(frozen=True, slots=True)
+class Triples:
+    """What some graphs are made of; one row a frame and feature.
+
+    Attributes
+    ----------
+    frames : int
+        How many frames these are.
+    names : list of tuple of str
+        Features: labels of an edge's source, of itself and of its destination; or of a node alone.
+    frame : (N,) int64
+        Frames, counted from 0.
+    feature : (N,) int64
+        Index into ``names``.
+    often : (N,) int64
+        How often it occurs.
+    """
+
+    frames: int
+    names: list[tuple[str, ...]]
+    frame: Ints
+    feature: Ints
+    often: Ints
+
+
+def triples(graphs: Labelled, rows: NDArray[np.intp]) -> Triples:
     """How often nodes and edges occur in frames: by label, and by the labels of both ends and their own.
 
     Parameters
@@ -147,32 +173,57 @@ def triples(graphs: Labelled, rows: NDArray[np.intp]) -> list[dict[tuple[str, ..
     rows : intp
         Frames, ascending.
     """
-    found: list[dict[tuple[str, ...], int]] = [{} for _ in range(len(rows))]
     place = np.full(graphs.frames, -1)
     place[rows] = np.arange(len(rows))
-    label_of = {
-        (frame, node): label
-        for frame, node, label in zip(
-            graphs.node_frame.tolist(),
-            graphs.node.tolist(),
-            graphs.node_label.tolist(),
-            strict=True,
-        )
-        if place[frame] >= 0
-    }
-    names = graphs.labels
-    for (frame, _), label in label_of.items():
-        one = found[place[frame]]
-        key = (names[label],)
-        one[key] = one.get(key, 0) + 1
-    wanted = np.flatnonzero(place[graphs.frame] >= 0)
-    columns = (graphs.frame, graphs.src, graphs.label, graphs.dst)
-    for frame, src, label, dst in zip(
-        *(column[wanted].tolist() for column in columns), strict=True
-    ):
-        one = found[place[frame]]
-        ends = names[label_of[frame, src]], names[label_of[frame, dst]]
-        for single in (label,) if label >= 0 else graphs.bundles[-1 - label]:
-            key = (ends[0], names[single], ends[1])
-            one[key] = one.get(key, 0) + 1
-    return found
+    size = len(graphs.labels)
+    node = np.flatnonzero(place[graphs.node_frame] >= 0)
+    of_node = place[graphs.node_frame[node]], graphs.node_label[node].astype(np.int64)
+    edge = np.flatnonzero(place[graphs.frame] >= 0)
+    ends = [
+        graphs.node_label[found(graphs.node_frame, graphs.node, graphs.frame[edge], end[edge])]
+        for end in (graphs.src, graphs.dst)
+    ]
+    edge, label, one = _single(graphs, edge)
+    src, dst = (end.astype(np.int64)[one] for end in ends)
+    of_edge = place[graphs.frame[edge]], (src * size + label) * size + dst
+    frame, key, often = _counted(of_node)
+    edge_frame, edge_key, edge_often = _counted(of_edge)
+    nodes, feature = np.unique(key, return_inverse=True)
+    edges, edge_feature = np.unique(edge_key, return_inverse=True)
+    names: list[tuple[str, ...]] = [(graphs.labels[code],) for code in nodes.tolist()]
+    for code in edges.tolist():
+        rest, last = divmod(code, size)
+        names.append(tuple(graphs.labels[part] for part in (*divmod(rest, size), last)))
+    return Triples(
+        len(rows),
+        names,
+        np.concatenate([frame, edge_frame]),
+        np.concatenate([feature, len(nodes) + edge_feature]),
+        np.concatenate([often, edge_often]),
+    )
+
+
+def _single(graphs: Labelled, edge: NDArray[np.intp]) -> tuple[NDArray[np.intp], Ints, Ints]:
+    """Edges with several labels as several: the edge, its label, and which of those that were given it is."""
+    bundles = [np.array(one, np.int64) for one in graphs.bundles]
+    label = graphs.label[edge].astype(np.int64)
+    many = np.ones(len(edge), np.int64)
+    several = np.flatnonzero(label < 0)
+    lengths = np.array([len(one) for one in bundles] or [0])
+    many[several] = lengths[-1 - label[several]]
+    one = np.repeat(np.arange(len(edge)), many)
+    flat = np.concatenate([*bundles, np.zeros(0, np.int64)])
+    starts = np.cumsum(lengths) - lengths
+    within = np.arange(len(one)) - np.repeat(np.cumsum(many) - many, many)
+    given = label[one]
+    bundled = given < 0
+    given[bundled] = flat[starts[-1 - given[bundled]] + within[bundled]]
+    return edge[one], given, one
+
+
+def _counted(of: tuple[Ints, Ints]) -> tuple[Ints, Ints, Ints]:
+    """Pairs of numbers, each once, and how often each comes."""
+    frame, key = of
+    span = int(key.max(initial=0)) + 1
+    both, often = np.unique(frame * span + key, return_counts=True)
+    return both // span, both % span, often
