@@ -9,6 +9,8 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[1]
 
+collect_ignore = ["learning.py"]  # a program that needs torch: make pyg
+
 
 @pytest.fixture(scope="session")
 def data() -> Path:
