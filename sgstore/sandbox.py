@@ -71,12 +71,15 @@ class Answer:
         Whether there were more rows than allowed.
     left_out : tuple of str
         Traces that cannot answer the pattern.
+    graphs : bool
+        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
     """
 
     columns: tuple[str, ...]
     rows: list[tuple[Any, ...]]
     truncated: bool
     left_out: tuple[str, ...] = ()
+    graphs: bool = False
 
 
 class Sandbox:
@@ -268,7 +271,8 @@ def _answer(reply: Any) -> Answer:
     if "error" in reply:
         raise _ERRORS[reply["kind"]](reply["error"])
     rows = [tuple(row) for row in reply["rows"]]
-    return Answer(tuple(reply["columns"]), rows, reply["truncated"], tuple(reply["left_out"]))
+    columns, left_out = tuple(reply["columns"]), tuple(reply["left_out"])
+    return Answer(columns, rows, reply["truncated"], left_out, reply.get("graphs", False))
 
 
 # The process ------------------------------------------------------------------------------------------------
@@ -305,6 +309,7 @@ def main() -> None:
 
 
 def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
+    graphs = False
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
         values, columns, truncated, left_out = rows.values, rows.columns, rows.truncated, ()
@@ -313,8 +318,10 @@ def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
         values = list(_first(matches, most + 1))
         truncated = len(values) > most
         values, columns, left_out = values[:most], matches.columns, matches.left_out
+        graphs = matches.graphs
     plain = [[_plain(value) for value in row] for row in values]
-    return {"columns": columns, "rows": plain, "truncated": truncated, "left_out": left_out}
+    about = {"truncated": truncated, "left_out": left_out, "graphs": graphs}
+    return {"columns": columns, "rows": plain, **about}
 
 
 def _first(rows: Iterable[Any], most: int) -> Iterator[Any]:

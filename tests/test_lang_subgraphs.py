@@ -165,8 +165,9 @@ def test_frames_and_clips_are_those_of_the_pattern(store: Store) -> None:
     assert [i.frames for i in graphs.intervals()] == [i.frames for i in plain.intervals()]
 
 
-def test_the_command_line_gives_what_networkx_reads(store: Store) -> None:
-    arguments = ["find", str(store.file.path), f"{LEADS} RETURN SUBGRAPHS LIMIT 2"]
+@pytest.mark.parametrize("safe", [[], ["--safe", "--timeout", "20s"]])
+def test_the_command_line_gives_what_networkx_reads(safe: list[str], store: Store) -> None:
+    arguments = ["find", str(store.file.path), f"{LEADS} RETURN SUBGRAPHS LIMIT 2", *safe]
 
     rows = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
     people = CliRunner().invoke(app, arguments).stdout

@@ -107,12 +107,23 @@ def _as_shown(matches: Matches, form: Format) -> tuple[tuple[str, ...], Iterable
     """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
     if form is Format.table:
         return matches.for_people()
-    if not matches.graphs or form not in {Format.json, Format.ndjson}:
-        return matches.columns, matches
-    columns = ("directed", "multigraph", *matches.columns)
+    return _node_link(matches, matches, form) if matches.graphs else (matches.columns, matches)
+
+
+def _node_link(
+    answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Rows that end in a graph: in JSON as networkx reads them, for people as two texts."""
+    if form is Format.table:
+        from sgstore.lang.subgraphs import shown
+
+        return answer.columns, ((*row[:-2], *shown(*row[-2:])) for row in rows)
+    if form not in {Format.json, Format.ndjson}:
+        return answer.columns, rows
+    columns = ("directed", "multigraph", *answer.columns)
     return columns, (
         (True, True, *row[:-1], [{**edge, "key": edge["relation"]} for edge in row[-1]])
-        for row in matches
+        for row in rows
     )
 
 
@@ -268,4 +279,7 @@ def _write_answer(answer: Answer, form: Format, output: Path | None) -> int:
     say_left_out(answer)
     if answer.truncated:
         say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
-    return write_rows(answer.columns, answer.rows, form, output)
+    columns, rows = answer.columns, answer.rows
+    if answer.graphs:
+        columns, rows = _node_link(answer, rows, form)
+    return write_rows(columns, rows, form, output)
