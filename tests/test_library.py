@@ -17,7 +17,7 @@ from sgstore.errors import QueryError, QueryNameError
 from sgstore.ingest import ingest
 from sgstore.lang import pattern, patterns
 from sgstore.lang.parser import parse
-from sgstore.lang.standard import entries, predicates, scenario
+from sgstore.lang.standard import entries, predicates
 from sgstore.lang.syntax import Check, Define, Match
 from sgstore.query import Store
 from sgstore.temporal import formula_of
@@ -72,15 +72,6 @@ def test_a_text_is_one_sentence_of_its_kind(name: str) -> None:
         assert statement.name == name
 
 
-@pytest.mark.parametrize("name", FOUND)
-def test_a_pattern_is_a_scenario_that_queries_may_use(name: str) -> None:
-    definition = scenario(name)
-
-    assert definition is not None
-    assert definition.name == name
-    assert [p.name for p in definition.parameters] == [*patterns()[name].parameters]
-
-
 def test_every_pattern_has_a_drawn_example() -> None:
     drawn = {name for name, one in patterns().items() if one.example}
 
@@ -110,8 +101,6 @@ def test_a_name_that_is_not_there_gets_a_suggestion() -> None:
         pattern("jaywalkin")
 
     assert caught.value.hint == "did you mean 'jaywalking'?"
-    assert scenario("nothing_like_it") is None
-    assert scenario("stopped") is None
 
 
 def test_parameters_are_written_into_the_text_as_their_types_are() -> None:
@@ -234,6 +223,14 @@ def test_a_pattern_finds_its_drawn_example_and_not_its_counter_example(
     assert example in found
     assert not set(others) & found
     assert "town" not in matches.left_out
+
+
+@pytest.mark.parametrize("name", ["cut_in", "near_miss", "merge_conflict", "starting_left_turn"])
+def test_a_pattern_is_a_step_by_its_name(store: Store, name: str) -> None:
+    one, other = (store.find(text) for text in (f"MATCH {name}()", patterns()[name].text))
+    rows = [dict(zip(other.columns, row, strict=True)) for row in other]
+
+    assert [dict(zip(one.columns, row, strict=True)) for row in one] == rows != []
 
 
 @pytest.mark.parametrize("name", [n for n in FOUND if patterns()[n].kind == "concept"])

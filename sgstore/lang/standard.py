@@ -251,23 +251,6 @@ class _Predicates(Mapping[str, Define]):
 
 
 @cache
-def scenario(name: str) -> Define | None:
-    """A pattern that has matches as a scenario that queries may use by name: ``MATCH cut_in(within = 2s)``.
-
-    Its parameters are those of the pattern. ``None``: the library has none of that name.
-    """
-    try:
-        found = pattern(name)
-    except QueryNameError:
-        return None
-    if found.kind not in {"concept", "scenario"}:
-        return None
-    formal = ", ".join(f"{p.name} = {p.default}" for p in found.parameters.values())
-    (statement,) = parse(f"DEFINE SCENARIO {found.name}({formal}) AS {found.query}")
-    return statement if isinstance(statement, Define) else None
-
-
-@cache
 def _drawings() -> Mapping[str, str]:
     folder = resources.files("sgstore.lang").joinpath("library")
     text = folder.joinpath("drawings.txt").read_text(encoding="utf-8")
