@@ -326,7 +326,7 @@ def _sizes(store: Store, folder: Path, frames: int) -> Iterator[Measure]:
         f"{edges / frames:.1f} edges",
     )
     yield Measure("whole store", store.file.path.stat().st_size / frames, "B/frame")
-    tables = sizes(store.file.path, folder)
+    tables = list(sizes(store.file.path, folder))
     structure = sum(size for label, size, _ in tables if label in {"edge", "node", "frame"})
     yield Measure("edges, nodes and frames", structure / frames, "B/frame", f"aim {BYTES}")
     for label, size, rows in tables:
