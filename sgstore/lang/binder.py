@@ -56,7 +56,7 @@ def bind_query(
     QueryNameError
         A label, relation, attribute, variable, function or parameter is not known.
     QueryError
-        Types do not fit, or a part belongs to the temporal layer.
+        Types do not fit, or a part has no meaning where it stands.
     """
     session = Session(text, parameters)
     session.ask(catalog)

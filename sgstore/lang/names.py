@@ -108,14 +108,6 @@ class Session:
         hint = hint or hint_at(name, known)
         raise QueryNameError(f"unknown {what} '{name}'", text=self.text, span=span, hint=hint)
 
-    def temporal(self, word: str, span: Span) -> NoReturn:
-        """Raise the one error about the temporal layer."""
-        self.refuse(
-            f"{word} belongs to the temporal layer, which this version does not have",
-            span,
-            "patterns of single frames can be asked; sequences and ALWAYS, EVENTUALLY, … cannot yet",
-        )
-
 
 @dataclass(slots=True)
 class ScopeBuilder:

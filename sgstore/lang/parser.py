@@ -176,7 +176,7 @@ _LATER: Final = frozenset(
     }
     | {"_ARROW"}
 )
-"""What is never proposed: the temporal layer, and other words for what is proposed."""
+"""What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
 
 _STARTS: Final = frozenset({"NUMBER", "STRING", "PARAM", "TRUTH", "NULL", "EXISTS"})
 _SAID: Final = {
