@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test lint format bench fuzz pyg oracle sample clean duckdb-versions
+.PHONY: help demo test lint format bench fuzz pyg oracle patterns sample clean duckdb-versions
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -17,6 +17,7 @@ help:
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
+	@echo "make patterns  draw the examples of the library, and write its page, again"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -81,6 +82,9 @@ oracle: $(VENV)/.dev
 
 duckdb-versions: $(VENV)/.dev
 	$(BIN)/python tests/duckdb_versions.py
+
+patterns: $(VENV)/.dev
+	$(BIN)/python tests/library_page.py
 
 sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py
