@@ -22,7 +22,9 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"matches"}),
     frozenset({"history"}),
     frozenset({"ingest", "importing", "query", "graphs"}),
-    frozenset({"monitor", "coverage", "selection", "exporters", "draw", "cluster", "sandbox"}),
+    frozenset({"locks"}),
+    frozenset({"monitor", "coverage", "exporters", "draw", "cluster", "sandbox"}),
+    frozenset({"selection", "differences"}),
     frozenset({"demo", "recording"}),
     frozenset({"cli", "web", "pytest_plugin"}),
 )

@@ -83,7 +83,8 @@ def selection_of(text: str) -> Chosen:
             found = frames_of(store, query)
             return Chosen(text, store, found, store.find(query).left_out)
     raise StoreError(
-        f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)', nor a lock"
+        f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)', nor a"
+        " lock"
     )
 
 

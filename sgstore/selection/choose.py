@@ -1,0 +1,386 @@
+"""Which units are selected: all, few that keep everything, some of each class or stratum, the rarest first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sgstore.coverage.frames import names_of
+from sgstore.coverage.tables import Table
+from sgstore.errors import ConfigError
+from sgstore.selection.cover import minimal, within
+from sgstore.selection.units import Budget, Measure, Piece, holdings, kept, units_of
+from sgstore.store.covering import seq_of
+
+if TYPE_CHECKING:
+    from sgstore.coverage import Chosen
+    from sgstore.selection.units import Holdings, Units
+    from sgstore.world import Floats, Ints
+
+
+class Way(StrEnum):
+    """How units are chosen."""
+
+    every = "every"
+    minimal = "minimal"
+    per_class = "per-class"
+    rarest = "rarest"
+    stratify = "stratify"
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be selected.
+
+    Attributes
+    ----------
+    way : Way
+    piece : Piece
+    clip_s : float
+        Length of clips; s.
+    abstraction : str
+    combos : int
+        0: classes are to be kept; k: combinations of k features.
+    of_ego : bool
+        Whether only features of the ego count, and of lanes by how they lie to it.
+    each : int
+        In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
+    by : str
+        Expression whose value is the stratum of a frame.
+    temper : float
+        A stratum gets a share of the budget as the power of its size: 1 as it is, 0 the same for all.
+    budget : Budget or None
+    least : Measure
+        What is to be as little as possible.
+    seed : int
+    """
+
+    way: Way = Way.every
+    piece: Piece = Piece.frame
+    clip_s: float = 2.0
+    abstraction: str = "RSV"
+    combos: int = 0
+    of_ego: bool = False
+    each: int = 1
+    by: str = ""
+    temper: float = 1.0
+    budget: Budget | None = None
+    least: Measure = Measure.units
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning.
+
+        Raises
+        ------
+        ConfigError
+        """
+        if self.way is Way.stratify and not (self.budget or self.each):
+            raise ConfigError("strata need a budget (--budget 600s), or a number (--per-class 10)")
+        if not 0 <= self.temper <= 10:
+            raise ConfigError(
+                f"--temper {self.temper:g}; expected 0 (the same for all) to 1 (as they are)"
+            )
+
+    def as_dict(self, query: str) -> dict[str, Any]:
+        """All of it as plain values, as a lock says it."""
+        cover = self.way in {Way.minimal, Way.per_class, Way.rarest}
+        return {
+            "query": query or None,
+            "way": self.way.value,
+            "unit": self.piece.value,
+            "clip_s": self.clip_s if self.piece is Piece.clip else None,
+            "abstraction": self.abstraction if cover else None,
+            "combos": self.combos if cover else None,
+            "of_ego": self.of_ego if cover and self.combos else None,
+            "each": self.each if self.way in {Way.per_class, Way.stratify} else None,
+            "by": self.by or None,
+            "temper": self.temper if self.way is Way.stratify else None,
+            "budget": None if self.budget is None else str(self.budget),
+            "least": self.least.value if cover else None,
+            "seed": self.seed,
+        }
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Units that were selected.
+
+    Attributes
+    ----------
+    wish : Wish
+    units : Units
+    picked : int64
+        Numbers of units, in the order in which they were chosen.
+    holdings : Holdings or None
+        What units hold, if that was asked.
+    result : dict
+        What is known of the choice: ``cost``, ``bound``, …; plain values, the same for the same recordings.
+    said : list of str
+        The same in sentences.
+    strata : dict
+        Of each stratum, by its value: units, and units that were chosen.
+    """
+
+    wish: Wish
+    units: Units
+    picked: Ints
+    holdings: Holdings | None = None
+    result: dict[str, Any] = field(default_factory=dict[str, Any])
+    said: list[str] = field(default_factory=list[str])
+    strata: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
+
+
+def select(chosen: Chosen, wish: Wish) -> Selection:
+    """Select units of some frames.
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction.
+    ConfigError
+        What is wished for has no meaning, or is too large to be gone through.
+    QueryError, ExportError
+        The expression of the strata is none.
+    """
+    units = units_of(chosen, wish.piece, wish.clip_s)
+    rank = units.ranks(wish.seed)
+    match wish.way:
+        case Way.every:
+            return _every(wish, units, rank)
+        case Way.stratify:
+            return _stratified(wish, units, rank)
+        case _:
+            held = holdings(units, wish.abstraction, wish.combos, of_ego=wish.of_ego)
+            if wish.way is Way.rarest:
+                return _rarest(wish, units, rank, held)
+            return _covering(wish, units, rank, held)
+
+
+def _every(wish: Wish, units: Units, rank: Ints) -> Selection:
+    """All units, or units at random until the budget is used up."""
+    picked = np.arange(len(units))
+    if wish.budget is not None:
+        cost = units.costs(wish.budget.measure)
+        order = np.argsort(rank)
+        picked = order[_fitting(cost[order], wish.budget.most)]
+        picked = picked if picked.size < len(units) else np.arange(len(units))
+    return Selection(wish, units, picked, result={"units": len(picked), "of": len(units)})
+
+
+def _fitting(cost: Floats, most: float) -> Ints:
+    """Which of things in order fit a budget, those passed over that do not fit any more."""
+    fitting: list[int] = []
+    left = most * (1 + 1e-12)
+    smallest = np.minimum.accumulate(cost[::-1])[::-1] if len(cost) else cost
+    for place, one in enumerate(cost.tolist()):
+        if smallest[place] > left:
+            break
+        if one <= left:
+            fitting.append(place)
+            left -= one
+    return np.array(fitting, np.int64)
+
+
+def _covering(wish: Wish, units: Units, rank: Ints, held: Holdings) -> Selection:
+    each = wish.each if wish.way is Way.per_class else 1
+    family = held.family(units, units.costs(wish.least), each, rank)
+    cover = minimal(family)
+    result = _said_of(held, units, wish)
+    met = _met(held, units, cover.chosen)
+    bound = cover.bound if wish.least is not Measure.units else round(cover.bound)
+    result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound, "exact": cover.exact}
+    result["greedy"] = cover.greedy
+    said = [
+        f"{len(cover.chosen)} of {len(units)} {units.piece}s keep all {held.total} {held.kind}"
+        + (f", each in {each} {units.piece}s or in all that have it" if each > 1 else ""),
+        f"{wish.least}: {_number(cover.cost)}; lower bound {_number(bound)}, so "
+        + (
+            "there is none smaller"
+            if cover.exact
+            else f"at most {_above(cover.cost, bound)} too many"
+        )
+        + f" (greedy choice alone: {_number(cover.greedy)})",
+    ]
+    budget = wish.budget
+    if budget is None:
+        return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
+    cost = units.costs(budget.measure)
+    if cost[cover.chosen].sum() <= budget.most * (1 + 1e-12):
+        said.append(
+            f"that is {_number(cost[cover.chosen].sum())} {budget.measure}, within {budget}"
+        )
+        return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
+    fitted = within(held.family(units, cost, each, rank), budget.most * (1 + 1e-12))
+    reached = _met(held, units, fitted.chosen)
+    result = _said_of(held, units, wish) | {
+        "units": len(fitted.chosen),
+        "cost": fitted.cost,
+        "kept": reached,
+        "met": fitted.met,
+        "at_most": int(fitted.most + 1e-6),
+    }
+    said = [
+        f"within {budget}: {len(fitted.chosen)} of {len(units)} {units.piece}s keep {reached} of"
+        f" {held.total} {held.kind}"
+        + (f" ({fitted.met} of each up to {each} times)" if each > 1 else ""),
+        f"upper bound: no choice within the budget meets more than {int(fitted.most + 1e-6)}"
+        f" (this one: {fitted.met}); all would take {_number(cost[cover.chosen].sum())} {budget.measure}"
+        " with the smallest set that is known",
+    ]
+    return Selection(wish, units, fitted.chosen, held, result, said)
+
+
+def _said_of(held: Holdings, units: Units, wish: Wish) -> dict[str, Any]:
+    return {"of": len(units), "elements": held.total, "kind": held.kind, "least": wish.least.value}
+
+
+def _met(held: Holdings, units: Units, picked: Ints) -> int:
+    """How many elements some units hold."""
+    taken = np.zeros(len(units), np.bool_)
+    taken[picked] = True
+    return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if value == round(value) else f"{value:,.2f}"
+
+
+def _above(cost: float, bound: float) -> str:
+    return f"{_number(cost - bound)} ({(cost - bound) / bound:.1%})" if bound else _number(cost)
+
+
+def _rarest(wish: Wish, units: Units, rank: Ints, held: Holdings) -> Selection:
+    """For each class that no unit has yet, the rarest first, the unit that brings most besides."""
+    measure = wish.budget.measure if wish.budget else wish.least
+    cost = units.costs(measure)
+    family = held.family(units, cost, 1, rank)
+    starts, sets = family.by_element()
+    there = np.zeros(len(held.frames), np.bool_)
+    left = wish.budget.most * (1 + 1e-12) if wish.budget else np.inf
+    picked: list[int] = []
+    for element in np.lexsort((np.arange(len(held.frames)), held.frames)).tolist():
+        if there[element]:
+            continue
+        options = sets[starts[element] : starts[element + 1]]
+        options = options[cost[options] <= left]
+        if not len(options):
+            continue
+        gain = np.array([(~there[family.elements(one)]).sum() for one in options.tolist()])
+        best = int(options[np.lexsort((rank[options], -gain / cost[options]))[0]])
+        picked.append(best)
+        left -= cost[best]
+        there[family.elements(best)] = True
+    reached = int(held.weight[there].sum())
+    used = float(cost[picked].sum())
+    said = [
+        f"the rarest first: {len(picked)} of {len(units)} {units.piece}s"
+        f" ({_number(used)} {measure}) keep {reached} of {held.total} {held.kind}"
+    ]
+    result = _said_of(held, units, wish) | {"units": len(picked), "cost": used, "kept": reached}
+    return Selection(wish, units, np.array(picked, np.int64), held, result, said)
+
+
+def _stratified(wish: Wish, units: Units, rank: Ints) -> Selection:
+    stratum, names = _strata(wish, units)
+    order = np.lexsort((rank, stratum))
+    size = np.bincount(stratum, minlength=len(names))
+    if wish.budget is None:
+        within_own = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
+        picked = order[within_own < wish.each]
+    else:
+        cost = units.costs(wish.budget.measure)
+        share = size.astype(np.float64) ** wish.temper
+        share = share / max(share.sum(), 1e-12)
+        picked = _allotted(order, stratum, cost, share * wish.budget.most, wish.budget.most, rank)
+    taken = np.bincount(stratum[picked], minlength=len(names))
+    strata = {
+        name: (int(all_), int(some))
+        for name, all_, some in zip(names, size.tolist(), taken.tolist(), strict=True)
+    }
+    said = [f"{len(picked)} of {len(units)} {units.piece}s, of {len(names)} strata by {wish.by}"]
+    result = {
+        "units": len(picked),
+        "of": len(units),
+        "strata": {n: list(v) for n, v in strata.items()},
+    }
+    return Selection(wish, units, picked, None, result, said, strata)
+
+
+def _allotted(
+    order: Ints, stratum: Ints, cost: Floats, shares: Floats, most: float, rank: Ints
+) -> Ints:
+    """Each stratum up to its share; then, of what is left of the budget, units at random."""
+    within_share: list[Ints] = []
+    for number, share in enumerate(shares.tolist()):
+        own = order[stratum[order] == number]
+        within_share.append(own[_fitting(cost[own], share)])
+    picked = np.concatenate(within_share) if within_share else np.zeros(0, np.int64)
+    # Shares are rarely a whole number of units: the rest goes to those strata that are furthest below theirs.
+    used = np.bincount(stratum[picked], cost[picked], len(shares))
+    others = np.setdiff1d(order, picked)
+    lack = (shares - used)[stratum[others]] / cost[others]
+    others = others[np.lexsort((rank[others], -lack))]
+    first = np.unique(stratum[others], return_index=True)[1]
+    others = others[np.sort(first)]
+    return np.concatenate(
+        [picked, others[_fitting(cost[others], most - float(cost[picked].sum()))]]
+    )
+
+
+def _strata(wish: Wish, units: Units) -> tuple[Ints, list[str]]:
+    """The stratum of each unit, the value that most of its frames have; and all values."""
+    from sgstore.exporters.labels import Labels
+
+    frames = units.frame_id[units.asked]
+    labels = Labels.asked(units.chosen.store, {"stratum": wish.by}, frames)
+    values = labels.of(frames)["stratum"]
+    names = sorted({_value(value) for value in values})
+    number = {name: i for i, name in enumerate(names)}
+    code = np.array([number[_value(value)] for value in values], np.int64)
+    pairs, often = np.unique(
+        np.stack([units.number[units.asked], code]), axis=1, return_counts=True
+    )
+    best = np.lexsort((pairs[1], -often, pairs[0]))
+    first = np.unique(pairs[0][best], return_index=True)[1]
+    return pairs[1][best][first], names
+
+
+def _value(value: Any) -> str:
+    """A value as a stratum is called."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def listed(selection: Selection) -> Table:
+    """The units that were chosen, in the order in which they were.
+
+    Returns
+    -------
+    Table
+        ``unit`` (``TRACE#FIRST-LAST``, as a lock calls it), ``frames``, and, if it was asked what units hold,
+        ``holds`` and ``new``: of these, how many no unit before it has.
+    """
+    units, held = selection.units, selection.holdings
+    starts = units.starts
+    first = names_of(units.chosen.store, units.first[selection.picked])
+    last = seq_of(units.last[selection.picked]).tolist()
+    frames = np.diff(starts)[selection.picked].tolist()
+    names = [
+        name if name.rpartition("#")[2] == str(end) else f"{name}-{end}"
+        for name, end in zip(first, last, strict=True)
+    ]
+    if held is None:
+        return Table(("unit", "frames"), list(zip(names, frames, strict=True)))
+    unit, element = held.pairs
+    has = np.bincount(unit, held.weight[element], len(units)).astype(np.int64)
+    so_far = kept(held.pairs, held.weight, selection.picked, len(units))
+    new = np.diff(so_far, prepend=0).tolist()
+    rows = zip(names, frames, has[selection.picked].tolist(), new, strict=True)
+    return Table(("unit", "frames", "holds", "new"), list(rows))

@@ -1,0 +1,357 @@
+"""Selection: few units that keep everything, against exhaustive search; budgets, strata, splits, curves."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sgstore
+from sgstore.coverage import Chosen, classed, selection_of
+from sgstore.errors import ConfigError
+from sgstore.importing import import_graphs
+from sgstore.ingest import ingest
+from sgstore.query import Store
+from sgstore.selection import (
+    Budget,
+    Family,
+    Measure,
+    Piece,
+    Selection,
+    Way,
+    Wish,
+    curve,
+    minimal,
+    parse_split,
+    select,
+    split,
+    split_table,
+    units_of,
+    within,
+)
+from sgstore.selection.bounds import bounded
+from sgstore.selection.choose import listed
+from sgstore.selection.cover import greedy
+from sgstore.selection.curve import expected
+from sgstore.store.covering import seq_of, trace_of
+
+SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+SEEDS = range(60)
+
+
+def family(seed: int) -> tuple[Family, np.ndarray]:
+    """A few random sets, of costs that are one, whole, or any; and which elements each holds."""
+    rng = np.random.default_rng(seed)
+    sets, elements = int(rng.integers(1, 10)), int(rng.integers(1, 12))
+    holds = rng.random((sets, elements)) < rng.uniform(0.1, 0.6)
+    cost = (np.ones(sets), rng.integers(1, 6, sets), rng.uniform(0.3, 3, sets))[seed % 3]
+    cost = cost.astype(np.float64)
+    pairs = np.array(np.nonzero(holds))
+    return Family.of(pairs, sets, elements, cost, 1 + (seed % 4 == 0)), holds
+
+
+def every_choice(sets: int) -> list[list[int]]:
+    return [list(some) for many in range(sets + 1) for some in combinations(range(sets), many)]
+
+
+def met(holds: np.ndarray, need: np.ndarray, some: list[int]) -> int:
+    return int(np.minimum(holds[some].sum(axis=0), need).sum())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_small_cover_is_the_cheapest_of_all_and_greedy_is_within_its_factor(seed: int) -> None:
+    of, holds = family(seed)
+    full = [some for some in every_choice(len(of)) if met(holds, of.need, some) == of.need.sum()]
+    best = min(float(of.cost[some].sum()) for some in full)
+
+    found = minimal(of)
+    bare = minimal(of, steps=0)
+    factor = sum(1 / i for i in range(1, int(holds.sum(axis=1).max(initial=1)) + 1))
+
+    assert (of.covered(found.chosen) >= of.need).all()
+    assert found.bound <= best + 1e-6
+    assert bare.bound <= best + 1e-6 <= bare.cost + 2e-6
+    assert of.cost[greedy(of)].sum() <= factor * best + 1e-6
+    if of.need.max(initial=0) <= 1:
+        assert found.cost == pytest.approx(best)
+        assert found.exact
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_under_a_budget_the_choice_is_within_its_factor_and_below_its_bound(seed: int) -> None:
+    of, holds = family(seed)
+    budget = float(np.random.default_rng(seed).uniform(0.3, of.cost.sum() + 0.5))
+    affordable = [some for some in every_choice(len(of)) if of.cost[some].sum() <= budget]
+    best = max(met(holds, of.need, some) for some in affordable)
+
+    found = within(of, budget)
+
+    assert found.cost <= budget + 1e-9
+    assert found.met == met(holds, of.need, found.chosen.tolist())
+    assert (1 - 1 / np.e) / 2 * best <= found.met <= best <= found.most + 1e-9
+
+
+def test_the_bound_is_that_of_the_linear_programme_where_that_is_known() -> None:
+    # Each two of three sets share an element: two are needed, the relaxation takes a half of each.
+    triangle = Family.of(np.array([[0, 0, 1, 1, 2, 2], [0, 1, 1, 2, 2, 0]]), 3, 3)
+
+    low, _ = bounded(triangle, np.array([0, 1, 2]))
+
+    assert low == pytest.approx(1.5, abs=0.01)
+    assert minimal(triangle).cost == minimal(triangle).bound == 2
+
+
+def test_a_search_that_may_not_end_still_gives_a_cover_and_a_bound_below_it() -> None:
+    rng = np.random.default_rng(5)
+    holds = rng.random((60, 120)) < 0.06
+    of = Family.of(np.array(np.nonzero(holds)), 60, 120)
+
+    short, long = minimal(of, steps=40), minimal(of)
+
+    assert (of.covered(short.chosen) >= of.need).all()
+    assert short.bound <= long.bound <= long.cost <= short.cost
+    assert long.exact
+
+
+def test_ties_are_broken_by_rank_alone() -> None:
+    pairs = np.array([[0, 1, 2, 3], [0, 0, 1, 1]])
+
+    chosen = [
+        sorted(minimal(Family.of(pairs, 4, 2, rank=np.array(rank))).chosen.tolist())
+        for rank in ([0, 1, 2, 3], [3, 2, 1, 0])
+    ]
+
+    assert chosen == [[0, 2], [1, 3]]
+
+
+# Units of a store ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    folder = tmp_path_factory.mktemp("selection")
+    copy = folder / "one.mcap"
+    copy.symlink_to(SAMPLE)
+    ingest(folder / "s.sgstore", [copy], until=20)
+    import_two(folder)
+    return Store(folder / "s.sgstore")
+
+
+def import_two(folder: Path) -> None:
+    """A second recording of other scenes: graphs of another tool."""
+    rows = ["graph,src,relation,dst"]
+    for i in range(30):
+        rows.append(f"g{i},ego,isIn,Ego Lane")
+        rows += [f"g{i},car_{k},near,ego" for k in range(i % 4)]
+    (folder / "two.csv").write_text("\n".join(rows) + "\n")
+    import_graphs(folder / "s.sgstore", [folder / "two.csv"], "csv")
+
+
+def whole(store: Store) -> Chosen:
+    return Chosen("s", store)
+
+
+def classes_in(found: Selection) -> set[int]:
+    """Classes in the frames of what was selected, counted frame by frame."""
+    of = classed(found.units.chosen, found.wish.abstraction)
+    picked = set(found.picked.tolist())
+    number = dict(zip(found.units.frame_id.tolist(), found.units.number.tolist(), strict=True))
+    pairs = zip(of.frame_id.tolist(), of.code.tolist(), strict=True)
+    return {code for frame, code in pairs if number[frame] in picked}
+
+
+@pytest.mark.parametrize("piece", list(Piece))
+@pytest.mark.parametrize("least", [Measure.units, Measure.seconds])
+def test_the_minimal_set_keeps_every_class(store: Store, piece: Piece, least: Measure) -> None:
+    wish = Wish(Way.minimal, piece, abstraction="EL", least=least)
+
+    found = select(whole(store), wish)
+    everything = set(classed(whole(store), "EL").code.tolist())
+
+    assert classes_in(found) == everything
+    assert found.result["exact"]
+    assert found.result["bound"] <= found.result["cost"]
+    assert len(found.picked) <= len(found.units)
+
+
+def test_of_frames_one_of_each_class_is_enough(store: Store) -> None:
+    found = select(whole(store), Wish(Way.minimal, abstraction="EL"))
+
+    assert len(found.picked) == len(set(classed(whole(store), "EL").code.tolist()))
+
+
+def test_each_class_comes_k_times_or_as_often_as_it_is_there(store: Store) -> None:
+    found = select(whole(store), Wish(Way.per_class, abstraction="EL", each=3))
+    of = classed(whole(store), "EL")
+    picked = np.isin(of.frame_id, found.units.frame_id[found.picked])
+
+    chosen = np.bincount(of.code[picked], minlength=len(of.names))
+
+    assert (chosen == np.minimum(np.bincount(of.code, minlength=len(of.names)), 3)).all()
+
+
+def test_pairs_of_features_are_those_that_coverage_counts(store: Store) -> None:
+    from sgstore.coverage import combos
+
+    found = select(whole(store), Wish(Way.minimal, Piece.clip, abstraction="E", combos=2))
+    known = combos(classed(whole(store), "E"), "E", 2)
+    ids = found.units.frame_id[np.isin(found.units.number, found.picked)]
+    kept = combos(classed(Chosen("kept", store, ids), "E"), "E", 2)
+
+    assert found.holdings is not None
+    assert found.holdings.total == len(known.covered().rows) == len(kept.covered().rows)
+    assert found.result["kept"] == found.holdings.total
+
+
+@pytest.mark.parametrize("budget", ["12frames", "3s", "2units", "700kB"])
+@pytest.mark.parametrize("way", [Way.minimal, Way.per_class, Way.rarest, Way.every])
+def test_no_budget_is_exceeded(store: Store, budget: str, way: Way) -> None:
+    most = Budget.parse(budget)
+
+    found = select(whole(store), Wish(way, Piece.clip, 0.5, "EL", budget=most))
+    cost = found.units.costs(most.measure)[found.picked].sum()
+
+    assert 0 < cost <= most.most + 1e-6
+    if "at_most" in found.result:
+        assert found.result["met"] <= found.result["at_most"]
+
+
+@pytest.mark.parametrize(
+    ("text", "most", "measure"),
+    [
+        ("600s", 600, "seconds"),
+        ("1.5h", 5400, "seconds"),
+        ("10 min", 600, "seconds"),
+        ("5GB", 5e9, "bytes"),
+        ("2MiB", 2 << 20, "bytes"),
+        ("1000frames", 1000, "frames"),
+        ("40units", 40, "units"),
+    ],
+)
+def test_budgets_are_read(text: str, most: float, measure: str) -> None:
+    assert Budget.parse(text) == Budget(most, Measure(measure))
+
+
+@pytest.mark.parametrize("text", ["", "5", "GB", "0s", "-3s", "5 lightyears", "1e9s"])
+def test_what_is_no_budget_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="not a budget"):
+        Budget.parse(text)
+
+
+def test_clips_are_runs_of_what_was_asked_for_cut_by_time(store: Store) -> None:
+    chosen = selection_of(
+        f"{store.file.path}:MATCH (e:Ego) WHERE frame.seq >= 13 AND trace.name = 'one'"
+    )
+
+    units = units_of(chosen, Piece.clip, 2.0)
+    many = np.diff(units.starts).tolist()
+
+    assert seq_of(units.first).tolist()[:3] == [13, 33, 53]
+    assert set(many[:-1]) == {20}
+    assert many[-1] <= 20
+    assert sum(many) == len(chosen.frame_id if chosen.frame_id is not None else ())
+
+
+def test_the_same_seed_chooses_the_same_and_another_chooses_otherwise(store: Store) -> None:
+    def some(seed: int) -> list[int]:
+        wish = Wish(Way.every, budget=Budget.parse("20frames"), seed=seed)
+        return sorted(select(whole(store), wish).picked.tolist())
+
+    assert some(1) == some(1) != some(2)
+    assert len(some(1)) == 20
+
+
+def test_strata_share_a_budget_as_they_are_or_evenly(store: Store) -> None:
+    def strata(temper: float) -> dict[str, tuple[int, int]]:
+        budget = Budget.parse("40frames")
+        wish = Wish(Way.stratify, each=0, by="trace.name", temper=temper, budget=budget)
+        return select(whole(store), wish).strata
+
+    own, even = strata(1.0), strata(0.0)
+    total = sum(size for size, _ in own.values())
+
+    assert {name: taken for name, (_, taken) in even.items()} == {"one": 20, "two": 20}
+    for size, taken in own.values():
+        assert abs(taken - 40 * size / total) <= 1
+
+
+def test_of_each_stratum_k(store: Store) -> None:
+    found = select(whole(store), Wish(Way.stratify, each=7, by="trace.name"))
+
+    assert {name: taken for name, (_, taken) in found.strata.items()} == {"one": 7, "two": 7}
+
+
+def test_parts_share_no_recording_and_what_leaks_is_told(store: Store) -> None:
+    found = select(whole(store), Wish(Way.every))
+    shares = parse_split("train=0.8,test=0.2")
+
+    parts = split(found, shares)
+    traces = {
+        name: set(trace_of(found.units.first[[u for u in parts if parts[u] == name]]).tolist())
+        for name in shares
+    }
+    rows = split_table(found, parts, shares).dicts()
+
+    assert not traces["train"] & traces["test"]
+    assert len(parts) == len(found.picked)
+    assert [row["split"] for row in rows] == ["train", "test"]
+    assert rows[0]["classes_in_test"] == 0
+    assert rows[0]["classes_in_train"] is None
+
+
+@pytest.mark.parametrize("text", ["train", "a=0.5,b=0.6", "a=0.5,a=0.5", "a=nan,b=1", "a=2"])
+def test_what_is_no_split_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="--split"):
+        parse_split(text)
+
+
+def test_the_curve_rises_to_all_and_random_order_is_hypergeometric(store: Store) -> None:
+    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL"))
+    drawn = curve(found)
+    held = found.holdings
+    assert held is not None
+    kept = [row["kept"] for row in drawn.table.dicts() if row["kept"] is not None]
+    rng = np.random.default_rng(0)
+    n, often = 7, np.bincount(held.pairs[1])
+    tries = []
+    for _ in range(4000):
+        some = np.isin(held.pairs[0], rng.permutation(len(found.units))[:n])
+        tries.append(len(np.unique(held.pairs[1][some])))
+
+    assert kept == sorted(kept)
+    assert kept[-1] == held.total
+    assert drawn.needed == len(found.picked) <= drawn.at_random
+    mean = expected(often, len(found.units), np.array([n]))[0]
+    assert mean == pytest.approx(np.mean(tries), rel=0.02)
+    assert expected(often, len(found.units), np.array([len(found.units)]))[0] == pytest.approx(
+        held.total
+    )
+
+
+def test_what_was_chosen_is_listed_with_what_it_brings(store: Store) -> None:
+    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL"))
+    rows = listed(found).dicts()
+
+    assert sum(row["new"] for row in rows) == found.result["elements"]
+    assert all(0 <= row["new"] <= row["holds"] for row in rows)
+    assert all(row["unit"].startswith(("one#", "two#")) for row in rows)
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [{"combos": 2, "abstraction": "ER"}, {"combos": 2, "abstraction": "ER", "of_ego": True}, {}],
+)
+def test_on_a_drive_of_sumo_the_set_of_clips_is_within_5_percent_of_its_bound(
+    data: Path, tmp_path_factory: pytest.TempPathFactory, wish: dict[str, object]
+) -> None:
+    place = tmp_path_factory.getbasetemp() / "sumo.sgstore"
+    if not place.exists():
+        ingest(place, [data / "traces" / "sumo" / "Town10HD_sumo_osi.mcap"])
+
+    found = select(Chosen("sumo", Store(place)), Wish(Way.minimal, Piece.clip, 2.0, **wish))  # type: ignore[arg-type]
+
+    assert len(found.units) == 30
+    assert found.result["cost"] <= 1.05 * found.result["bound"]
+    assert found.result["kept"] == found.result["elements"]
