@@ -1,4 +1,4 @@
-"""Checks and patterns while a simulator runs: the same text as over a store, the same answer, as soon as it is known.
+"""Checks and patterns while a simulator runs: the text and the answer of a store, as soon as it is known.
 
 ::
 
@@ -8,8 +8,8 @@
     monitor.finish()             # the verdicts
 
 Conditions on one frame are asked of its graph in memory; what they make over time is worked out frame by frame.
-What looks ahead by d is told d later. Memory does not grow with time: what is kept is bounded by how far a check or a
-pattern looks, and by the number of entities of which something must be remembered.
+What looks ahead by d is told d later. Memory does not grow with time: what is kept is bounded by how far a
+check or a pattern looks, and by the number of entities of which something must be remembered.
 """
 
 from sgstore.monitor.events import Event, Moment

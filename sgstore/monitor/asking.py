@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.lang.evaluation import Binding
 from sgstore.lang.match import Search, expression
 from sgstore.lang.printing import value_text
+from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,13 +34,19 @@ class Question:
         Keys of its nodes that an answer tells; the others are only asked to exist.
     value : Bound, optional
         What is asked of each match.
+    edges : tuple of str
+        Keys of its edges that an answer tells, behind the nodes: by places in :data:`RELATIONS`.
     """
 
     def __init__(
-        self, query: b.Query, variables: tuple[str, ...], value: b.Bound | None = None
+        self,
+        query: b.Query,
+        variables: tuple[str, ...],
+        value: b.Bound | None = None,
+        edges: tuple[str, ...] = (),
     ) -> None:
         scope = query.scope
-        self._variables, self._scope = variables, scope
+        self._variables, self._edges = variables, edges
         self._search = Search(scope, injective=query.injective)
         self._value: Evaluate | None = None
         if value is not None:
@@ -58,6 +65,8 @@ class Question:
         at, found = Binding(view), dict[Key, Any]()
         for _ in self._search.run(at):
             key = tuple(at.nodes[name] for name in self._variables)
+            if self._edges:
+                key += tuple(RELATIONS.index(at.edges[name][0]) for name in self._edges)
             if key not in found:
                 found[key] = self._value(at) if self._value is not None else None
                 if not key:
@@ -76,6 +85,9 @@ class People:
     def __init__(self, view: FrameView) -> None:
         self._view = view
         self._found: dict[b.Kinds, frozenset[int]] = {}
+
+    def __contains__(self, node: int) -> bool:
+        return node in self._view.nodes
 
     def of(self, kinds: b.Kinds) -> frozenset[int]:
         """Those that are of some kinds."""
@@ -101,12 +113,18 @@ class Questions:
     _all: list[Question] = field(default_factory=list["Question"])
     answers: list[Mapping[Key, Any]] = field(default_factory=list["Mapping[Key, Any]"])
 
-    def add(self, query: b.Query, variables: tuple[str, ...], value: b.Bound | None = None) -> int:
+    def add(
+        self,
+        query: b.Query,
+        variables: tuple[str, ...],
+        value: b.Bound | None = None,
+        edges: tuple[str, ...] = (),
+    ) -> int:
         """The number of a question; the same for those that ask the same."""
-        key = _told(query), variables, None if value is None else _text(value)
+        key = _told(query), variables, None if value is None else _text(value), edges
         if key not in self._known:
             self._known[key] = len(self._all)
-            self._all.append(Question(query, variables, value))
+            self._all.append(Question(query, variables, value, edges))
         return self._known[key]
 
     def ask(self, view: FrameView, people: People) -> None:

@@ -4,7 +4,8 @@ A binding says of each variable which node it is, or ``None``: any node of which
 of a binding that is not held is what is known of the one held that says most of what it says; so a check over a
 hundred vehicles of which five come near costs what five cost.
 
-Whatever is held is closed: with two bindings that do not contradict one another, the one that says both is held.
+Whatever is told is closed: with two bindings that do not contradict one another, the one that says both is
+told.
 """
 
 from __future__ import annotations
@@ -66,9 +67,8 @@ class Lattice:
         for binding in bindings:
             if binding in found:
                 continue
-            new = {_both(binding, other) for other in found}
-            new.discard(None)
-            found |= new  # type: ignore[arg-type]
+            both = (_both(binding, other) for other in found)
+            found |= {one for one in both if one is not None}
         return found
 
     def ordered(self, bindings: Iterable[Partial]) -> list[Partial]:

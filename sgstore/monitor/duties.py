@@ -1,7 +1,7 @@
 """What a check still asks of one binding: states that are shared by all bindings that are in the same.
 
-A state is made once and compared by identity. What follows a state and a letter is remembered, where time does not
-matter in it, so most bindings of most checks take one look into a table a frame.
+A state is made once and compared by identity. What follows a state and a letter is remembered, where time does
+not matter in it, so most bindings of most checks take one look into a table a frame.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from weakref import WeakValueDictionary
 
-from sgstore.temporal.formulas import TRUE, And, Formula, Not, propositions
+from sgstore.temporal.formulas import TRUE, And, Formula, propositions
 from sgstore.temporal.progression import Frame, Past, Progression, Term, Tick
-from sgstore.temporal.verdicts import always_true, bounded, looks_ahead
+from sgstore.temporal.verdicts import always_true, bounded
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ REMEMBERED: Final = 100_000
 """Steps that are remembered before they are begun anew."""
 
 Duties = tuple["frozenset[Term] | Term | None", ...]
-"""For each part of a formula: what is open of an ``ALWAYS`` at former frames; what is open of another; nothing."""
+"""For each part of a formula: what is open of an ``ALWAYS`` at former frames, or what is open of another."""
 
 
 class State:

@@ -18,12 +18,13 @@ from sgstore.lang.results import GAP
 from sgstore.lang.syntax import Check, Define, Match, Parameter
 from sgstore.monitor.asking import People, Questions
 from sgstore.monitor.events import Event, Moment
+from sgstore.monitor.following import Follow
 from sgstore.monitor.watching import Watch
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.temporal.courses import Pulse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.graph import SceneGraph
     from sgstore.lang.bound import Query
@@ -98,7 +99,14 @@ class Monitor:
                 self._watches.append((ego, Watch(check, questions, self._pulse)))
             else:
                 self._unknown.append(check.name)
-        self.names = tuple(check.name for check in checks)
+        self._follows: list[tuple[int, Follow]] = []
+        for number, query in enumerate(queries, start=1):
+            if query.relations <= answers or query.unknown_is_false:
+                ego, questions = self._of_ego(query.ego)
+                name = f"pattern {number}"
+                self._follows.append((ego, Follow(name, query, questions, self._pulse)))
+        told = (follow.name for _, follow in self._follows)
+        self.names = (*(check.name for check in checks), *told)
 
     def _of_ego(self, ego: str | None) -> tuple[int, Questions]:
         """The number of an ego, and what is asked of its graphs."""
@@ -114,8 +122,8 @@ class Monitor:
         Raises
         ------
         ValueError
-            The frame contradicts itself, as :meth:`sgstore.sgg.SceneGraphGenerator.steps` says; it is as if it had
-            not been given.
+            The frame contradicts itself, as :meth:`sgstore.sgg.SceneGraphGenerator.steps` says; it is as if it
+            had not been given.
         """
         graphs = self.generator.steps(frame, self._egos or [""])
         return self.look(graphs, classed=True)
@@ -140,6 +148,8 @@ class Monitor:
             people.append(People(view))
             questions.ask(view, people[-1])
         found = [event for ego, watch in self._watches for event in watch.step(here, people[ego])]
+        for ego, follow in self._follows:
+            found += follow.step(here, people[ego])
         return self._told(found)
 
     def _view(self, graph: SceneGraph, here: Moment, number: int | None) -> FrameView:
@@ -170,6 +180,26 @@ class Monitor:
         known = {watch.name: watch.status() for _, watch in self._watches}
         return known | dict.fromkeys(self._unknown, "unknown")
 
+    def run(
+        self, frames: Iterable[Frame], *, duration_s: float | None = None
+    ) -> tuple[Verdict, ...]:
+        """Watch frames one after the other, until they end, or Ctrl-C ends it: the verdicts.
+
+        Parameters
+        ----------
+        frames : iterable of Frame
+        duration_s : float, optional
+            How much simulation time is watched; by default all.
+        """
+        try:
+            for frame in frames:
+                self.step(frame)
+                if self._last is not None and duration_s is not None and self._last.t >= duration_s:
+                    break
+        except KeyboardInterrupt:
+            pass  # what was seen until then has its verdicts
+        return self.finish()
+
     def finish(self) -> tuple[Verdict, ...]:
         """The trace has ended: the verdicts of all checks, as a store has them of the recorded trace."""
         if self._last is None:
@@ -180,6 +210,8 @@ class Monitor:
             verdict, late = watch.finish(self.trace, self._last)
             verdicts.append(verdict)
             events += late
+        for _, follow in self._follows:
+            events += follow.finish(self._last)
         self._told(events)
         return (*verdicts, *(Verdict(name, self.trace, "unknown") for name in self._unknown))
 

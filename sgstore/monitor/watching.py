@@ -12,10 +12,10 @@ from sgstore.history.bindings import Level, folded_values, levels_of
 from sgstore.history.checks import Verdict, Witness
 from sgstore.lang.bound import Query, Result
 from sgstore.matches import Interval
-from sgstore.monitor.bindings import Known, Lattice, Partial
+from sgstore.monitor.bindings import Known, Partial
 from sgstore.monitor.duties import Automaton, State, Step
 from sgstore.monitor.events import Event, Moment
-from sgstore.temporal.courses import Courses, Memory, column_of
+from sgstore.monitor.letters import Letters
 from sgstore.temporal.plans import Plan
 from sgstore.temporal.verdicts import (
     CERTAINLY_TRUE,
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.over_time import Check, Quantifier
     from sgstore.monitor.asking import Key, People, Questions
-    from sgstore.temporal.courses import Pulse
-    from sgstore.temporal.measures import Column
-    from sgstore.temporal.plans import Signal
+    from sgstore.temporal.courses import Memory, Pulse
     from sgstore.world import Bools
 
     Keys = NDArray[np.int64]
@@ -94,7 +92,7 @@ class Watch:
     """
 
     def __init__(self, check: Check, questions: Questions, pulse: Pulse) -> None:
-        self._check, self._pulse, self._questions = check, pulse, questions
+        self._check, self._pulse = check, pulse
         self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
         whole = Query(check.scope, Result(), check.relations, check.injective, check.ego)
         whole = replace(whole, unknown_is_false=check.unknown_is_false)
@@ -102,6 +100,11 @@ class Watch:
         plan = Plan(whole, frozenset(self._variables), absent)
         formula = plan.formula(check.formula)
         reset = plan.formula(check.reset) if check.reset is not None else None
+        if check.gaps == "unknown":
+            raise QueryError(
+                f"USING GAPS unknown of {check.name} is a question about what was recorded",
+                hint="a monitor sees every frame that there is; leave it out, or ask a store",
+            )
         if reset is not None and looks_ahead(reset):
             raise QueryError(
                 f"RESET WHEN of {check.name} looks ahead",
@@ -109,24 +112,13 @@ class Watch:
             )
         guards = {q: plan.formula(q.where) for q in check.quantifiers if q.where is not None}
         self._guards: dict[Quantifier, int] = {q: 1 << n for n, q in enumerate(guards)}
-        self._courses = Courses(plan, pulse, bridge=check.gaps == "bridge")
-        names = [*plan.atoms, *plan.tests]
-        self._bits = {name: 1 << number for number, name in enumerate(names)}
-        self._automaton = Automaton(formula, reset, tuple(guards.values()), self._bits)
-        self._atoms = [
-            (
-                self._bits[name],
-                questions.add(atom.query, atom.variables),
-                self._places(atom.variables),
-            )
-            for name, atom in plan.atoms.items()
-        ]
-        self._signals = {
-            name: (questions.add(s.query, s.variables, s.value), self._places(s.variables))
-            for name, s in plan.signals.items()
-        }
-        strangers = _Entry(self._automaton.begun, 0, None, (), self._courses.begun)
-        self._known = Known(Lattice(len(self._variables)), strangers)
+        self._letters = Letters(
+            plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
+        )
+        bits = self._letters.bits
+        self._automaton = Automaton(formula, reset, tuple(guards.values()), bits)
+        strangers = _Entry(self._automaton.begun, 0, None, (), self._letters.begun)
+        self._known = Known(self._letters.lattice, strangers)
         self._domains: dict[str, dict[int, str]] = {node: {} for node in check.scope.nodes}
         self._told: dict[Key, tuple[int, int]] = {}
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
@@ -136,31 +128,19 @@ class Watch:
         """Of the check."""
         return self._check.name
 
-    def _places(self, variables: tuple[str, ...]) -> tuple[int, ...]:
-        return tuple(self._variables.index(name) for name in variables)
-
     # Frame by frame
 
     def step(self, here: Moment, people: People) -> list[Event]:
         """A frame has come, and the questions were asked of it: what is known from it on."""
         self._meet(people)
-        known, lattice = self._known, self._known.lattice
-        letters = self._letters()
-        rows = lattice.closed([*known.held, *letters, *self._told_signals()])
-        if lattice.size < 2:
-            base = letters.get(lattice.stranger, 0)
-            full = {row: base | letters.get(row, 0) for row in rows}
-        else:
-            full = {row: self._letter(row, letters) for row in rows}
-        memories: Mapping[Partial, Memory] = {}
-        if self._courses:
-            memories = self._measure(list(rows), full)
+        known = self._known
+        letters, memories = self._letters.read(known.held, lambda row: known.of(row).memory)
         found: dict[Partial, _Entry] = {}
         seen: dict[tuple[State, int], Step] = {}
         tick, automaton, mask = self._pulse.tick, self._automaton, self._automaton.mask
-        for row in rows:
+        for row, letter in letters.items():
             entry = known.of(row)
-            step = automaton.step(entry.state, full[row] & mask, tick, seen)
+            step = automaton.step(entry.state, letter & mask, tick, seen)
             found[row] = _stepped(entry, step, here, memories.get(row, ()))
         known.keep(found, _same)
         return list(self._events(here)) if self._immediate else []
@@ -170,56 +150,6 @@ class Watch:
             domain = self._domains[key]
             for new in people.of(node.kinds) - domain.keys():
                 domain[new] = people.name(new)
-
-    def _letters(self) -> dict[Partial, int]:
-        """The atoms that are true of bindings, of those that say no more than the atom asks."""
-        answers, placed = self._questions.answers, self._known.lattice.placed
-        letters: dict[Partial, int] = {}
-        for bit, number, places in self._atoms:
-            for key in answers[number]:
-                row = placed(key, places)
-                letters[row] = letters.get(row, 0) | bit
-        return letters
-
-    def _letter(self, row: Partial, letters: Mapping[Partial, int]) -> int:
-        found = 0
-        for wider in self._known.lattice.wider(row):
-            found |= letters.get(wider, 0)
-        return found
-
-    def _told_signals(self) -> Iterator[Partial]:
-        placed = self._known.lattice.placed
-        for number, places in self._signals.values():
-            for key, value in self._questions.answers[number].items():
-                if value is not None:
-                    yield placed(key, places)
-
-    def _measure(self, rows: list[Partial], letters: dict[Partial, int]) -> dict[Partial, Memory]:
-        """Tell letters the tests that are true; what bindings remember from now on."""
-        self._courses.step()
-        columns: dict[str, Bools] = {}
-
-        def atom(name: str) -> Bools:
-            if name not in columns:
-                bit = self._bits[name]
-                columns[name] = np.array([bool(letters[row] & bit) for row in rows], np.bool_)
-            return columns[name]
-
-        def signal(one: Signal) -> Column:
-            number, places = self._signals[one.name]
-            answers = self._questions.answers[number]
-            keys = [tuple(row[place] for place in places) for row in rows]
-            return column_of([answers.get(key) for key in keys])  # type: ignore[arg-type]
-
-        memories = [self._known.of(row).memory for row in rows]
-        tests, memories = self._courses.values(memories, atom, signal)
-        for name, column in tests.items():
-            bit = self._bits[name]
-            true = np.broadcast_to(column.true[:, 0], len(rows)).tolist()
-            for row, flag in zip(rows, true, strict=True):
-                if flag:
-                    letters[row] |= bit
-        return dict(zip(rows, memories, strict=True))
 
     # What is known
 

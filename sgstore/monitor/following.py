@@ -1,0 +1,414 @@
+"""One ``MATCH``, frame by frame: a pattern of one frame, or a sequence."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import Span
+from sgstore.lang.bound import Query, Result, Scope
+from sgstore.lang.over_time import Link, Step
+from sgstore.monitor.bindings import Known
+from sgstore.monitor.events import Event, Moment
+from sgstore.monitor.holding import NEVER, Binding, Held, Needs, Place, joined
+from sgstore.monitor.letters import Letters
+from sgstore.temporal.formulas import And, Formula
+from sgstore.temporal.plans import Plan
+from sgstore.temporal.progression import Frame, Past, Progression, Term
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sgstore.monitor.asking import Key, People, Questions
+    from sgstore.monitor.bindings import Partial
+    from sgstore.temporal.courses import Memory, Pulse
+
+FAILED: Final = "failed"
+OPEN: Final = "open"
+Ways = tuple[Place, ...] | str
+"""The places of the steps from one on; :data:`FAILED`: there are none; :data:`OPEN`: it is not known yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    past: Past
+    memory: Memory
+
+
+class Follow:
+    """A pattern, while a trace comes.
+
+    Parameters
+    ----------
+    name : str
+    query : Query
+    questions : Questions
+        What is asked of each frame; those of the pattern become part of them.
+    pulse : Pulse
+        Told of each frame before this is.
+    """
+
+    def __init__(self, name: str, query: Query, questions: Questions, pulse: Pulse) -> None:
+        self.name, self._query = name, query
+        self._questions, self._pulse = questions, pulse
+        one = Step(query.scope, (), None, absent=False, span=Span(0, 0))
+        self._steps: Sequence[Step] = query.steps or (one,)
+        self._named = _named(query)
+        self._edges = tuple(edge.key for edge in query.scope.edges if edge.named)
+        self._asks = [self._ask(step) for step in self._steps]
+        self._conditions = _Conditions(query, self._steps, questions, pulse)
+        self._columns = [self._projected(number) for number in range(len(self._steps))]
+        self._held: list[dict[Key, Held]] = [{} for _ in self._steps]
+        self._apart = frozenset(self._named) if query.injective else frozenset[str]()
+        self._told: dict[tuple[int, ...], int] = {}
+        self._over: set[tuple[int, ...]] = set()
+        self._names: dict[int, str] = {}
+        self._ended = False
+        self._happen = [n for n, step in enumerate(self._steps) if not step.absent]
+
+    def _ask(self, step: Step) -> tuple[int, tuple[str, ...]]:
+        """The question of a step, and the variables of its answers."""
+        scope = step.scope
+        kept = set(scope.nodes) if step.when else set(self._named)
+        variables = tuple(sorted(kept & set(scope.nodes)))
+        edges = tuple(sorted(edge.key for edge in scope.edges if edge.named))
+        edges = () if step.absent else edges
+        query = replace(self._query, scope=scope, result=Result(), steps=(), links=())
+        return self._questions.add(query, variables, None, edges), (*variables, *edges)
+
+    # Frame by frame
+
+    def step(self, here: Moment, people: People) -> list[Event]:
+        """A frame has come, and the questions were asked of it: what is known from it on."""
+        self._conditions.step()
+        tick, gap = self._pulse.tick, self._pulse.gap and self._query.gaps != "bridge"
+        for number in range(len(self._steps)):
+            now = self._now(number)
+            held = self._held[number]
+            for key in now:
+                if key not in held:
+                    held[key] = Held()
+                    self._names |= {n: people.name(n) for n in key if n in people}
+            for key, one in held.items():
+                one.ask(tick.number, tick.time, gap=gap, holds=now.get(key, False))
+            self._decide(number)
+        return self._found(here)
+
+    def _now(self, number: int) -> dict[Key, Needs]:
+        """The bindings in which a step's pattern is found, and what its conditions still need."""
+        question, variables = self._asks[number]
+        places = [variables.index(name) for name in self._columns[number]]
+        answers = self._questions.answers[question]
+        if not self._steps[number].when:
+            return dict.fromkeys((tuple(key[p] for p in places) for key in answers), True)
+        found: defaultdict[Key, list[tuple[Partial, Term]]] = defaultdict(list)
+        for key in answers:
+            row = self._conditions.row(dict(zip(variables, key, strict=True)))
+            term = self._conditions.now(number, row)
+            found[tuple(key[p] for p in places)].append((row, term))
+        return {key: settled(needs) for key, needs in found.items()}
+
+    def _projected(self, number: int) -> tuple[str, ...]:
+        variables = self._asks[number][1]
+        return tuple(n for n in variables if n in self._named or n in self._edges)
+
+    def _decide(self, number: int) -> None:
+        hold, period = self._steps[number].hold, self._pulse.period
+        for key, one in list(self._held[number].items()):
+            *before, latest = one.open
+            needs = [self._conditions.resolved(need) for need in before]
+            one.decide([*needs, latest], hold, period)
+            if one.idle:
+                del self._held[number][key]
+
+    # Matches
+
+    def _found(self, here: Moment) -> list[Event]:
+        found: list[Event] = []
+        if all(self._held[number] for number in self._happen):
+            for binding in self._bindings({}, self._happen):
+                found += self._matches(binding, here)
+        self._forget()
+        return found
+
+    def _bindings(self, binding: Binding, steps: list[int]) -> Iterator[Binding]:
+        """Bindings of all steps together, each of which has places."""
+        if not steps:
+            yield binding
+            return
+        for key, held in self._agreeing(steps[0], binding):
+            if held.places:
+                both = joined(binding, self._columns[steps[0]], key, self._apart)
+                if both is not None:
+                    yield from self._bindings(both, steps[1:])
+
+    def _agreeing(self, number: int, binding: Binding) -> list[tuple[Key, Held]]:
+        """The bindings of a step that may agree with another one."""
+        names, held = self._columns[number], self._held[number]
+        if all(name in binding for name in names):
+            key = tuple(binding[name] for name in names)
+            return [(key, held[key])] if key in held else []
+        known = [(place, binding[name]) for place, name in enumerate(names) if name in binding]
+        return [
+            (key, one)
+            for key, one in held.items()
+            if all(key[place] == node for place, node in known)
+        ]
+
+    def _matches(self, binding: Binding, here: Moment) -> Iterator[Event]:
+        held = self._of(0, binding)
+        key = tuple(binding[name] for name in sorted(binding))
+        waiting: int | None = None
+        for place in held.places if held is not None else ():
+            run = place.run.number
+            if run <= self._told.get(key, -1) or run == waiting or key in self._over:
+                continue
+            ways = self._ways(0, place, binding)
+            if ways == OPEN:
+                waiting = run
+            elif isinstance(ways, tuple):
+                self._told[key] = run
+                if self._query.policy == "first":
+                    self._over.add(key)
+                yield self._event(binding, ways, here)
+
+    def _of(self, number: int, binding: Binding) -> Held | None:
+        return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
+
+    def _ways(self, at: int, place: Place, binding: Binding) -> Ways:
+        """The places of the steps from one on, the first of which is given."""
+        steps, following = self._steps, at + 1
+        if following == len(steps):
+            return (place,)
+        link, absent = self._query.links[at], None
+        if steps[following].absent:
+            absent = self._of(following, binding) or Held()
+            if following + 1 == len(steps):
+                return self._unfollowed(place, link, absent)
+            link, following = self._query.links[following], following + 1
+        held = self._of(following, binding)
+        stop = (
+            next((a.number for a in absent.places if a.number > place.number), NEVER)
+            if absent
+            else NEVER
+        )
+        found = self._reached(place, link, held, stop)
+        latest = self._query.policy == "longest"
+        open_end = not self._closed(place, link, held, stop)
+        if latest and open_end:
+            return OPEN
+        for other in reversed(found) if latest else found:
+            if absent is not None and absent.undecided < other.number:
+                return OPEN
+            rest = self._ways(following, other, binding)
+            if rest != FAILED:
+                return rest if isinstance(rest, str) else (place, *rest)
+        return OPEN if open_end else FAILED
+
+    def _reached(self, place: Place, link: Link, held: Held | None, stop: int) -> list[Place]:
+        """The places of the next step that a link allows."""
+        found = [p for p in held.places if p.number <= stop] if held is not None else []
+        first = place.number
+        match link.kind:
+            case "while":
+                return [p for p in found if p.number == first]
+            case "immediately":
+                return [p for p in found if p.number == first + 1 and not p.gap]
+            case "until":
+                last = place.run.last
+                return [
+                    p
+                    for p in found
+                    if first < p.number <= last or (p.number == last + 1 > first and not p.gap)
+                ]
+            case "then":
+                return [p for p in found if p.number > first and _within(link, place, p)]
+
+    def _closed(  # noqa: PLR0911 - a case each
+        self, place: Place, link: Link, held: Held | None, stop: int
+    ) -> bool:
+        """Whether no further place of the next step can come that a link allows."""
+        if self._ended:
+            return True
+        tick = self._pulse.tick
+        undecided = min(held.undecided if held is not None else NEVER, tick.number + 1)
+        if stop < undecided:
+            return True
+        match link.kind:
+            case "while":
+                return undecided > place.number
+            case "immediately":
+                return undecided > place.number + 1
+            case "until":
+                return place.run.over and undecided > place.run.last + 1
+            case "then":
+                within = link.within
+                if within is None:
+                    return False
+                if within.frames:
+                    return undecided > place.number + within.amount
+                beyond = tick.time >= place.time + within.amount
+                return beyond and (held is None or held.undecided == NEVER)
+
+    def _unfollowed(self, place: Place, link: Link, absent: Held) -> Ways:
+        plain = replace(link, kind="then", after=None)
+        if self._reached(place, plain, absent, NEVER):
+            return FAILED
+        return (place,) if self._closed(place, plain, absent, NEVER) else OPEN
+
+    def _event(self, binding: Binding, ways: tuple[Place, ...], here: Moment) -> Event:
+        steps = tuple(self._moment(place) for place in ways)
+        nodes = {name: node for name, node in binding.items() if name in self._named}
+        names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
+        return Event("found", self.name, here, steps[0], steps[-1], nodes, names, steps)
+
+    def _moment(self, place: Place) -> Moment:
+        return Moment(place.number, place.time, (place.time - self._pulse.start) / 1e9)
+
+    # What is kept
+
+    def _forget(self) -> None:
+        """Let go of the places that no match can have any more."""
+        first = self._held[0]
+        for key, one in first.items():
+            if one.places:
+                one.places = self._kept(key, one.places)
+        oldest = min(
+            (
+                min([one.undecided, *(place.number for place in one.places[:1])])
+                for one in first.values()
+            ),
+            default=NEVER,
+        )
+        for held in self._held[1:]:
+            for one in held.values():
+                while one.places and one.places[0].number <= min(
+                    oldest - 1, self._pulse.tick.number - 2
+                ):
+                    one.places.pop(0)
+
+    def _kept(self, key: Key, places: list[Place]) -> list[Place]:
+        if not self._query.links:
+            return [p for p in places if p.number >= self._pulse.tick.number]
+        link, absent = self._query.links[0], self._steps[1].absent
+        open_ended = link.kind == "until" or (link.kind == "then" and link.within is None)
+        if open_ended and not absent and self._query.policy != "longest":
+            # Whatever follows a later frame of a run follows its first one.
+            runs: dict[int, Place] = {}
+            for place in places:
+                runs.setdefault(place.run.number, place)
+            places = list(runs.values())
+        if absent:
+            return places
+        binding = dict(zip(self._columns[0], key, strict=True))
+        target = [held for _, held in self._agreeing(1, binding)]
+        return [p for p in places if self._alive(p, link, target)]
+
+    def _alive(self, place: Place, link: Link, target: list[Held]) -> bool:
+        if not self._closed(place, link, None, NEVER):
+            return True
+        return any(
+            not self._closed(place, link, held, NEVER) or self._reached(place, link, held, NEVER)
+            for held in target
+        )
+
+    def finish(self, here: Moment) -> list[Event]:
+        """The trace has ended: what only that makes known."""
+        self._ended = True
+        for number, held in enumerate(self._held):
+            for one in held.values():
+                one.finish(self._steps[number].hold, self._pulse.period)
+        return self._found(here)
+
+
+def _named(query: Query) -> tuple[str, ...]:
+    return tuple(
+        sorted(
+            key for key, node in query.scope.nodes.items() if node.role == "named" or query.steps
+        )
+    )
+
+
+def _within(link: Link, place: Place, other: Place) -> bool:
+    """Whether another place is as much later as a link asks."""
+    after, within = link.after, link.within
+    if after is not None:
+        least = place.number + after.amount if after.frames else place.time + after.amount
+        if (other.number if after.frames else other.time) < least:
+            return False
+    if within is not None:
+        most = place.number + within.amount if within.frames else place.time + within.amount
+        return (other.number if within.frames else other.time) <= most
+    return True
+
+
+class _Conditions:
+    """The conditions of steps that look at other frames."""
+
+    def __init__(
+        self, query: Query, steps: Sequence[Step], questions: Questions, pulse: Pulse
+    ) -> None:
+        nodes = {key: node for step in reversed(steps) for key, node in step.scope.nodes.items()}
+        scope = Scope(nodes, {}, (), (), frozenset())
+        whole = replace(query, scope=scope, result=Result(), steps=(), links=())
+        plan = Plan(whole, frozenset(nodes))
+        when = [And(tuple(map(plan.formula, step.when))) for step in steps]
+        self._progression = Progression(And(tuple(when)))
+        whole_formula = self._progression.formula
+        assert isinstance(whole_formula, And)  # noqa: S101 - it was made so
+        self._when: tuple[Formula, ...] = whole_formula.operands
+        self._asked = [bool(step.when) for step in steps]
+        told = [*plan.atoms.values(), *plan.signals.values()]
+        self._variables = tuple(sorted({name for one in told for name in one.variables}))
+        bridge = query.gaps == "bridge"
+        self._letters = Letters(plan, self._variables, questions, pulse, bridge=bridge)
+        self._pulse = pulse
+        self._known = Known(
+            self._letters.lattice, _Entry(self._progression.begun, self._letters.begun)
+        )
+        self._frames: dict[Partial, Frame] = {}
+
+    def step(self) -> None:
+        """A frame has come, and the questions were asked of it."""
+        if not any(self._asked):
+            return
+        known = self._known
+        letters, memories = self._letters.read(known.held, lambda row: known.of(row).memory)
+        shared: dict[tuple[Past, int], Frame] = {}
+        entries: dict[Partial, _Entry] = {}
+        self._frames = {}
+        for row, letter in letters.items():
+            past = known.of(row).past
+            if (past, letter) not in shared:
+                named = {n: bool(letter & self._letters.bits[n]) for n in self._progression.names}
+                shared[past, letter] = Frame(self._progression, past, named, self._pulse.tick)
+            frame = self._frames[row] = shared[past, letter]
+            entries[row] = _Entry(frame.past(), memories.get(row, ()))
+        known.keep(entries, lambda one, other: one == other)
+
+    def row(self, nodes: Binding) -> Partial:
+        """What the conditions are told of a binding."""
+        return tuple(nodes.get(name) for name in self._variables)
+
+    def now(self, number: int, row: Partial) -> Term:
+        """What the conditions of a step need, of a binding in this frame."""
+        return self._frame(row).now(self._when[number])
+
+    def resolved(self, needs: Needs) -> Needs:
+        """What conditions of a former frame need, with what this one shows."""
+        if isinstance(needs, bool):
+            return needs
+        return settled([(row, self._frame(row).resolved(term)) for row, term in needs])
+
+    def _frame(self, row: Partial) -> Frame:
+        frames = self._frames
+        return next(frames[w] for w in self._letters.lattice.wider(row) if w in frames)
+
+
+def settled(needs: list[tuple[Partial, Term]]) -> Needs:
+    """Whether one of some conditions holds, or which of them may."""
+    if any(term.word == "true" for _, term in needs):
+        return True
+    left = tuple((row, term) for row, term in needs if term.word != "false")
+    return left or False
