@@ -67,7 +67,7 @@ def check(
     and from when to when.
     """
     given = parameters_of(parameters)
-    asked, values = _asked(file, name, text, given)
+    asked, values = asked_of(file, name, text, given)
     run = open_store(store).check(asked, sgsm_compat=sgsm_compat, **values)
     if explain:
         typer.echo(run.explain())
@@ -93,7 +93,7 @@ def check(
     return NO_MATCH if require and tally["false"] else 0
 
 
-def _asked(
+def asked_of(
     file: Path | None, name: str | None, text: str | None, given: Mapping[str, Any]
 ) -> tuple[str, Mapping[str, Any]]:
     """The text that is asked, and the values of parameters that it does not hold yet."""

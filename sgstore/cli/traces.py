@@ -104,7 +104,7 @@ def ingest(
             store,
             recordings(_names(traces)),
             road_map=road_map,
-            config=_settings(config, preset),
+            config=settings_of(config, preset),
             egos=ego or (),
             jobs=jobs or os.cpu_count() or 1,
             since=None if since is None else seconds_of(since, "--since"),
@@ -128,7 +128,7 @@ def _names(traces: list[str]) -> list[str]:
     return [name for one in traces for name in (lines_of(Path("-")) if one == "-" else [one])]
 
 
-def _settings(config: Path | None, preset: str | None) -> Settings | None:
+def settings_of(config: Path | None, preset: str | None) -> Settings | None:
     from sgstore.config import load
     from sgstore.config import preset as preset_named
 
@@ -221,7 +221,7 @@ def doctor(
     from sgstore.ingest import Examination, examine, recordings
 
     form = form_of(form, as_json=as_json)
-    settings = _settings(config, preset)
+    settings = settings_of(config, preset)
     found = (
         examine(path, config=settings, road_map=road_map) for path in recordings(_names(traces))
     )

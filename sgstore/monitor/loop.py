@@ -51,6 +51,8 @@ class Monitor:
         What the trace is called in verdicts.
     period_s : float, optional
         Time between two frames, from which gaps are told; by default the median of those seen.
+    called : str
+        What a pattern is called in events; of several each has a number as well.
 
     Attributes
     ----------
@@ -80,6 +82,7 @@ class Monitor:
         parameters: Mapping[str, Any] | None = None,
         trace: str = "online",
         period_s: float | None = None,
+        called: str = "pattern",
     ) -> None:
         self.generator = SceneGraphGenerator(road_map, config or Config())
         self.trace = trace
@@ -103,7 +106,7 @@ class Monitor:
         for number, query in enumerate(queries, start=1):
             if query.relations <= answers or query.unknown_is_false:
                 ego, questions = self._of_ego(query.ego)
-                name = f"pattern {number}"
+                name = called if len(queries) == 1 else f"{called} {number}"
                 self._follows.append((ego, Follow(name, query, questions, self._pulse)))
         told = (follow.name for _, follow in self._follows)
         self.names = (*(check.name for check in checks), *told)
