@@ -57,8 +57,8 @@ def selection_of(text: str) -> Chosen:
     Parameters
     ----------
     text : str
-        ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A lock
-        is a file that is called ``….lock``.
+        ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A
+        lock is a file that is called ``….lock``.
 
     Raises
     ------
