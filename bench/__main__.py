@@ -15,7 +15,9 @@ TITLES = {
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
     "patterns": "Patterns over a million frames",
+    "temporal": "Time: formulas over columns, and frame by frame",
     "coverage": "Coverage of a million frames",
+    "selection": "Small parts of a million frames that keep every class",
 }
 
 names = [name for name in sys.argv[1:] if not name.startswith("-")] or list(TITLES)

@@ -23,7 +23,9 @@ from sgstore.lang.pairs import WAY
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
+    from sgstore.geometry import PairNumbers
     from sgstore.graph import SceneGraph
+    from sgstore.world import Floats
 
 Attributes = Mapping[str, Any]
 
@@ -112,40 +114,54 @@ class FrameView:
 
     def pair(self, name: str, one: int, other: int) -> float | None:
         """A number of a pair of entities; ``None`` where something that it needs is missing."""
-        key = (one, other)
         if name == WAY:
             reach = self.graph.reach
             places = self._places.get(one, ()), self._places.get(other, ())
             return None if reach is None else reach.distance(*places)
-        if key not in self._pairs:
-            boxes = [self._box(one), self._box(other)]
-            if None in boxes:
-                self._pairs[key] = {}
-            else:
-                with np.errstate(invalid="ignore"):
-                    numbers = pair_numbers(np.array(boxes[:1]), np.array(boxes[1:]))
-                self._pairs[key] = {
-                    name: float(scale * getattr(numbers, column)[0])
-                    for name, (column, scale) in _PAIR_COLUMNS.items()
-                }
-        value = self._pairs[key].get(name)
-        return None if value is None or math.isnan(value) else value
+        place = self._boxed.get(other)
+        if place is None or one not in self._boxed:
+            return None
+        value = self._numbers(name, one)[place]
+        return None if math.isnan(value) else value
+
+    def _numbers(self, name: str, one: int) -> list[float]:
+        """A number of one entity and each other: all at once, as most are asked one after the other."""
+        key = name, one
+        if key not in self._columns:
+            if one not in self._pairs:
+                boxes = self._boxes
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    own = np.broadcast_to(boxes[self._boxed[one]], boxes.shape)
+                    self._pairs[one] = pair_numbers(own, boxes)
+            column, scale = _PAIR_COLUMNS[name]
+            self._columns[key] = (scale * getattr(self._pairs[one], column)).tolist()
+        return self._columns[key]
 
     @cached_property
     def _places(self) -> Mapping[int, Sequence[tuple[int, float]]]:
         return self.graph.places()
 
     @cached_property
-    def _pairs(self) -> dict[tuple[int, int], dict[str, float]]:
+    def _pairs(self) -> dict[int, PairNumbers]:
         return {}
 
-    def _box(self, node: int) -> list[float] | None:
-        attributes = self.nodes[node]
-        if attributes["kind"] in MAP_KINDS:
-            return None
-        known = [attributes.get(name, math.nan) for name in _BOX]
-        known[3] = math.radians(known[3])
-        return known
+    @cached_property
+    def _columns(self) -> dict[tuple[str, int], list[float]]:
+        return {}
+
+    @cached_property
+    def _boxed(self) -> Mapping[int, int]:
+        """Rows of the entities in :attr:`_boxes`."""
+        known = (n for n, about in self.nodes.items() if about["kind"] not in MAP_KINDS)
+        return {node: row for row, node in enumerate(known)}
+
+    @cached_property
+    def _boxes(self) -> Floats:
+        """(E, 8) what numbers of pairs are made of."""
+        rows = [[self.nodes[n].get(name, math.nan) for name in _BOX] for n in self._boxed]
+        boxes = np.array(rows, np.float64).reshape(-1, len(_BOX))
+        boxes[:, 3] = np.radians(boxes[:, 3])
+        return boxes
 
 
 _BOX: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")

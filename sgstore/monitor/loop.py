@@ -72,7 +72,7 @@ class Monitor:
     ``unknown``, a pattern none.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - most have names
         self,
         text: str,
         road_map: RoadMap | None = None,
@@ -141,15 +141,25 @@ class Monitor:
         classed : bool
             Whether they are the last ones of :attr:`generator`, which can then be asked for their classes.
         """
+        return self._tell(*self._ask(graphs, classed=classed))
+
+    def _ask(
+        self, graphs: Sequence[SceneGraph], *, classed: bool = False
+    ) -> tuple[Moment, list[People]]:
+        """Ask all questions of the graphs of a frame."""
         self._pulse.step(graphs[0].time_ns)
         tick, start = self._pulse.tick, self._pulse.start
         here = Moment(tick.number, tick.time, (tick.time - start) / 1e9)
-        self._last = here
         people: list[People] = []
         for number, (graph, questions) in enumerate(zip(graphs, self._questions, strict=False)):
             view = self._view(graph, here, number if classed else None)
             people.append(People(view))
             questions.ask(view, people[-1])
+        return here, people
+
+    def _tell(self, here: Moment, people: list[People]) -> tuple[Event, ...]:
+        """Tell checks and patterns the answers."""
+        self._last = here
         found = [event for ego, watch in self._watches for event in watch.step(here, people[ego])]
         for ego, follow in self._follows:
             found += follow.step(here, people[ego])

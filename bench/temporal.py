@@ -1,0 +1,276 @@
+"""Time: formulas over columns and frame by frame, beside a DFA of LTLf that is stepped in Python."""
+
+from __future__ import annotations
+
+import random
+import resource
+import shutil
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from bench.measure import Measure
+from sgstore.config import Config
+from sgstore.monitor import Monitor
+from sgstore.online import Frame
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.temporal import Online, evaluate, formula_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from sgstore.world import Bools
+
+FORMULAS: Final = (
+    "ALWAYS NOT a",
+    "ALWAYS (a IMPLIES b)",
+    "ALWAYS (a IMPLIES EVENTUALLY[0s, 2s] b)",
+    "ALWAYS (a AND NEXT NOT a IMPLIES b)",
+    "EVENTUALLY (a AND EVENTUALLY b)",
+    "(NOT a) UNTIL b",
+    "ALWAYS ((a AND NEXT NOT a) IMPLIES NEXT (NOT a UNTIL (b OR ALWAYS NOT a)))",
+    "ALWAYS (ALWAYS[0s, 5s] a IMPLIES EVENTUALLY[0s, 10s] NOT a)",
+    "ALWAYS (b IMPLIES ONCE[0s, 3s] a)",
+    "ALWAYS (a SINCE[0s, 8s] b OR NOT c)",
+    "ALWAYS (c IMPLIES HISTORICALLY[1s, 4s] NOT b)",
+    "ALWAYS (a IMPLIES (b UNTIL[0s, 6s] c))",
+    "ALWAYS (PREVIOUS a AND b IMPLIES c RELEASE b)",
+)
+"""Thirteen properties of the kinds that the literature asks."""
+
+PLAIN: Final = (
+    ("ALWAYS (a IMPLIES EVENTUALLY b)", "G(a -> F b)"),
+    ("ALWAYS (a AND NEXT NOT a IMPLIES b)", "G((a & X(!a)) -> b)"),
+    ("(NOT a) UNTIL (b AND NEXT c)", "(!a) U (b & X(c))"),
+)
+"""Formulas without bounds and past, and the same as ltlf2dfa reads them."""
+
+PERIOD: Final = 50_000_000
+
+CHECKS: Final = "\n".join(
+    [
+        *(
+            f"CHECK near_{n}: FORALL (v:Vehicle) ALWAYS (dist(ego, v) < {n} IMPLIES"
+            f" EVENTUALLY[0s, 2s] dist(ego, v) > {n}) RESET WHEN dist(ego, v) > {n};"
+            for n in range(4, 10)
+        ),
+        *(f"CHECK fast_{n}: FORALL (v:Vehicle) ALWAYS NOT v.speed > {n};" for n in range(14, 18)),
+        *(
+            f"CHECK brakes_{n}: FORALL (v:Vehicle) ALWAYS"
+            f" (v.accel < -{n} IMPLIES ONCE[0s, 3s] dist(ego, v) < 30);"
+            for n in range(3, 7)
+        ),
+        *(
+            f"CHECK ego_{n}: ALWAYS (ego.speed > {n} IMPLIES EVENTUALLY[0s, 5s] ego.speed < {n});"
+            for n in range(5, 9)
+        ),
+        "CHECK people: ALWAYS NOT EXISTS {(ego)-[:near_coll]->(:Person)} RESET WHEN ego.speed < 1;",
+        "CHECK lead: ALWAYS (EXISTS {(:Vehicle)-[:inDFrontOf]->(ego)} SINCE ego.speed < 50)",
+    ]
+)
+"""Twenty properties."""
+
+
+def run(quick: bool) -> Iterator[Measure]:
+    """Measure."""
+    yield from _columns(100_000 if quick else 1_000_000, 1_000_000 if quick else 10_000_000)
+    yield from _beside_dfa(20_000 if quick else 200_000)
+    yield from _monitor(200 if quick else 1000)
+
+
+def _made(frames: int) -> tuple[dict[str, Bools], np.ndarray[Any, np.dtype[np.int64]]]:
+    """Propositions that hold for a while, on a clock of 20 Hz."""
+    rng = np.random.default_rng(3)
+    columns = {
+        name: np.repeat(rng.random(frames // 20 + 1) < share, 20)[:frames]
+        for name, share in (("a", 0.3), ("b", 0.5), ("c", 0.2))
+    }
+    return columns, np.arange(frames, dtype=np.int64) * PERIOD
+
+
+def _columns(frames: int, many: int) -> Iterator[Measure]:
+    columns, times = _made(frames)
+    formulas = [formula_of(text) for text in FORMULAS]
+    seconds = _taken(lambda: [evaluate(f, columns, times) for f in formulas])
+    yield Measure(f"{len(FORMULAS)} properties over {frames:,} frames, one core", seconds, "s")
+    with ThreadPoolExecutor(2) as pool:
+        both = _taken(lambda: list(pool.map(lambda f: evaluate(f, columns, times), formulas)))
+    yield Measure("… on two cores", both, "s", "goal at 1,000,000: 5 s")
+    columns, times = _made(many)
+    worst = [
+        (_taken(partial(evaluate, f, columns, times)), text)
+        for f, text in zip(formulas, FORMULAS, strict=True)
+    ]
+    slowest, text = max(worst)
+    yield Measure(
+        f"the slowest of them over {many:,} frames",
+        slowest,
+        "s",
+        f"goal at 10,000,000: 2 s; {text}",
+    )
+    middle = sorted(seconds for seconds, _ in worst)[len(worst) // 2]
+    yield Measure("… the median of them", middle, "s")
+
+
+def _beside_dfa(frames: int) -> Iterator[Measure]:
+    columns, times = _made(frames)
+    letters = [
+        dict(zip(columns, row, strict=True))
+        for row in zip(*(c.tolist() for c in columns.values()), strict=True)
+    ]
+    stepped = {text: _online(text, letters) for text, _ in PLAIN}
+    for text, (seconds, verdict) in stepped.items():
+        whole = bool(evaluate(formula_of(text), columns, times)[0])
+        if whole != verdict:
+            raise AssertionError(f"{text}: {whole} over columns, {verdict} frame by frame")
+        yield Measure(f"frame by frame: {text}", seconds / frames * 1e6, "µs a frame")
+    missing = _missing()
+    if missing:
+        print(f"beside an LTLf DFA: left out, {missing}", file=sys.stderr)
+        return
+    for text, ltlf in PLAIN:
+        machine = _dfa(ltlf)
+        began = time.perf_counter()
+        accepted = machine(letters)
+        seconds = time.perf_counter() - began
+        if accepted != stepped[text][1]:
+            raise AssertionError(f"{text}: the DFA says {accepted}")
+        ratio = seconds / stepped[text][0]
+        yield Measure(
+            f"an LTLf DFA beside it: {ltlf}",
+            seconds / frames * 1e6,
+            "µs a frame",
+            f"{ratio:.2f} times",
+        )
+        columnar = _taken(partial(evaluate, formula_of(text), columns, times))
+        yield Measure("… and beside columns", seconds / columnar, "times")
+
+
+def _missing() -> str:
+    if find_spec("ltlf2dfa") is None:
+        return "pip install ltlf2dfa (and MONA: apt install mona)"
+    return "" if shutil.which("mona") else "MONA is not there: apt install mona"
+
+
+def _online(text: str, letters: Sequence[Mapping[str, bool]]) -> tuple[float, bool]:
+    engine = Online(formula_of(text), every=False)
+    began = time.perf_counter()
+    for number, letter in enumerate(letters):
+        engine.step(letter, number * PERIOD)
+    return time.perf_counter() - began, bool(engine.verdict)
+
+
+def _dfa(ltlf: str) -> Callable[[Sequence[Mapping[str, bool]]], bool]:
+    """The automaton that MONA makes of a formula, stepped as SGSM does: guard by guard."""
+    parsed = import_module("ltlf2dfa.parser.ltlf").LTLfParser()(ltlf)
+    dot: str = parsed.to_dfa()
+    accepting: set[str] = set()
+    guards: dict[str, list[tuple[str, dict[str, bool]]]] = {}
+    for line in dot.splitlines():
+        text = line.strip().rstrip(";")
+        if "doublecircle" in text:
+            accepting = set(text.partition("]")[2].replace(";", " ").split())
+        if "->" in text and "label" in text:
+            ends, _, label = text.partition('[label="')
+            src, dst = (end.strip() for end in ends.split("->"))
+            for guard in label.rstrip('"];').split("|"):
+                words = [word.strip(" ()") for word in guard.split("&")]
+                wanted = {w.lstrip("~ "): not w.startswith("~") for w in words if w != "true"}
+                guards.setdefault(src, []).append((dst, wanted))
+
+    def machine(letters: Sequence[Mapping[str, bool]]) -> bool:
+        state = "1"
+        for letter in letters:
+            for dst, wanted in guards[state]:
+                if all(letter[name] == value for name, value in wanted.items()):
+                    state = dst
+                    break
+        return state in accepting
+
+    return machine
+
+
+def _monitor(frames: int) -> Iterator[Measure]:
+    """A hundred vehicles that drive about the ego, and twenty properties."""
+    generator = SceneGraphGenerator(None, Config())
+    monitor = Monitor(CHECKS)
+    made: list[float] = []
+    asked: list[float] = []
+    told: list[float] = []
+    sizes: list[int] = []
+    for number in range(frames):
+        times = [time.perf_counter()]
+        graph = generator.step(_frame(number))
+        times.append(time.perf_counter())
+        frame = monitor._ask([graph])  # noqa: SLF001 # pyright: ignore[reportPrivateUsage]
+        times.append(time.perf_counter())
+        monitor._tell(*frame)  # noqa: SLF001 # pyright: ignore[reportPrivateUsage]
+        times.append(time.perf_counter())
+        for taken, (a, z) in zip((made, asked, told), pairwise(times), strict=True):
+            taken.append(z - a)
+        if number % (frames // 4) == frames // 4 - 1:
+            sizes.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    whole = [a + b for a, b in zip(asked, told, strict=True)]
+    yield Measure(
+        "monitor, 100 nodes, 20 properties: time, median", _share(told, 0.5) * 1e3, "ms a frame"
+    )
+    yield Measure("… 99th percentile", _share(told, 0.99) * 1e3, "ms a frame", "goal: 1 ms")
+    yield Measure("… with atoms, median", _share(whole, 0.5) * 1e3, "ms a frame")
+    yield Measure("… 99th percentile", _share(whole, 0.99) * 1e3, "ms a frame", "goal: 10 ms")
+    yield Measure("… beside the making of the graph", sum(whole) / sum(made), "times")
+    yield Measure(
+        "… memory from a quarter of the run to its end", sizes[-1] / sizes[0], "times", "goal: 1"
+    )
+
+
+def _frame(number: int) -> Frame:
+    rng = random.Random(number // 10)
+    frame = Frame(time_ns=number * PERIOD, ego="ego")
+    frame.add(
+        "ego",
+        "car",
+        0.0,
+        0.0,
+        heading=0.0,
+        length=4.5,
+        width=1.9,
+        vx=6 + number % 40 / 20,
+        vy=0.0,
+        ax=0.0,
+        ay=0.0,
+    )
+    for who in range(99):
+        x, y = (who % 10 - 5) * 9 + number % 60 / 20, (who // 10 - 5) * 9 + rng.random()
+        speed = 5 + rng.random() * 10
+        kind = "person" if who % 10 == 0 else "car"
+        frame.add(
+            f"v{who}",
+            kind,
+            x,
+            y,
+            heading=0.0,
+            length=4.5,
+            width=1.9,
+            vx=speed,
+            vy=0.0,
+            ax=-rng.random() * 4,
+            ay=0.0,
+        )
+    return frame
+
+
+def _share(values: list[float], share: float) -> float:
+    return sorted(values)[int(share * (len(values) - 1))]
+
+
+def _taken(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began

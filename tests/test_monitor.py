@@ -1,0 +1,229 @@
+"""Monitors: what is told frame by frame is what a store answers of the whole recording."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from sgstore.config import Config
+from sgstore.demo import RECORDING
+from sgstore.errors import QueryError
+from sgstore.ingest import ingest
+from sgstore.monitor import Event, Monitor
+from sgstore.monitor.sources import opened
+from sgstore.online import Frame
+from sgstore.query import Store
+from sgstore.sgg import SceneGraphGenerator
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sgstore.graph import SceneGraph
+    from sgstore.history import Verdict
+    from sgstore.roads import RoadMap
+
+CHECKS = """
+CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 RESET WHEN dist(ego, v) > 9;
+CHECK faster: FORSOME (v:Vehicle) EVENTUALLY (v.speed > 8 AND prev(v.speed) <= 8);
+CHECK met: FORALL (v:Vehicle) FORSOME (p:Person) EVENTUALLY dist(v, p) < 20;
+CHECK turning: FORALL (v:Vehicle WHERE v.speed > 5)
+  ALWAYS (delta(v.heading, 1s) < 20 OR run_length(v.speed < 3) < 2s)
+  RESET WHEN age(v) > 3 AND since_true(v.speed > 1) < 1s;
+CHECK fast: FORALL (v:Vehicle) EVENTUALLY v.speed > 10;
+CHECK lately: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS ONCE[0s, 5s] v.speed > 1;
+CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND ALWAYS ego.speed < 9;
+USING END pending CHECK due: EVENTUALLY ego.speed > 40;
+USING END weak CHECK forgiven: EVENTUALLY ego.speed > 40
+"""
+
+SEQUENCES = (
+    "MATCH (e:Ego) WHERE e.speed < 1 THEN MATCH (e) WHERE e.speed > 5",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 12"
+    " THEN WITHIN 2s MATCH (e), (v) WHERE dist(e, v) < 8 FOR >= 0.5s",
+    "MATCH (v:Vehicle) WHERE v.speed > 5 THEN IMMEDIATELY MATCH (v) WHERE v.speed <= 5",
+    "MATCH (v:Vehicle) WHERE v.speed > 3 UNTIL MATCH (v) WHERE v.speed <= 3 FOR < 3s",
+    "MATCH (v:Vehicle) WHERE v.speed < 1 FOR >= 1s"
+    " THEN NOT MATCH (v) WHERE v.speed > 4 THEN WITHIN 8s MATCH (v) WHERE v.speed > 2",
+    "MATCH (v:Vehicle) WHERE v.speed > 5 THEN WITHIN 1s NOT MATCH (v) WHERE v.speed < 4",
+    "MATCH (v:Vehicle) WHERE v.speed > 5 AND prev(v.speed) <= 5"
+    " THEN AFTER 1s WITHIN 4s MATCH (v), (w:Vehicle) WHERE dist(v, w) < 8",
+    "MATCH (v:Vehicle) WHERE v.speed > 2 AND EVENTUALLY[0s, 1s] v.speed < 1"
+    " THEN WITHIN 2s MATCH (v) WHERE v.speed < 0.5",
+    "USING MATCHES longest MATCH (v:Vehicle) WHERE v.speed > 5 THEN WITHIN 2s MATCH (v) WHERE v.speed < 5",
+    "USING MATCHES first MATCH (v:Vehicle) WHERE v.speed < 1 THEN MATCH (v) WHERE v.speed > 4",
+)
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[RoadMap | None, list[SceneGraph]]:
+    """The map and the graphs of the bundled recording, one frame after the other."""
+    with opened(str(RECORDING), Config()) as source:
+        generator = SceneGraphGenerator(source.road_map, Config())
+        return source.road_map, [generator.step(frame) for frame in source.frames]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """The bundled recording in a store."""
+    path = tmp_path_factory.mktemp("town") / "town.sgstore"
+    ingest(path, [RECORDING])
+    return Store(path)
+
+
+def watched(
+    text: str, drive: tuple[RoadMap | None, list[SceneGraph]]
+) -> tuple[tuple[Verdict, ...], list[Event], Monitor]:
+    road_map, graphs = drive
+    events: list[Event] = []
+    monitor = Monitor(text, road_map, trace="town", on_event=events.append)
+    for graph in graphs:
+        monitor.look([graph])
+    return monitor.finish(), events, monitor
+
+
+def told(verdicts: Sequence[Verdict]) -> list[tuple[Any, ...]]:
+    return [(v.check, v.verdict, v.violations, v.witnesses) for v in verdicts]
+
+
+def library_checks() -> str:
+    from sgstore.lang import patterns
+
+    found = [p.text for p in patterns().values() if p.is_check]
+    return ";\n".join(text.strip().rstrip(";") for text in found)
+
+
+@pytest.mark.parametrize("text", [CHECKS, library_checks()], ids=["made", "library"])
+def test_a_recording_watched_has_the_verdicts_that_it_has_in_a_store(
+    text: str, drive: tuple[RoadMap | None, list[SceneGraph]], town: Store
+) -> None:
+    verdicts, events, _ = watched(text, drive)
+    wanted = list(town.check(text))
+
+    assert told(verdicts) == told(wanted)
+    violated = Counter(event.name for event in events if event.kind == "violated")
+    alone = {v.check: len(v.violations) for v in wanted if not v.witnesses and v.violated}
+    assert {name: violated[name] for name in alone} == alone
+
+
+@pytest.mark.parametrize("text", SEQUENCES)
+def test_sequences_are_found_when_they_complete_as_a_store_finds_them(
+    text: str, drive: tuple[RoadMap | None, list[SceneGraph]], town: Store
+) -> None:
+    _, events, _ = watched(text, drive)
+    found = list(town.find(text).intervals())
+    names = {name for one in found for name in one.values}
+    wanted = Counter(
+        (one.start_seq, tuple(sorted((k, v) for k, v in one.values.items() if isinstance(v, int))))
+        for one in found
+    )
+
+    assert wanted or "UNTIL" in text
+    assert wanted == Counter(
+        (e.start.seq, tuple(sorted((k, v) for k, v in e.nodes.items() if k in names)))
+        for e in events
+    )
+    assert all(e.start.seq <= e.end.seq <= e.told.seq for e in events)
+
+
+def car(t: float, speed: float, *others: tuple[str, float]) -> Frame:
+    frame = Frame(time_ns=round(t * 1e9), ego="ego")
+    frame.add("ego", "car", 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=speed, vy=0.0)
+    for ident, x in others:
+        frame.add(ident, "car", x, 0.0, heading=0.0, length=4.0, width=2.0, vx=0.0, vy=0.0)
+    return frame
+
+
+def test_a_violation_is_told_in_the_frame_that_makes_it_certain() -> None:
+    monitor = Monitor(
+        "CHECK brake: ALWAYS (ego.speed > 10 IMPLIES EVENTUALLY[0s, 1s] ego.speed < 5)"
+    )
+    events = [monitor.step(car(t / 10, 12 if t >= 5 else 0)) for t in range(30)]
+
+    (only,) = [event for some in events for event in some]
+    assert (only.kind, only.told.seq, only.start.seq) == ("violated", 16, 16)
+    assert monitor.status == {"brake": "false"}
+
+
+def test_what_is_reset_is_kept_again_and_can_be_violated_again() -> None:
+    monitor = Monitor("CHECK slow: ALWAYS ego.speed < 5 RESET WHEN ego.speed < 3")
+    speeds = [0, 6, 6, 2, 0, 6, 6]
+    kinds = [[e.kind for e in monitor.step(car(t / 10, v))] for t, v in enumerate(speeds)]
+
+    assert kinds == [[], ["violated"], [], ["kept again"], [], ["violated"], []]
+    (verdict,) = monitor.finish()
+    assert [(i.start_seq, i.end_seq) for i in verdict.violations] == [(1, 3), (5, 6)]
+
+
+def test_who_comes_later_is_held_to_what_strangers_owe() -> None:
+    monitor = Monitor("CHECK seen: FORALL (v:Vehicle) ALWAYS exists_now(v)")
+    early = [monitor.step(car(t / 10, 0)) for t in range(3)]
+    late = monitor.step(car(0.3, 0, ("late", 30.0)))
+
+    assert early == [(), (), ()]
+    assert [(e.kind, e.start.seq, e.told.seq) for e in late] == [("violated", 0, 3)]
+
+
+def test_statuses_say_what_the_verdict_would_be_now() -> None:
+    monitor = Monitor("CHECK moves: EVENTUALLY ego.speed > 1; CHECK slow: ALWAYS ego.speed < 5")
+    statuses = []
+    for t, speed in enumerate([0, 2, 6]):
+        monitor.step(car(t / 10, speed))
+        statuses.append(monitor.status)
+
+    assert statuses == [
+        {"moves": "presumably_false", "slow": "presumably_true"},
+        {"moves": "true", "slow": "presumably_true"},
+        {"moves": "true", "slow": "false"},
+    ]
+
+
+def test_what_the_graphs_cannot_have_is_unknown() -> None:
+    monitor = Monitor("CHECK lane: ALWAYS NOT off_road(ego); CHECK slow: ALWAYS ego.speed < 5")
+    monitor.step(car(0.0, 0))
+
+    assert {v.check: v.verdict for v in monitor.finish()} == {"slow": "true", "lane": "unknown"}
+
+
+def test_memory_does_not_grow_with_time() -> None:
+    text = """CHECK near: FORALL (v:Vehicle)
+      ALWAYS (dist(ego, v) < 6 IMPLIES EVENTUALLY[0s, 1s] dist(ego, v) > 6) RESET WHEN dist(ego, v) > 6;
+    MATCH (v:Vehicle) WHERE dist(ego, v) < 6 THEN WITHIN 1s MATCH (v) WHERE dist(ego, v) > 6"""
+    monitor = Monitor(text)
+    (_, watch), *_ = monitor._watches
+    (_, follow), *_ = monitor._follows
+    sizes = []
+    for t in range(600):
+        monitor.step(car(t / 10, 0, (f"v{t // 20}", 4.0 + t % 20)))
+        sizes.append((len(watch._known.held), sum(len(h) for h in follow._held)))
+
+    assert max(sizes[300:]) <= max(sizes[:300])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("CHECK a: ALWAYS ego.speed < 5 RESET WHEN NEXT ego.speed < 3", "looks ahead"),
+        ("USING GAPS unknown CHECK a: ALWAYS ego.speed < 5", "what was recorded"),
+        ("CHECK a: ALWAYS ego.sped < 5", "sped"),
+        ("DEFINE PREDICATE slow(x) AS x.speed < 5", "nothing is checked"),
+    ],
+)
+def test_what_cannot_be_watched_is_refused_with_the_reason(text: str, reason: str) -> None:
+    with pytest.raises(QueryError, match=reason):
+        Monitor(text)
+
+
+def test_a_parameter_that_no_statement_has_is_refused() -> None:
+    with pytest.raises(QueryError, match="no parameter 'least'"):
+        Monitor("CHECK a: ALWAYS ego.speed < $most", parameters={"most": 5, "least": 1})
+
+
+def test_the_same_question_of_two_checks_is_asked_once() -> None:
+    monitor = Monitor(
+        "CHECK a: ALWAYS NOT EXISTS {(ego)-[:near]->(:Car)};"
+        " CHECK b: EVENTUALLY NOT EXISTS {(ego)-[:near]->(:Car)}"
+    )
+
+    assert len(monitor._questions[0]._all) == 1
