@@ -123,7 +123,7 @@ def test_classes_are_those_that_s3c_published(data: Path, tmp_path: Path) -> Non
     import_graphs(tmp_path / "x.sgstore", files, "s3c")
     store = sgstore.open(tmp_path / "x.sgstore")
 
-    for abstraction in ("RSV", "junction", "SG"):
+    for abstraction in ("RSV", "SG"):
         found = [
             len(set(store.classes(abstraction, f"carla_{name}.csv")["class"])) for name in numbers
         ]
@@ -155,7 +155,7 @@ def test_what_networkx_writes_comes_back_with_its_attributes(tmp_path: Path) -> 
 def test_graphs_of_this_house_have_the_same_classes_when_they_come_back(tmp_path: Path) -> None:
     """Entities and their relations: what is known without a map."""
     sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
-    ingest(tmp_path / "town.sgstore", [sample], rate=1, until=20)
+    ingest(tmp_path / "town.sgstore", [sample], rate=1, until=9)
     town = sgstore.open(tmp_path / "town.sgstore")
     frames = town.classes("ER")["frame_id"].tolist()
     lines = []
@@ -165,13 +165,13 @@ def test_graphs_of_this_house_have_the_same_classes_when_they_come_back(tmp_path
         lines.append(json.dumps(nx.node_link_data(graph, edges="links")))
     store, done = imported(tmp_path, "\n".join(lines), "nodelink")
 
-    assert done.frames == len(frames) >= 20
+    assert done.frames == len(frames) == 10
     for abstraction in ("E", "ER"):
         wanted = town.classes(abstraction)["class"].tolist()
         assert store.classes(abstraction)["class"].tolist() == wanted
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_graph_and_the_same_in_another_order_have_one_class_in_all_formats(
     tmp_path: Path, seed: int
 ) -> None:
@@ -305,7 +305,7 @@ def mutated(text: str, rng: random.Random) -> bytes:
     return bytes(raw)
 
 
-HURT = int(os.environ.get("SGSTORE_HURT_GRAPHS", "400"))
+HURT = int(os.environ.get("SGSTORE_HURT_GRAPHS", "200"))
 """Files that are hurt; ``make oracle`` takes 20,000."""
 
 
@@ -455,7 +455,7 @@ def test_what_is_exported_as_s3c_comes_back_with_the_same_classes(
         import_graphs(first, [tmp_path / "two.csv"], "s3c")
     else:
         sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
-        ingest(first, [sample], rate=1, until=15)
+        ingest(first, [sample], rate=1, until=9)
     command = [
         "export",
         str(first),
