@@ -29,6 +29,7 @@ from sgstore.cli import (
     selection,
     settings,
     stores,
+    timelines,
     tour,
     traces,
 )
@@ -49,6 +50,7 @@ VERBS = (
     queries,
     checks,
     monitoring,
+    timelines,
     library,
     coverage,
     selection,

@@ -129,6 +129,7 @@ def _names(traces: list[str]) -> list[str]:
 
 
 def settings_of(config: Path | None, preset: str | None) -> Settings | None:
+    """What ``--config`` and ``--preset`` say; ``None``: neither is given."""
     from sgstore.config import load
     from sgstore.config import preset as preset_named
 

@@ -1,0 +1,80 @@
+"""Swim lanes: what they tell of a trace, as text and as a picture."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sgstore.cli import run
+from sgstore.demo import RECORDING
+from sgstore.draw.swimlanes import Lane, Span, Timeline, lines_of, timelines
+from sgstore.ingest import ingest
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CLOSE = "CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 7 RESET WHEN dist(ego, v) > 9"
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("town") / "town.sgstore"
+    ingest(path, [RECORDING])
+    return path
+
+
+def test_a_letter_is_full_where_most_of_it_is_covered_and_half_where_some_of_it_is() -> None:
+    lane = Lane(
+        "brakes", "car 3", "", [Span(0, 2, False), Span(1, 3, False), Span(7.1, 7.2, False)]
+    )
+    head, line = lines_of(Timeline("drive", 10.0, [lane]), letters=10)
+
+    assert head == "drive  0 … 10.0 s"
+    assert line == "  brakes · car 3  ███▌···▌··  found 3 times, 3.1 s"
+
+
+def test_the_lanes_of_a_store_are_its_violations_and_its_matches(town: Path) -> None:
+    store = Store(town)
+    text = "MATCH (e:Ego) WHERE e.speed > 8"
+    (timeline,) = timelines(store, {"rules": (CLOSE, {}), "fast": (text, {})})
+    (verdict,) = store.check(CLOSE)
+    violated = {(lane.who, len(lane.spans)) for lane in timeline.lanes if lane.name == "apart"}
+    (fast,) = [lane for lane in timeline.lanes if lane.name == "fast"]
+
+    assert violated == {(w.names["v"], len(w.violations)) for w in verdict.witnesses}
+    assert [(s.start, s.end) for s in fast.spans] == [
+        (i.start, i.end) for i in store.find(text).intervals()
+    ]
+    assert timelines(store, {"fast": (text, {})}, "elsewhere") == []
+
+
+def test_the_verb_prints_lanes_or_draws_them(
+    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["timeline", str(town), CLOSE, "-p", "phi6"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"^  phi6 +[█▌·]+  violated once", text, re.MULTILINE)
+
+    picture = tmp_path / "when.svg"
+    assert run(["timeline", str(town), CLOSE, "-p", "phi6", "-o", str(picture)]) == 0
+    drawn = picture.read_text(encoding="utf-8")
+    assert "phi6" in drawn
+    assert drawn.count("apart · ") == text.count("apart · ")
+    assert run(["timeline", str(town)]) == 2
+
+
+def test_a_recording_is_watched_by_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    rule = "CHECK slow: ALWAYS ego.speed < 8; MATCH (e:Ego) WHERE e.speed < 1 THEN MATCH (e) WHERE e.speed > 5"
+    asked = ["monitor", str(RECORDING), "-e", rule, "--duration", "12s"]
+
+    assert run([*asked, "--require"]) == 4
+    text = capsys.readouterr().out
+    assert "violated    slow" in text
+    assert text.endswith("slow: false  1 violation\n")
+
+    assert run([*asked, "--json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert '"event": "verdict", "name": "slow"' in lines[-1]
