@@ -73,6 +73,7 @@ pyg: $(VENV)/.base
 
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
+	$(BIN)/python tests/oracle_monitor.py 100000
 	$(BIN)/python tests/oracle.py 100000
 	$(BIN)/python tests/oracle_over_time.py 3000
 	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py
