@@ -225,7 +225,9 @@ def test_a_pattern_finds_its_drawn_example_and_not_its_counter_example(
     assert "town" not in matches.left_out
 
 
-@pytest.mark.parametrize("name", ["cut_in", "near_miss", "merge_conflict", "starting_left_turn"])
+@pytest.mark.parametrize(
+    "name", ["cut_in", "CutIn", "near_miss", "merge_conflict", "starting_left_turn"]
+)
 def test_a_pattern_is_a_step_by_its_name(store: Store, name: str) -> None:
     one, other = (store.find(text) for text in (f"MATCH {name}()", patterns()[name].text))
     rows = [dict(zip(other.columns, row, strict=True)) for row in other]

@@ -171,7 +171,8 @@ def _shipped(step: s.ScenarioStep, session: Session) -> s.Sequence | None:
     name = folded(step.name)
     if name in session.predicates:
         return None
-    entry = next((p for p in patterns().values() if folded(p.name) == name), None)
+    like = (p for p in patterns().values() if folded(p.name) == name)
+    entry = patterns().get(step.name) or next(like, None)  # CutIn and cut_in are two
     if entry is None or entry.kind not in SEQUENCES:
         return None
     names = Names(session, ScopeBuilder(session))
