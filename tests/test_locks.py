@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,9 @@ from sgstore.selection import Piece, Way, Wish, locked_selection, select
 from sgstore.store.contents import graph_digests
 
 pytest_plugins = ["pytester"]
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 FRAMES = 61
@@ -263,30 +267,30 @@ def test_one_case_of_two_contents_is_no_set(lock: Lock) -> None:
 # What is no lock --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda v: v.pop("cases"), "missing or unknown: 'cases'"),
-        (lambda v: v.update(more=1), "missing or unknown: 'more'"),
-        (lambda v: v.update(sgstore_lock=9), "expected 1: upgrade"),
-        (lambda v: v.update(traces={}), "traces: expected a list"),
-        (lambda v: v["cases"][0].pop("graph"), "cases[0]: expected id, trace"),
-        (lambda v: v["cases"][1].update(first="0"), "cases[1].first: '0'; expected int"),
-        (lambda v: v["cases"][1].update(first=True), "cases[1].first: 'True'"),
-        (lambda v: v["cases"][1].update(first=9, last=8), "cases[1]: it ends before it begins"),
-        (lambda v: v["cases"][1].update(last=10**12), "cases[1]: it ends before it begins"),
-        (lambda v: v["cases"][1].update(start_ns=10**30), "beyond 64 bits"),
-        (lambda v: v["cases"][1].update(trace="no"), "no trace 'no' among the traces"),
-        (lambda v: v["cases"].append(v["cases"][0]), "two cases have one id"),
-        (lambda v: v["traces"].append(v["traces"][0]), "two traces have one name"),
-        (lambda v: v["cases"][0].update(payload={"a": 1}), "payload: expected texts"),
-    ],
-)
+CHANGES: list[tuple[Callable[[dict[str, Any]], object], str]] = [
+    (lambda v: v.pop("cases"), "missing or unknown: 'cases'"),
+    (lambda v: v.update(more=1), "missing or unknown: 'more'"),
+    (lambda v: v.update(sgstore_lock=9), "expected 1: upgrade"),
+    (lambda v: v.update(traces={}), "traces: expected a list"),
+    (lambda v: v["cases"][0].pop("graph"), "cases[0]: expected id, trace"),
+    (lambda v: v["cases"][1].update(first="0"), "cases[1].first: '0'; expected int"),
+    (lambda v: v["cases"][1].update(first=True), "cases[1].first: 'True'"),
+    (lambda v: v["cases"][1].update(first=9, last=8), "cases[1]: it ends before it begins"),
+    (lambda v: v["cases"][1].update(last=10**12), "cases[1]: it ends before it begins"),
+    (lambda v: v["cases"][1].update(start_ns=10**30), "beyond 64 bits"),
+    (lambda v: v["cases"][1].update(trace="no"), "no trace 'no' among the traces"),
+    (lambda v: v["cases"].append(v["cases"][0]), "two cases have one id"),
+    (lambda v: v["traces"].append(v["traces"][0]), "two traces have one name"),
+    (lambda v: v["cases"][0].update(payload={"a": 1}), "payload: expected texts"),
+]
+
+
+@pytest.mark.parametrize(("change", "says"), CHANGES)
 def test_what_is_no_lock_is_refused_and_says_where(
-    lock: Lock, tmp_path: Path, change: object, says: str
+    lock: Lock, tmp_path: Path, change: Callable[[dict[str, Any]], object], says: str
 ) -> None:
     values = json.loads(lock.text())
-    change(values)  # type: ignore[operator]
+    change(values)
     path = tmp_path / "x.lock"
     path.write_text(json.dumps(values))
 

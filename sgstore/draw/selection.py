@@ -71,12 +71,13 @@ def draw_curve(
         page.text(14, _HEIGHT - 20, title, fontsize=10, weight="bold")
         page.text(14, _HEIGHT - 34, below, fontsize=7, color=FAINT_INK)
         for tick in range(_TICKS + 1):
-            share, n = tick / _TICKS, tick / _TICKS * most
+            share = tick / _TICKS
             page.sheet.plot([_LEFT, right], [up(share * total)] * 2, color=RULE, linewidth=0.6)
             page.text(
                 _LEFT - 5, up(share * total) - 2.5, f"{share:.0%}", ha="right", color=FAINT_INK
             )
-            page.text(across(n), _BELOW - 11, f"{n:,.0f}", ha="center", color=FAINT_INK)
+        for n in _round_numbers(most):
+            page.text(across(n), _BELOW - 11, f"{n:,}", ha="center", color=FAINT_INK)
         page.sheet.plot([_LEFT, right], [_BELOW, _BELOW], color=INK, linewidth=0.8)
         page.sheet.plot([_LEFT, _LEFT], [_BELOW, top], color=INK, linewidth=0.8)
         page.text((_LEFT + right) / 2, _BELOW - 28, f"{unit}s", ha="center", fontsize=8)
@@ -101,3 +102,10 @@ def draw_curve(
         page.sheet.plot([at, at + 22], [low] * 2, **dashed)
         page.text(at + 28, low - 2.5, f"{unit}s at random")
         page.save(to)
+
+
+def _round_numbers(most: int) -> range:
+    """Some five round numbers up to a number."""
+    step = 10 ** max(len(str(most)) - 2, 0)
+    step *= next(one for one in (1, 2, 5, 10, 20) if most / (one * step) <= _TICKS + 1)
+    return range(0, most + 1, step)

@@ -1,0 +1,77 @@
+"""Small parts of a million frames that keep every class, beside a random order and the bound from below.
+
+::
+
+    python -m bench selection [--quick]
+
+The store is made up as for ``coverage``: a million frames, scene after scene, how often a scene comes
+falling with its rank. ``--quick`` takes a fiftieth. The baseline is units in random order: how many it takes
+to keep as much.
+``SGSTORE_BENCH_SELECTION=FOLDER`` keeps the store, and takes it if it is there.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bench.coverage import PARTS, Library, made
+from bench.measure import Measure
+from sgstore.coverage import selection_of
+from sgstore.importing.blocks import parts_map
+from sgstore.selection import Budget, Piece, Way, Wish, curve, select
+
+FRAMES = 1_000_000
+WISHES = {
+    "frames": Wish(Way.minimal),
+    "clips of 2 s": Wish(Way.minimal, Piece.clip, 2.0),
+    "clips of 2 s within 1 h": Wish(Way.minimal, Piece.clip, 2.0, budget=Budget.parse("1h")),
+    "clips of 2 s, pairs of features": Wish(Way.minimal, Piece.clip, 2.0, "ER", combos=2),
+}
+
+
+def run(quick: bool = False) -> list[Measure]:
+    """Build, select, and compare."""
+    measures: list[Measure] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(os.environ.get("SGSTORE_BENCH_SELECTION") or name)
+        store = folder / f"selection{'-quick' if quick else ''}.sgstore"
+        if not store.exists():
+            road_map = parts_map("bench", '{"format": "bench"}', PARTS)
+            frames = FRAMES // (50 if quick else 1)
+            library = Library(np.random.default_rng(0), road_map)
+            seconds = made(store, frames, 1, library, road_map)
+            measures.append(
+                Measure("store made", frames / seconds, "frames/s", f"{frames:,} frames")
+            )
+        for label, wish in WISHES.items():
+            measures += _selected(str(store), label, wish)
+    return measures
+
+
+def _selected(store: str, label: str, wish: Wish) -> list[Measure]:
+    start = time.perf_counter()
+    found = select(selection_of(store), wish)
+    seconds = time.perf_counter() - start
+    result = found.result
+    measures = [
+        Measure(
+            f"minimal set of {label}", seconds, "s", "; ".join(found.said[:1]) + "; wanted: 10 s"
+        )
+    ]
+    if "bound" in result:
+        above = result["cost"] / max(result["bound"], 1)
+        note = f"{result['cost']:,.0f}, lower bound {result['bound']:,}, greedy {result['greedy']:,.0f}"
+        measures.append(Measure("    times its lower bound", above, "", note))
+        start = time.perf_counter()
+        drawn = curve(found)
+        note = f"{drawn.at_random:,.0f} in random order, mean of {drawn.orders} orders"
+        measures.append(
+            Measure("    of what random order needs", drawn.needed / drawn.at_random, "", note)
+        )
+        measures.append(Measure("    its curve", time.perf_counter() - start, "s"))
+    return measures
