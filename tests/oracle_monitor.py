@@ -23,10 +23,10 @@ def told(seed: int) -> tuple[Spans, Spans, str] | None:
     """Violations as a monitor tells them, as columns do, and of what; ``None``: the formulas do not fit."""
     rng = random.Random(seed)
     formula, reset = random_formula(rng, rng.randint(1, 4)), random_formula(rng, rng.randint(0, 2))
-    # What stood before a reset, and looks ahead beyond it, is asked anew over columns: no twin of this.
+    # Of what looks ahead from the past, columns know less before the end: no twin of this.
     both_ways = any(isinstance(p, Since | Previous) and looks_ahead(p) for p in walk(formula))
     with_reset = rng.random() < 0.7
-    if with_reset and (looks_ahead(reset) or both_ways):
+    if both_ways or (with_reset and looks_ahead(reset)):
         return None
     frames = rng.randint(1, 14)
     times = np.cumsum([rng.randint(1, 25) for _ in range(frames)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -137,9 +139,9 @@ def test_sequences_are_found_when_they_complete_as_a_store_finds_them(
 
 def car(t: float, speed: float, *others: tuple[str, float]) -> Frame:
     frame = Frame(time_ns=round(t * 1e9), ego="ego")
-    frame.add("ego", "car", 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=speed, vy=0.0)
+    frame.add("ego", "car", 0.0, 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=speed, vy=0.0)
     for ident, x in others:
-        frame.add(ident, "car", x, 0.0, heading=0.0, length=4.0, width=2.0, vx=0.0, vy=0.0)
+        frame.add(ident, "car", x, 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=0.0, vy=0.0)
     return frame
 
 
@@ -235,3 +237,23 @@ def test_the_same_question_of_two_checks_is_asked_once() -> None:
     )
 
     assert len(monitor._questions[0]._all) == 1
+
+
+def test_the_program_of_the_page_runs() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "online.md").read_text(encoding="utf-8")
+    (program,) = [
+        block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "RULES" in block
+    ]
+    frames = [car(t / 10, 15 if t > 5 else 0, ("v", 30.0 - t)) for t in range(40)]
+    told: list[tuple[Any, ...]] = []
+    names: dict[str, Any] = {
+        "frames": frames,
+        "road_map": None,
+        "print": lambda *values: told.append(values),
+    }
+    exec(compile(program, "online.md", "exec"), names)
+
+    kinds = [(kind, name) for _, kind, name, _ in told]
+    assert ("violated", "brakes") in kinds
+    assert ("violated", "apart") in kinds
+    assert {v.check: v.verdict for v in names["verdicts"]} == {"apart": "false", "brakes": "false"}

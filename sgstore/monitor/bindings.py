@@ -115,11 +115,7 @@ class Known(Generic[T]):
         lattice = self.lattice
         strangers = found[lattice.stranger]
         if lattice.size < 2:
-            self.held = {
-                one: value
-                for one, value in found.items()
-                if value is strangers or not same(value, strangers)
-            }
+            self.held = {one: value for one, value in found.items() if not same(value, strangers)}
             self.held[lattice.stranger] = strangers
             return
         held: dict[Partial, T] = {}

@@ -281,6 +281,9 @@ class Follow:
             ),
             default=NEVER,
         )
+        if self._told:
+            runs = min((one.oldest for one in first.values()), default=NEVER)
+            self._told = {key: run for key, run in self._told.items() if run >= runs}
         for held in self._held[1:]:
             for one in held.values():
                 while one.places and one.places[0].number <= min(
@@ -299,19 +302,36 @@ class Follow:
             for place in places:
                 runs.setdefault(place.run.number, place)
             places = list(runs.values())
-        if absent:
-            return places
         binding = dict(zip(self._columns[0], key, strict=True))
-        target = [held for _, held in self._agreeing(1, binding)]
-        return [p for p in places if self._alive(p, link, target)]
+        return [place for place in places if self._alive(0, binding, place)]
 
-    def _alive(self, place: Place, link: Link, target: list[Held]) -> bool:
+    def _alive(  # noqa: PLR0911 - a case each
+        self, at: int, binding: Binding, place: Place
+    ) -> bool:
+        """Whether it is still open what follows a place."""
+        following = at + 1
+        if following == len(self._steps):
+            return False
+        link = self._query.links[at]
+        if self._steps[following].absent:
+            if any(held.undecided < NEVER for _, held in self._agreeing(following, binding)):
+                return True
+            following += 1
+            if following == len(self._steps):
+                return not self._closed(place, replace(link, kind="then", after=None), None, NEVER)
+            link = self._query.links[at + 1]
         if not self._closed(place, link, None, NEVER):
             return True
-        return any(
-            not self._closed(place, link, held, NEVER) or self._reached(place, link, held, NEVER)
-            for held in target
-        )
+        for key, held in self._agreeing(following, binding):
+            if not self._closed(place, link, held, NEVER):
+                return True
+            both = {**dict(zip(self._columns[following], key, strict=True)), **binding}
+            if any(
+                self._alive(following, both, other)
+                for other in self._reached(place, link, held, NEVER)
+            ):
+                return True
+        return False
 
     def finish(self, here: Moment) -> list[Event]:
         """The trace has ended: what only that makes known."""

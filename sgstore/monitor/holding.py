@@ -27,7 +27,7 @@ class Run:
     Attributes
     ----------
     number : int
-        Which run of its binding it is.
+        The number of its first frame.
     last : int
         The number of its last frame so far.
     over : bool
@@ -84,12 +84,18 @@ class Held:
     _waiting: list[Place] = field(default_factory=list[Place])
     _start: tuple[int, int] = (0, 0)
     _fits: bool = True
-    _runs: int = 0
 
     @property
     def idle(self) -> bool:
         """Whether nothing is remembered."""
         return not (self.places or self._queue or self._run)
+
+    @property
+    def oldest(self) -> int:
+        """The first frame of the runs of which something is kept or may come; :data:`NEVER`: there are none."""
+        runs = [place.run.number for place in self.places[:1]]
+        runs += [self._run.number] if self._run is not None else []
+        return min([*runs, self.undecided])
 
     @property
     def undecided(self) -> int:
@@ -120,8 +126,7 @@ class Held:
 
     def _extend(self, asked: _Asked, hold: Hold | None, period: int) -> None:
         if self._run is None:
-            self._run = Run(self._runs, asked.number)
-            self._runs += 1
+            self._run = Run(asked.number, asked.number)
             self._start = asked.number, asked.time
             self._fits = hold is None
         self._run.last = asked.number
