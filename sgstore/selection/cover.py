@@ -70,7 +70,9 @@ class Family:
         rank: Ints | None = None,
     ) -> Family:
         """A family of pairs (2, M) of a set and an element, in any order; a pair may come twice."""
-        key = np.unique(pairs[0].astype(np.int64) * max(elements, 1) + pairs[1])
+        key = pairs[0].astype(np.int64) * max(elements, 1) + pairs[1]
+        if (np.diff(key) <= 0).any():
+            key = np.unique(key)
         of_set, members = np.divmod(key, max(elements, 1))
         starts = np.searchsorted(of_set, np.arange(sets + 1))
         often = np.bincount(members, minlength=elements)
