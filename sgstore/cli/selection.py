@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sgstore.coverage import Chosen, Table
     from sgstore.locks import Lock
     from sgstore.query import Store
-    from sgstore.selection import Selection, Wish
+    from sgstore.selection import Selection, Way, Wish
 
 lock = typer.Typer(no_args_is_help=True)
 app.add_typer(
@@ -139,17 +139,11 @@ def select(
     Without --minimal, --per-class, --rarest or --stratify all are taken, or some at
     random within the --budget.
     """
-    from sgstore.locks.lock import ENDING
-    from sgstore.selection import Budget, Measure, Piece, Way, Wish, parse_split
+    from sgstore.selection import Budget, Measure, Piece, Wish, parse_split
     from sgstore.selection import select as choose
 
-    ways = {Way.minimal: minimal, Way.rarest: rarest, Way.stratify: bool(stratify)}
-    ways[Way.per_class] = per_class is not None and not stratify
-    asked = [way for way, wanted in ways.items() if wanted]
-    if len(asked) > 1:
-        raise typer.BadParameter("give one of --minimal, --per-class, --rarest, --stratify")
     wish = Wish(
-        asked[0] if asked else Way.every,
+        _way(minimal=minimal, per_class=per_class, rarest=rarest, stratify=stratify),
         Piece(unit.value),
         seconds_of(clip, "--clip"),
         abstraction,
@@ -162,8 +156,7 @@ def select(
         least=Measure(least.value),
         seed=seed,
     )
-    if output is not None and output.suffix != ENDING:
-        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
+    _check_output(output)
     shares = parse_split(split) if split else {}
     found = choose(_chosen(store, query, parameters), wish)
     for text in found.said:
@@ -176,6 +169,26 @@ def select(
         _write(parts[1] if shares else _listed(found), form)
     if output is not None:
         _lock(found, wish, query, parts[0], output, payloads=not no_payloads)
+
+
+def _way(*, minimal: bool, per_class: int | None, rarest: bool, stratify: str) -> Way:
+    """How units are chosen, by the options that are given."""
+    from sgstore.selection import Way
+
+    ways = {Way.minimal: minimal, Way.rarest: rarest, Way.stratify: bool(stratify)}
+    ways[Way.per_class] = per_class is not None and not stratify
+    asked = [way for way, wanted in ways.items() if wanted]
+    if len(asked) > 1:
+        raise typer.BadParameter("give one of --minimal, --per-class, --rarest, --stratify")
+    return asked[0] if asked else Way.every
+
+
+def _check_output(output: Path | None) -> None:
+    """Refuse a name that no lock can have, before anything is searched."""
+    from sgstore.locks.lock import ENDING
+
+    if output is not None and output.suffix != ENDING:
+        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
 
 
 def _chosen(store: Path, query: str | None, parameters: list[str] | None) -> Chosen:

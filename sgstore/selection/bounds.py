@@ -22,13 +22,16 @@ if TYPE_CHECKING:
     from sgstore.world import Floats, Ints
 
 ROUNDS: Final = 400
-"""Steps along subgradients."""
+"""Steps along subgradients at most."""
 
 PATIENCE: Final = 20
 """Steps without a better bound after which they become half as long."""
 
 TRIES: Final = 10
 """Every so many steps the prices suggest a cover."""
+
+_WORK: Final = 200_000_000
+"""Memberships that all steps may look at together: fewer steps where there are very many."""
 
 ROUNDING: Final = 1e-7
 
@@ -61,7 +64,8 @@ def _priced(family: Family, cover: Ints) -> tuple[float, Ints, Floats]:
     upper = float(cost[cover].sum())
     best, kept, low = cover, prices, -math.inf
     scale, idle = 2.0, 0
-    for step in range(ROUNDS):
+    rounds = int(np.clip(_WORK // max(len(set_of), 1), TRIES, ROUNDS))
+    for step in range(rounds):
         left = cost - np.bincount(set_of, prices[family.members], len(cost))
         taken = left < 0
         bound = float((need * prices).sum() + left[taken].sum())
