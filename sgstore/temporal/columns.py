@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.temporal.formulas import (
+    TRUE,
     And,
     Bound,
     Constant,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.world import Bools, Ints
+
+    Places = NDArray[np.int32 | np.int64]
 
 CELLS: Final = 4_000_000
 """Frames times prefixes that are worked on at once."""
@@ -151,45 +154,66 @@ class _Table:
                 shifted[:, 1:] = self.value(operand, last)[:, :-1]
                 return shifted
             case Until(left=left, right=right, bound=bound):
-                return self._until(self.value(left, last), self.value(right, last), bound, last)
+                kept = None if left == TRUE else self.value(left, last)
+                return self._until(kept, self.value(right, last), bound, last)
             case Since(left=left, right=right, bound=bound):
-                return self._since(self.value(left, last), self.value(right, last), bound)
+                kept = None if left == TRUE else self.value(left, last)
+                return self._since(kept, self.value(right, last), bound)
 
-    def _until(self, left: Bools, right: Bools, bound: Bound, last: Ints) -> Bools:
-        here = np.arange(len(self.times))
+    def _until(self, left: Bools | None, right: Bools, bound: Bound, last: Ints) -> Bools:
+        """``left`` is ``None`` where it is true always."""
+        frames = len(self.times)
+        behind = None if np.all(last == frames - 1) else np.arange(frames) > last
+        hit = _next(right if behind is None else right & ~behind)
         start, end = self._window(bound, forward=True)
-        behind = here > last
-        hit = _at(_next(right & ~behind), start)
-        fails = _next(~left & ~behind)
-        return (hit <= np.minimum(end, last)) & (hit <= fails)
+        hit = hit if start is None else _at(hit, start)
+        true = hit <= (last if end is None else np.minimum(end, last))
+        if left is not None:
+            true &= hit <= _next(~left if behind is None else ~left & ~behind)
+        return true
 
-    def _since(self, left: Bools, right: Bools, bound: Bound) -> Bools:
+    def _since(self, left: Bools | None, right: Bools, bound: Bound) -> Bools:
+        hit = _last(right)
         start, end = self._window(bound, forward=False)
-        hit = _at(_last(right), start)
-        fails = _last(~left)
-        return (hit >= np.maximum(end, 0)) & (hit >= fails)
+        hit = hit if start is None else _at(hit, start)
+        true = hit >= (0 if end is None else np.maximum(end, 0))
+        if left is not None:
+            true &= hit >= _last(~left)
+        return true
 
-    def _window(self, bound: Bound, *, forward: bool) -> tuple[Ints, Ints]:
-        """The first and the last frame that an operator looks at, from each frame, in its direction."""
-        times, frames = self.times, len(self.times)
-        here = np.arange(frames)
+    def _window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
+        """The first and the last frame that an operator looks at, from each frame, in its direction.
+
+        ``None``: this frame; and the last one that there is.
+        """
         sign = 1 if forward else -1
-        if bound.frames:
-            near = here + sign * bound.low
-            far = None if bound.high is None else here + sign * bound.high
+        near = far = None
+        here = _frames(len(self.times))
+        low, high = bound.low, bound.high
+        period = None if bound.frames else self._period
+        if bound.frames or period:
+            # Of a clock that goes evenly, too, it is enough to count.
+            unit = period or 1
+            near = here + sign * min(-(-low // unit), len(here)) if low else None
+            far = None if high is None else here + sign * min(high // unit, len(here))
         elif forward:
-            near = np.searchsorted(times, times + bound.low, "left")
-            far = None
-            if bound.high is not None:
-                far = np.searchsorted(times, _sum(times, bound.high), "right") - 1
+            near = np.searchsorted(self.times, _sum(self.times, low), "left") if low else None
+            if high is not None:
+                far = np.searchsorted(self.times, _sum(self.times, high), "right") - 1
         else:
-            near = np.searchsorted(times, times - bound.low, "right") - 1
-            far = None
-            if bound.high is not None:
-                far = np.searchsorted(times, times - bound.high, "left")
-        if far is None:
-            far = np.full(frames, frames - 1 if forward else 0)
+            if low:
+                near = np.searchsorted(self.times, self.times - low, "right") - 1
+            if high is not None:
+                far = np.searchsorted(self.times, self.times - high, "left")
         return near, far
+
+    @property
+    def _period(self) -> int | None:
+        """The time between two frames, if it is always the same; ns."""
+        if len(self.times) < 2:
+            return None
+        period = int(self.times[1] - self.times[0])
+        return period if bool(np.all(np.diff(self.times) == period)) else None
 
 
 def _sum(times: Ints, by: int) -> Ints:
@@ -197,20 +221,26 @@ def _sum(times: Ints, by: int) -> Ints:
     return np.minimum(times, np.iinfo(np.int64).max - by) + by
 
 
-def _next(flags: Bools) -> NDArray[np.int64]:
+def _frames(frames: int) -> Places:
+    """Their numbers, in as few bytes as they need with some room."""
+    return np.arange(frames, dtype=np.int32 if frames < 1 << 29 else np.int64)
+
+
+def _next(flags: Bools) -> Places:
     """(R, F): the first frame from each on where a flag is set; F where there is none."""
     frames = flags.shape[1]
-    places = np.where(flags, np.arange(frames), frames)
-    return np.minimum.accumulate(places[:, ::-1], axis=1)[:, ::-1]
+    here = _frames(frames)
+    places = np.where(flags, here, here.dtype.type(frames))[:, ::-1]
+    return np.minimum.accumulate(places, axis=1)[:, ::-1]
 
 
-def _last(flags: Bools) -> NDArray[np.int64]:
+def _last(flags: Bools) -> Places:
     """(R, F): the last frame up to each where a flag is set; -1 where there is none."""
-    places = np.where(flags, np.arange(flags.shape[1]), -1)
-    return np.maximum.accumulate(places, axis=1)
+    here = _frames(flags.shape[1])
+    return np.maximum.accumulate(np.where(flags, here, here.dtype.type(-1)), axis=1)
 
 
-def _at(places: NDArray[np.int64], frame: Ints) -> NDArray[np.int64]:
+def _at(places: Places, frame: Places) -> Places:
     """The places told at other frames; F and -1 where these are out of the trace, behind and before it."""
     frames = places.shape[1]
     inside = (frame >= 0) & (frame < frames)
