@@ -278,6 +278,18 @@ def test_strata_share_a_budget_as_they_are_or_evenly(store: Store) -> None:
         assert abs(taken - 40 * size / total) <= 1
 
 
+@pytest.mark.parametrize("way", list(Way))
+def test_of_nothing_nothing_is_selected_and_it_is_said(store: Store, way: Way) -> None:
+    none = selection_of(f"{store.file.path}:MATCH (e:Ego) WHERE frame.seq > 9999")
+
+    found = select(none, Wish(way, Piece.clip, by="trace.name"))
+
+    assert len(found.picked) == 0
+    assert found.said[0].endswith("no frame to select from")
+    assert listed(found).rows == []
+    assert curve(found).table.rows == []
+
+
 def test_of_each_stratum_k(store: Store) -> None:
     found = select(whole(store), Wish(Way.stratify, each=7, by="trace.name"))
 

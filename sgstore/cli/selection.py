@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sgstore.coverage import Chosen, Table
     from sgstore.locks import Lock
     from sgstore.query import Store
-    from sgstore.selection import Selection, Way, Wish
+    from sgstore.selection import Selection, Way
 
 lock = typer.Typer(no_args_is_help=True)
 app.add_typer(
@@ -168,7 +168,8 @@ def select(
     else:
         _write(parts[1] if shares else _listed(found), form)
     if output is not None:
-        _lock(found, wish, query, parts[0], output, payloads=not no_payloads)
+        asked = query or "", parameters_of(parameters)
+        _lock(found, asked, parts[0], output, payloads=not no_payloads)
 
 
 def _way(*, minimal: bool, per_class: int | None, rarest: bool, stratify: str) -> Way:
@@ -251,8 +252,7 @@ def _curve(found: Selection, picture: Path | None, form: Format, *, printed: boo
 
 def _lock(
     found: Selection,
-    wish: Wish,
-    query: str | None,
+    asked: tuple[str, dict[str, Any]],
     parts: dict[int, str],
     output: Path,
     *,
@@ -261,7 +261,9 @@ def _lock(
     from sgstore.selection import locked_selection
 
     with count_bar(output.name, "cases") as progress:
-        made = locked_selection(found, query or "", parts, payloads=payloads, progress=progress)
+        made = locked_selection(
+            found, asked[0], parts, parameters=asked[1], payloads=payloads, progress=progress
+        )
     made.write(output)
     say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
 

@@ -148,6 +148,11 @@ def select(chosen: Chosen, wish: Wish) -> Selection:
     """
     units = units_of(chosen, wish.piece, wish.clip_s)
     rank = units.ranks(wish.seed)
+    if not len(units):
+        said = [f"{chosen.text}: no frame to select from"]
+        return Selection(
+            wish, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
+        )
     match wish.way:
         case Way.every:
             return _every(wish, units, rank)

@@ -58,6 +58,10 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
         It was not chosen by what it keeps.
     """
     held, units = selection.holdings, selection.units
+    if not len(units):
+        return Curve(
+            Table(("units", "kept", "share", "at_random"), [], list(selection.said)), 0, 0.0, 0
+        )
     if held is None:
         raise ConfigError("a curve shows what is kept: say --minimal, --per-class or --rarest")
     elements, total, pairs = held.total, len(units), held.pairs

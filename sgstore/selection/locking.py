@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sgstore.locks.contents import Part, lock_of
 
@@ -18,6 +18,7 @@ def locked_selection(
     query: str = "",
     parts: Mapping[int, str] | None = None,
     *,
+    parameters: Mapping[str, Any] | None = None,
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
@@ -30,6 +31,8 @@ def locked_selection(
         The query whose frames were selected from; empty: all.
     parts : mapping of int to str, optional
         The part that each unit belongs to: :func:`sgstore.selection.splits.split`.
+    parameters : mapping, optional
+        Values of ``$name`` in the query.
     payloads : bool
         Whether the messages of the recordings count, too; then they must be there.
     progress : callable, optional
@@ -50,5 +53,6 @@ def locked_selection(
         )
         for unit in sorted(selection.picked.tolist())
     ]
-    how = selection.wish.as_dict(query) | {"result": dict(selection.result)}
+    how = selection.wish.as_dict(query)
+    how |= {"parameters": dict(parameters or {}), "result": dict(selection.result)}
     return lock_of(units.chosen.store, wanted, how, payloads=payloads, progress=progress)
