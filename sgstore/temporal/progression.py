@@ -285,9 +285,9 @@ class Frame:
             case Not(operand=operand):
                 return terms.negated(self.now(operand))
             case And(operands=operands):
-                return terms.joined("and", [self.now(operand) for operand in operands])
+                return terms.joined("and", (self.now(operand) for operand in operands))
             case Or(operands=operands):
-                return terms.joined("or", [self.now(operand) for operand in operands])
+                return terms.joined("or", (self.now(operand) for operand in operands))
             case Next(operand=operand, weak=weak):
                 return terms.duty(operand, None, weak=weak)
             case Previous() | Since():
@@ -300,12 +300,15 @@ class Frame:
         age = (self._tick.number if bound.frames else self._tick.time) - start
         if bound.high is not None and age > bound.high:
             return terms.false
+        right = self.now(formula.right) if age >= bound.low else terms.false
+        if right is terms.true:
+            return right
+        left = self.now(formula.left)
+        if left is terms.false:
+            return right
         timed = bool(bound.low) or bound.high is not None
         later = terms.duty(formula, start if timed else None, weak=False)
-        later = terms.joined("and", [self.now(formula.left), later])
-        if age < bound.low:
-            return later
-        return terms.joined("or", [self.now(formula.right), later])
+        return terms.joined("or", (right, terms.joined("and", (left, later))))
 
     def resolved(self, term: Term) -> Term:
         """A combination of the frame before, with what this frame shows of its duties."""
@@ -323,7 +326,7 @@ class Frame:
             case "not":
                 return self._terms.negated(self.resolved(term.operands[0]))
             case word:
-                return self._terms.joined(word, [self.resolved(o) for o in term.operands])
+                return self._terms.joined(word, (self.resolved(o) for o in term.operands))
 
     def _of_past(
         self, part: Formula, before: Term, entries: tuple[Entry, ...]
