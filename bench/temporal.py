@@ -143,6 +143,7 @@ def _beside_dfa(frames: int) -> Iterator[Measure]:
         seconds = time.perf_counter() - began
         if accepted != stepped[text][1]:
             raise AssertionError(f"{text}: the DFA says {accepted}")
+        _agree(text, machine)
         ratio = seconds / stepped[text][0]
         yield Measure(
             f"an LTLf DFA beside it: {ltlf}",
@@ -154,9 +155,18 @@ def _beside_dfa(frames: int) -> Iterator[Measure]:
         yield Measure("… and beside columns", seconds / columnar, "times")
 
 
+def _agree(text: str, machine: Callable[[Sequence[Mapping[str, bool]]], bool]) -> None:
+    """Hold the automaton to the same answers on short words."""
+    rng = random.Random(5)
+    for _ in range(500):
+        word = [{name: rng.random() < 0.5 for name in "abc"} for _ in range(rng.randint(1, 8))]
+        if machine(word) != _online(text, word)[1]:
+            raise AssertionError(f"{text}: the DFA and the progression differ on {word}")
+
+
 def _missing() -> str:
     if find_spec("ltlf2dfa") is None:
-        return "pip install ltlf2dfa (and MONA: apt install mona)"
+        return "pip install --group peers, and apt install mona"
     return "" if shutil.which("mona") else "MONA is not there: apt install mona"
 
 
