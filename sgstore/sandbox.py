@@ -11,6 +11,7 @@ Parent and child speak JSON, a line a message.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import queue
@@ -260,6 +261,7 @@ def _sent_and_read(
 
 
 _QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
+_SPILLED: Final = os.strerror(errno.EFBIG)
 _ERRORS: Final = {"sql": SqlError, "store": StoreError}
 
 
@@ -347,6 +349,11 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
         span = (error.span.start, error.span.end) if error.span else None
         about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
         return {**about, "span": span, "hint": error.hint}
+    text = str(error)
+    if (
+        _SPILLED in text and "duckdb_temp" in text
+    ):  # it would go on in files, which it may not write
+        error = SqlError("stopped: it took more memory than is allowed")
     kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "sql")
     return {"kind": kind, "error": str(error)}
 

@@ -10,7 +10,7 @@ import pytest
 from sgstore.cli import run
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
-from sgstore.lang import pattern, patterns
+from sgstore.lang import pattern_named, patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def test_list_names_them_all_or_those_of_a_kind(capsys: pytest.CaptureFixture[st
     rows = json.loads(said(capsys, "list", "--json"))
 
     assert [row["name"] for row in rows] == [*patterns()]
-    assert rows[0]["sentence"] == pattern("stopped").sentence
+    assert rows[0]["sentence"] == pattern_named("stopped").sentence
     text = said(capsys, "list", "--kind", "concept")
     assert "cut_in" in text
     assert "ParkingExit" not in text
@@ -52,7 +52,7 @@ def test_show_prints_a_query_that_can_be_asked(
     assert "-- param ttc = 1.5: the largest time to collision; s" in text
     assert "--   ····e→" in text
     assert run(["find", store, "-f", str(file), "--count"]) == OK
-    frames = Store(store).find(pattern("low_ttc").text).count()
+    frames = Store(store).find(pattern_named("low_ttc").text).count()
     assert capsys.readouterr().out == f"{frames}\n"
 
 
@@ -67,7 +67,7 @@ def test_show_gives_the_same_as_data(capsys: pytest.CaptureFixture[str]) -> None
         "meaning": "the longest time from the first step to the second",
     }
     assert "THEN WITHIN $within" in told["query"]
-    assert told["example"] == pattern("CutIn").example
+    assert told["example"] == pattern_named("CutIn").example
 
 
 def test_run_finds_when_and_who(capsys: pytest.CaptureFixture[str], store: str) -> None:

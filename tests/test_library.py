@@ -15,7 +15,7 @@ from test_temporal import FORMULAS, FORMULAS_OF_TIME, never, property_named
 from sgstore.demo import RECORDING
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.ingest import ingest
-from sgstore.lang import pattern, patterns
+from sgstore.lang import pattern_named, patterns
 from sgstore.lang.parser import parse
 from sgstore.lang.standard import entries, predicates
 from sgstore.lang.syntax import Check, Define, Match
@@ -89,42 +89,42 @@ def test_the_page_and_the_drawings_are_up_to_date() -> None:
 
 
 def test_a_name_may_be_written_otherwise_where_only_one_is_meant() -> None:
-    assert pattern("Hard-Braking".replace("-", "")).name == "hard_braking"
-    assert pattern("CutIn").library == "leaderboard"
-    assert pattern("cut_in").library == "concepts"
+    assert pattern_named("Hard-Braking".replace("-", "")).name == "hard_braking"
+    assert pattern_named("CutIn").library == "leaderboard"
+    assert pattern_named("cut_in").library == "concepts"
     with pytest.raises(QueryNameError, match="'CUTIN' may be cut_in or CutIn"):
-        pattern("CUTIN")
+        pattern_named("CUTIN")
 
 
 def test_a_name_that_is_not_there_gets_a_suggestion() -> None:
     with pytest.raises(QueryNameError) as caught:
-        pattern("jaywalkin")
+        pattern_named("jaywalkin")
 
     assert caught.value.hint == "did you mean 'jaywalking'?"
 
 
 def test_parameters_are_written_into_the_text_as_their_types_are() -> None:
-    cut_in = pattern("cut_in")
+    cut_in = pattern_named("cut_in")
 
     assert "$" not in cut_in.text
     assert "THEN WITHIN 4s" in cut_in.text
     assert "THEN WITHIN 2.5s" in cut_in.written(within=2.5)
     assert "THEN WITHIN 300ms" in cut_in.written(within="300ms")
     assert "< 0.5 * e.speed" in cut_in.written(headway=0.5)
-    assert "ego.speed > 12" in pattern("phi4").written(S="12")
+    assert "ego.speed > 12" in pattern_named("phi4").written(S="12")
 
 
 @pytest.mark.parametrize("value", ["soon", True, float("nan"), "2; MATCH (e)", None, "-1s", -1])
 def test_a_value_of_another_type_is_refused(value: object) -> None:
     with pytest.raises(QueryError, match="parameter 'within' cannot be") as caught:
-        pattern("cut_in").written(within=value)
+        pattern_named("cut_in").written(within=value)
 
     assert caught.value.hint == "expected a duration such as 4s"
 
 
 def test_a_parameter_that_a_pattern_does_not_have_is_refused() -> None:
     with pytest.raises(QueryNameError, match="cut_in has no parameter 'speed'") as caught:
-        pattern("cut_in").written(speed=3)
+        pattern_named("cut_in").written(speed=3)
 
     assert caught.value.hint == "it has: headway, within, hold"
 
@@ -172,8 +172,8 @@ def published(name: str) -> Formula:
     """
     number, *of = name.lower().split("_")
     value = {} if not of else {"N": f"{2 * int(of[1])}frames"} if of[0] == "t" else {"S": of[1]}
-    text = pattern(f"{number}_as_coded").written(**value).split(":", 1)[1]
-    view = pattern("nothing_in_view").query.split(" AS", 1)[1]
+    text = pattern_named(f"{number}_as_coded").written(**value).split(":", 1)[1]
+    view = pattern_named("nothing_in_view").query.split(" AS", 1)[1]
     text = text.replace("nothing_in_view()", f"({view})")
     text = re.sub(r"ego_is_faster_than\(\d+\)", "ego_is_faster_than_s", text)
     text = text.replace("()", "")

@@ -21,7 +21,7 @@ from oracle_temporal import random_formula
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang.over_time import Hold, Length
-from sgstore.lang.standard import pattern
+from sgstore.lang.standard import pattern_named
 from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
 from sgstore.temporal.measures import Clock
 from sgstore.temporal.sequences import Leg, Line, matches_of
@@ -308,7 +308,7 @@ def test_a_scenario_is_the_sequence_that_it_stands_for(store: Store) -> None:
 
 
 def test_patterns_of_the_library_are_steps_by_their_names(store: Store) -> None:
-    text = pattern("hard_braking").written(decel=0.1, hold=0)
+    text = pattern_named("hard_braking").written(decel=0.1, hold=0)
 
     rows = store.find("MATCH hard_braking(decel = 0.1, hold = 0s) THEN MATCH (e)").rows()
 
@@ -343,6 +343,33 @@ def test_explain_tells_steps_and_atoms(store: Store) -> None:
     assert "then within 1s" in text
     assert "atom a1(e) = (e.speed > 0.5)" in text
     assert "for >= 1s" in text
+
+
+@pytest.mark.parametrize(
+    ("formula", "first"),
+    [
+        ("ALWAYS frame.seq < 60", "min(seq) FILTER (seq >= 60)"),
+        ("ALWAYS (frame.t < 1 OR trace.name = 'elsewhere')", "min(seq) FILTER (t >= 1)"),
+        ("EVENTUALLY frame.t >= 0", "NULL"),
+        ("NOT TRUE", "min(seq)"),
+    ],
+)
+def test_a_check_may_speak_of_frames_and_traces_alone(
+    store: Store, formula: str, first: str
+) -> None:
+    wanted = dict(store.sql(f"SELECT trace, {first} FROM frames GROUP BY trace").values)
+
+    violations = {v.trace: v.first_violation for v in store.check(f"CHECK {formula}")}
+
+    assert {trace: v and v.start_seq for trace, v in violations.items()} == wanted
+
+
+def test_texts_that_differ_in_a_number_are_different_questions(store: Store) -> None:
+    check = "CHECK FORALL (v:Entity) NOT (EVENTUALLY v.ident = 'a#1' OR EVENTUALLY v.ident = 'a#2')"
+
+    explained = store.check(check).explain()
+
+    assert explained.count("\natom ") == 2
 
 
 def test_a_check_tells_who_violates_it_and_when(store: Store) -> None:

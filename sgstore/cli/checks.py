@@ -100,9 +100,9 @@ def asked_of(
     if sum(source is not None for source in (file, name, text)) != 1:
         raise typer.BadParameter("give one of: a FILE, -p NAME, -e TEXT")
     if name is not None:
-        from sgstore.lang.standard import pattern
+        from sgstore.lang.standard import pattern_named
 
-        return pattern(name).written(**given), {}
+        return pattern_named(name).written(**given), {}
     return (text if text is not None else text_of(file or Path("-"))), given
 
 

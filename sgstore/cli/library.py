@@ -83,9 +83,9 @@ def show_pattern(name: PatternName, as_json: AsJson = False, output: Output = No
 
     What is printed is a query, its remarks being comments: it can be changed and asked with find -f.
     """
-    from sgstore.lang import pattern
+    from sgstore.lang import pattern_named
 
-    found = pattern(name)
+    found = pattern_named(name)
     if as_json:
         write_document({**_told(found), "example": found.example}, Format.json)
     else:
@@ -122,9 +122,9 @@ def run_pattern(
 
     Of a property: whether each trace keeps it, and where it does not.
     """
-    from sgstore.lang import pattern
+    from sgstore.lang import pattern_named
 
-    found = pattern(name)
+    found = pattern_named(name)
     if found.kind == "predicate":
         hint = f"a condition: ask 'sgstore find STORE \"MATCH … WHERE {found.name}(…)\"'"
         raise typer.BadParameter(f"{found.name} is {hint}")

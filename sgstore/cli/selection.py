@@ -404,9 +404,9 @@ def _asked(
     """The text that is asked, and the values of parameters that it does not hold yet."""
     if name is None:
         return query or "", values
-    from sgstore.lang.standard import pattern
+    from sgstore.lang.standard import pattern_named
 
-    return pattern(name).written(**values), {}
+    return pattern_named(name).written(**values), {}
 
 
 def _store(path: str) -> Store:

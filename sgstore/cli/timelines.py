@@ -67,7 +67,7 @@ def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
     """What is asked, by the names of its lanes."""
-    from sgstore.lang.standard import pattern
+    from sgstore.lang.standard import pattern_named
 
     found: dict[str, tuple[str, Mapping[str, Any]]] = {}
     for number, text in enumerate(queries, start=1):
@@ -75,7 +75,7 @@ def _asked(
     for file in files:
         found[file.stem] = text_of(file), values
     for name in names:
-        one = pattern(name)
+        one = pattern_named(name)
         own = {key: value for key, value in values.items() if key in one.parameters}
         found[name] = one.written(**own), {}
     if not found:

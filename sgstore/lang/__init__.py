@@ -7,7 +7,7 @@ printed.
 
 from sgstore.lang.catalog import Catalog, TraceFacts
 from sgstore.lang.compiler import Compiled, compile_query
-from sgstore.lang.standard import NamedPattern, pattern, patterns
+from sgstore.lang.standard import NamedPattern, pattern_named, patterns
 
 __all__ = [
     "Catalog",
@@ -15,6 +15,6 @@ __all__ = [
     "NamedPattern",
     "TraceFacts",
     "compile_query",
-    "pattern",
+    "pattern_named",
     "patterns",
 ]

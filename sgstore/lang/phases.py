@@ -91,7 +91,8 @@ def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
         parts.rest += parts.single.pop(key)
     parts.rest += [c for c in parts.direct if nodes_of(c) & parts.late]
     parts.direct = [c for c in parts.direct if not nodes_of(c) & parts.late]
-    parts.empty = not (scope.outer or scope.edges or parts.blocks or set(scope.nodes) - parts.late)
+    first = scope.outer or scope.edges or parts.blocks or set(scope.nodes) - parts.late
+    parts.empty = bool(parts.late) and not first
     if parts.empty:
         parts.rest += parts.trace + parts.direct
         parts.trace, parts.direct = [], []

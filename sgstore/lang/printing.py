@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -118,6 +119,15 @@ def kinds_text(kinds: Kinds) -> str:
 
 def _kinds(kinds: frozenset[str]) -> str:
     return "|".join(kind for kind in KINDS if kind in kinds) or "nothing"
+
+
+def unnumbered_text(value: Bound) -> str:
+    """An expression as :func:`value_text` prints it, without the numbers that tell unnamed nodes apart."""
+    return _NUMBERED.sub(lambda found: "#" if found[0][0] == "#" else found[0], value_text(value))
+
+
+_NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
+"""Texts, which are left as they are, and numbers of nodes."""
 
 
 def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each

@@ -202,7 +202,7 @@ def patterns() -> Mapping[str, NamedPattern]:
     return MappingProxyType(found)
 
 
-def pattern(name: str) -> NamedPattern:
+def pattern_named(name: str) -> NamedPattern:
     """A pattern by its name; how it is written matters only where two differ in nothing else.
 
     Raises

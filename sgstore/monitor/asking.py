@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from sgstore.lang.evaluation import Binding
 from sgstore.lang.match import Search, expression
-from sgstore.lang.printing import value_text
+from sgstore.lang.printing import unnumbered_text
 from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
@@ -16,9 +15,6 @@ if TYPE_CHECKING:
 
     from sgstore.lang import bound as b
     from sgstore.lang.evaluation import Evaluate, FrameView
-
-_NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
-"""Texts, which are left as they are, and numbers that tell unnamed nodes apart."""
 
 Key = tuple[int, ...]
 """What some variables are bound to, in their order."""
@@ -121,7 +117,7 @@ class Questions:
         edges: tuple[str, ...] = (),
     ) -> int:
         """The number of a question; the same for those that ask the same."""
-        key = _told(query), variables, None if value is None else _text(value), edges
+        key = _told(query), variables, None if value is None else unnumbered_text(value), edges
         if key not in self._known:
             self._known[key] = len(self._all)
             self._all.append(Question(query, variables, value, edges))
@@ -136,9 +132,5 @@ def _told(query: b.Query) -> tuple[Any, ...]:
     scope = query.scope
     nodes = tuple((key, node.kinds) for key, node in sorted(scope.nodes.items()))
     edges = tuple((e.key, e.src, e.dst, e.relations, e.both, e.low, e.high) for e in scope.edges)
-    where = tuple(map(_text, scope.where))
+    where = tuple(map(unnumbered_text, scope.where))
     return nodes, edges, where, scope.distinct, query.injective
-
-
-def _text(value: b.Bound) -> str:
-    return _NUMBERED.sub(lambda found: "#" if found[0][0] == "#" else found[0], value_text(value))

@@ -24,7 +24,6 @@ none can be copied when it comes. Values of signals at former frames are kept as
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -32,13 +31,12 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import bound as b
 from sgstore.lang.catalog import Type
-from sgstore.lang.printing import value_text
+from sgstore.lang.printing import unnumbered_text
 from sgstore.temporal import formulas as f
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-_NUMBERED: Final = re.compile(r"#\d+")
 _CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
 _KNOWN: Final = frozenset({"IS NULL", "IS NOT NULL"})
 FALSE: Final = b.Value(value=False, type=Type.boolean)
@@ -199,7 +197,7 @@ class Plan:
     def _atom(self, expression: b.Bound, nodes: frozenset[str]) -> f.Formula:
         if isinstance(expression, b.Value) and not nodes:
             return f.Constant(expression.value is True)
-        key = _NUMBERED.sub("#", value_text(expression)) + f" of {sorted(nodes)}"
+        key = unnumbered_text(expression) + f" of {sorted(nodes)}"
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = f"a{len(self.atoms) + 1}"
@@ -214,7 +212,7 @@ class Plan:
 
     def test(self, expression: b.Bound) -> Test:
         """An expression over values of several frames, of any type."""
-        key = "=" + _NUMBERED.sub("#", value_text(expression))
+        key = "=" + unnumbered_text(expression)
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = f"t{len(self.tests) + 1}"
@@ -246,7 +244,7 @@ class Plan:
 
     def _signal(self, value: b.Bound) -> Signal:
         nodes = b.nodes_of(value)
-        key = ":" + _NUMBERED.sub("#", value_text(value)) + f" of {sorted(nodes)}"
+        key = ":" + unnumbered_text(value) + f" of {sorted(nodes)}"
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = f"s{len(self.signals) + 1}"
