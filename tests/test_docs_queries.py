@@ -16,6 +16,7 @@ from sgstore.config import Config
 from sgstore.demo import RECORDING
 from sgstore.graphs import derive
 from sgstore.ingest import ingest
+from sgstore.monitor import Monitor
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -79,10 +80,21 @@ def test_the_queries_of_a_page_are_answered(page: Path, store: sgstore.Store) ->
     for text in queries_of(page.read_text(encoding="utf-8")):
         if text.startswith(("SELECT", "WITH", "DESCRIBE", "FROM")):
             store.sql(text, max_rows=ROWS)
+        elif re.search(r"^CHECK\b.*^MATCH\b", text, re.MULTILINE | re.DOTALL):
+            watched(text, store)
         elif re.search(r"^CHECK\b", text, re.MULTILINE):
-            assert store.check(text)
+            assert {verdict.trace for verdict in store.check(text)} == {"town"}
         else:
             list(islice(store.find(text), ROWS))
+
+
+def watched(text: str, store: sgstore.Store) -> None:
+    """What checks and searches at once is for a monitor."""
+    given = dict.fromkeys(re.findall(r"\$(\w+)", text), 10)
+    monitor = Monitor(text, parameters=given)
+    for seq in range(ROWS):
+        monitor.look([store.file.graph(f"town#{seq}")])
+    assert len(monitor.finish()) == text.count("CHECK ")
 
 
 def test_queries_are_found_wherever_they_stand() -> None:
