@@ -7,8 +7,7 @@
 The recordings are made up. Objects: 60 a frame, in CARLA's messages and in OSI's. Skimming: the same objects in
 a file that is mostly camera and lidar: stored; in zstd, which finds nothing in a JPEG; and in zstd of raw
 pictures and points, which it halves. Bytes are counted as they are without compression. Files are read from the
-page cache, and seconds are those of processors; by the clock it is faster where a second core decompresses
-ahead, as far as there is one to spare. Hashing is left out, because it has a processor of its own.
+page cache, and seconds are those of one processor. Hashing is left out, because it has a processor of its own.
 """
 
 from __future__ import annotations
@@ -177,16 +176,14 @@ def walked(path: Path) -> int:
 # Tables -------------------------------------------------------------------------------------------
 
 
-def best(
-    work: Callable[[], int], clock: Callable[[], float] = time.process_time
-) -> tuple[float, int]:
-    """Least time in some rounds, and what came out; s."""
+def best(work: Callable[[], int]) -> tuple[float, int]:
+    """Least time of a processor in some rounds, and what came out; s."""
     times: list[float] = []
     result = 0
     for _ in range(ROUNDS):
-        start = clock()
+        start = time.process_time()
         result = work()
-        times.append(clock() - start)
+        times.append(time.process_time() - start)
     return min(times), result
 
 
@@ -234,8 +231,6 @@ def skimming(folder: Path, frames: int) -> list[Measure]:
         theirs, _ = best(lambda: official_carla(path))  # noqa: B023
         found, _ = best(lambda: walked(path))  # noqa: B023
         whole, _ = best(lambda: ours(path))  # noqa: B023
-        clock, _ = best(lambda: ours(path), time.perf_counter)  # noqa: B023
-        bare_clock, _ = best(lambda: decompressed(path), time.perf_counter)  # noqa: B023
         table += [
             Measure(name, stored, "of it", "in the file"),
             Measure("  bare chunks, read and decompressed", size / bare, "MB/s"),
@@ -251,12 +246,6 @@ def skimming(folder: Path, frames: int) -> list[Measure]:
                 size / whole,
                 "MB/s",
                 f"{theirs / whole:.1f} times, {bare / whole:.2f} of the bare chunks",
-            ),
-            Measure(
-                "  the same by the clock",
-                size / clock,
-                "MB/s",
-                f"{bare_clock / clock:.2f} of the bare chunks, {size / bare_clock:,.0f} MB/s",
             ),
         ]
         path.unlink()

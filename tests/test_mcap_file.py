@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import threading
 import time
 import tracemalloc
 import zlib
@@ -22,8 +21,8 @@ from mcap.stream_reader import StreamReader
 from recordings import OSI, Recorder, bulb, car, drive, ground_truth, house, person, sign
 
 from sgstore.errors import TraceError
-from sgstore.traces import chunks, open_trace, read_message
-from sgstore.traces.chunks import MAX_RECORDS, ChunkHead, decompress
+from sgstore.traces import open_trace, read_message
+from sgstore.traces.chunks import MAX_RECORDS, decompress
 from sgstore.traces.mcap_file import McapFile
 from sgstore.world import TraceReport
 
@@ -151,34 +150,6 @@ def test_a_file_can_be_walked_again(tmp_path: Path) -> None:
 
         assert first == second
         assert len(recording.metadata) == 0
-
-
-@pytest.mark.parametrize(("compression", "ahead"), [("zstd", 1), ("lz4", 1), ("", 0)])
-def test_the_next_chunk_that_is_wanted_is_decompressed_ahead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str, ahead: int
-) -> None:
-    path = drive(tmp_path / "a.mcap", compression=compression, chunk_size=2000)
-    offsets = [chunk.chunk_start_offset for chunk in chunk_index(path)]
-    threads: dict[int, str] = {}
-
-    def records_of(stored: bytes, head: ChunkHead, *, verify: bool = True) -> bytes | bytearray:
-        threads[head.offset] = threading.current_thread().name
-        return chunks.records_of(stored, head, verify=verify)
-
-    monkeypatch.setattr("sgstore.traces.ahead.records_of", records_of)
-    with McapFile(path) as recording:
-        walked = [
-            run.chunk_offset
-            for run in recording.walk(TraceReport(), wanted=lambda at: at in offsets[::2])
-        ]
-    assert walked == offsets[::2]
-    with McapFile(path) as recording:
-        walked = [run.chunk_offset for run in recording.walk(TraceReport())]
-    assert walked == offsets
-
-    assert sorted(threads) == offsets[1:] * ahead
-    assert all(name.startswith("sgstore-chunks") for name in threads.values())
-    assert not [t for t in threading.enumerate() if t.name.startswith("sgstore-chunks")]
 
 
 @pytest.mark.parametrize("how", LAYOUTS)

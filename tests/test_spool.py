@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recordings import drive
 
-from sgstore.traces import ahead, chunks, open_trace, spool
+from sgstore.traces import chunks, mcap_file, open_trace, spool
 from sgstore.traces.mcap_file import McapFile
 from sgstore.world import FrameBlock, TraceReport
 
@@ -41,14 +41,13 @@ def told(recording: McapFile, keep: Callable[[int], bool] | None = None) -> Told
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Offsets of the chunks that are read from the file, as they are."""
     offsets: list[int] = []
-    records_of = chunks.records_of
+    read = chunks.read_records
 
-    def counted_records_of(stored: Any, head: chunks.ChunkHead, *, verify: bool = True) -> Any:
+    def read_records(file: Any, head: chunks.ChunkHead, *, verify: bool = True) -> Any:
         offsets.append(head.offset)
-        return records_of(stored, head, verify=verify)
+        return read(file, head, verify=verify)
 
-    monkeypatch.setattr(chunks, "records_of", counted_records_of)
-    monkeypatch.setattr(ahead, "records_of", counted_records_of)
+    monkeypatch.setattr(mcap_file, "read_records", read_records)
     return offsets
 
 

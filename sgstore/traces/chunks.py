@@ -215,17 +215,6 @@ def read_records(file: BinaryIO, head: ChunkHead, *, verify: bool = True) -> byt
     TraceError
         The chunk is too large, cut, not what it declares, or damaged.
     """
-    return records_of(read_stored(file, head), head, verify=verify)
-
-
-def read_stored(file: BinaryIO, head: ChunkHead) -> bytes:
-    """The records of a chunk as they stand in the file.
-
-    Raises
-    ------
-    TraceError
-        The chunk is too large, or cut.
-    """
     if head.size > MAX_CHUNK or head.data_length > MAX_CHUNK:
         largest = max(head.size, head.data_length)
         reason = f"the chunk declares {largest} bytes; at most {MAX_CHUNK} are read"
@@ -234,17 +223,6 @@ def read_stored(file: BinaryIO, head: ChunkHead) -> bytes:
     stored = file.read(head.data_length)
     if len(stored) != head.data_length:
         raise TraceError("the file ends inside this chunk", offset=head.offset)
-    return stored
-
-
-def records_of(stored: bytes, head: ChunkHead, *, verify: bool = True) -> bytes | bytearray:
-    """The records of a chunk from what :func:`read_stored` gives.
-
-    Raises
-    ------
-    TraceError
-        The chunk is not what it declares, or damaged.
-    """
     try:
         records = decompress(stored, head.compression, head.size)
     except TraceError as error:

@@ -33,7 +33,6 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema
 
 from sgstore.errors import TraceError
-from sgstore.traces.ahead import ReadAhead
 from sgstore.traces.chunks import (
     CHUNK_FIELDS,
     HEAD,
@@ -47,6 +46,7 @@ from sgstore.traces.chunks import (
     message_columns,
     parse_records,
     read_chunk_head,
+    read_records,
 )
 from sgstore.traces.fetch import open_regular
 from sgstore.traces.losses import Place, lose, loss_of_chunk, name_of
@@ -157,7 +157,6 @@ class McapFile:
         self.counts: dict[int, int] | None
         self.compression = "zstd"
         self._verified: set[int] = set()
-        self._ahead = ReadAhead()
         self._definition_bytes = 0
         self._file = open_regular(path)
         try:
@@ -177,7 +176,6 @@ class McapFile:
 
     def close(self) -> None:
         """Close the file."""
-        self._ahead.close()
         self._file.close()
         if self._own_spool:
             self._spool.close()
@@ -363,7 +361,6 @@ class McapFile:
                 place = Place(place.offset, astray - place.offset)
             walk.pending = loss_of_chunk(error.reason, place, head)
             return
-        self._look_ahead(walk, place.offset)
         walk.messages += len(messages)
         for opcode, content in definitions:
             self._define(walk, opcode, content, place.offset)
@@ -377,8 +374,7 @@ class McapFile:
         """Messages and definitions of a chunk, kept ones or from the file."""
 
         def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
-            verify = head.offset not in self._verified
-            records = self._ahead.records(self._file, head, verify=verify)
+            records = read_records(self._file, head, verify=head.offset not in self._verified)
             return parse_records(records, head.offset)
 
         kept = self._spool.get(self.path, head.offset, lambda: read()[0].read)
@@ -387,16 +383,6 @@ class McapFile:
         found = read()
         self._verified.add(head.offset)
         return found
-
-    def _look_ahead(self, walk: _Walk, offset: int) -> None:
-        """Begin with the chunk that the summary names next, while the messages of this one are looked at."""
-        behind = self._chunk_behind(offset, self.size)
-        if behind is None or (walk.wanted is not None and not walk.wanted(behind)):
-            return
-        if not self._spool.has(self.path, behind):
-            with suppress(TraceError):  # it is told when its turn comes
-                head = read_chunk_head(self._file, behind)
-                self._ahead.begin(self._file, head, verify=behind not in self._verified)
 
     def _known(self, walk: _Walk, messages: Messages) -> Iterator[Messages]:
         """The messages, without those of channels that were never defined."""
