@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.abstractions.classes import Classes, classes_of
 from sgstore.abstractions.columns import Grounds, Labelled, Seen
+from sgstore.abstractions.lanes import lane_roles
 from sgstore.abstractions.literature import (
     entities,
     in_lanes,
     junction,
-    lane_roles,
     related,
     road_scene,
     whole,

@@ -434,3 +434,15 @@ def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
     none = np.zeros(0, np.int64)
     columns = zip(*parts, (none,) * count, strict=True)
     return [np.concatenate(column).astype(np.int64) for column in columns]
+
+
+def repeated(columns: Part) -> Bools:
+    """Which rows have come before."""
+    again = np.zeros(len(columns[0]), np.bool_)
+    if len(again):
+        order = np.lexsort(columns)
+        same = np.ones(len(order) - 1, np.bool_)
+        for column in columns:
+            same &= column[order][1:] == column[order][:-1]
+        again[order[1:]] = same
+    return again

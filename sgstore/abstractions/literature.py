@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.abstractions.columns import BETWEEN_ENTITIES, EGO, SCENERY, Labelled
-from sgstore.abstractions.roles import OPPOSING, UNNAMED, role_name
+from sgstore.abstractions.columns import BETWEEN_ENTITIES, EGO, SCENERY, Labelled, repeated
+from sgstore.abstractions.lanes import NAMELESS, OFF_ROAD, ego_lanes
+from sgstore.abstractions.roles import UNNAMED, role_name
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     KIND_CODE,
@@ -40,10 +41,7 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from sgstore.abstractions.columns import Grounds, Part, Seen
-    from sgstore.abstractions.roles import Strands
     from sgstore.world import Bools, Ints
 
 ROOT_ROAD: Final = -(1 << 40)
@@ -95,7 +93,6 @@ _MAPS: Final = 4
 _EGO_LABEL: Final = len(KINDS)
 _KIND_LABELS: Final = (*KINDS, EGO)
 _IS_IN: Final = RELATION_CODE["isIn"]
-_OFF_ROAD: Final = -1
 _ON_ROADS: Final = np.array([r in OF_JUNCTION and r not in BETWEEN_ENTITIES for r in RELATIONS])
 
 
@@ -195,7 +192,7 @@ def _drawn(seen: Seen, kept: Bools, columns: Part, whose: Ints | None) -> Part:
     of_map = (src < 0) | (dst < 0)
     src, dst = _standing_for(whose, src), _standing_for(whose, dst)
     rows = np.flatnonzero(of_map)
-    again = _repeated((frame[rows], relation[rows], src[rows], dst[rows]))
+    again = repeated((frame[rows], relation[rows], src[rows], dst[rows]))
     keep = np.ones(len(frame), np.bool_)
     keep[rows[again]] = False
     keep &= src != dst
@@ -204,18 +201,6 @@ def _drawn(seen: Seen, kept: Bools, columns: Part, whose: Ints | None) -> Part:
 
 def _standing_for(whose: Ints, node: Ints) -> Ints:
     return np.where(node < 0, whose[np.clip(-1 - node, 0, len(whose) - 1)], node)
-
-
-def _repeated(columns: Part) -> Bools:
-    """Which rows have come before."""
-    again = np.zeros(len(columns[0]), np.bool_)
-    if len(again):
-        order = np.lexsort(columns)
-        same = np.ones(len(order) - 1, np.bool_)
-        for column in columns:
-            same &= column[order][1:] == column[order][:-1]
-        again[order[1:]] = same
-    return again
 
 
 @lru_cache(maxsize=_MAPS)
@@ -308,137 +293,30 @@ def _with_lanes(seen: Seen, *, related: bool) -> Labelled:
 
 def _lanes(seen: Seen, first: int) -> tuple[list[Part], list[Part], list[str]]:
     """Nodes, ``isIn`` edges and labels of the lanes as the ego has them; labels count from ``first``."""
-    assert seen.grounds is not None  # noqa: S101 - the caller has looked
     is_in = len(_KIND_LABELS) + _IS_IN
-    strands = seen.grounds.strands
-    frame, src, dst = _inside(seen)
-    off = dst == _OFF_ROAD
-    strand = strands.of[-1 - dst]
-    on = np.flatnonzero(strand != 0)
-    on = on[~_repeated((frame[on], src[on], strand[on]))]
-    inside = (frame[on], src[on], strand[on])
-    lane_frame, lane, role = _roles(seen, strands, inside)
-    off_frames = np.unique(frame[off])
-    roots = np.unique(lane_frame)
+    lanes = ego_lanes(seen)
+    roots = np.unique(lanes.frame)
+    frame, src = lanes.off_road
+    off_frames = np.unique(frame)
     names = ["Root Road", "Off Road", "Lane"]
-    present = np.unique(role)
-    label = first + len(names) + np.searchsorted(present, role)
-    label[role == _NAMELESS] = first + 2
-    names += [role_name(one) if one != _NAMELESS else "Lane" for one in present.tolist()]
+    present = np.unique(lanes.role)
+    label = first + len(names) + np.searchsorted(present, lanes.role)
+    label[lanes.role == NAMELESS] = first + 2
+    names += [role_name(one) if one != NAMELESS else "Lane" for one in present.tolist()]
     nodes = [
-        (lane_frame, lane, label),
+        (lanes.frame, lanes.strand, label),
         (roots, np.full(len(roots), ROOT_ROAD), np.full(len(roots), first)),
-        (off_frames, np.full(len(off_frames), _OFF_ROAD), np.full(len(off_frames), first + 1)),
+        (off_frames, np.full(len(off_frames), OFF_ROAD), np.full(len(off_frames), first + 1)),
     ]
+    in_frame, inner, strand = lanes.inside
     edges = [
-        (inside[0], inside[1], np.full(len(on), is_in), inside[2]),
-        (lane_frame, lane, np.full(len(lane), is_in), np.full(len(lane), ROOT_ROAD)),
-        (frame[off], src[off], np.full(int(off.sum()), is_in), dst[off]),
+        (in_frame, inner, np.full(len(inner), is_in), strand),
+        (
+            lanes.frame,
+            lanes.strand,
+            np.full(len(lanes.frame), is_in),
+            np.full(len(lanes.frame), ROOT_ROAD),
+        ),
+        (frame, src, np.full(len(src), is_in), np.full(len(src), OFF_ROAD)),
     ]
     return nodes, edges, names
-
-
-def lane_roles(seen: Seen) -> tuple[Ints, Ints, list[str]]:
-    """What the lanes of each frame are to the ego in ``RSV``, as far as that can be said.
-
-    Returns
-    -------
-    frame, node : (N,) int64
-        Frame, counted from 0, and lane: one that is in range or that somebody is in. Ascending.
-    role : list of str
-        ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on.
-    """
-    if seen.grounds is None:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), []
-    strands = seen.grounds.strands
-    frame, src, dst = _inside(seen)
-    on = np.flatnonzero(strands.of[-1 - dst] != 0)
-    frame, src, dst = frame[on], src[on], dst[on]
-    role_frame, strand, role = _roles(seen, strands, (frame, src, strands.of[-1 - dst]))
-    said = role != _NAMELESS
-    span = len(strands.of) + 1  # node ids of lanes are below zero, and above -span
-    known = role_frame[said] * span - strand[said]
-    order = np.argsort(known)
-    known, role = known[order], role[said][order]
-    present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
-    in_range = seen.node_frame[present] * span - seen.node[present]
-    lane_frame, lane = np.divmod(np.union1d(in_range, frame * span - dst), span)
-    wanted = lane_frame * span - strands.of[lane - 1]
-    at = np.searchsorted(known, wanted)
-    hit = np.flatnonzero(np.append(known, -1)[at] == wanted)
-    names = [role_name(one) for one in role[at[hit]].tolist()]
-    return lane_frame[hit], -lane[hit], names
-
-
-def _inside(seen: Seen) -> tuple[Ints, Ints, Ints]:
-    """Frames, traffic, and the lanes that it is in."""
-    rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
-    entity = seen.row_of(seen.frame[rows], seen.src[rows])
-    rows = rows[(entity >= 0) & seen.is_traffic[entity]]
-    return seen.frame[rows], seen.src[rows], seen.dst[rows]
-
-
-_NAMELESS: Final = -(1 << 20)
-"""Role of a lane of which nobody can say how it lies to the ego."""
-
-
-def _roles(seen: Seen, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
-    """The lanes of each frame and their roles: ``(frame, strand, role)``."""
-    frame, src, strand = inside
-    ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
-    present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
-    here_frame = np.concatenate([seen.node_frame[present], frame])
-    here = np.concatenate([strands.of[-1 - seen.node[present]], strand])
-    reached = np.append(np.zeros(len(present), np.bool_), np.ones(len(frame), np.bool_))
-    role = np.full(len(here), OPPOSING)
-    own = ego[here_frame]
-    for one in np.unique(own[own != 0]).tolist():
-        roles = strands.roles(one)
-        known = np.array(sorted(roles))
-        values = np.array([roles[s] for s in known.tolist()])
-        of = np.flatnonzero(own == one)
-        at = np.minimum(np.searchsorted(known, here[of]), len(known) - 1)
-        role[of] = np.where(known[at] == here[of], values[at], OPPOSING)
-    named = strands.named[-1 - here]
-    keep = (here != 0) & (reached | (role != OPPOSING) | (named != UNNAMED))
-    fresh = np.flatnonzero(keep)
-    fresh = fresh[~_repeated((here_frame[fresh], here[fresh]))]
-    here_frame, here, role, named = here_frame[fresh], here[fresh], role[fresh], named[fresh]
-    role = _numbered(seen, (frame, src, strand), (here_frame, here, role))
-    return here_frame, here, np.where(named != UNNAMED, named, role)
-
-
-def _numbered(seen: Seen, inside: Part, lanes: Part) -> Ints:
-    """The roles of lanes, with the opposing ones numbered by the distance of what is in them."""
-    here_frame, here, role = lanes
-    distance, has_ego = _from_ego(seen)
-    rows = np.flatnonzero(role == OPPOSING)
-    if not len(rows) or not len(inside[0]):  # then all of them are there by their names
-        return role
-    order = rows[np.lexsort((here[rows], here_frame[rows]))]
-    frame, src, strand = inside
-    low = int(strand.min())
-    span = 1 - low
-    keys = here_frame[order] * span + (here[order] - low)
-    wanted = frame * span + (strand - low)
-    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    hit = keys[at] == wanted
-    nearest = np.full(len(order), np.inf)
-    np.minimum.at(nearest, at[hit], distance[seen.row_of(frame[hit], src[hit])])
-    ranked = np.lexsort((-here[order], nearest, here_frame[order]))
-    sorted_frame = here_frame[order][ranked]
-    starts = np.searchsorted(sorted_frame, sorted_frame)
-    numbers = OPPOSING + np.arange(len(order)) - starts
-    numbers[~(has_ego & (seen.ego_lane < 0))[sorted_frame]] = _NAMELESS
-    role = role.copy()
-    role[order[ranked]] = numbers
-    return role
-
-
-def _from_ego(seen: Seen) -> tuple[NDArray[np.float64], Bools]:
-    """Distance of each node from the ego in the plane, infinite if unknown; and which frames have an ego."""
-    x, y = (np.full(seen.frames, np.nan) for _ in range(2))
-    ego = np.flatnonzero(seen.is_ego)
-    x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]
-    away = np.hypot(seen.x - x[seen.node_frame], seen.y - y[seen.node_frame])
-    return np.where(np.isfinite(away), away, np.inf), np.isfinite(x + y)
