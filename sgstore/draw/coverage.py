@@ -5,14 +5,12 @@ PNG or SVG by the ending of the file's name; the same numbers give the same byte
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from textwrap import wrap
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.draw.palette import EGO, FAINT_INK, INK, JUNCTION, ROAD_EDGE, RULE
+from sgstore.draw.chart import AT_RANDOM, CHOSEN, Scale, paint_axes, paint_key, scales, sheet
+from sgstore.draw.palette import EGO, JUNCTION, ROAD_EDGE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,87 +20,10 @@ if TYPE_CHECKING:
 
     from sgstore.draw.page import Page
 
-_WIDTH: Final = 560.0
-_HEIGHT: Final = 330.0
-_LEFT: Final = 62.0
 _RIGHT: Final = 62.0
-_BELOW: Final = 46.0
-_ABOVE: Final = 60.0
 _CELL: Final = 11.0
-_LETTER: Final = 3.9
-"""Width of a letter of 7 points, about."""
 MOST_FEATURES: Final = 120
 """Features that a matrix shows; of more, those with the most gaps."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """Numbers along one side of a chart, as points of the page."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-    log: bool = False
-
-    def at(self, value: Any) -> NDArray[np.float64]:
-        """Where numbers stand."""
-        numbers = np.asarray(value, np.float64)
-        if self.log:
-            numbers = np.log10(np.maximum(numbers, 1e-12))
-            low, high = math.log10(self.low), math.log10(self.high)
-        else:
-            low, high = self.low, self.high
-        return self.start + (numbers - low) / max(high - low, 1e-12) * (self.end - self.start)
-
-    def ticks(self) -> list[float]:
-        """Round numbers on it, some five."""
-        if self.log:
-            first, last = math.floor(math.log10(self.low)), math.floor(math.log10(self.high) + 1e-9)
-            return [10.0**power for power in range(first, last + 1)]
-        raw = (self.high - self.low) / 5
-        step = 10.0 ** math.floor(math.log10(max(raw, 1e-12)))
-        step *= next(one for one in (1, 2, 5, 10) if one * step >= raw)
-        first = math.ceil(self.low / step)
-        return [step * i for i in range(first, math.floor(self.high / step + 1e-9) + 1)]
-
-
-def _sheet(to: Path, width: float, height: float, title: str, below: str) -> Page:
-    from sgstore.draw import check_installed
-
-    check_installed()
-    from sgstore.draw.page import Page, check_format
-
-    check_format(to)
-    page = Page(width, height)
-    page.text(14, height - 20, title, fontsize=10, weight="bold")
-    for number, line in enumerate(wrap(below, int((width - 28) / _LETTER))[:2]):
-        page.text(14, height - 34 - 10 * number, line, fontsize=7, color=FAINT_INK)
-    return page
-
-
-def _axes(page: Page, x: _Scale, y: _Scale, names: tuple[str, str]) -> None:
-    """The frame of a chart, with its numbers and what they are."""
-    for value in x.ticks():
-        at = float(x.at(value))
-        page.sheet.plot([at, at], [y.start, y.end], color=RULE, linewidth=0.6)
-        page.text(at, y.start - 11, _written(value), ha="center", color=FAINT_INK)
-    for value in y.ticks():
-        at = float(y.at(value))
-        page.sheet.plot([x.start, x.end], [at, at], color=RULE, linewidth=0.6)
-        page.text(x.start - 5, at - 2.5, _written(value), ha="right", color=FAINT_INK)
-    page.sheet.plot([x.start, x.end], [y.start, y.start], color=INK, linewidth=0.8)
-    page.sheet.plot([x.start, x.start], [y.start, y.end], color=INK, linewidth=0.8)
-    page.text((x.start + x.end) / 2, y.start - 28, names[0], ha="center", fontsize=8)
-    middle = (y.start + y.end) / 2
-    page.text(16, middle, names[1], fontsize=8, rotation=90, ha="center", va="center")
-
-
-def _written(value: float) -> str:
-    if value >= 10_000:
-        power = math.floor(math.log10(value) / 3)
-        return f"{value / 1000**power:g}{('', 'k', 'M', 'G', 'T')[min(power, 4)]}"
-    return f"{value:g}"
 
 
 def draw_rank_sizes(
@@ -137,22 +58,21 @@ def draw_rank_sizes(
     with own_style():
         once = sum(1 for size in sizes if size == 1)
         below = f"{len(sizes)} classes, {sum(sizes)} {unit}s; {once} classes come once"
-        page = _sheet(to, _WIDTH, _HEIGHT, title, below)
-        x = _Scale(1, max(len(sizes), 10), _LEFT, _WIDTH - _RIGHT, log=True)
-        y = _Scale(1, max(sizes[0], 10), _BELOW, _HEIGHT - _ABOVE, log=True)
-        _axes(page, x, y, ("rank of the class", f"{unit}s of the class"))
+        page = sheet(to, title, below)
+        x, y = scales(
+            page, (1, max(len(sizes), 10)), (1, max(sizes[0], 10)), right=_RIGHT, log=True
+        )
+        paint_axes(page, x, y, ("rank of the class", f"{unit}s of the class"))
         ranks = np.arange(1, len(sizes) + 1)
         if len(cumulative):
-            _draw_share(page, x, _Scale(0, 1, y.start, y.end), cumulative, unit)
+            _draw_share(page, x, Scale(0, 1, y.start, y.end), cumulative, unit)
         page.sheet.plot(
             x.at(ranks), y.at(sizes), color=ROAD_EDGE, linewidth=1.6, marker=".", markersize=2.5
         )
         page.save(to)
 
 
-def _draw_share(
-    page: Page, x: _Scale, share: _Scale, cumulative: Sequence[float], unit: str
-) -> None:
+def _draw_share(page: Page, x: Scale, share: Scale, cumulative: Sequence[float], unit: str) -> None:
     """The share that classes have together, with its own numbers to the right."""
     ranks = np.arange(1, len(cumulative) + 1)
     page.sheet.plot(x.at(ranks), share.at(cumulative), color=EGO, linewidth=1.4)
@@ -160,7 +80,7 @@ def _draw_share(
         page.text(x.end + 5, float(share.at(value)) - 2.5, f"{value:.0%}", color=EGO)
     look = {"fontsize": 8, "color": EGO, "rotation": 90, "ha": "center", "va": "center"}
     middle = (share.start + share.end) / 2
-    page.text(_WIDTH - 12, middle, f"share of all {unit}s so far", **look)
+    page.text(page.width - 12, middle, f"share of all {unit}s so far", **look)
 
 
 def draw_growth(
@@ -196,29 +116,17 @@ def draw_growth(
     from sgstore.draw.page import own_style
 
     with own_style():
-        page = _sheet(to, _WIDTH, _HEIGHT, title, below)
-        x = _Scale(0, max(n), _LEFT, _WIDTH - _RIGHT)
-        y = _Scale(0, max(classes) * 1.05, _BELOW, _HEIGHT - _ABOVE)
-        _axes(page, x, y, (f"{unit}s", "classes"))
+        page = sheet(to, title, below)
+        x, y = scales(page, (0, max(n)), (0, max(classes) * 1.05))
+        paint_axes(page, x, y, (f"{unit}s", "classes"))
         known = [(one, value) for one, value in zip(n, at_random, strict=True) if value is not None]
+        key = [("as they came", CHOSEN)]
         if known:
             numbers, values = zip(*known, strict=True)
-            page.sheet.plot(
-                x.at(numbers), y.at(values), color=FAINT_INK, linewidth=1.2, linestyle=(0, (4, 3))
-            )
-        page.sheet.plot(x.at(n), y.at(classes), color=ROAD_EDGE, linewidth=1.8)
-        right, low = x.end - 128, y.start + 12
-        page.sheet.plot([right, right + 22], [low + 14, low + 14], color=ROAD_EDGE, linewidth=1.8)
-        page.text(right + 28, low + 11.5, "as they came")
-        if known:
-            page.sheet.plot(
-                [right, right + 22],
-                [low, low],
-                color=FAINT_INK,
-                linewidth=1.2,
-                linestyle=(0, (4, 3)),
-            )
-            page.text(right + 28, low - 2.5, f"{unit}s at random")
+            page.sheet.plot(x.at(numbers), y.at(values), **AT_RANDOM)
+            key.append((f"{unit}s at random", AT_RANDOM))
+        page.sheet.plot(x.at(n), y.at(classes), **CHOSEN)
+        paint_key(page, x, y, key)
         page.save(to)
 
 
@@ -270,7 +178,7 @@ def draw_matrix(
     with own_style():
         side = len(names) * _CELL
         label = 12 + 3.7 * max((len(name) for name in names), default=0)
-        page = _sheet(to, max(label + side + 30, 420), side + label + _ABOVE + 30, title, below)
+        page = sheet(to, title, below, max(label + side + 30, 420), side + label + 90)
         left, bottom = label, 30.0
         image = _colours(frames, gaps)
         page.sheet.imshow(
