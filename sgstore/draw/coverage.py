@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _RIGHT: Final = 62.0
 _CELL: Final = 11.0
+_GAP: Final = "#f5b877"
 MOST_FEATURES: Final = 120
 """Features that a matrix shows; of more, those with the most gaps."""
 
@@ -203,11 +204,13 @@ def draw_matrix(
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(F, F, 3): the darker the more frames, orange where there is a gap."""
+    from matplotlib.colors import to_rgb
+
     weight = np.log1p(frames) / max(float(np.log1p(frames).max(initial=0)), 1e-12)
     pale, dark = np.array([0.93, 0.945, 0.965]), np.array([0.17, 0.33, 0.57])
     image = pale + weight[..., None] * (dark - pale)
     image[frames == 0] = (1.0, 1.0, 1.0)
-    image[gaps] = (0.91, 0.44, 0.04)
+    image[gaps] = to_rgb(_GAP)
     return image
 
 
@@ -217,7 +220,7 @@ def _key(page: Page, left: float, gaps: NDArray[np.bool_]) -> None:
     entries = (
         ("#2b5491", "many frames have both"),
         ("#edf1f6", "few"),
-        (EGO, f"a gap: no frame has both ({many} pairs)"),
+        (_GAP, f"a gap: no frame has both ({many} pairs)"),
     )
     x = min(left, 40.0)
     for colour, text in entries:
