@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sgstore.lang.bound import FrameAttribute
     from sgstore.lang.evaluation import FrameView
     from sgstore.lang.pattern import Pattern
-    from sgstore.lang.whynot import WhyNot
+    from sgstore.lang.whynot import WhyNot, WhyNotSteps
     from sgstore.matches import Matches
     from sgstore.store import Rows, StoredTrace
     from sgstore.store.likeness import Like
@@ -302,7 +302,9 @@ class Store:
         """What becomes of a query, stage by stage: parse, bind, rewrite, emit."""
         return self.find(text, **parameters).explain()
 
-    def why_not(self, frame: int | str | FrameRef, text: str, /, **parameters: object) -> WhyNot:
+    def why_not(
+        self, frame: int | str | FrameRef, text: str, /, **parameters: object
+    ) -> WhyNot | WhyNotSteps:
         """How far a pattern holds in a frame: the first part of it that fails, and how near it came.
 
         Parameters
@@ -314,6 +316,11 @@ class Store:
         **parameters
             Values of ``$name``.
 
+        Returns
+        -------
+        WhyNot or WhyNotSteps
+            Of a sequence, an answer for each of its steps.
+
         Raises
         ------
         QueryError
@@ -321,12 +328,10 @@ class Store:
         StoreError
             There is no such frame.
         """
-        from sgstore.history.stories import refuse_over_time
         from sgstore.lang.whynot import WhyNot, looked_up, why_not  # with numpy: only for who asks
 
         with self.file.snapshot():
             compiled = compile_query(text, self.catalog(), parameters)
-            refuse_over_time(compiled)
             ref = self.file.frame(_ref(frame))
             if ref.trace in compiled.left_out:
                 answers = self.file.trace(ref.trace_id).answers
@@ -337,7 +342,8 @@ class Store:
                     {},
                     "such relations are unknown of it (no road map, perhaps)",
                 )
-            return why_not(compiled.bound, self._view(ref, looked_up(compiled.bound)))
+            view = self._view(ref, looked_up(compiled.bound))
+            return why_not(compiled.bound, view, compiled.text)
 
     def _view(self, frame: FrameRef, asked: Sequence[FrameAttribute]) -> FrameView:
         """A frame as patterns in memory see it, with what they ask that only the store can tell."""

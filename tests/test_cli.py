@@ -415,3 +415,26 @@ def test_properties_of_sgsm_are_translated(tmp_path: Path, sgstore) -> None:
 
     assert told[:2] == (0, "DEFINE PREDICATE x() AS EXISTS {(n2:Ego)-[:near]->(n1)};\n")
     assert (written[1], (tmp_path / "p.sgql").read_text()) == ("", told[1])
+
+
+def test_a_pattern_of_the_library_is_asked_by_its_name(store: str, sgstore, tmp_path: Path) -> None:
+    intervals = json.loads(sgstore("patterns", "run", store, "jaywalking", "--json")[1])
+    code, out, _ = sgstore("find", store, "-p", "jaywalking", "--json")
+    found = json.loads(out)
+    assert (code, min(row["t"] for row in found)) == (0, min(row["start"] for row in intervals))
+
+    frame = found[0]["frame_id"]
+    code, out, _ = sgstore("why-not", store, frame, "-p", "jaywalking", "--json")
+    assert (code, [step["matches"] for step in json.loads(out)["steps"]]) == (0, [True])
+    code, _, err = sgstore("show", store, frame, "-p", "jaywalking", "-o", tmp_path / "it.png")
+    assert (code, "nothing is marked" in err) == (0, False)
+    code, out, _ = sgstore("export", store, "-p", "jaywalking", "--to", tmp_path / "it", "--json")
+    assert (code, bool(json.loads(out))) == (0, True)
+
+
+@pytest.mark.parametrize("verb", [["find"], ["why-not", "town@20s"], ["export"]])
+def test_a_query_and_a_name_are_not_asked_at_once(store: str, sgstore, verb: list[str]) -> None:
+    code, _, err = sgstore(verb[0], store, *verb[1:], "MATCH (e:Ego)", "-p", "jaywalking")
+
+    assert code == 2
+    assert "give one of" in err

@@ -435,11 +435,17 @@ def test_what_is_no_check_is_refused(store: Store, text: str, complaint: str) ->
         store.check(text)
 
 
-def test_why_not_says_that_it_speaks_of_one_frame(store: Store) -> None:
+def test_why_not_speaks_of_each_step_of_a_sequence(store: Store) -> None:
     frame = next(store.find("MATCH (e:Ego)").frames())
+    step = "MATCH (e) WHERE e.speed > 1000"
 
-    with pytest.raises(QueryError, match="speaks of one frame"):
-        store.why_not(frame, "MATCH (e:Ego) THEN MATCH (e)")
+    answer = store.why_not(frame, f"MATCH (e:Ego) FOR >= 1s THEN WITHIN 4s {step}").as_dict()
+
+    assert [one["matches"] for one in answer["steps"]] == [True, False]
+    alone = store.why_not(frame, "MATCH (e:Ego)").as_dict()
+    assert answer["steps"][0] == {"step": "MATCH (e:Ego) FOR >= 1s"} | alone
+    assert answer["steps"][1]["failed"] == "e.speed > 1000"
+    assert answer["steps"][1]["step"] == step
 
 
 def test_the_verb_ends_with_4_only_if_something_is_violated(

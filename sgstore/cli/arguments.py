@@ -38,6 +38,12 @@ QueryText = Annotated[
 QueryFile = Annotated[
     Path | None, typer.Option("--file", "-f", help="Read the query from a file; - is stdin.")
 ]
+PatternName = Annotated[
+    str | None,
+    typer.Option(
+        "--pattern", "-p", metavar="NAME", help="A pattern of the library, in place of a query."
+    ),
+]
 Parameters = Annotated[
     list[str] | None,
     typer.Option("--param", metavar="NAME=VALUE", help="Value of $NAME in the query; repeatable."),
@@ -132,6 +138,19 @@ def query_of(text: str | None, file: Path | None) -> str:
     if (text is None) == (file is None):
         raise typer.BadParameter("give a query as an argument, or a file with -f FILE")
     return text if text is not None else text_of(file or Path("-"))
+
+
+def asked_of(
+    text: str | None, file: Path | None, name: str | None, values: Mapping[str, Any]
+) -> tuple[str, Mapping[str, Any]]:
+    """The query as a text, from a file, or of the library by its name; and values that it does not hold yet."""
+    if sum(source is not None for source in (text, file, name)) != 1:
+        raise typer.BadParameter("give one of: a query as a text, a file with it, -p NAME")
+    if name is None:
+        return query_of(text, file), values
+    from sgstore.lang import pattern_named
+
+    return pattern_named(name).written(**values), {}
 
 
 def text_of(file: Path) -> str:

@@ -15,15 +15,15 @@ from sgstore.cli.arguments import (
     RowFormat,
     StorePath,
     app,
+    asked_of,
     form_of,
     open_store,
     parameters_of,
-    text_of,
 )
 from sgstore.cli.output import Format, say, write_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from sgstore.history import Verdict
     from sgstore.matches import Interval
@@ -67,7 +67,7 @@ def check(
     and from when to when.
     """
     given = parameters_of(parameters)
-    asked, values = asked_of(file, name, text, given)
+    asked, values = asked_of(text, file, name, given)
     run = open_store(store).check(asked, sgsm_compat=sgsm_compat, **values)
     if explain:
         typer.echo(run.explain())
@@ -91,19 +91,6 @@ def check(
             output,
         )
     return NO_MATCH if require and tally["false"] else 0
-
-
-def asked_of(
-    file: Path | None, name: str | None, text: str | None, given: Mapping[str, Any]
-) -> tuple[str, Mapping[str, Any]]:
-    """The text that is asked, and the values of parameters that it does not hold yet."""
-    if sum(source is not None for source in (file, name, text)) != 1:
-        raise typer.BadParameter("give one of: a FILE, -p NAME, -e TEXT")
-    if name is not None:
-        from sgstore.lang.standard import pattern_named
-
-        return pattern_named(name).written(**given), {}
-    return (text if text is not None else text_of(file or Path("-"))), given
 
 
 def _rows(verdict: Verdict) -> Iterator[tuple[Any, ...]]:

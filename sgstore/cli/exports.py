@@ -12,15 +12,16 @@ from sgstore.cli.arguments import (
     LOSS,
     AsJson,
     Parameters,
+    PatternName,
     QueryFile,
     QueryText,
     StorePath,
     app,
+    asked_of,
     form_of,
     lines_of,
     open_store,
     parameters_of,
-    query_of,
     say_left_out,
     seconds_of,
 )
@@ -28,6 +29,7 @@ from sgstore.cli.output import Format, say, write_rows
 from sgstore.cli.progress import count_bar
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from typing import Any
 
     from sgstore.query import Store
@@ -87,6 +89,7 @@ def export(
     query: QueryText = None,
     to: Folder = Path("clips"),
     file: QueryFile = None,
+    name: PatternName = None,
     parameters: Parameters = None,
     frames: Frames = None,
     form: Form = "mcap",
@@ -115,10 +118,10 @@ def export(
     opened = open_store(store)
     values = parameters_of(parameters)
     margins = seconds_of(before, "--before"), seconds_of(after, "--after")
-    if frames is not None and (query or file):
+    if frames is not None and (query or file or name):
         raise typer.BadParameter("give a QUERY or --frames, not both")
-    text = query_of(query, file) if frames is None else ""
-    clips = _clips(opened, frames, text, values, margins)
+    text, held = ("", {}) if frames is not None else asked_of(query, file, name, values)
+    clips = _clips(opened, frames, text, held, margins)
     if not clips:
         say("nothing matches: nothing to export")
         return 0
@@ -150,7 +153,7 @@ def _clips(
     store: Store,
     frames: Path | None,
     text: str,
-    parameters: dict[str, Any],
+    parameters: Mapping[str, Any],
     margins: tuple[float, float],
 ) -> list[Clip]:
     """The clips around what a query finds, or around frames that are named."""

@@ -14,10 +14,10 @@ from sgstore.cli.arguments import (
     AsJson,
     Parameters,
     app,
+    asked_of,
     parameters_of,
     seconds_of,
 )
-from sgstore.cli.checks import asked_of
 from sgstore.cli.output import say
 from sgstore.cli.traces import Config, Preset, RoadMap, settings_of
 
@@ -66,7 +66,7 @@ def monitor(
     from sgstore.monitor import Monitor
     from sgstore.monitor.sources import opened
 
-    asked, values = asked_of(file, name, text, parameters_of(parameters))
+    asked, values = asked_of(text, file, name, parameters_of(parameters))
     settings = settings_of(config, preset) or Settings()
     tell = _as_json if as_json else _for_people
     with opened(trace, settings, road_map=road_map, ego=ego) as source:

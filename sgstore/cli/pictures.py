@@ -10,13 +10,14 @@ import typer
 
 from sgstore.cli.arguments import (
     Parameters,
+    PatternName,
     QueryFile,
     QueryText,
     StorePath,
     app,
+    asked_of,
     open_store,
     parameters_of,
-    query_of,
 )
 from sgstore.cli.output import say
 from sgstore.cli.progress import count_bar
@@ -67,6 +68,7 @@ def show(
     query: QueryText = None,
     output: Picture = None,
     file: QueryFile = None,
+    name: PatternName = None,
     parameters: Parameters = None,
     relations: DrawnEdges = DrawnRelations.ego,
     camera: Camera = None,
@@ -79,11 +81,12 @@ def show(
     from sgstore.draw.stored import draw_clip, draw_stored, range_of
 
     opened = open_store(store)
-    text = query_of(query, file) if query or file else None
+    asked = query or file or name
+    text, values = asked_of(query, file, name, parameters_of(parameters)) if asked else ("", {})
     clip = range_of(frame)
     output = output or Path("clip.gif" if clip else "frame.png")
     options: dict[str, Any] = {
-        "matches": opened.find(text, **parameters_of(parameters)) if text else None,
+        "matches": opened.find(text, **values) if text else None,
         "camera": camera,
         "relations": relations.value,
         "radius": radius,

@@ -15,12 +15,14 @@ from sgstore.cli.arguments import (
     FrameName,
     Output,
     Parameters,
+    PatternName,
     QueryFile,
     QueryText,
     RowFormat,
     StorePath,
     With,
     app,
+    asked_of,
     form_for,
     open_store,
     parameters_of,
@@ -56,6 +58,7 @@ def find(
     store: StorePath,
     query: QueryText = None,
     file: QueryFile = None,
+    name: PatternName = None,
     parameters: Parameters = None,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
@@ -78,15 +81,16 @@ def find(
 
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
     """
+    text, values = asked_of(query, file, name, parameters_of(parameters))
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
         with _sandbox(store, timeout, max_rows, tables) as box:
-            answer = box.find(query_of(query, file), **parameters_of(parameters))
+            answer = box.find(text, **values)
         number = _write_answer(answer, form_for(form, output, as_json=as_json), output)
         return NO_MATCH if require and not number else 0
     opened = open_store(store, tables_of(tables))
-    matches = opened.find(query_of(query, file), **parameters_of(parameters))
+    matches = opened.find(text, **values)
     if explain:
         typer.echo(matches.explain())
         return 0
@@ -133,11 +137,13 @@ def why_not(
     frame: FrameName,
     query: QueryText = None,
     file: QueryFile = None,
+    name: PatternName = None,
     parameters: Parameters = None,
     as_json: AsJson = False,
 ) -> int:
     """Say how far a pattern holds in a frame: what fails first, and how near it came."""
-    answer = open_store(store).why_not(frame, query_of(query, file), **parameters_of(parameters))
+    text, values = asked_of(query, file, name, parameters_of(parameters))
+    answer = open_store(store).why_not(frame, text, **values)
     if as_json:
         write_document(answer.as_dict(), Format.json)
     else:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import QueryError
 from sgstore.history.joining import Joined, joined
 from sgstore.history.reading import CELLS, WORDS, Ask, Trace, Values, asks_of, read
 from sgstore.history.relations import Relation
@@ -83,23 +82,6 @@ class Stories(Matches):
             finder = Finder(self._file, compiled.query, compiled.catalog)
             places = tuple(with_places(compiled.query)[1])
             return f"{text}\n\n---- plan\n{finder.text(places)}"
-
-
-def refuse_over_time(compiled: Compiled) -> None:
-    """Refuse a query that looks at several frames where one frame is spoken of.
-
-    Raises
-    ------
-    QueryError
-        It does.
-    """
-    if compiled.query.steps:
-        raise QueryError(
-            "why-not speaks of one frame, and this looks at several",
-            text=compiled.text,
-            span=compiled.query.steps[0].span,
-            hint="ask it of the pattern of one step",
-        )
 
 
 @dataclass(slots=True)

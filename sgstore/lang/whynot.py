@@ -49,7 +49,7 @@ class WhyNot:
     nearest: Mapping[str, str]
     found: str
 
-    def as_dict(self) -> dict[str, object]:
+    def as_dict(self) -> dict[str, Any]:
         """The same as plain values."""
         return {
             "matches": not self.failed,
@@ -71,15 +71,53 @@ class WhyNot:
         return "\n".join(lines)
 
 
-def why_not(query: b.Query, view: FrameView) -> WhyNot:
-    """How far a bound pattern holds in a graph."""
-    scope, parts = _nothing(query.scope), _parts(query.scope)
+@dataclass(frozen=True, slots=True)
+class WhyNotSteps:
+    """How far each step of a sequence holds in one graph; how long it does, and what comes when, is left aside.
+
+    Attributes
+    ----------
+    texts : tuple of str
+        The steps as they were written.
+    steps : tuple of WhyNot
+        Each by itself: its variables are bound anew.
+    """
+
+    texts: tuple[str, ...]
+    steps: tuple[WhyNot, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain values."""
+        pairs = zip(self.texts, self.steps, strict=True)
+        return {"steps": [{"step": text, **step.as_dict()} for text, step in pairs]}
+
+    def __str__(self) -> str:
+        lines: list[str] = []
+        for number, (text, step) in enumerate(zip(self.texts, self.steps, strict=True), start=1):
+            lines += [f"step {number} of {len(self.steps)}: {text}"]
+            lines += [f"  {line}" for line in str(step).splitlines()]
+        return "\n".join(
+            [*lines, "what looks at other frames (FOR, THEN, EVENTUALLY …) is not asked"]
+        )
+
+
+def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
+    """How far a bound pattern, written as ``text``, holds in a graph; of a sequence, each of its steps."""
+    if not query.steps:
+        return _in_frame(query.scope, query, view)
+    texts = (" ".join(text[step.span.start : step.span.end].split()) for step in query.steps)
+    steps = tuple(_in_frame(step.scope, query, view) for step in query.steps)
+    return WhyNotSteps(tuple(texts), steps)
+
+
+def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
+    scope, parts = _nothing(asked), _parts(asked)
     held: list[str] = []
-    for part, wider in _growing(query.scope, scope, parts):
+    for part, wider in _growing(asked, scope, parts):
         if not _first(wider, query, view):
             return _failure(part, scope, query, view, tuple(held))
         scope = wider
-        held.append(_text(part))
+        held.append(_text(part, scope))
     at = _first(scope, query, view)
     return WhyNot(tuple(held), "", _named(at, scope) if at else {}, "")
 
@@ -96,7 +134,8 @@ def looked_up(query: b.Query) -> list[b.FrameAttribute]:
                 elif isinstance(leaf, b.FrameAttribute) and leaf.attribute.of_store:
                     found[leaf.attribute.name] = leaf
 
-    look(query.scope)
+    for scope in (query.scope, *(step.scope for step in query.steps)):
+        look(scope)
     return list(found.values())
 
 
@@ -153,7 +192,7 @@ def _failure(
         at = _first(scope, query, view)
         nearest = _named(at, scope) if at else {}
         found = _population(view)
-        return WhyNot(held, _text(part), nearest, found)
+        return WhyNot(held, _text(part, scope), nearest, found)
     # A condition on an edge needs the edge bound, which a scope without conditions on it does not do.
     edges = tuple(replace(edge, named=True) if edge.high == 1 else edge for edge in scope.edges)
     for at in islice(_bindings(replace(scope, edges=edges), query, view), MOST_LOOKED_AT):
@@ -161,7 +200,7 @@ def _failure(
         if short < best or not found:
             best, nearest = short, _named(at, scope)
             found = _between(part, at) if isinstance(part, b.Edge) else _values(part, at, query)
-    return WhyNot(held, _text(part), nearest, found)
+    return WhyNot(held, _text(part, scope), nearest, found)
 
 
 def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:
@@ -197,13 +236,22 @@ def _apart(edge: b.Edge, at: Binding) -> float:
 # As text ----------------------------------------------------------------------------------------------------
 
 
-def _text(part: _Part) -> str:
+def _text(part: _Part, scope: b.Scope) -> str:
+    """A part as a person reads it: what has no name is called by its kinds."""
     if isinstance(part, b.Node):
-        return f"({part.key}) is {kinds_text(part.kinds)}"
+        kinds = kinds_text(part.kinds)
+        return f"some {kinds}" if part.key.startswith("#") else f"({part.key}) is {kinds}"
     if isinstance(part, b.Edge):
-        return edge_text(part)
+        return _NAMELESS.sub(lambda key: f"({_kind(key[1], scope)})", edge_text(part))
     text = re.sub(r"\{.*\}", "{…}", value_text(part), flags=re.DOTALL)
     return text[1:-1] if text.startswith("(") and text.endswith(")") else text
+
+
+_NAMELESS: Final = re.compile(r"\((#\d+)\)")
+
+
+def _kind(key: str, scope: b.Scope) -> str:
+    return kinds_text(scope.nodes[key].kinds) if key in scope.nodes else "something"
 
 
 def _named(at: Binding, scope: b.Scope) -> dict[str, str]:
