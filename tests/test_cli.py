@@ -438,3 +438,20 @@ def test_a_query_and_a_name_are_not_asked_at_once(store: str, sgstore, verb: lis
 
     assert code == 2
     assert "give one of" in err
+
+
+def test_a_narrow_table_keeps_the_frames_that_one_will_type(
+    store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "70")
+    with capsys.disabled():
+        main, side = os.openpty()
+        with os.fdopen(side, "w") as terminal:
+            monkeypatch.setattr(sys, "stdout", terminal)
+            assert run(["like", store, "town@20s", "--limit", "3"]) == 0
+        lines = os.read(main, 1 << 16).decode().splitlines()
+        os.close(main)
+
+    assert all(len(line) <= 70 for line in lines)
+    assert any("…" in line for line in lines)
+    assert lines[2].startswith("town#200 ")

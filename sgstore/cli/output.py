@@ -34,6 +34,10 @@ class Format(StrEnum):
     arrow = "arrow"
 
 
+_KEYS: Final = frozenset({"frame", "from", "trace"})
+"""Columns by which a row is found again."""
+_LEAST: Final = 8
+"""Letters that a column keeps."""
 _BINARY: Final = frozenset({Format.parquet, Format.arrow})
 _WITHOUT_NESTING: Final = frozenset({Format.csv, *_BINARY})
 
@@ -233,7 +237,7 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
         return 0
     numeric = [all(_is_number(row[i]) for row in first) for i in range(len(columns))]
     widths = [max(len(name), *(len(row[i]) for row in first)) for i, name in enumerate(columns)]
-    widths = _fitted(widths, _room(stream))
+    widths = _fitted(columns, widths, _room(stream))
     stream.write(_line(columns, widths, numeric))
     stream.write(_line(["─" * width for width in widths], widths, numeric))
     rest = ([_cell(value) for value in row] for row in rows)
@@ -245,13 +249,18 @@ def _room(stream: TextIO) -> int | None:
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
-def _fitted(widths: list[int], room: int | None) -> list[int]:
-    """Widths that fit: the widest columns give way first, none below eight characters."""
+def _fitted(columns: Sequence[str], widths: list[int], room: int | None) -> list[int]:
+    """Widths that fit: the widest columns give way first, what a row is found by last; none below 8 letters."""
     if room is None:
         return widths
     widths = list(widths)
-    while sum(widths) + len(GAP) * (len(widths) - 1) > room and max(widths) > 8:
-        widths[widths.index(max(widths))] -= 1
+    others = [i for i, name in enumerate(columns) if name not in _KEYS]
+    for giving in (others, list(range(len(columns)))):
+        while giving and sum(widths) + len(GAP) * (len(widths) - 1) > room:
+            widest = max(giving, key=widths.__getitem__)
+            if widths[widest] <= _LEAST:
+                break
+            widths[widest] -= 1
     return widths
 
 

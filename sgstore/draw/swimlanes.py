@@ -136,8 +136,8 @@ def _matched(
     lanes: dict[tuple[str, str], Lane] = {}
     for interval in store.find(text, **values).intervals():
         told = interval.values
-        names = [str(v) for k, v in told.items() if isinstance(v, str) or f"{k}.name" not in told]
-        who = ", ".join(names)
+        nodes = [f"{name}.name" for name in told if f"{name}.name" in told]  # without RETURN
+        who = ", ".join(str(told[name]) for name in nodes or told)
         lane = lanes.setdefault((interval.trace, who), Lane(name, who))
         lane.spans += _spans((interval,), violation=False)
     for (trace, _), lane in lanes.items():
