@@ -73,17 +73,13 @@ class Search:
         self, block: s.Block, names: dict[int, str], binding: Binding, number: int
     ) -> Iterator[Binding]:
         """Extensions of a binding of all nodes by the edge variables, where all edges exist."""
-        links = [
-            (path.edges[i], names[id(path.nodes[i])], names[id(path.nodes[i + 1])])
-            for path in block.paths
-            for i in range(len(path.edges))
-        ]
+        links = links_of(block)
         if number == len(links):
             if self.conditions(block, names, binding):
                 yield binding
             return
         edge, left, right = links[number]
-        a, b = binding[left], binding[right]
+        a, b = binding[names[left]], binding[names[right]]
         ways = {"right": [(a, b)], "left": [(b, a)], "any": [(a, b), (b, a)]}[edge.direction]
         found = [hit for way in ways for hit in self.linked(edge, *way, binding)]
         if edge.name is None:
@@ -275,14 +271,31 @@ def related(relation: str, label: s.LabelExpression) -> bool:
     )
 
 
-def free_names(block: s.Block) -> set[str]:
+def links_of(block: s.Block) -> list[tuple[s.EdgePattern, int, int]]:
+    """The edges of a block, and which nodes they join."""
+    if id(block) not in LINKS:
+        LINKS[id(block)] = (
+            block,
+            [
+                (edge, id(left), id(right))
+                for path in block.paths
+                for edge, left, right in zip(path.edges, path.nodes, path.nodes[1:], strict=False)
+            ],
+        )
+    return LINKS[id(block)][1]
+
+
+LINKS: dict[int, tuple[s.Block, list[tuple[s.EdgePattern, int, int]]]] = {}
+
+
+def free_names(block: s.Block | s.Match) -> set[str]:
     """All names that occur in a block, or in blocks in it."""
     if id(block) not in FREE:
         FREE[id(block)] = block, names_in(block)
     return FREE[id(block)][1]
 
 
-FREE: dict[int, tuple[s.Block, set[str]]] = {}
+FREE: dict[int, tuple[s.Block | s.Match, set[str]]] = {}
 
 
 def names_in(block: s.Block | s.Match) -> set[str]:
@@ -384,9 +397,8 @@ def assignments(match: s.Match, world: World) -> Iterator[tuple[Search, Binding]
             continue
         search = Search(frame, frame.graph, injective)
         outside: Binding = {}
-        if "ego" in names_in(
-            match
-        ):  # it stands for a node of its own, as if (ego:Ego) were written
+        # It stands for a node of its own, as if (ego:Ego) were written.
+        if "ego" in free_names(match):
             if frame.ego is None:
                 continue
             outside["ego"] = frame.ego

@@ -48,6 +48,11 @@ class Kinds:
         """All kinds, whether ego or not."""
         return self.ego | self.other
 
+    @property
+    def one_a_frame(self) -> bool:
+        """Whether there is no more than one such node in a frame, for it must be the ego."""
+        return not self.other
+
 
 ANY: Final = Kinds(frozenset(ENTITY_KINDS), frozenset(KINDS))
 EGO: Final = Kinds(frozenset(ENTITY_KINDS), frozenset())

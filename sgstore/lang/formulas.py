@@ -365,6 +365,7 @@ _TEMPLATES: Final = {
     "-": "({0} - {1})",
     "*": "({0} * {1})",
     "sqrt": "CASE WHEN {0} >= 0 THEN sqrt({0}) END",
+    "name": "{0} || ' ' || CAST({1} AS VARCHAR)",
 }
 
 

@@ -98,6 +98,7 @@ class Frames(Masks):
         told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
         told |= {leaf.node for leaf in wanted if _is_id(leaf)}
         hidden = (bound | parts.late | ties) - nodes - edges - told
+        hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
         return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
 
     def _by_buckets(
@@ -192,7 +193,7 @@ class Frames(Masks):
 
     def _of_kinds(self, scope: Scope, key: str, state: str) -> list[str]:
         """Conditions that keep states to what a node may be; of the ego's states it is enough that they are."""
-        if not scope.kinds(key).other and key not in self.phases(scope).late:
+        if scope.kinds(key).one_a_frame and key not in self.phases(scope).late:
             return [f'{state}."is_ego"']
         return kind_conditions(
             scope.kinds(key), f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
@@ -272,7 +273,11 @@ class Frames(Masks):
         state, entity, part = at.state, None, None
         if Home.state in homes and state is None:
             state = quoted(key)
-            on = [f'{state}."frame_id" = {join.frame}', f'{state}."node_id" = {node}']
+            on = [f'{state}."frame_id" = {join.frame}']
+            if not scope.kinds(
+                key
+            ).one_a_frame:  # by one column alone a scan is filtered as it reads
+                on.append(f'{state}."node_id" = {node}')
             on += self._of_kinds(scope, key, state) + self.within(f'{state}."frame_id"', 64)
             alone = profile.places == 1
             join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")

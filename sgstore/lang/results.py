@@ -26,7 +26,7 @@ from sgstore.lang.bound import (
     Result,
     walk,
 )
-from sgstore.lang.catalog import NODE_ATTRIBUTES, Catalog, Type
+from sgstore.lang.catalog import NODE_ATTRIBUTES, Catalog, Type, Unit
 from sgstore.lang.formulas import (
     Leaf,
     Select,
@@ -38,6 +38,7 @@ from sgstore.lang.formulas import (
     quoted,
 )
 from sgstore.lang.frames import Frames, column_of
+from sgstore.lang.kinds import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -107,6 +108,7 @@ def rows(
     """
     if query.result.form in {"intervals", "clips"}:
         return intervals(query, catalog, window, writer, span)
+    query = _spelled(query, catalog)
     return _Rows(query, writer or Frames(query, catalog, window)).statement()
 
 
@@ -145,6 +147,7 @@ def intervals(
     span: Span | None = None,
 ) -> Statement:
     """Intervals in which what is returned (nothing but a match, if nothing is) stays the same."""
+    query = _spelled(query, catalog)
     return _Intervals(query, writer or Frames(query, catalog, window), span).statement()
 
 
@@ -192,8 +195,8 @@ class _Rows:
         values += [key.value for key in self.result.order if not isinstance(key.value, str)]
         per = self.result.sample and self.result.sample.per
         values += [per] if per is not None and not isinstance(per, str) else []
+        values += [name for _, name in self._names()]
         wanted = [leaf for value in values for leaf in leaves(value)]
-        wanted += [name for _, name in self._names()]
         relation = self.writer.frames(self.query.scope, None, self.nodes, self.edges, wanted)
         outputs = self._outputs()
         select = Select([_named(o.text, o.name) for o in outputs])
@@ -224,23 +227,21 @@ class _Rows:
             outputs.append(
                 Output(f"{key}.id" if key in taken else key, f"{_ROWS}.{quoted(f'{key}.id')}")
             )
-            outputs.append(Output(f"{key}.name", f"{_ROWS}.{quoted(column_of(name))}"))
+            outputs.append(Output(f"{key}.name", self._text(name)))
         edges = [edge.key for edge in self.query.scope.edges if edge.key in self.edges]
         return outputs + [Output(key, f"{_ROWS}.{quoted(f'{key}.type')}") for key in edges]
 
-    def _names(self) -> list[tuple[str, Leaf]]:
+    def _names(self) -> list[tuple[str, Bound]]:
         if not self.result.whole:
             return []
         return [
-            (k, NodeAttribute(k, _NAME, Type.text))
+            (k, _name_of(k, self.query, self.writer.catalog))
             for k in self.query.scope.nodes
             if k in self.nodes
         ]
 
     def _text(self, value: Bound) -> str:
-        return expression_text(
-            value, lambda leaf: f"{_ROWS}.{quoted(column_of(leaf))}", self.writer.values
-        )
+        return expression_text(value, _column, self.writer.values)
 
     def _ordered(self, select: Select, names: list[str]) -> str:
         """The statement in the order of the query, or else of frames and bindings, cut to what is wanted."""
@@ -264,15 +265,25 @@ class _Rows:
 
 
 class _Intervals:
-    """Writes the statement of a query whose results are intervals, or the clips around them."""
+    """Writes the statement of a query whose results are intervals, or the clips around them.
+
+    What stays the same in an interval are its *keys*: the values that are returned, or, of a name that is put
+    together, its parts.
+    """
 
     def __init__(self, query: Query, writer: Frames, span: Span | None) -> None:
         self.query, self.result = query, query.result
         self.writer, self.span = writer, span
+        kept = [value for column in self.result.columns for value in _kept(column.value)]
+        distinct = enumerate(dict.fromkeys(kept))
+        self.keys = {value: quoted(f"key {number}") for number, value in distinct}
+        # In a trace, what has one id has one kind.
+        implied = {kind for c in self.result.columns for kind in _kept(c.value)[:-1]}
+        self.apart = [key for value, key in self.keys.items() if value not in implied]
 
     def statement(self) -> Statement:
         columns = self.result.columns
-        keys = [quoted(f"key {number}") for number in range(len(columns))]
+        keys = list(self.keys.values())
         wanted = [leaf for column in columns for leaf in leaves(column.value)]
         wanted += self.span or ()
         relation = self.writer.frames(self.query.scope, None, frozenset(), frozenset(), wanted)
@@ -282,13 +293,13 @@ class _Intervals:
             runs = self._spans(relation, keys, self.span)
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
-        named = [f"{key} AS {quoted(c.name)}" for key, c in zip(keys, columns, strict=True)]
+        named = [f"{self._told(c.value)} AS {quoted(c.name)}" for c in columns]
         select = Select([_named(text, name) for name, text in own] + named)
         select.join(nested(runs, ":runs"), [])
         select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = ":runs"."trace_id"'])
         first = '":runs"."first"'
         order = [_directed(_named_key(k.value), k.descending) for k in self.result.order]
-        order += [first, *keys]
+        order += [first, *(self._told(column.value) for column in columns)]
         names = (*(name for name, _ in own), *(column.name for column in columns))
         sample = self.result.sample
         if sample is None:
@@ -299,38 +310,45 @@ class _Intervals:
         text = _sampled(select, shown, sample.number, per, first, order)
         return _finished(self.writer, _limited(text, self.result.limit), names)
 
+    def _told(self, value: Bound) -> str:
+        """A value that is returned, in terms of the keys."""
+        if value in self.keys and not isinstance(value, NodeAttribute):
+            return self.keys[value]
+        return expression_text(value, self.keys.__getitem__, self.writer.values)
+
     def _steps(self, relation: str, keys: list[str]) -> str:
         """Frames and keys, with the number and the time of the frame before that has the same keys."""
         # The relation has a frame with the same values once; what is made of different values may be the same.
-        made = any(isinstance(column.value, Operation) for column in self.result.columns)
+        made = any(isinstance(key, Operation) for key in self.keys)
         inner = Select(['"frame_id"'], [nested(relation, ":rows")], distinct=made)
-        inner.columns += self._keys(keys)
+        inner.columns += self._keys()
         times = ["frame_id", "trace_id", "seq", "time_ns", "log_time_ns"]
         select = Select([f"{_FRAME}.{quoted(name)}" for name in times] + keys)
-        same = ", ".join([f'{_FRAME}."trace_id"', *keys])
+        same = ", ".join([f'{_FRAME}."trace_id"', *self.apart])
         over = f'OVER (PARTITION BY {same} ORDER BY {_FRAME}."seq")'
         select.columns += [
             f'lag({_FRAME}."seq") {over} AS "seq before"',
             f'lag({_FRAME}."time_ns") {over} AS "time before"',
-            f'coalesce({_TRACE}."period_ns", 0) * {GAP} AS "longest gap"',
+            f'CAST(floor(coalesce({_TRACE}."period_ns", 0) * {GAP}) AS BIGINT) AS "longest gap"',
         ]
         _from_frames(select, inner.text())
         return select.text()
 
-    def _keys(self, keys: list[str]) -> list[str]:
+    def _keys(self) -> list[str]:
         """The values that stay the same, under their keys."""
+        # A word of the vocabulary is a number inside, as long as it is not told.
         texts = [
-            expression_text(
-                column.value, lambda leaf: f"{_ROWS}.{quoted(column_of(leaf))}", self.writer.values
-            )
-            for column in self.result.columns
+            _column(value)
+            if isinstance(value, NodeAttribute)
+            else expression_text(value, _column, self.writer.values)
+            for value in self.keys
         ]
-        return [f"{text} AS {key}" for text, key in zip(texts, keys, strict=True)]
+        return [f"{text} AS {key}" for text, key in zip(texts, self.keys.values(), strict=True)]
 
     def _spans(self, relation: str, keys: list[str], span: Span) -> str:
         """Matches that are intervals themselves, each as one row."""
-        ends = [f"{_ROWS}.{quoted(column_of(leaf))}" for leaf in span]
-        inner = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"', *self._keys(keys)])
+        ends = [_column(leaf) for leaf in span]
+        inner = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"', *self._keys()])
         inner.join(nested(relation, ":rows"), [])
         inner.distinct = True
         select = Select(['":from"."trace_id" AS "trace_id"', *keys])
@@ -348,7 +366,7 @@ class _Intervals:
         """Runs of frames, numbered for each key, and then each as one row."""
         apart = '"time_ns" - "time before"'
         follows = f'"seq" = "seq before" + 1 AND {apart} >= 0 AND {apart} <= "longest gap"'
-        same = ", ".join(['"trace_id"', *keys])
+        same = ", ".join(['"trace_id"', *self.apart])
         over = f'OVER (PARTITION BY {same} ORDER BY "seq" ROWS UNBOUNDED PRECEDING)'
         numbered = Select(["*", f'sum(CASE WHEN {follows} THEN 0 ELSE 1 END) {over} AS "run"'])
         numbered.join(nested(steps, ":steps"), [])
@@ -372,6 +390,51 @@ class _Intervals:
         start = f'"min log" + {self.result.before}'
         end = f'"max log" + {self.result.after}'
         return list(zip(CLIP_COLUMNS, [f'{_TRACE}."name"', start, end], strict=True))
+
+
+def _column(leaf: Leaf) -> str:
+    """Where a value stands in what matches."""
+    return f"{_ROWS}.{quoted(column_of(leaf))}"
+
+
+def _kept(value: Bound) -> tuple[Bound, ...]:
+    """What must stay the same for a value to do so."""
+    return value.operands if isinstance(value, Operation) and value.word == "name" else (value,)
+
+
+def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
+    """The name of a node; that of an entity is put together late, for till then it is but two numbers."""
+    name = NodeAttribute(node, _NAME, Type.text)
+    profile = Profile.of(query.scope.kinds(node), catalog)
+    if query.steps or profile.mapped or profile.places != 1:
+        return name
+    kind = NodeAttribute(node, NODE_ATTRIBUTES["kind"], Type.text)
+    return Operation("name", (kind, NodeValue(node)), Type.text)
+
+
+def _spelled(query: Query, catalog: Catalog) -> Query:
+    """A query in whose results names are put together late, where they can be."""
+
+    def spelled(value: Bound) -> Bound:
+        match value:
+            case NodeAttribute(node=node, attribute=attribute) if attribute.unit is Unit.label:
+                return _name_of(node, query, catalog)
+            case Operation(operands=operands):
+                return replace(value, operands=tuple(spelled(operand) for operand in operands))
+            case _:
+                return value
+
+    def key(value: Bound | str) -> Bound | str:
+        return value if isinstance(value, str) else spelled(value)
+
+    result, sample = query.result, query.result.sample
+    result = replace(
+        result,
+        columns=tuple(replace(c, value=spelled(c.value)) for c in result.columns),
+        order=tuple(replace(k, value=key(k.value)) for k in result.order),
+        sample=sample and replace(sample, per=sample.per and key(sample.per)),
+    )
+    return replace(query, result=result)
 
 
 def _frame_columns() -> list[tuple[str, str]]:
