@@ -157,10 +157,14 @@ def whole(store: Store) -> Chosen:
 def classes_in(found: Selection) -> set[int]:
     """Classes in the frames of what was selected, counted frame by frame."""
     of = classed(found.units.chosen, found.wish.abstraction)
-    picked = set(found.picked.tolist())
-    number = dict(zip(found.units.frame_id.tolist(), found.units.number.tolist(), strict=True))
+    units = found.units
+    frames = {
+        frame
+        for unit in found.picked.tolist()
+        for frame in units.frame_id[units.begin[unit] : units.end[unit]].tolist()
+    }
     pairs = zip(of.frame_id.tolist(), of.code.tolist(), strict=True)
-    return {code for frame, code in pairs if number[frame] in picked}
+    return {code for frame, code in pairs if frame in frames}
 
 
 @pytest.mark.parametrize("piece", list(Piece))
@@ -198,7 +202,7 @@ def test_pairs_of_features_are_those_that_coverage_counts(store: Store) -> None:
 
     found = select(whole(store), Wish(Way.minimal, Piece.clip, abstraction="E", combos=2))
     known = combos(classed(whole(store), "E"), "E", 2)
-    ids = found.units.frame_id[np.isin(found.units.number, found.picked)]
+    ids = found.units.frame_id[found.units.rows_of(found.picked)]
     kept = combos(classed(Chosen("kept", store, ids), "E"), "E", 2)
 
     assert found.holdings is not None
@@ -247,7 +251,7 @@ def test_clips_are_runs_of_what_was_asked_for_cut_by_time(store: Store) -> None:
     )
 
     units = units_of(chosen, Piece.clip, 2.0)
-    many = np.diff(units.starts).tolist()
+    many = units.sizes.tolist()
 
     assert seq_of(units.first).tolist()[:3] == [13, 33, 53]
     assert set(many[:-1]) == {20}

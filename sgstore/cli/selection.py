@@ -18,6 +18,7 @@ from sgstore.cli.arguments import (
     RowFormat,
     StorePath,
     app,
+    asked_of,
     form_of,
     parameters_of,
     seconds_of,
@@ -80,6 +81,15 @@ UnitName = Annotated[ChosenUnit, typer.Option("--unit", help="Frames, clips, or 
 ClipLength = Annotated[
     str, typer.Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")
 ]
+Stride = Annotated[
+    str,
+    typer.Option(
+        "--stride",
+        metavar="TIME",
+        help="From where a clip begins to where the next one does; below --clip, they overlap.",
+        show_default="--clip",
+    ),
+]
 Abstraction = Annotated[
     str, typer.Option("--abstraction", metavar="NAME", help="Whose classes: E, EL, ER, RSV, …")
 ]
@@ -119,6 +129,7 @@ def select(
     budget: BudgetText = "",
     unit: UnitName = ChosenUnit.frame,
     clip: ClipLength = "2s",
+    stride: Stride = "",
     abstraction: Abstraction = "RSV",
     combos: Combos = 0,
     ego: OfEgo = False,
@@ -155,6 +166,7 @@ def select(
         budget=Budget.parse(budget) if budget else None,
         least=Measure(least.value),
         seed=seed,
+        stride_s=seconds_of(stride, "--stride") if stride else None,
     )
     _check_output(output)
     shares = parse_split(split) if split else {}
@@ -387,7 +399,7 @@ def diff(
         raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
     values = parameters_of(parameters)
     if name is not None or query is not None:
-        text, values = _asked(name, query, values)
+        text, values = asked_of(query, None, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
         table = compare(_store(a), _store(b), text, values)
     else:
@@ -396,17 +408,6 @@ def diff(
     _write(table, form_of(form, as_json=as_json), output)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0
-
-
-def _asked(
-    name: str | None, query: str | None, values: dict[str, Any]
-) -> tuple[str, dict[str, Any]]:
-    """The text that is asked, and the values of parameters that it does not hold yet."""
-    if name is None:
-        return query or "", values
-    from sgstore.lang.standard import pattern_named
-
-    return pattern_named(name).written(**values), {}
 
 
 def _store(path: str) -> Store:

@@ -7,8 +7,9 @@ random order · ``splits`` makes parts that share no recording · ``locking`` ma
 
 from sgstore.locks import cases_of
 from sgstore.selection.choose import Selection, Way, Wish, select
-from sgstore.selection.cover import Cover, Family, Fitted, minimal, within
+from sgstore.selection.cover import Cover, Fitted, minimal, within
 from sgstore.selection.curve import Curve, curve
+from sgstore.selection.family import Family
 from sgstore.selection.locking import locked_selection
 from sgstore.selection.splits import parse_split, split, split_table
 from sgstore.selection.units import Budget, Measure, Piece, Units, units_of

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from sgstore.selection.cover import Family
+    from sgstore.selection.family import Family
     from sgstore.world import Floats, Ints
 
 ROUNDS: Final = 400

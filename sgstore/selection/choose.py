@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ from sgstore.coverage.frames import names_of
 from sgstore.coverage.tables import Table
 from sgstore.errors import ConfigError
 from sgstore.selection.cover import minimal, within
+from sgstore.selection.overlapping import affordable, cheapest
+from sgstore.selection.purse import ROUNDING, Purse
 from sgstore.selection.units import Budget, Measure, Piece, holdings, kept, units_of
 from sgstore.store.covering import seq_of
 
@@ -56,6 +59,9 @@ class Wish:
     least : Measure
         What is to be as little as possible.
     seed : int
+    stride_s : float or None
+        From the beginning of one clip to that of the next; s. If that is less than their length, clips overlap.
+        ``None``: the length.
     """
 
     way: Way = Way.every
@@ -70,6 +76,7 @@ class Wish:
     budget: Budget | None = None
     least: Measure = Measure.units
     seed: int = 0
+    stride_s: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning.
@@ -80,6 +87,15 @@ class Wish:
         """
         if self.way is Way.stratify and not (self.budget or self.each):
             raise ConfigError("strata need a budget (--budget 600s), or a number (--per-class 10)")
+        if (
+            self.way is Way.per_class
+            and self.each > 1
+            and (self.stride_s or math.inf) < self.clip_s
+        ):
+            raise ConfigError(
+                "clips that overlap share frames, so a class that is in two of them may have come once:"
+                " to have each class several times, leave out --stride"
+            )
         if not 0 <= self.temper <= 10:
             raise ConfigError(
                 f"--temper {self.temper:g}; expected 0 (the same for all) to 1 (as they are)"
@@ -93,6 +109,7 @@ class Wish:
             "way": self.way.value,
             "unit": self.piece.value,
             "clip_s": self.clip_s if self.piece is Piece.clip else None,
+            "stride_s": self.stride_s if self.piece is Piece.clip else None,
             "abstraction": self.abstraction if cover else None,
             "combos": self.combos if cover else None,
             "of_ego": self.of_ego if cover and self.combos else None,
@@ -146,13 +163,25 @@ def select(chosen: Chosen, wish: Wish) -> Selection:
     QueryError, ExportError
         The expression of the strata is none.
     """
-    units = units_of(chosen, wish.piece, wish.clip_s)
-    rank = units.ranks(wish.seed)
+    units = units_of(chosen, wish.piece, wish.clip_s, wish.stride_s)
     if not len(units):
         said = [f"{chosen.text}: no frame to select from"]
         return Selection(
             wish, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
         )
+    found = _selected(wish, units, units.ranks(wish.seed))
+    if not units.overlap:
+        return found
+    frames, seconds = (units.together(found.picked, m) for m in (Measure.frames, Measure.seconds))
+    said = (
+        f"together {_number(frames)} of {len(units.frame_id):,} frames, {_number(seconds)} s: what clips share"
+        " counts once"
+    )
+    result = found.result | {"frames": int(frames), "seconds": round(seconds, 6)}
+    return replace(found, result=result, said=[*found.said, said])
+
+
+def _selected(wish: Wish, units: Units, rank: Ints) -> Selection:
     match wish.way:
         case Way.every:
             return _every(wish, units, rank)
@@ -169,31 +198,19 @@ def _every(wish: Wish, units: Units, rank: Ints) -> Selection:
     """All units, or units at random until the budget is used up."""
     picked = np.arange(len(units))
     if wish.budget is not None:
-        cost = units.costs(wish.budget.measure)
-        order = np.argsort(rank)
-        picked = order[_fitting(cost[order], wish.budget.most)]
+        purse = Purse.of(units, wish.budget.measure, wish.budget.most)
+        picked = purse.fitting(np.argsort(rank))
         picked = picked if picked.size < len(units) else np.arange(len(units))
     return Selection(wish, units, picked, result={"units": len(picked), "of": len(units)})
 
 
-def _fitting(cost: Floats, most: float) -> Ints:
-    """Which of things in order fit a budget, those passed over that do not fit any more."""
-    fitting: list[int] = []
-    left = most * (1 + 1e-12)
-    smallest = np.minimum.accumulate(cost[::-1])[::-1] if len(cost) else cost
-    for place, one in enumerate(cost.tolist()):
-        if smallest[place] > left:
-            break
-        if one <= left:
-            fitting.append(place)
-            left -= one
-    return np.array(fitting, np.int64)
-
-
 def _covering(wish: Wish, units: Units, rank: Ints, held: Holdings) -> Selection:
     each = wish.each if wish.way is Way.per_class else 1
-    family = held.family(units, units.costs(wish.least), each, rank)
-    cover = minimal(family)
+    shared = units.overlap
+    if shared and wish.least is not Measure.units:
+        cover = cheapest(units, held, wish.least, rank)
+    else:
+        cover = minimal(held.family(units, units.costs(wish.least), each, rank))
     result = _said_of(held, units, wish)
     met = _met(held, units, cover.chosen)
     bound = cover.bound if wish.least is not Measure.units else round(cover.bound)
@@ -213,13 +230,15 @@ def _covering(wish: Wish, units: Units, rank: Ints, held: Holdings) -> Selection
     budget = wish.budget
     if budget is None:
         return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
-    cost = units.costs(budget.measure)
-    if cost[cover.chosen].sum() <= budget.most * (1 + 1e-12):
-        said.append(
-            f"that is {_number(cost[cover.chosen].sum())} {budget.measure}, within {budget}"
-        )
+    whole = units.together(cover.chosen, budget.measure)
+    if whole <= budget.most * ROUNDING:
+        said.append(f"that is {_number(whole)} {budget.measure}, within {budget}")
         return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
-    fitted = within(held.family(units, cost, each, rank), budget.most * (1 + 1e-12))
+    if shared and budget.measure is not Measure.units:
+        fitted = affordable(units, held, budget.measure, rank, budget.most * ROUNDING)
+    else:
+        family = held.family(units, units.costs(budget.measure), each, rank)
+        fitted = within(family, budget.most * ROUNDING)
     reached = _met(held, units, fitted.chosen)
     result = _said_of(held, units, wish) | {
         "units": len(fitted.chosen),
@@ -233,7 +252,7 @@ def _covering(wish: Wish, units: Units, rank: Ints, held: Holdings) -> Selection
         f" {held.total} {held.kind}"
         + (f" ({fitted.met} of each up to {each} times)" if each > 1 else ""),
         f"upper bound: no choice within the budget meets more than {int(fitted.most + 1e-6)}"
-        f" (this one: {fitted.met}); all would take {_number(cost[cover.chosen].sum())} {budget.measure}"
+        f" (this one: {fitted.met}); all would take {_number(whole)} {budget.measure}"
         " with the smallest set that is known",
     ]
     return Selection(wish, units, fitted.chosen, held, result, said)
@@ -261,26 +280,26 @@ def _above(cost: float, bound: float) -> str:
 def _rarest(wish: Wish, units: Units, rank: Ints, held: Holdings) -> Selection:
     """For each class that no unit has yet, the rarest first, the unit that brings most besides."""
     measure = wish.budget.measure if wish.budget else wish.least
-    cost = units.costs(measure)
-    family = held.family(units, cost, 1, rank)
+    purse = Purse.of(units, measure, wish.budget.most if wish.budget else np.inf)
+    family = held.family(units, purse.cost, 1, rank)
     starts, sets = family.by_element()
     there = np.zeros(len(held.frames), np.bool_)
-    left = wish.budget.most * (1 + 1e-12) if wish.budget else np.inf
     picked: list[int] = []
     for element in np.lexsort((np.arange(len(held.frames)), held.frames)).tolist():
         if there[element]:
             continue
         options = sets[starts[element] : starts[element + 1]]
-        options = options[cost[options] <= left]
+        price = purse.prices(options)
+        options, price = options[price <= purse.left], price[price <= purse.left]
         if not len(options):
             continue
         gain = np.array([(~there[family.elements(one)]).sum() for one in options.tolist()])
-        best = int(options[np.lexsort((rank[options], -gain / cost[options]))[0]])
-        picked.append(best)
-        left -= cost[best]
-        there[family.elements(best)] = True
+        best = int(np.lexsort((rank[options], -gain / price))[0])
+        picked.append(int(options[best]))
+        purse.buy(picked[-1], float(price[best]))
+        there[family.elements(picked[-1])] = True
     reached = int(held.weight[there].sum())
-    used = float(cost[picked].sum())
+    used = purse.spent
     said = [
         f"the rarest first: {len(picked)} of {len(units)} {units.piece}s"
         f" ({_number(used)} {measure}) keep {reached} of {held.total} {held.kind}"
@@ -297,10 +316,10 @@ def _stratified(wish: Wish, units: Units, rank: Ints) -> Selection:
         within_own = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
         picked = order[within_own < wish.each]
     else:
-        cost = units.costs(wish.budget.measure)
+        purse = Purse.of(units, wish.budget.measure, wish.budget.most)
         share = size.astype(np.float64) ** wish.temper
         share = share / max(share.sum(), 1e-12)
-        picked = _allotted(order, stratum, cost, share * wish.budget.most, wish.budget.most, rank)
+        picked = _allotted(order, stratum, purse, share * wish.budget.most, rank)
     taken = np.bincount(stratum[picked], minlength=len(names))
     strata = {
         name: (int(all_), int(some))
@@ -315,43 +334,43 @@ def _stratified(wish: Wish, units: Units, rank: Ints) -> Selection:
     return Selection(wish, units, picked, None, result, said, strata)
 
 
-def _allotted(
-    order: Ints, stratum: Ints, cost: Floats, shares: Floats, most: float, rank: Ints
-) -> Ints:
+def _allotted(order: Ints, stratum: Ints, purse: Purse, shares: Floats, rank: Ints) -> Ints:
     """Each stratum up to its share; then, of what is left of the budget, units at random."""
     within_share: list[Ints] = []
+    used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
-        own = order[stratum[order] == number]
-        within_share.append(own[_fitting(cost[own], share)])
-    picked = np.concatenate(within_share) if within_share else np.zeros(0, np.int64)
+        before = purse.spent
+        within_share.append(purse.fitting(order[stratum[order] == number], share))
+        used[number] = purse.spent - before
+    picked = np.concatenate([np.zeros(0, np.int64), *within_share])
     # Shares are rarely a whole number of units: the rest goes to those strata that are furthest below theirs.
-    used = np.bincount(stratum[picked], cost[picked], len(shares))
     others = np.setdiff1d(order, picked)
-    lack = (shares - used)[stratum[others]] / cost[others]
+    lack = (shares - used)[stratum[others]] / purse.cost[others]
     others = others[np.lexsort((rank[others], -lack))]
     first = np.unique(stratum[others], return_index=True)[1]
-    others = others[np.sort(first)]
-    return np.concatenate(
-        [picked, others[_fitting(cost[others], most - float(cost[picked].sum()))]]
-    )
+    return np.concatenate([picked, purse.fitting(others[np.sort(first)])])
 
 
 def _strata(wish: Wish, units: Units) -> tuple[Ints, list[str]]:
     """The stratum of each unit, the value that most of its frames have; and all values."""
     from sgstore.exporters.labels import Labels
 
-    frames = units.frame_id[units.asked]
-    labels = Labels.asked(units.chosen.store, {"stratum": wish.by}, frames)
-    values = labels.of(frames)["stratum"]
+    asked = np.flatnonzero(units.asked)
+    labels = Labels.asked(units.chosen.store, {"stratum": wish.by}, units.frame_id[asked])
+    values = labels.of(units.frame_id[asked])["stratum"]
     names = sorted({_value(value) for value in values})
     number = {name: i for i, name in enumerate(names)}
-    code = np.array([number[_value(value)] for value in values], np.int64)
-    pairs, often = np.unique(
-        np.stack([units.number[units.asked], code]), axis=1, return_counts=True
-    )
-    best = np.lexsort((pairs[1], -often, pairs[0]))
-    first = np.unique(pairs[0][best], return_index=True)[1]
-    return pairs[1][best][first], names
+    code = np.full(len(units.frame_id), -1)
+    code[asked] = [number[_value(value)] for value in values]
+    stratum = np.zeros(len(units), np.int64)
+    for unit, row in units.members():
+        known = code[row] >= 0
+        key, often = np.unique(unit[known] * len(names) + code[row[known]], return_counts=True)
+        of, value = np.divmod(key, len(names))
+        best = np.lexsort((value, -often, of))
+        first = best[np.unique(of[best], return_index=True)[1]]
+        stratum[of[first]] = value[first]
+    return stratum, names
 
 
 def _value(value: Any) -> str:
@@ -373,10 +392,9 @@ def listed(selection: Selection) -> Table:
         ``holds`` and ``new``: of these, how many no unit before it has.
     """
     units, held = selection.units, selection.holdings
-    starts = units.starts
     first = names_of(units.chosen.store, units.first[selection.picked])
     last = seq_of(units.last[selection.picked]).tolist()
-    frames = np.diff(starts)[selection.picked].tolist()
+    frames = units.sizes[selection.picked].tolist()
     names = [
         name if name.rpartition("#")[2] == str(end) else f"{name}-{end}"
         for name, end in zip(first, last, strict=True)

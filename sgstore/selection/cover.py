@@ -1,28 +1,30 @@
 """Set cover: few sets, or cheap ones, that together hold every element as often as is asked.
 
-What must be taken is taken, what is the same is merged, what is left falls into parts that have nothing to do
-with one another. Each part is covered greedily and bounded from below (:mod:`sgstore.selection.bounds`); a part
-whose bound is not met is searched, up to a number of steps. So the answer is exact where that is cheap, and
-beside it stands how far from the best it can be at most.
+What must be taken is taken, what is superfluous is dropped (:mod:`sgstore.selection.reduce`), what is left
+falls into parts that have nothing to do with one another. Each part is covered greedily and bounded from below
+(:mod:`sgstore.selection.bounds`); a part whose bound is not met is searched, up to a number of steps. So the
+answer is exact where that is cheap, and beside it stands how far from the best it can be at most.
 
 Sources. Greedy and its factor H(n): Chvátal, "A greedy heuristic for the set-covering problem", Mathematics of
-Operations Research 4 (1979). Reductions: Garfinkel and Nemhauser, "Integer Programming" (1972), ch. 8. Under a
-budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem", Information Processing Letters 70 (1999).
+Operations Research 4 (1979). Under a budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem",
+Information Processing Letters 70 (1999).
 """
 
 from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from sgstore.selection.bounds import bounded, searched
+from sgstore.selection.reduce import reduced
 
 if TYPE_CHECKING:
-    from sgstore.world import Bools, Floats, Ints
+    from sgstore.selection.family import Family
+    from sgstore.world import Ints
 
 STEPS: Final = 60_000
 """Steps of searching, in all parts together; one with many elements counts as several. They are counted, not
@@ -30,104 +32,6 @@ timed, so that the answer is the same everywhere."""
 
 ROUNDING: Final = 1e-7
 """How much of a cost is due to rounding."""
-
-
-@dataclass(frozen=True)
-class Family:
-    """Sets of elements.
-
-    Attributes
-    ----------
-    starts : (S + 1,) int64
-        Where the elements of each set begin in ``members``.
-    members : (M,) int64
-        Elements, 0 … E - 1, each once in a set.
-    cost : (S,) float64
-        Above zero.
-    need : (E,) int64
-        In how many sets of the answer each element must be; of one that is in fewer sets, in all of these.
-    rank : (S,) int64
-        Of sets that are equally good the one of the lowest rank is taken.
-    weight : (E,) int64
-        How much an element counts where not all can be had.
-    """
-
-    starts: Ints
-    members: Ints
-    cost: Floats
-    need: Ints
-    rank: Ints
-    weight: Ints
-
-    @classmethod
-    def of(
-        cls,
-        pairs: Ints,
-        sets: int,
-        elements: int,
-        cost: Floats | None = None,
-        need: int = 1,
-        rank: Ints | None = None,
-    ) -> Family:
-        """A family of pairs (2, M) of a set and an element, in any order; a pair may come twice."""
-        key = pairs[0].astype(np.int64) * max(elements, 1) + pairs[1]
-        if (np.diff(key) <= 0).any():
-            key = np.unique(key)
-        of_set, members = np.divmod(key, max(elements, 1))
-        starts = np.searchsorted(of_set, np.arange(sets + 1))
-        often = np.bincount(members, minlength=elements)
-        return cls(
-            starts.astype(np.int64),
-            members,
-            np.ones(sets) if cost is None else cost,
-            np.minimum(often, need).astype(np.int64),
-            np.arange(sets) if rank is None else rank,
-            np.ones(elements, np.int64),
-        )
-
-    def __len__(self) -> int:
-        return len(self.cost)
-
-    @property
-    def set_of(self) -> Ints:
-        """(M,): the set of each of ``members``."""
-        return np.repeat(np.arange(len(self)), np.diff(self.starts))
-
-    def elements(self, one: int) -> Ints:
-        """The elements of a set."""
-        return self.members[self.starts[one] : self.starts[one + 1]]
-
-    def by_element(self) -> tuple[Ints, Ints]:
-        """Where the sets of each element begin, and these sets."""
-        order = np.argsort(self.members, kind="stable")
-        starts = np.searchsorted(self.members[order], np.arange(len(self.need) + 1))
-        return starts, self.set_of[order]
-
-    def gains(self, open_: Bools) -> Floats:
-        """(S,): the weight of those elements of each set that are open."""
-        rows = open_[self.members]
-        weight = self.weight[self.members[rows]].astype(np.float64)
-        return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
-
-    def covered(self, chosen: Ints) -> Ints:
-        """(E,): how many of some sets hold each element."""
-        taken = np.zeros(len(self), np.bool_)
-        taken[chosen] = True
-        return np.bincount(self.members[taken[self.set_of]], minlength=len(self.need))
-
-    def part(self, sets: Ints, wanted: Bools, need: Ints) -> Family:
-        """Only some sets, and of them only the elements that are wanted; these are numbered anew."""
-        kept = np.zeros(len(self), np.bool_)
-        kept[sets] = True
-        rows = kept[self.set_of] & wanted[self.members]
-        number = np.cumsum(wanted) - 1
-        place = np.full(len(self), -1)
-        place[sets] = np.arange(len(sets))
-        pairs = np.stack([place[self.set_of[rows]], number[self.members[rows]]])
-        found = Family.of(
-            pairs, len(sets), int(wanted.sum()), self.cost[sets], rank=self.rank[sets]
-        )
-        return replace(found, need=need[wanted])
 
 
 @dataclass(frozen=True)
@@ -166,7 +70,7 @@ def minimal(family: Family, steps: int = STEPS) -> Cover:
     steps : int
         Of searching at most; 0: greedy choice and bound alone.
     """
-    forced, rest = _reduced(family)
+    forced, rest = reduced(family)
     chosen, bound = [forced], float(family.cost[forced].sum())
     plain = bound
     whole = bool((family.cost == np.round(family.cost)).all())
@@ -311,108 +215,3 @@ def _at_most(family: Family, chosen: Ints, budget: float) -> float:
         room = budget - (float(cost[fits - 1]) if fits else 0.0)
         more += float(gain[order[fits]]) * room / float(family.cost[order[fits]])
     return _met(family, chosen) + min(more, float((left * family.weight).sum()))
-
-
-# Reductions -----------------------------------------------------------------------------------------------
-
-
-def _reduced(family: Family) -> tuple[Ints, list[tuple[Family, Ints]]]:
-    """Sets that every answer may be taken to hold; and what is left, in parts, with their sets."""
-    need, alive = family.need.copy(), np.ones(len(family), np.bool_)
-    forced = np.zeros(len(family), np.bool_)
-    wanted = need > 0
-    size = -1
-    while size != (size := int(alive.sum()) + int(wanted.sum())):
-        _force(family, need, alive, forced)
-        wanted &= need > 0
-        _drop_same_elements(family, need, alive, wanted)
-        if need[wanted].max(initial=0) == 1:
-            _drop_same_sets(family, alive, wanted)
-        alive &= np.bincount(family.set_of[wanted[family.members]], minlength=len(family)) > 0
-    return np.flatnonzero(forced), _parts(family, need, alive, wanted)
-
-
-def _force(family: Family, need: Ints, alive: Bools, forced: Bools) -> None:
-    """Take all sets of elements that are in no more sets than they need."""
-    while True:
-        rows = alive[family.set_of]
-        often = np.bincount(family.members[rows], minlength=len(need))
-        tight = (need > 0) & (often <= need)
-        taken = np.unique(family.set_of[rows & tight[family.members]])
-        if not len(taken):
-            return
-        forced[taken], alive[taken] = True, False
-        held = np.zeros(len(family), np.bool_)
-        held[taken] = True
-        need -= np.bincount(family.members[held[family.set_of]], minlength=len(need))
-        np.maximum(need, 0, out=need)
-
-
-def _drop_same_elements(family: Family, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """Of elements that are in the same sets only the one that needs most counts."""
-    rows = alive[family.set_of] & wanted[family.members]
-    key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
-    elements = np.flatnonzero(wanted)
-    order = elements[np.lexsort((elements, -need[elements], key[1][elements], key[0][elements]))]
-    wanted[order[_repeated(key[0][order], key[1][order])]] = False
-
-
-def _drop_same_sets(family: Family, alive: Bools, wanted: Bools) -> None:
-    """Of sets that hold the same only the cheapest counts."""
-    rows = alive[family.set_of] & wanted[family.members]
-    key = _keys(family.set_of[rows], family.members[rows], len(family), len(wanted))
-    sets = np.flatnonzero(alive)
-    order = sets[np.lexsort((family.rank[sets], family.cost[sets], key[1][sets], key[0][sets]))]
-    alive[order[_repeated(key[0][order], key[1][order])]] = False
-
-
-def _keys(of: Ints, what: Ints, size: int, things: int) -> tuple[Ints, Ints]:
-    """Two numbers for each set of things, 106 bits together: equal where the sets are."""
-    words = np.random.Generator(np.random.PCG64(20_24)).integers(1 << 31, size=(2, 2, things))
-    found: list[Ints] = []
-    for low, high in words:
-        # Sums of numbers below 2³¹ are exact in floating point, if there are below 2²² of them.
-        first = np.bincount(of, low[what], size).astype(np.int64)
-        second = np.bincount(of, high[what], size).astype(np.int64)
-        found.append(first * (1 << 31) ^ second)
-    return found[0], found[1]
-
-
-def _repeated(*keys: Ints) -> Bools:
-    same = np.zeros(len(keys[0]), np.bool_)
-    same[1:] = np.logical_and.reduce([key[1:] == key[:-1] for key in keys])
-    return same
-
-
-def _parts(family: Family, need: Ints, alive: Bools, wanted: Bools) -> list[tuple[Family, Ints]]:
-    """What is left, as families that share no element, the one with the first set first."""
-    rows = alive[family.set_of] & wanted[family.members]
-    sets, members = family.set_of[rows], family.members[rows]
-    parent = list(range(len(family)))
-
-    def root(one: int) -> int:
-        while parent[one] != one:
-            parent[one] = parent[parent[one]]
-            one = parent[one]
-        return one
-
-    holder: dict[int, int] = {}
-    for one, element in zip(sets.tolist(), members.tolist(), strict=True):
-        mine, other = root(one), root(holder.setdefault(element, one))
-        parent[max(mine, other)] = min(mine, other)
-    group = np.array([root(one) for one in sets.tolist()], np.int64)
-    order = np.argsort(group, kind="stable")
-    ends = np.flatnonzero(np.append(np.diff(group[order]) != 0, True)) + 1 if len(order) else ()
-    found: list[tuple[Family, Ints]] = []
-    first = 0
-    for end in map(int, ends):
-        own = order[first:end]
-        first = end
-        inside, place = np.unique(sets[own], return_inverse=True)
-        element, number = np.unique(members[own], return_inverse=True)
-        pairs = np.stack([place, number])
-        part = Family.of(
-            pairs, len(inside), len(element), family.cost[inside], 1, family.rank[inside]
-        )
-        found.append((replace(part, need=need[element]), inside))
-    return found

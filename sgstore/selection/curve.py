@@ -10,10 +10,11 @@ import numpy as np
 
 from sgstore.coverage.tables import Table
 from sgstore.errors import ConfigError
-from sgstore.selection.units import kept
+from sgstore.selection.units import Measure, kept
 
 if TYPE_CHECKING:
     from sgstore.selection.choose import Selection
+    from sgstore.selection.units import Holdings, Units
     from sgstore.world import Floats, Ints
 
 POINTS: Final = 60
@@ -40,13 +41,19 @@ class Curve:
     at_random : float
         How many units in random order it takes, in the mean, to keep as much as the selection does in the end:
         over ``orders`` orders.
+    spread : float
+        Their standard deviation from one order to the next.
     orders : int
+    at_random_s : float
+        What as many cost together, where clips overlap: s, in the mean.
     """
 
     table: Table
     needed: int
     at_random: float
+    spread: float
     orders: int
+    at_random_s: float = 0.0
 
 
 def curve(selection: Selection, points: int = POINTS) -> Curve:
@@ -60,14 +67,14 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
     held, units = selection.holdings, selection.units
     if not len(units):
         return Curve(
-            Table(("units", "kept", "share", "at_random"), [], list(selection.said)), 0, 0.0, 0
+            Table(("units", "kept", "share", "at_random"), [], list(selection.said)), 0, 0.0, 0.0, 0
         )
     if held is None:
         raise ConfigError("a curve shows what is kept: say --minimal, --per-class or --rarest")
     elements, total, pairs = held.total, len(units), held.pairs
     so_far = kept(pairs, held.weight, selection.picked, total)
     often = np.bincount(pairs[1], minlength=len(held.weight))
-    n = np.unique(np.concatenate([_spread(len(so_far), points), _spread(total, points)]))
+    n = np.unique(np.concatenate([_points(len(so_far), points), _points(total, points)]))
     n = n[n <= total]
     random = expected(often, total, n, held.weight)
     rows = [
@@ -81,15 +88,18 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
     ]
     reached = int(so_far[-1]) if len(so_far) else 0
     needed = int(np.searchsorted(so_far, reached)) + 1 if len(so_far) else 0
-    mean, orders = random_need(pairs, held.weight, total, reached, selection.wish.seed)
+    need, seconds = random_need(units, held, reached, selection.wish.seed)
+    own = selection.result.get("seconds", 0.0)
     said = [
-        f"{needed} {units.piece}s keep {reached} of {elements} {held.kind}; in random order that takes"
-        f" {mean:.1f} of {total} (mean of {orders} orders)"
+        f"{needed} {units.piece}s{f' ({own:.1f} s)' if own else ''} keep {reached} of {elements} {held.kind};"
+        f" in random order that takes {need.mean():.1f} ± {need.std():.1f} of {total}"
+        f"{f' ({seconds:.1f} s)' if seconds else ''} (mean and standard deviation of {len(need)} orders)"
     ]
-    return Curve(Table(("units", "kept", "share", "at_random"), rows, said), needed, mean, orders)
+    table = Table(("units", "kept", "share", "at_random"), rows, said)
+    return Curve(table, needed, float(need.mean()), float(need.std()), len(need), seconds)
 
 
-def _spread(most: int, points: int) -> Ints:
+def _points(most: int, points: int) -> Ints:
     if not most:
         return np.zeros(0, np.int64)
     return np.unique(np.linspace(1, most, min(points, most)).round().astype(np.int64))
@@ -121,21 +131,40 @@ def expected(often: Ints, units: int, drawn: Ints, weight: Ints | None = None) -
     return found
 
 
-def random_need(pairs: Ints, weight: Ints, units: int, wanted: int, seed: int) -> tuple[float, int]:
-    """How many units in random order it takes to hold so many elements: the mean, and over how many orders."""
+def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
+    """How many units in random order it takes to hold so many elements.
+
+    Returns
+    -------
+    needed : (K,) float64
+        Of K orders.
+    seconds : float
+        How long these are together in the mean, if units overlap; else 0.
+    """
     if not wanted:
-        return 0.0, 0
+        return np.zeros(1), 0.0
+    pairs, weight = held.pairs, held.weight
     order = np.argsort(pairs[1], kind="stable")
     unit = pairs[0][order]
     starts = np.flatnonzero(np.append(True, np.diff(pairs[1][order]) != 0))
     own = weight[pairs[1][order][starts]]
     orders = int(np.clip(_WORK // max(len(unit), 1), 20, ORDERS))
+    period = units.weights(Measure.seconds) if units.overlap else None
+    rows = np.arange(len(units.frame_id))
+    holding = [
+        np.searchsorted(units.end, rows, side="right"),
+        np.searchsorted(units.begin, rows, side="right"),
+    ]
+    ranges = np.stack(holding, axis=1).ravel()
     rng = np.random.Generator(np.random.PCG64(seed))
-    needed = np.empty(orders)
+    needed, seconds = np.empty(orders), 0.0
     for number in range(orders):
-        place = rng.permutation(units)
+        place = rng.permutation(len(units))
         first = np.minimum.reduceat(place[unit], starts)
         in_order = np.argsort(first)
         enough = int(np.searchsorted(np.cumsum(own[in_order]), wanted))
         needed[number] = first[in_order[enough]] + 1
-    return float(needed.mean()), orders
+        if period is not None:
+            there = np.minimum.reduceat(np.append(place, 0), ranges)[::2] < needed[number]
+            seconds += float(period[there].sum())
+    return needed, seconds / orders

@@ -44,11 +44,10 @@ def locked_selection(
         A recording is gone, was replaced, or is damaged.
     """
     units = selection.units
-    starts = units.starts
     wanted = [
         Part(
-            units.frame_id[starts[unit] : starts[unit + 1]],
-            units.log_time_ns[starts[unit] : starts[unit + 1]],
+            units.frame_id[units.begin[unit] : units.end[unit]],
+            units.log_time_ns[units.begin[unit] : units.end[unit]],
             (parts or {}).get(unit, ""),
         )
         for unit in sorted(selection.picked.tolist())

@@ -16,7 +16,6 @@ from sgstore.store.covering import trace_of
 
 if TYPE_CHECKING:
     from sgstore.selection.choose import Selection
-    from sgstore.world import Ints
 
 
 def parse_split(text: str) -> dict[str, float]:
@@ -59,12 +58,13 @@ def split(selection: Selection, shares: dict[str, float]) -> dict[int, str]:
     units = selection.units
     recording = {one.trace_id: one.digest for one in units.chosen.store.info()}
     of = [recording[trace] for trace in trace_of(units.first[selection.picked]).tolist()]
-    frames = np.diff(units.starts)[selection.picked].tolist()
+    rows = units.rows_of(selection.picked)
+    traces, often = np.unique(trace_of(units.frame_id[rows]), return_counts=True)
     total: dict[str, int] = {}
-    for digest, many in zip(of, frames, strict=True):
-        total[digest] = total.get(digest, 0) + many
+    for trace, many in zip(traces.tolist(), often.tolist(), strict=True):
+        total[recording[trace]] = total.get(recording[trace], 0) + many
     order = sorted(total, key=lambda d: (-total[d], _drawn(d, selection.wish.seed)))
-    lack = {name: share * sum(frames) for name, share in shares.items()}
+    lack = {name: share * len(rows) for name, share in shares.items()}
     part: dict[str, str] = {}
     for digest in order:
         part[digest] = max(lack, key=lambda name: lack[name])
@@ -88,29 +88,29 @@ def split_table(selection: Selection, parts: dict[int, str], shares: dict[str, f
     """
     units = selection.units
     of = classed(units.chosen, selection.wish.abstraction)
-    rows = np.searchsorted(units.frame_id, of.frame_id)
-    name_of = np.full(len(units), "", object)
-    for unit, name in parts.items():
-        name_of[unit] = name
-    own = name_of[units.number[rows]]
-    sizes: dict[str, Ints] = {}
-    for name in shares:
-        code = of.code[(own == name) & (of.code != UNKNOWN)]
-        sizes[name] = np.bincount(code, minlength=len(of.names))
+    code = np.full(len(units.frame_id), UNKNOWN)
+    code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
+    mine = {
+        name: np.array([unit for unit, part in parts.items() if part == name], np.int64)
+        for name in shares
+    }
+    rows = {name: units.rows_of(own) for name, own in mine.items()}
+    sizes = {
+        name: np.bincount(code[own][code[own] != UNKNOWN], minlength=len(of.names))
+        for name, own in rows.items()
+    }
     digests = {one.trace_id: one.digest for one in units.chosen.store.info()}
-    frames = np.diff(units.starts)
     columns = ["split", "units", "frames", "share", "wanted", "recordings", "classes"]
     columns += [f"{what}_in_{name}" for name in shares for what in ("classes", "frames")]
     listed: list[tuple[object, ...]] = []
-    total = max(int(frames[list(parts)].sum()), 1)
+    total = max(sum(len(own) for own in rows.values()), 1)
     for name, wanted in shares.items():
-        mine = np.array([unit for unit, part in parts.items() if part == name], np.int64)
-        recordings = {digests[trace] for trace in trace_of(units.first[mine]).tolist()}
-        many = int(frames[mine].sum())
+        recordings = {digests[trace] for trace in trace_of(units.first[mine[name]]).tolist()}
+        many = len(rows[name])
         has = sizes[name] > 0
         row: list[object] = [
             name,
-            len(mine),
+            len(mine[name]),
             many,
             many / total,
             wanted,

@@ -14,7 +14,7 @@ from sgstore.coverage.asking import is_of_ego
 from sgstore.coverage.classed import GAP, UNKNOWN
 from sgstore.coverage.features import combined, features
 from sgstore.errors import ConfigError
-from sgstore.selection.cover import Family
+from sgstore.selection.family import Family
 from sgstore.store.contents import lengths_of_messages
 from sgstore.store.covering import seq_of, trace_of
 
@@ -105,7 +105,7 @@ _MEASURES: Final[dict[str, tuple[float, Measure]]] = {
 
 @dataclass(frozen=True)
 class Units:
-    """Frames in units.
+    """Frames in units, which may overlap.
 
     Attributes
     ----------
@@ -116,55 +116,98 @@ class Units:
         The frames of all units, ascending.
     asked : (N,) bool
         Whether a frame is one that was asked for: only these count. Others are in whole traces.
-    number : (N,) int64
-        The unit of each frame, 0 … U - 1, ascending.
     log_time_ns : (N,) int64
+    begin, end : (U,) int64
+        The rows of each unit, the last one not included; both ascend, and each row is in a unit.
     """
 
     chosen: Chosen
     piece: Piece
     frame_id: Ints
     asked: Bools
-    number: Ints
     log_time_ns: Ints
+    begin: Ints
+    end: Ints
 
     def __len__(self) -> int:
-        return int(self.number[-1]) + 1 if len(self.number) else 0
+        return len(self.begin)
 
     @property
-    def starts(self) -> Ints:
-        """(U + 1,): where the frames of each unit begin."""
-        return np.searchsorted(self.number, np.arange(len(self) + 1))
+    def overlap(self) -> bool:
+        """Whether a frame is in several units."""
+        return bool((self.begin[1:] < self.end[:-1]).any())
+
+    @property
+    def sizes(self) -> Ints:
+        """(U,): how many frames each unit has."""
+        return self.end - self.begin
 
     @property
     def first(self) -> Ints:
         """(U,): ids of the first frames of the units."""
-        return self.frame_id[self.starts[:-1]]
+        return self.frame_id[self.begin]
 
     @property
     def last(self) -> Ints:
         """(U,): ids of their last frames."""
-        return self.frame_id[self.starts[1:] - 1]
+        return self.frame_id[self.end - 1]
 
-    def costs(self, measure: Measure) -> Floats:
-        """(U,): what each unit costs; a frame lasts the median period of its trace."""
+    def rows_of(self, picked: Ints) -> Ints:
+        """Rows of the frames of some units, ascending, each once."""
+        step = np.zeros(len(self.frame_id) + 1, np.int64)
+        np.add.at(step, self.begin[picked], 1)
+        np.add.at(step, self.end[picked], -1)
+        return np.flatnonzero(np.cumsum(step)[:-1])
+
+    def members(self) -> Iterator[tuple[Ints, Ints]]:
+        """Units and rows of their frames, unit after unit, whole units at a time."""
+        ends = np.cumsum(self.sizes)
+        low = 0
+        while low < len(self):
+            base = int(ends[low] - self.sizes[low])
+            high = max(int(np.searchsorted(ends, base + _CELLS // 10, side="right")), low + 1)
+            unit, row = spread(self.begin[low:high], self.end[low:high])
+            yield low + unit, row
+            low = high
+
+    def weights(self, measure: Measure) -> Floats:
+        """(N,): what each frame costs; it lasts the median period of its trace."""
         match measure:
-            case Measure.units:
-                return np.ones(len(self))
-            case Measure.frames:
-                return np.diff(self.starts).astype(np.float64)
+            case Measure.units | Measure.frames:
+                return np.ones(len(self.frame_id))
             case Measure.seconds:
                 periods = {one.trace_id: one.period_ns for one in self.chosen.store.info()}
                 traces, number = np.unique(trace_of(self.frame_id), return_inverse=True)
                 period = np.array([periods[one] for one in traces.tolist()], np.float64) / 1e9
-                # A trace of one frame has no period; it must not be free.
-                return np.maximum(np.bincount(self.number, period[number], len(self)), 1e-3)
+                return period[number]
             case Measure.bytes:
-                found = np.zeros(len(self))
+                found = np.zeros(len(self.frame_id))
                 for frame_id, length in lengths_of_messages(self.chosen.store.file, self.frame_id):
-                    rows = np.searchsorted(self.frame_id, frame_id)
-                    np.add.at(found, self.number[rows], length)
-                return np.maximum(found, 1.0)
+                    np.add.at(found, np.searchsorted(self.frame_id, frame_id), length)
+                return found
+
+    def costs(self, measure: Measure) -> Floats:
+        """(U,): what each unit costs alone."""
+        if measure is Measure.units:
+            return np.ones(len(self))
+        return self.summed(self.weights(measure), measure)
+
+    def summed(self, weights: Floats, measure: Measure) -> Floats:
+        """(U,): the weights of the frames of each unit; nothing is free."""
+        if not len(self):
+            return np.zeros(0)
+        ranges = np.stack([self.begin, self.end], axis=1).ravel()
+        found = np.add.reduceat(np.append(weights, 0.0), ranges)[::2]
+        # A trace of one frame has no period, a frame perhaps no message.
+        return np.maximum(found, 1e-3 if measure is Measure.seconds else 1.0)
+
+    def together(self, picked: Ints, measure: Measure) -> float:
+        """What some units cost together: a frame that is in several of them costs once."""
+        if measure is Measure.units:
+            return float(len(picked))
+        if not self.overlap:
+            return float(self.costs(measure)[picked].sum())
+        return float(self.weights(measure)[self.rows_of(picked)].sum())
 
     def ranks(self, seed: int) -> Ints:
         """(U,): an order of the units at random, the same in every store that has the same traces."""
@@ -188,12 +231,22 @@ def _mixed(
     return words ^ (words >> np.uint64(31))
 
 
-def units_of(chosen: Chosen, piece: Piece, clip_s: float = 2.0) -> Units:
+def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
+    """Ranges, and all whole numbers in each of them."""
+    many = end - begin
+    unit = np.repeat(np.arange(len(many)), many)
+    return unit, np.arange(len(unit)) + np.repeat(begin - (np.cumsum(many) - many), many)
+
+
+def units_of(
+    chosen: Chosen, piece: Piece, clip_s: float = 2.0, stride_s: float | None = None
+) -> Units:
     """The units of some frames.
 
-    A clip is a part of a run of consecutive frames that were asked for, of a given time: a run is cut from its
-    beginning, and its last clip may be shorter. A step in time of more than 2.5 median periods ends a run. A
-    trace is taken whole if one of its frames was asked for.
+    A clip is a part of a run of consecutive frames that were asked for, of a given time. The first one begins
+    with the run, the others a stride after one another, until one reaches the end of the run; that one may be
+    shorter. A step in time of more than 2.5 median periods ends a run. A trace is taken whole if one of its
+    frames was asked for.
 
     Parameters
     ----------
@@ -201,14 +254,23 @@ def units_of(chosen: Chosen, piece: Piece, clip_s: float = 2.0) -> Units:
     piece : Piece
     clip_s : float
         Length of clips; s.
+    stride_s : float, optional
+        From the beginning of one clip to that of the next; s. Shorter than they are long, they overlap. By
+        default as long.
 
     Raises
     ------
     ConfigError
-        Clips would have no length.
+        Clips would have no length, or frames would lie between them.
     """
+    stride_s = clip_s if stride_s is None else stride_s
     if not clip_s > 0:
         raise ConfigError(f"clips of {clip_s:g} s; expected a time above zero, such as 2s")
+    if not 0 < stride_s <= clip_s:
+        raise ConfigError(
+            f"clips of {clip_s:g} s that begin every {stride_s:g} s: expected a time above zero, and no longer"
+            " than a clip, so that every frame is in one"
+        )
     found = chosen.store.file.arrays(
         "SELECT frame_id, time_ns, log_time_ns FROM frames ORDER BY frame_id"
     )
@@ -218,33 +280,50 @@ def units_of(chosen: Chosen, piece: Piece, clip_s: float = 2.0) -> Units:
     asked[rows] = True
     if piece is Piece.trace:
         rows = np.flatnonzero(np.isin(trace_of(frame_id), trace_of(frame_id[rows])))
-    own = Units(chosen, piece, frame_id[rows], asked[rows], np.arange(len(rows)), log_time_ns[rows])
+    each = np.arange(len(rows))
+    own = Units(chosen, piece, frame_id[rows], asked[rows], log_time_ns[rows], each, each + 1)
     if piece is Piece.frame or not len(rows):
         return own
     trace = trace_of(own.frame_id)
-    fresh = np.ones(len(rows), np.bool_)
-    fresh[1:] = trace[1:] != trace[:-1]
+    fresh = np.append(True, trace[1:] != trace[:-1])
     if piece is Piece.clip:
-        fresh = _clips(own, time_ns[rows], fresh, clip_s)
-    return replace(own, number=np.cumsum(fresh) - 1)
+        begin, end = _clips(own, time_ns[rows], fresh, clip_s, stride_s)
+    else:
+        begin, end = _ranges(fresh)
+    return replace(own, begin=begin, end=end)
 
 
-def _clips(units: Units, time_ns: Ints, fresh: Bools, clip_s: float) -> Bools:
-    """Which frames begin a clip."""
-    periods = {one.trace_id: one.period_ns for one in units.chosen.store.info()}
-    traces, number = np.unique(trace_of(units.frame_id), return_inverse=True)
+def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
+    """Where ranges begin and end whose first rows are known."""
+    begin = np.flatnonzero(fresh)
+    return begin, np.append(begin[1:], len(fresh))
+
+
+def _clips(
+    frames: Units, time_ns: Ints, fresh: Bools, clip_s: float, stride_s: float
+) -> tuple[Ints, Ints]:
+    """Where clips begin and end."""
+    periods = {one.trace_id: one.period_ns for one in frames.chosen.store.info()}
+    traces, number = np.unique(trace_of(frames.frame_id), return_inverse=True)
     period = np.array([periods[one] for one in traces.tolist()], np.float64)[number]
-    seq = seq_of(units.frame_id)
+    seq = seq_of(frames.frame_id)
     step = np.diff(time_ns, prepend=time_ns[:1])
     fresh = fresh.copy()
     fresh[1:] |= (seq[1:] != seq[:-1] + 1) | (step[1:] > GAP * period[1:]) | (step[1:] < 0)
-    starts = np.flatnonzero(fresh)
-    since = time_ns - np.repeat(time_ns[starts], np.diff(np.append(starts, len(time_ns))))
+    starts, ends = _ranges(fresh)
+    run = np.cumsum(fresh) - 1
     # Frames stand at whole periods, more or less: what is a hair early belongs to the next clip.
-    length = round(clip_s * 1e9)
-    part = (since + (period * 0.25).astype(np.int64)) // length
+    since = time_ns - time_ns[starts][run] + (period * 0.25).astype(np.int64)
+    length, stride = max(round(clip_s * 1e9), 1), max(round(stride_s * 1e9), 1)
+    part = since // stride
     fresh[1:] |= part[1:] != part[:-1]
-    return fresh
+    begin = np.flatnonzero(fresh)
+    # Runs one after another on one axis of time, so far apart that no clip of one reaches the next.
+    far = np.cumsum(since[ends - 1] + 2 * length) - since[ends - 1]
+    end = np.searchsorted(since + far[run], far[run[begin]] + part[begin] * stride + length)
+    reaches = end == ends[run[begin]]
+    kept = ~reaches | np.append(True, ~reaches[:-1] | (run[begin][1:] != run[begin][:-1]))
+    return begin[kept], end[kept].astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -263,6 +342,8 @@ class Holdings:
         Frames that were asked for with each.
     kind : str
         What the elements are.
+    has : (C, E) bool or None
+        Elements of the classes that occur; ``None``: they are the elements.
     """
 
     classed: Classed
@@ -270,6 +351,7 @@ class Holdings:
     weight: Ints
     frames: Ints
     kind: str
+    has: Bools | None = None
 
     @property
     def total(self) -> int:
@@ -280,6 +362,11 @@ class Holdings:
         """The units as sets of their elements."""
         found = Family.of(self.pairs, len(units), len(self.frames), cost, need, rank)
         return replace(found, weight=self.weight)
+
+    def over(self, units: Units) -> Holdings:
+        """The same of other units of the same frames."""
+        pairs = _classes_of(units, self.classed)
+        return replace(self, pairs=pairs if self.has is None else _of_units(pairs, self.has))
 
 
 def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = False) -> Holdings:
@@ -302,15 +389,10 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
         There are more combinations, or combinations in units, than can be gone through.
     """
     of = classed(units.chosen, abstraction)
-    rows = np.searchsorted(units.frame_id, of.frame_id)
-    known = of.code != UNKNOWN
-    present = of.present()
-    number = np.full(len(of.names) + 1, UNKNOWN)
-    number[present] = np.arange(len(present))
-    pairs = _distinct(units.number[rows[known]], number[of.code[known]], len(present))
+    pairs = _classes_of(units, of)
     if not combos:
-        weight = np.ones(len(present), np.int64)
-        return Holdings(of, pairs, weight, of.sizes()[present], f"classes in {abstraction}")
+        sizes = of.sizes()[of.present()]
+        return Holdings(of, pairs, np.ones_like(sizes), sizes, f"classes in {abstraction}")
     own = features(of, abstraction)
     if of_ego:
         keep = [i for i, name in enumerate(own.names) if is_of_ego(name)]
@@ -319,12 +401,26 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
     found = combined(own, combos)
     inside, weight, frames = _distinct_combinations(found)
     kind = f"combinations of {combos} features{' of the ego' if of_ego else ''} in {abstraction}"
-    return Holdings(of, _of_units(pairs, inside), weight, frames, kind)
+    return Holdings(of, _of_units(pairs, inside), weight, frames, kind, inside)
 
 
-def _distinct(unit: Ints, element: Ints, elements: int) -> Ints:
-    key = np.unique(unit * max(elements, 1) + element)
-    return np.stack(np.divmod(key, max(elements, 1)))
+def _classes_of(units: Units, of: Classed) -> Ints:
+    """(2, M): units, and the classes that occur, counted from 0, that each holds."""
+    present = of.present()
+    number = np.full(len(of.names) + 1, UNKNOWN)
+    number[present] = np.arange(len(present))
+    code = np.full(len(units.frame_id), UNKNOWN)
+    code[np.searchsorted(units.frame_id, of.frame_id)] = number[of.code]
+    held = 0
+    parts: list[Ints] = []
+    for unit, row in units.members():
+        known = code[row] != UNKNOWN
+        key = np.unique(unit[known] * max(len(present), 1) + code[row[known]])
+        parts.append(np.stack(np.divmod(key, max(len(present), 1))))
+        held += len(key)
+        if held > MOST:
+            raise ConfigError(f"more than {MOST:,} classes in units: ask for a longer stride")
+    return np.concatenate(parts, axis=1) if parts else np.zeros((2, 0), np.int64)
 
 
 def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
