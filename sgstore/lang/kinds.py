@@ -34,6 +34,11 @@ class Profile:
         return cls(moving, fixed, mapped)
 
     @property
+    def kinds(self) -> frozenset[str]:
+        """All kinds that they may be of."""
+        return self.moving | self.fixed | self.mapped
+
+    @property
     def places(self) -> int:
         """In how many places they live."""
         return sum(map(bool, (self.moving, self.fixed, self.mapped)))

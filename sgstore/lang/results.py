@@ -24,6 +24,7 @@ from sgstore.lang.bound import (
     Operation,
     Query,
     Result,
+    Value,
     walk,
 )
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Catalog, Type, Unit
@@ -399,7 +400,9 @@ def _column(leaf: Leaf) -> str:
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
     """What must stay the same for a value to do so."""
-    return value.operands if isinstance(value, Operation) and value.word == "name" else (value,)
+    return (
+        tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
+    )
 
 
 def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
@@ -408,7 +411,9 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
     profile = Profile.of(query.scope.kinds(node), catalog)
     if query.steps or profile.mapped or profile.places != 1:
         return name
-    kind = NodeAttribute(node, NODE_ATTRIBUTES["kind"], Type.text)
+    kind: Bound = NodeAttribute(node, NODE_ATTRIBUTES["kind"], Type.text)
+    if len(profile.kinds) == 1:
+        kind = Value(next(iter(profile.kinds)), Type.text, closed=True)
     return Operation("name", (kind, NodeValue(node)), Type.text)
 
 
