@@ -34,6 +34,7 @@ OWNERS = {
     "google": {"traces", "exporters"},
     "zstandard": {"traces", "exporters"},
     "lz4": {"traces", "exporters"},
+    "isal": {"traces"},
     "typer": {"cli"},
     "rich": {"cli"},
     "networkx": {"graph", "exporters"},

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recordings import drive
 
-from sgstore.traces import chunks, mcap_file, open_trace, spool
+from sgstore.traces import ahead, chunks, open_trace, spool
 from sgstore.traces.mcap_file import McapFile
 from sgstore.world import FrameBlock, TraceReport
 
@@ -43,11 +43,11 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     offsets: list[int] = []
     read = chunks.read_records
 
-    def read_records(file: Any, head: chunks.ChunkHead, *, verify: bool = True) -> Any:
+    def read_records(file: Any, head: chunks.ChunkHead, **how: Any) -> Any:
         offsets.append(head.offset)
-        return read(file, head, verify=verify)
+        return read(file, head, **how)
 
-    monkeypatch.setattr(mcap_file, "read_records", read_records)
+    monkeypatch.setattr(ahead, "read_records", read_records)
     return offsets
 
 

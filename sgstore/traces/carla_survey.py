@@ -180,20 +180,17 @@ class Survey:
     # One run of messages -----------------------------------------------------------------------------
 
     def _look_at(self, run: Messages) -> None:
-        channels, rows, counts = np.unique(run.channel, return_index=True, return_counts=True)
-        watched: list[int] = []
-        for channel, row, count in zip(
-            channels.tolist(), rows.tolist(), counts.tolist(), strict=True
-        ):
+        counts = np.bincount(run.channel)
+        watched = np.zeros(len(counts), np.bool_)
+        for channel in np.flatnonzero(counts).tolist():
             content = self._meet(channel)
             if content == OBJECTS:
                 self._count(channel, run)
             if content not in LASTING | {OBJECTS}:
-                before, ref = self._others.get(channel, (0, ref_of(run, row)))
-                self._others[channel] = (before + count, ref)
-            if self._is_watched(channel, content):
-                watched.append(channel)
-        for row in np.flatnonzero(np.isin(run.channel, watched)).tolist():
+                before, ref = self._others.get(channel) or (0, _first(run, channel))
+                self._others[channel] = (before + int(counts[channel]), ref)
+            watched[channel] = self._is_watched(channel, content)
+        for row in np.flatnonzero(watched[run.channel]).tolist():
             try:
                 self._look(run, row)
             except TraceError as error:
@@ -347,3 +344,8 @@ class Survey:
     def _find_egos(self) -> None:
         for role, ident in self._whereabouts.found().items():
             self.egos.by_role.setdefault(role, ident)
+
+
+def _first(run: Messages, channel: int) -> Ref:
+    """Where the first message of a channel stands."""
+    return ref_of(run, int(np.argmax(run.channel == channel)))

@@ -13,7 +13,6 @@ Source: MCAP specification, format version 0 (mcap.dev/spec).
 from __future__ import annotations
 
 import struct
-import zlib
 from array import array
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,6 +27,11 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
 from sgstore.errors import TraceError
+
+try:
+    from isal.isal_zlib import crc32
+except ImportError:  # the extra [fast], whose checksums are the same, ten times sooner
+    from zlib import crc32
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,6 +63,9 @@ READ_ERRORS: Final = (
     OSError,
 )
 """Whatever the parsers and decompressors below are known to raise on bytes that are not what they seem."""
+
+Records = bytes | bytearray | memoryview
+"""The records of a chunk, uncompressed."""
 
 HEAD: Final = struct.Struct("<BQ")
 """Head of every record: opcode, length of what follows."""
@@ -207,13 +214,51 @@ def read_chunk_head(file: BinaryIO, offset: int) -> ChunkHead:
     return ChunkHead(offset, start, end, size, crc, compression, data_offset, data_length)
 
 
-def read_records(file: BinaryIO, head: ChunkHead, *, verify: bool = True) -> bytes | bytearray:
+def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | None:
+    """The head of a chunk record at an offset whose end is missing, and what there is of its data.
+
+    ``rest``: the bytes from there on. ``None`` where not even the head is whole.
+    """
+    try:
+        begin, end, size, crc = CHUNK_FIELDS.unpack_from(rest, HEAD.size)
+        at = HEAD.size + CHUNK_FIELDS.size
+        (length,) = struct.unpack_from("<I", rest, at)
+        compression = rest[at + 4 : at + 4 + length].decode()
+        at += 4 + length + 8
+    except (struct.error, UnicodeDecodeError):
+        return None
+    return ChunkHead(offset, begin, end, size, crc, compression, offset + at, 0), rest[at:]
+
+
+def read_records(
+    file: BinaryIO, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
+) -> Records:
     """The records of a chunk, decompressed and, if the chunk has a checksum, verified.
+
+    Parameters
+    ----------
+    file : file
+    head : ChunkHead
+    verify : bool
+        Whether to look at the checksum.
+    into : memoryview, optional
+        Memory of the chunk's size that may be used for them.
 
     Raises
     ------
     TraceError
         The chunk is too large, cut, not what it declares, or damaged.
+    """
+    return records_of(read_stored(file, head), head, verify=verify, into=into)
+
+
+def read_stored(file: BinaryIO, head: ChunkHead) -> bytes:
+    """The records of a chunk as they stand in the file.
+
+    Raises
+    ------
+    TraceError
+        The chunk is too large, or cut.
     """
     if head.size > MAX_CHUNK or head.data_length > MAX_CHUNK:
         largest = max(head.size, head.data_length)
@@ -223,18 +268,35 @@ def read_records(file: BinaryIO, head: ChunkHead, *, verify: bool = True) -> byt
     stored = file.read(head.data_length)
     if len(stored) != head.data_length:
         raise TraceError("the file ends inside this chunk", offset=head.offset)
+    return stored
+
+
+def records_of(
+    stored: bytes, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
+) -> Records:
+    """The records of a chunk from what :func:`read_stored` gives; otherwise as :func:`read_records`.
+
+    Raises
+    ------
+    TraceError
+        The chunk is not what it declares, or damaged.
+    """
     try:
-        records = decompress(stored, head.compression, head.size)
+        records = decompress(stored, head.compression, head.size, into)
     except TraceError as error:
         raise TraceError(error.reason, offset=head.offset) from error
-    if verify and head.crc and zlib.crc32(records) != head.crc:
+    if verify and head.crc and crc32(records) != head.crc:
         reason = "the chunk does not match its checksum"
         raise TraceError(reason, offset=head.offset)
     return records
 
 
-def decompress(stored: bytes, compression: str, size: int) -> bytes | bytearray:
+def decompress(
+    stored: bytes, compression: str, size: int, into: memoryview | None = None
+) -> Records:
     """What a chunk's bytes become: exactly ``size`` bytes, and never more of them in memory.
+
+    ``into``: memory of that size that may be used for them.
 
     Raises
     ------
@@ -244,7 +306,7 @@ def decompress(stored: bytes, compression: str, size: int) -> bytes | bytearray:
     if compression not in _DECOMPRESS:
         raise TraceError(f"the compression {compression!r} is not known; known: zstd, lz4, none")
     try:
-        records = _DECOMPRESS[compression](stored, size)
+        records = _DECOMPRESS[compression](stored, size, into)
     except READ_ERRORS as error:
         reason = f"the chunk cannot be decompressed ({compression}): {error}"
         raise TraceError(reason) from error
@@ -279,8 +341,11 @@ def _zstd(size: int) -> zstandard.ZstdDecompressor:
     return zstandard.ZstdDecompressor(max_window_size=max(size, MIN_WINDOW))
 
 
-def _from_zstd(stored: bytes, size: int) -> bytes | bytearray:
+def _from_zstd(stored: bytes, size: int, into: memoryview | None) -> Records:
     declared = zstandard.get_frame_parameters(stored).content_size
+    if declared == size and into is not None:
+        with _zstd(size).stream_reader(stored) as reader:
+            return into[: reader.readinto(into)]
     if declared == size:
         return _zstd(size).decompress(stored)
     if declared != zstandard.CONTENTSIZE_UNKNOWN and declared > size:
@@ -293,7 +358,7 @@ def _from_zstd(stored: bytes, size: int) -> bytes | bytearray:
     return records
 
 
-def _from_lz4(stored: bytes, size: int) -> bytes | bytearray:
+def _from_lz4(stored: bytes, size: int, _into: memoryview | None) -> Records:
     records = bytearray()
     while stored and len(records) <= size:
         decompressor = lz4.frame.LZ4FrameDecompressor()
@@ -313,21 +378,21 @@ def _lz4_piece(records: bytearray, size: int) -> int:
     return min(_LZ4_PIECE, size + 1 - len(records))
 
 
-_DECOMPRESS: Final[dict[str, Callable[[bytes, int], bytes | bytearray]]] = {
+_DECOMPRESS: Final[dict[str, Callable[[bytes, int, memoryview | None], Records]]] = {
     "zstd": _from_zstd,
     "lz4": _from_lz4,
-    "": lambda stored, _size: stored,
+    "": lambda stored, _size, _into: stored,
 }
 
 
 def parse_records(
-    records: bytes | bytearray, chunk_offset: int, *, whole: bool = True
+    records: Records, chunk_offset: int, *, whole: bool = True
 ) -> tuple[Messages, list[tuple[int, memoryview]]]:
     """The records of a chunk: its messages as columns, and the definitions among them.
 
     Parameters
     ----------
-    records : bytes or bytearray
+    records : bytes-like
     chunk_offset : int
         Byte offset of the chunk in the file.
     whole : bool
@@ -395,7 +460,7 @@ def message_columns(
     )
 
 
-def _frame_records(records: bytes | bytearray) -> tuple[Ints, list[tuple[int, int, int]], int]:
+def _frame_records(records: Records) -> tuple[Ints, list[tuple[int, int, int]], int]:
     """Offsets of the messages, spans of the definitions, and where the last whole record ends."""
     offsets = array("q")
     definitions: list[tuple[int, int, int]] = []

@@ -256,7 +256,8 @@ def assemble(
     FrameBlock
         Its messages are those that stand in the file from its first frame up to the next block's.
     """
-    wanted = np.array(sorted(channels), np.int64)
+    wanted = np.zeros(1 << 16, np.bool_)
+    wanted[[*channels]] = True
     raw: list[Raw] = []
     done: list[FrameRows] = []  # the frame before the block, and those of it that are complete
     open_refs: list[MessageRefs] = []
@@ -265,7 +266,7 @@ def assemble(
     first, known = 0, 0
     for run in runs:
         start = 0
-        for row in np.flatnonzero(np.isin(run.channel, wanted)).tolist():
+        for row in np.flatnonzero(wanted[run.channel]).tolist():
             entered = decoder.roster.size
             frame = decoder.decode(run, row)
             if frame is None:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
+    from sgstore.traces.chunks import Records
+
 
 def read_messages(
     path: Path, places: Iterable[tuple[int, int, int]]
@@ -59,7 +61,7 @@ def read_messages(
         yield _message(path, chunk_offset, records, offset, length)
 
 
-def _chunk(path: Path, offset: int) -> bytes | bytearray:
+def _chunk(path: Path, offset: int) -> Records:
     with open_regular(path) as file:
         try:
             return read_records(file, read_chunk_head(file, offset))

@@ -22,8 +22,8 @@ Source: MCAP specification, format version 0 (mcap.dev/spec).
 from __future__ import annotations
 
 import os
-import struct
 from array import array
+from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Self, cast
@@ -33,8 +33,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema
 
 from sgstore.errors import TraceError
+from sgstore.traces.ahead import ReadAhead
 from sgstore.traces.chunks import (
-    CHUNK_FIELDS,
     HEAD,
     MAX_CHUNK,
     MESSAGE_HEAD,
@@ -43,10 +43,10 @@ from sgstore.traces.chunks import (
     Messages,
     StrictStream,
     decompress_head,
+    head_of_cut_chunk,
     message_columns,
     parse_records,
     read_chunk_head,
-    read_records,
 )
 from sgstore.traces.fetch import open_regular
 from sgstore.traces.losses import Place, lose, loss_of_chunk, name_of
@@ -65,6 +65,8 @@ MAX_DEFINITION: Final = 16 << 20
 """Greatest size of a schema, channel or metadata record; bytes."""
 MAX_DEFINITIONS: Final = 64 << 20
 """Greatest size of all schemas, channels and metadata of a file together; bytes."""
+SMALL: Final = 4 << 20
+"""Files up to this size are read chunk by chunk, without threads; bytes."""
 RUN_MESSAGES: Final = 1024
 """Messages outside chunks that are handed on together."""
 
@@ -91,6 +93,7 @@ class _Walk:
     """
 
     report: TraceReport
+    ahead: ReadAhead
     wanted: Callable[[int], bool] | None = None
     keep: Callable[[int], bool] | None = None
     position: int = len(MAGIC)
@@ -157,6 +160,8 @@ class McapFile:
         self.counts: dict[int, int] | None
         self.compression = "zstd"
         self._verified: set[int] = set()
+        self._aheads: list[ReadAhead] = []
+        self._known_channels = np.zeros(1 << 16, np.bool_)
         self._definition_bytes = 0
         self._file = open_regular(path)
         try:
@@ -176,6 +181,8 @@ class McapFile:
 
     def close(self) -> None:
         """Close the file."""
+        for ahead in self._aheads:
+            ahead.close()
         self._file.close()
         if self._own_spool:
             self._spool.close()
@@ -227,16 +234,22 @@ class McapFile:
         TraceError
             The definitions of channels exceed all measure, or the file cannot be read any more.
         """
-        walk = _Walk(report, wanted, keep)
+        walk = _Walk(report, self._read_ahead(wanted), wanted, keep)
+        self._aheads.append(walk.ahead)
         try:
             while not walk.closed:
                 head = self._head(walk.position)
                 if head is None:
                     break
+                if head[0] == Opcode.MESSAGE_INDEX and self._passes(walk, head[1]):
+                    continue
                 yield from self._step(walk, *head)
             yield from self._flush(walk)
         except READ_ERRORS as error:
             raise TraceError(f"cannot be read: {error}", path=self.path) from error
+        finally:
+            self._aheads.remove(walk.ahead)
+            walk.ahead.close()
         self._settle(walk)
         self._closing_words(walk)
 
@@ -273,7 +286,17 @@ class McapFile:
         self.channels.update(summary.channels)
         self.counts = summary.counts
         self.chunk_offsets = summary.chunk_offsets
+        self._chunk_starts = array("q", summary.chunk_offsets.tobytes())
         self._summary_fault = summary.fault
+        for number in self.channels:
+            self._known_channels[number] = True
+
+    def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
+        """What begins the chunks of a walk before their turn, where they are many and all wanted."""
+        if wanted is not None or self.size <= SMALL:
+            return ReadAhead(self._file)
+        offsets = (at for at in self._chunk_starts if not self._spool.has(self.path, at))
+        return ReadAhead(self._file, offsets, self._verified)
 
     # The walk ------------------------------------------------------------------------------------------------
 
@@ -282,6 +305,15 @@ class McapFile:
         self._file.seek(position)
         head = self._file.read(HEAD.size)
         return HEAD.unpack(head) if len(head) == HEAD.size else None
+
+    def _passes(self, walk: _Walk, length: int) -> bool:
+        """Pass over a record that tells nothing, the most frequent one; whether it is as it should be."""
+        stop = walk.position + HEAD.size + length
+        sound = walk.pending is None and stop <= self.size
+        sound = sound and self._chunk_behind(walk.position, stop) is None
+        if sound:
+            walk.position = stop
+        return sound
 
     def _step(self, walk: _Walk, opcode: int, length: int) -> Iterator[Messages]:
         """What one record gives; the walk stands behind it afterwards."""
@@ -354,7 +386,7 @@ class McapFile:
             if walk.chunks == 1:
                 self.compression = head.compression
             walk.unverified += head.crc == 0
-            messages, definitions = self._records(head)
+            messages, definitions = self._records(walk, head)
         except TraceError as error:
             if astray is not None:
                 walk.position = astray
@@ -366,16 +398,17 @@ class McapFile:
             self._define(walk, opcode, content, place.offset)
         yield from self._known(walk, messages)
         if walk.keep is not None and head.compression and not definitions:
-            ids, index = np.unique(messages.channel, return_inverse=True)
-            keep = [number in self.channels and walk.keep(number) for number in ids.tolist()]
-            self._spool.put(self.path, messages, np.array(keep, np.bool_)[index])
+            ids = messages.channel.tolist()
+            keep = {number: number in self.channels and walk.keep(number) for number in set(ids)}
+            self._spool.put(self.path, messages, np.array([keep[i] for i in ids], np.bool_))
 
-    def _records(self, head: ChunkHead) -> tuple[Messages, list[tuple[int, memoryview]]]:
+    def _records(
+        self, walk: _Walk, head: ChunkHead
+    ) -> tuple[Messages, list[tuple[int, memoryview]]]:
         """Messages and definitions of a chunk, kept ones or from the file."""
 
         def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
-            records = read_records(self._file, head, verify=head.offset not in self._verified)
-            return parse_records(records, head.offset)
+            return parse_records(walk.ahead.records(head), head.offset)
 
         kept = self._spool.get(self.path, head.offset, lambda: read()[0].read)
         if kept is not None:
@@ -386,10 +419,9 @@ class McapFile:
 
     def _known(self, walk: _Walk, messages: Messages) -> Iterator[Messages]:
         """The messages, without those of channels that were never defined."""
-        ids = np.unique(messages.channel)
-        unknown = [int(number) for number in ids if int(number) not in self.channels]
-        if unknown:
-            lost = np.isin(messages.channel, unknown)
+        lost = ~self._known_channels[messages.channel]
+        if lost.any():
+            unknown: list[int] = np.unique(messages.channel[lost]).tolist()
             times = messages.log_time_ns[lost]
             loss = Loss(
                 f"messages of channels that the file does not define: {unknown[:10]}",
@@ -411,12 +443,12 @@ class McapFile:
 
         The summary is believed where there is the head of a chunk indeed.
         """
-        if not len(self.chunk_offsets):
-            return None
-        first, last = np.searchsorted(self.chunk_offsets, [start + 1, stop])
-        for offset in self.chunk_offsets[first:last]:
+        starts = self._chunk_starts
+        for at in range(bisect_right(starts, start), len(starts)):
+            if starts[at] >= stop:
+                break
             with suppress(TraceError):
-                return read_chunk_head(self._file, int(offset)).offset
+                return read_chunk_head(self._file, starts[at]).offset
         return None
 
     def _broken(self, walk: _Walk, opcode: int, length: int) -> Iterator[Messages]:
@@ -444,8 +476,9 @@ class McapFile:
     def _cut_chunk(self, walk: _Walk, start: int) -> Iterator[Messages]:
         """The whole messages of a chunk whose end is missing."""
         kept = None
-        head, stored = self._head_of_cut_chunk(start)
-        if head is not None:
+        found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
+        if found is not None:
+            head, stored = found
             records = decompress_head(stored, head.compression, min(head.size, MAX_CHUNK))
             try:
                 kept, definitions = parse_records(records, start, whole=False)
@@ -456,21 +489,10 @@ class McapFile:
         count = 0 if kept is None else len(kept)
         walk.messages += count
         reason = f"the file ends inside a chunk; its first {count} messages were kept"
-        lose(walk.report, loss_of_chunk(reason, Place(start, self.size - start), head))
+        place = Place(start, self.size - start)
+        lose(walk.report, loss_of_chunk(reason, place, found[0] if found else None))
         if kept is not None:
             yield from self._known(walk, kept)
-
-    def _head_of_cut_chunk(self, start: int) -> tuple[ChunkHead | None, bytes]:
-        rest = bytes(self._at(start, min(self.size - start, MAX_CHUNK)))
-        try:
-            begin, end, size, crc = CHUNK_FIELDS.unpack_from(rest, HEAD.size)
-            at = HEAD.size + CHUNK_FIELDS.size
-            (length,) = struct.unpack_from("<I", rest, at)
-            compression = rest[at + 4 : at + 4 + length].decode()
-            at += 4 + length + 8
-        except (struct.error, UnicodeDecodeError):
-            return None, b""
-        return ChunkHead(start, begin, end, size, crc, compression, start + at, 0), rest[at:]
 
     def _count(self, walk: _Walk, length: int) -> None:
         """Add the messages that a message index names to those that were lost with its chunk."""
@@ -547,6 +569,8 @@ class McapFile:
         if record.id not in known:
             self._weigh(len(content))
             known[record.id] = record
+            if isinstance(record, Channel):
+                self._known_channels[record.id] = True
         elif known[record.id] != record:
             return (
                 f"{name_of(opcode)} {record.id} is defined twice, differently; the first one counts"

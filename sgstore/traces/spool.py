@@ -76,6 +76,10 @@ class Spool:
         self._places[key] = self._size, len(messages), size
         self._size += total
 
+    def has(self, path: Path, chunk_offset: int) -> bool:
+        """Whether the messages of a chunk are kept."""
+        return (path, chunk_offset) in self._places
+
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
         """The messages of a chunk; ``None`` if they are not kept, or cannot be read any more.
 
