@@ -27,6 +27,7 @@ from sgstore.temporal.formulas import (
     once,
     release,
 )
+from sgstore.temporal.verdicts import PRESUMABLY_TRUE, Settled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -142,6 +143,8 @@ def try_formulas(first: int, count: int, depth: int = 4) -> int:
         prefixes = [holds(formula, word[: i + 1], times, 0) for i in range(len(word))]
         assert verdicts == prefixes, (seed, formula)
         assert prefix_verdicts(formula, columns, clock).tolist() == prefixes, (seed, formula)
+        statuses = Settled(formula, columns, clock).statuses()
+        assert (statuses >= PRESUMABLY_TRUE).tolist() == prefixes, (seed, formula)
         true += sum(wanted)
     return true
 

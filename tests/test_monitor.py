@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from collections import Counter
 from pathlib import Path
@@ -257,3 +258,20 @@ def test_the_program_of_the_page_runs() -> None:
     assert ("violated", "brakes") in kinds
     assert ("violated", "apart") in kinds
     assert {v.check: v.verdict for v in names["verdicts"]} == {"apart": "false", "brakes": "false"}
+
+
+def test_a_step_leaves_nothing_for_the_garbage_collector() -> None:
+    monitor = Monitor(
+        "CHECK apart: FORALL (v:Vehicle) ALWAYS (dist(ego, v) < 6 IMPLIES EVENTUALLY[0s, 2s] v.speed < 1);"
+        " CHECK alone: ALWAYS NOT EXISTS {(ego)-[:near]->(:Car)}"
+    )
+    frames = [car(t / 10, 3, ("v", 5.0), ("w", 20.0 - t / 10)) for t in range(60)]
+    monitor.step(frames[0])  # what is imported then is no part of it
+    gc.collect()
+    gc.disable()
+    try:
+        for frame in frames[1:]:
+            monitor.step(frame)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()

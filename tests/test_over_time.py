@@ -16,13 +16,16 @@ from oracle_over_time import (
     random_sequence,
     worlds,
 )
-from oracle_temporal import random_formula
+from oracle_temporal import holds, random_formula, random_word
 
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang.over_time import Hold, Length
 from sgstore.lang.standard import pattern_named
 from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
+from sgstore.temporal.columns import Table
+from sgstore.temporal.formulas import And
+from sgstore.temporal.knowing import known
 from sgstore.temporal.measures import Clock
 from sgstore.temporal.sequences import Leg, Line, matches_of
 from sgstore.temporal.verdicts import STATUS, Settled, within_bounds
@@ -183,7 +186,7 @@ def test_a_run_lasts_from_its_first_frame_to_its_last(comparison: str) -> None:
 # Verdicts
 
 
-def test_status_and_traps_are_those_of_the_engine_that_reads_frame_by_frame() -> None:
+def test_statuses_and_traps_are_those_of_the_engine_that_reads_frame_by_frame() -> None:
     rng = random.Random(11)
     certain = 0
     for _ in range(400):
@@ -195,22 +198,55 @@ def test_status_and_traps_are_those_of_the_engine_that_reads_frame_by_frame() ->
         told: list[int] = []
         for i in range(frames):
             engine.step({name: bool(column[i]) for name, column in columns.items()}, int(times[i]))
-            told.append(3 * engine.certain if engine.verdict else 0 if engine.certain else 1)
-            told[-1] = told[-1] or (2 if engine.verdict else 0)
+            told.append(
+                (3 if engine.verdict else 0) if engine.certain else 1 + bool(engine.verdict)
+            )
 
         settled = Settled(formula, columns, times)
 
         status = settled.statuses()
         verdicts = prefix_verdicts(formula, columns, times)
         assert (status >= 2).tolist() == verdicts.tolist()
-        if status[-1] == 0:
-            trap = settled.trap(0)
-            assert trap is not None
-            assert trap <= told.index(0)
-            certain += 1
+        assert status.tolist() == told
+        assert settled.trap(0) == (told.index(0) if 0 in told else None)
+        certain += 0 in told
 
     assert certain > 50
     assert STATUS[0] == "false"
+
+
+def test_what_is_known_no_other_future_changes() -> None:
+    tried = 0
+    for seed in range(300):
+        rng = random.Random(seed)
+        formula, (word, times) = random_formula(rng, rng.randint(1, 4)), random_word(rng)
+        columns = {name: np.array([letter[name] for letter in word]) for name in "abc"}
+        told = known(formula, Table(columns, np.array(times, np.int64)))
+        for i in range(len(word)):
+            for at, value in ((int(told.true[i]), True), (int(told.false[i]), False)):
+                if at == len(word):
+                    continue
+                more, later = random_word(rng)
+                moved = times[at] - later[0] + rng.choice((1, 7, 60))
+                longer = word[: at + 1] + more, times[: at + 1] + [t + moved for t in later]
+                assert holds(formula, *longer, i) == value, (seed, i)
+                tried += 1
+
+    assert tried > 1000
+
+
+def test_what_was_before_a_reset_is_seen_by_operators_of_the_past_that_look_ahead() -> None:
+    formula = formula_of("ALWAYS (late IMPLIES ONCE NEXT early)")
+    columns = {
+        "early": np.array([0, 1, 0, 0, 0, 0], np.bool_),
+        "late": np.array([1, 0, 0, 0, 1, 0], np.bool_),
+    }
+    assert Settled(formula, columns, np.arange(6)).violations(None) == []
+    twice = And((formula, formula_of("ALWAYS NOT bad")))
+    columns["bad"] = np.array([0, 0, 1, 0, 0, 0], np.bool_)
+
+    (violation,) = Settled(twice, columns, np.arange(6)).violations(columns["bad"])
+    assert (violation.start, violation.end) == (2, 2)
 
 
 def test_a_violation_lasts_to_its_reset_and_the_formula_is_asked_anew() -> None:

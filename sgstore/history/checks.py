@@ -332,7 +332,7 @@ class _Check:
             broken = status < PRESUMABLY_TRUE
             return not broken.any(), _Told(tuple(_runs(broken)), status)
         violations = tuple(settled.violations(reset, weak=weak))
-        holds = bool(settled.value()[0])
+        holds = bool(settled.value[0])
         if weak and not holds:
             holds = not violations
         return holds, _Told(violations, status)

@@ -25,6 +25,7 @@ from sgstore.vocabulary import MAP_KINDS
 if TYPE_CHECKING:
     from sgstore.geometry import PairNumbers
     from sgstore.graph import SceneGraph
+    from sgstore.lang.crowds import Crowd
     from sgstore.world import Floats
 
 Attributes = Mapping[str, Any]
@@ -89,6 +90,11 @@ class FrameView:
             found[edge[1], edge[at]].append(edge[other])  # type: ignore[index, arg-type]
         return found
 
+    @cached_property
+    def crowds(self) -> dict[b.Kinds, Crowd]:
+        """Nodes of some kinds with their numbers, kept by :mod:`sgstore.lang.crowds`."""
+        return {}
+
     def class_in(self, abstraction: str) -> str | None:
         """The class of the graph in an abstraction; ``None`` where it is not known."""
         if abstraction not in self._classes:
@@ -118,47 +124,54 @@ class FrameView:
             reach = self.graph.reach
             places = self._places.get(one, ()), self._places.get(other, ())
             return None if reach is None else reach.distance(*places)
-        place = self._boxed.get(other)
-        if place is None or one not in self._boxed:
+        place = self.rows.get(other)
+        if place is None or one not in self.rows:
             return None
-        value = self._numbers(name, one)[place]
+        key = name, one
+        if key not in self._numbers:
+            self._numbers[key] = self.pairs(name, one).tolist()
+        value = self._numbers[key][place]
         return None if math.isnan(value) else value
 
-    def _numbers(self, name: str, one: int) -> list[float]:
-        """A number of one entity and each other: all at once, as most are asked one after the other."""
-        key = name, one
-        if key not in self._columns:
-            if one not in self._pairs:
-                boxes = self._boxes
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    own = np.broadcast_to(boxes[self._boxed[one]], boxes.shape)
-                    self._pairs[one] = pair_numbers(own, boxes)
-            column, scale = _PAIR_COLUMNS[name]
-            self._columns[key] = (scale * getattr(self._pairs[one], column)).tolist()
-        return self._columns[key]
+    def pairs(self, name: str, one: int, *, ahead: bool = True) -> Floats:
+        """(E,) a number of one entity and each other, by :attr:`rows`: most are asked one after the other.
+
+        NaN where something that it needs is missing. Unless ``ahead``, of each other and the one.
+        """
+        place = self.rows.get(one)
+        if place is None:
+            return np.full(len(self.rows), math.nan)
+        key = one, ahead
+        if key not in self._pairs:
+            boxes = self._boxes
+            with np.errstate(invalid="ignore", divide="ignore"):
+                own = np.broadcast_to(boxes[place], boxes.shape)
+                self._pairs[key] = pair_numbers(own, boxes) if ahead else pair_numbers(boxes, own)
+        column, scale = PAIR_NUMBERS[name]
+        return scale * getattr(self._pairs[key], column)
 
     @cached_property
     def _places(self) -> Mapping[int, Sequence[tuple[int, float]]]:
         return self.graph.places()
 
     @cached_property
-    def _pairs(self) -> dict[int, PairNumbers]:
+    def _pairs(self) -> dict[tuple[int, bool], PairNumbers]:
         return {}
 
     @cached_property
-    def _columns(self) -> dict[tuple[str, int], list[float]]:
+    def _numbers(self) -> dict[tuple[str, int], list[float]]:
         return {}
 
     @cached_property
-    def _boxed(self) -> Mapping[int, int]:
-        """Rows of the entities in :attr:`_boxes`."""
+    def rows(self) -> Mapping[int, int]:
+        """Places of the entities in :meth:`pairs`."""
         known = (n for n, about in self.nodes.items() if about["kind"] not in MAP_KINDS)
         return {node: row for row, node in enumerate(known)}
 
     @cached_property
     def _boxes(self) -> Floats:
         """(E, 8) what numbers of pairs are made of."""
-        rows = [[self.nodes[n].get(name, math.nan) for name in _BOX] for n in self._boxed]
+        rows = [[self.nodes[n].get(name, math.nan) for name in _BOX] for n in self.rows]
         boxes = np.array(rows, np.float64).reshape(-1, len(_BOX))
         boxes[:, 3] = np.radians(boxes[:, 3])
         return boxes
@@ -166,7 +179,7 @@ class FrameView:
 
 _BOX: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
 _DEGREES: Final = 180 / math.pi
-_PAIR_COLUMNS: Final = {
+PAIR_NUMBERS: Final = {
     "dist": ("distance", 1.0),
     "gap": ("gap", 1.0),
     "lon": ("lon", 1.0),
@@ -181,6 +194,7 @@ _PAIR_COLUMNS: Final = {
     "headway": ("headway", 1.0),
     "rel_speed": ("rel_speed", 1.0),
 }
+"""Numbers of two boxes: what :func:`sgstore.geometry.pair_numbers` calls them, and what they are seen in."""
 
 
 @dataclass(slots=True)

@@ -9,7 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sgstore.lang import bound as b
+from sgstore.lang.crowds import crowd, crowd_test
 from sgstore.lang.evaluation import Attributes, Binding, Evaluate, FrameView, evaluator
 from sgstore.lang.subgraphs import Layout
 
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.lang.bound import BlockValue, Edge, Query, Scope
+    from sgstore.lang.crowds import Test
     from sgstore.lang.subgraphs import Record
 
 
@@ -82,15 +86,24 @@ class Matcher:
 
 @dataclass(slots=True)
 class _Step:
-    """A node to be bound, where it is looked for, and what can be tested once it is bound."""
+    """A node to be bound, where it is looked for, and what can be tested once it is bound.
+
+    ``crowd`` is tested before, of all that it may be at once.
+    """
 
     key: str
     kinds: b.Kinds
     via: Edge | None
     others: tuple[str, ...] = ()
     edges: list[Edge] = field(default_factory=list["Edge"])
+    crowd: list[Test] = field(default_factory=list["Test"])
     tests: list[Evaluate] = field(default_factory=list[Evaluate])
     named: list[_NamedEdge] = field(default_factory=list["_NamedEdge"])
+
+    @property
+    def among(self) -> bool:
+        """Whether all nodes of its kinds are looked at, not only neighbours or the ego."""
+        return bool(self.key) and self.via is None and bool(self.kinds.other)
 
 
 @dataclass(slots=True)
@@ -129,6 +142,10 @@ class Search:
                     step.edges.append(edge)
             for found in [c for c in conditions if c[1] <= bound and c[2] <= bound_edges]:
                 conditions.remove(found)
+                at_once = crowd_test(found[0], step.key) if step.among and not found[2] else None
+                if at_once is not None:
+                    step.crowd.append(at_once)
+                    continue
                 test = expression(found[0], injective=injective)
                 place = next((n for n in step.named if n.edge.key in found[2]), None)
                 (place.tests if place else step.tests).append(test)
@@ -171,6 +188,12 @@ class Search:
             return
         step = self._steps[number]
         taken = {at.nodes[key] for key in step.others}
+        if step.crowd:
+            for node in _fitting(at, step):
+                if node not in taken:
+                    at.nodes[step.key] = node
+                    yield from self._bound(at, number)
+            return
         for node in _candidates(at, step):
             if node not in taken and at.view.is_one(node, step.kinds):
                 at.nodes[step.key] = node
@@ -285,6 +308,15 @@ def _candidates(at: Binding, step: _Step) -> Iterator[int]:
     else:
         for kind in step.kinds.every:
             yield from view.by_kind.get(kind, ())
+
+
+def _fitting(at: Binding, step: _Step) -> list[int]:
+    """Nodes that a step may bind of which all is true that is tested at once."""
+    among = crowd(at.view, step.kinds)
+    fits = step.crowd[0](at, among)
+    for test in step.crowd[1:]:
+        fits = fits & test(at, among)
+    return [among.nodes[place] for place in np.flatnonzero(fits).tolist()]
 
 
 def _steps(

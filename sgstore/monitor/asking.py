@@ -103,11 +103,25 @@ class People:
 
 @dataclass(slots=True)
 class Questions:
-    """All questions about the graphs of one ego, and their answers in the last frame."""
+    """All questions about the graphs of one ego, and their answers in the last frame.
+
+    Attributes
+    ----------
+    answers : list of mapping
+        By the number of the question.
+    fresh : set of Kinds
+        Of which somebody is in the last frame who was in none before.
+    """
 
     _known: dict[Any, int] = field(default_factory=dict[Any, int])
     _all: list[Question] = field(default_factory=list["Question"])
+    _met: dict[b.Kinds, dict[int, str]] = field(default_factory=dict["b.Kinds", dict[int, str]])
     answers: list[Mapping[Key, Any]] = field(default_factory=list["Mapping[Key, Any]"])
+    fresh: set[b.Kinds] = field(default_factory=set["b.Kinds"])
+
+    def met(self, kinds: b.Kinds) -> Mapping[int, str]:
+        """Who of some kinds was in a frame so far: node → name; it grows with each frame."""
+        return self._met.setdefault(kinds, {})
 
     def add(
         self,
@@ -125,6 +139,12 @@ class Questions:
 
     def ask(self, view: FrameView, people: People) -> None:
         """Ask them all of a graph."""
+        self.fresh.clear()
+        for kinds, known in self._met.items():
+            present = people.of(kinds)
+            if not present <= known.keys():
+                known.update((node, people.name(node)) for node in present - known.keys())
+                self.fresh.add(kinds)
         self.answers = [question.answers(view, people) for question in self._all]
 
 

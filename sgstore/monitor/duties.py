@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from weakref import WeakValueDictionary
 
 from sgstore.temporal.formulas import TRUE, And, Formula, propositions
-from sgstore.temporal.progression import Frame, Past, Progression, Term, Tick
+from sgstore.temporal.progression import Frame, Past, Progression, Term, Tick, least
 from sgstore.temporal.verdicts import always_true, bounded
 
 if TYPE_CHECKING:
@@ -175,7 +175,16 @@ class Automaton:
         ended = False
         if word == "broken" and self._reset is not None and frame.now(self._reset) is true:
             word, ended = "begins", True
-        return Step(self._state(word, frame.past(), duties), started, ended, guards)
+        # Of what will not change any more the past does not matter either, but to guards.
+        past = self._progression.begun if self._lasts(word) and not self._guards else frame.past()
+        return Step(self._state(word, past, duties), started, ended, guards)
+
+    def _lasts(self, word: str) -> bool:
+        return word == "kept" or (word == "broken" and self._reset is None)
+
+    def final(self, state: State, counted: int) -> bool:
+        """Whether no frame changes a state any more, if so many guards were true in some frame."""
+        return self._lasts(state.word) and counted == (1 << len(self._guards)) - 1
 
     def _moved(self, state: State, frame: Frame) -> tuple[str, Duties]:
         terms = self._progression.terms
@@ -188,7 +197,8 @@ class Automaton:
                 found = {frame.resolved(term) for term in before or ()} | {frame.now(part)}
                 if terms.false in found:
                     return "broken", ()
-                duties.append(frozenset(found - {terms.true}))
+                found.discard(terms.true)
+                duties.append(frozenset(least(found)))
             else:
                 assert before is None or isinstance(before, Term)  # noqa: S101 - it was made so
                 term = frame.now(part) if before is None else frame.resolved(before)

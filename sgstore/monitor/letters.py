@@ -70,7 +70,7 @@ class Letters:
         return tuple(self._variables.index(name) for name in variables)
 
     def read(
-        self, held: Iterable[Partial], memory: Callable[[Partial], Memory]
+        self, held: Iterable[Partial], memory: Callable[[Partial], Memory | None]
     ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
         """A frame has come, and the questions were asked of it.
 
@@ -79,7 +79,7 @@ class Letters:
         held : iterable of Partial
             Bindings of which something is known from former frames.
         memory : function
-            What a binding remembers.
+            What a binding remembers; ``None``: nobody asks for it any more.
 
         Returns
         -------
@@ -91,6 +91,8 @@ class Letters:
         told = self._told()
         lattice = self.lattice
         rows = lattice.closed([*held, *told, *self._told_signals()])
+        if self._measured:
+            rows = {row for row in rows if memory(row) is not None}
         if lattice.size < 2:
             base = told.get(lattice.stranger, 0)
             letters = {row: base | told.get(row, 0) for row in rows}
@@ -126,7 +128,7 @@ class Letters:
         self,
         rows: list[Partial],
         letters: dict[Partial, int],
-        memory: Callable[[Partial], Memory],
+        memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
         """Tell letters the tests that are true; what bindings remember from now on."""
         self._courses.step()
@@ -143,7 +145,7 @@ class Letters:
             answers: Mapping[Partial, object] = self._questions.answers[number]  # type: ignore[assignment]
             return column_of([answers.get(tuple(row[p] for p in places)) for row in rows])
 
-        tests, memories = self._courses.values([memory(row) for row in rows], atom, signal)
+        tests, memories = self._courses.values([memory(row) or () for row in rows], atom, signal)
         for name, column in tests.items():
             bit = self.bits[name]
             true = np.broadcast_to(column.true[:, 0], len(rows)).tolist()

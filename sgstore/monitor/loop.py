@@ -20,6 +20,7 @@ from sgstore.monitor.asking import People, Questions
 from sgstore.monitor.events import Event, Moment
 from sgstore.monitor.following import Follow
 from sgstore.monitor.watching import Watch
+from sgstore.online.stepping import Uncollected
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.temporal.courses import Pulse
 
@@ -128,8 +129,11 @@ class Monitor:
             The frame contradicts itself, as :meth:`sgstore.sgg.SceneGraphGenerator.steps` says; it is as if it
             had not been given.
         """
-        graphs = self.generator.steps(frame, self._egos or [""])
-        return self.look(graphs, classed=True)
+        with Uncollected():  # the graphs are let go within
+            return self._step(frame)
+
+    def _step(self, frame: Frame) -> tuple[Event, ...]:
+        return self.look(self.generator.steps(frame, self._egos or [""]), classed=True)
 
     def look(self, graphs: Sequence[SceneGraph], *, classed: bool = False) -> tuple[Event, ...]:
         """The graphs of the next frame, of whoever makes them: what is known from it on.
@@ -160,7 +164,7 @@ class Monitor:
     def _tell(self, here: Moment, people: list[People]) -> tuple[Event, ...]:
         """Tell checks and patterns the answers."""
         self._last = here
-        found = [event for ego, watch in self._watches for event in watch.step(here, people[ego])]
+        found = [event for _, watch in self._watches for event in watch.step(here)]
         for ego, follow in self._follows:
             found += follow.step(here, people[ego])
         return self._told(found)

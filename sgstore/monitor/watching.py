@@ -16,6 +16,7 @@ from sgstore.monitor.bindings import Known, Partial
 from sgstore.monitor.duties import Automaton, State, Step
 from sgstore.monitor.events import Event, Moment
 from sgstore.monitor.letters import Letters
+from sgstore.temporal.formulas import looks_ahead
 from sgstore.temporal.plans import Plan
 from sgstore.temporal.verdicts import (
     CERTAINLY_TRUE,
@@ -23,7 +24,6 @@ from sgstore.temporal.verdicts import (
     PRESUMABLY_FALSE,
     PRESUMABLY_TRUE,
     STATUS,
-    looks_ahead,
 )
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang.over_time import Check, Quantifier
-    from sgstore.monitor.asking import Key, People, Questions
+    from sgstore.monitor.asking import Key, Questions
     from sgstore.temporal.courses import Memory, Pulse
     from sgstore.world import Bools
 
@@ -55,6 +55,8 @@ class _Entry:
         Violations that have ended.
     memory : Memory
         What values over time need of former frames.
+    final : bool
+        Whether no frame changes it any more.
     """
 
     state: State
@@ -62,6 +64,7 @@ class _Entry:
     since: Moment | None
     over: tuple[Span, ...]
     memory: Memory
+    final: bool = False
 
 
 def _same(one: _Entry, other: _Entry) -> bool:
@@ -119,7 +122,10 @@ class Watch:
         self._automaton = Automaton(formula, reset, tuple(guards.values()), bits)
         strangers = _Entry(self._automaton.begun, 0, None, (), self._letters.begun)
         self._known = Known(self._letters.lattice, strangers)
-        self._domains: dict[str, dict[int, str]] = {node: {} for node in check.scope.nodes}
+        self._questions = questions
+        nodes = check.scope.nodes.items()
+        self._domains = {key: questions.met(node.kinds) for key, node in nodes}
+        self._kinds = {node.kinds for _, node in nodes}
         self._told: dict[Key, tuple[int, int]] = {}
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
 
@@ -130,31 +136,43 @@ class Watch:
 
     # Frame by frame
 
-    def step(self, here: Moment, people: People) -> list[Event]:
+    def step(self, here: Moment) -> list[Event]:
         """A frame has come, and the questions were asked of it: what is known from it on."""
-        self._meet(people)
         known = self._known
-        letters, memories = self._letters.read(known.held, lambda row: known.of(row).memory)
-        found: dict[Partial, _Entry] = {}
+        found = {row: entry for row, entry in known.held.items() if entry.final}
+        left = (row for row in known.held if row not in found) if found else known.held
+        letters, memories = self._letters.read(left, self._remembered)
+        changed: list[Partial] = []
         seen: dict[tuple[State, int], Step] = {}
         tick, automaton, mask = self._pulse.tick, self._automaton, self._automaton.mask
         for row, letter in letters.items():
-            entry = known.of(row)
-            step = automaton.step(entry.state, letter & mask, tick, seen)
-            found[row] = _stepped(entry, step, here, memories.get(row, ()))
+            before = known.of(row)
+            if before.final:
+                found[row] = before
+                continue
+            step = automaton.step(before.state, letter & mask, tick, seen)
+            entry = _stepped(before, step, here, memories.get(row, ()))
+            if entry is not before:
+                changed.append(row)
+                if automaton.final(entry.state, entry.counted):
+                    entry = replace(entry, memory=(), final=True)
+            found[row] = entry
         known.keep(found, _same)
-        return list(self._events(here)) if self._immediate else []
+        if not self._immediate:
+            return []
+        return list(self._events(here, changed))
 
-    def _meet(self, people: People) -> None:
-        for key, node in self._check.scope.nodes.items():
-            domain = self._domains[key]
-            for new in people.of(node.kinds) - domain.keys():
-                domain[new] = people.name(new)
+    def _remembered(self, row: Partial) -> Memory | None:
+        entry = self._known.of(row)
+        return None if entry.final else entry.memory
 
     # What is known
 
-    def _events(self, here: Moment) -> Iterator[Event]:
-        for row, entry in list(self._known.held.items()):
+    def _events(self, here: Moment, changed: list[Partial]) -> Iterator[Event]:
+        """What is told of bindings of which something else is known than before; of all, if somebody is new."""
+        rows = list(self._known.held) if self._kinds & self._questions.fresh else changed
+        for row in rows:
+            entry = self._known.of(row)
             if entry.since is None and not entry.over:
                 continue
             for key in self._covered(row, entry):

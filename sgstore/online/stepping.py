@@ -109,7 +109,7 @@ class Online:
             ident, _ = self._moving.popitem(last=False)
             self._inner.pop(ident, None)
         known = {self._moving[e.ident].node: self._moving[e.ident] for e in moving}
-        with _Uncollected():
+        with Uncollected():
             return [self._records.graph(graph, self._outer, known) for graph in graphs]
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
@@ -195,11 +195,12 @@ class Online:
         )
 
 
-class _Uncollected:
+class Uncollected:
     """No garbage is looked for meanwhile, if it is at all.
 
     The records of a graph are thousands of small objects, none of them garbage. Python would look through them
     several times while they are made, and every few frames through all that the client has: 30 ms and more.
+    What is let go again before the end is never looked through: Python counts what is more than it was.
     """
 
     def __enter__(self) -> None:

@@ -62,7 +62,7 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
     ValueError
         A proposition is missing, columns have different lengths, or times do not ascend.
     """
-    table = _Table.of(formula, columns, times)
+    table = Table.of(formula, columns, times)
     if not len(times):
         return np.zeros(0, np.bool_)
     return table.value(formula, np.array([[len(times) - 1]]))[0]
@@ -86,7 +86,7 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
     (B, F) bool
     """
     last = np.full((rows, 1), len(times) - 1)
-    return _Table(columns, times).value(formula, last)
+    return Table(columns, times).value(formula, last)
 
 
 def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
@@ -102,7 +102,7 @@ def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints)
     (F,) bool
         The verdict over the frames 0 … f. Time grows with the square of F; memory does not.
     """
-    table = _Table.of(formula, columns, times)
+    table = Table.of(formula, columns, times)
     frames = len(times)
     rows = max(CELLS // max(frames, 1), 1)
     parts = [
@@ -113,14 +113,22 @@ def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints)
 
 
 @dataclass(frozen=True, slots=True)
-class _Table:
-    """The propositions of a trace. Values have a row for each end of it, ``last`` (R, 1); a column a frame."""
+class Table:
+    """The propositions of a trace. Values have a row for each end of it, ``last`` (R, 1); a column a frame.
+
+    Parameters
+    ----------
+    columns : mapping of str to (F,) bool
+    times : (F,) int64
+        Ascending; ns.
+    """
 
     columns: Mapping[str, Bools]
     times: Ints
 
     @classmethod
-    def of(cls, formula: Formula, columns: Mapping[str, Bools], times: Ints) -> _Table:
+    def of(cls, formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Table:
+        """The same, if it has what a formula asks; see :func:`evaluate`."""
         missing = sorted(propositions(formula) - set(columns))
         if missing:
             raise ValueError(f"no column for the proposition {missing[0]!r}")
@@ -165,7 +173,7 @@ class _Table:
         frames = len(self.times)
         behind = None if np.all(last == frames - 1) else np.arange(frames) > last
         hit = _next(right if behind is None else right & ~behind)
-        start, end = self._window(bound, forward=True)
+        start, end = self.window(bound, forward=True)
         hit = hit if start is None else _at(hit, start)
         true = hit <= (last if end is None else np.minimum(end, last))
         if left is not None:
@@ -174,21 +182,21 @@ class _Table:
 
     def _since(self, left: Bools | None, right: Bools, bound: Bound) -> Bools:
         hit = _last(right)
-        start, end = self._window(bound, forward=False)
+        start, end = self.window(bound, forward=False)
         hit = hit if start is None else _at(hit, start)
         true = hit >= (0 if end is None else np.maximum(end, 0))
         if left is not None:
             true &= hit >= _last(~left)
         return true
 
-    def _window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
+    def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
         """The first and the last frame that an operator looks at, from each frame, in its direction.
 
         ``None``: this frame; and the last one that there is.
         """
         sign = 1 if forward else -1
         near = far = None
-        here = _frames(len(self.times))
+        here = self.frames
         low, high = bound.low, bound.high
         period = None if bound.frames else self._period
         if bound.frames or period:
@@ -206,6 +214,11 @@ class _Table:
             if high is not None:
                 far = np.searchsorted(self.times, self.times - high, "left")
         return near, far
+
+    @property
+    def frames(self) -> Places:
+        """(F,) the numbers of the frames."""
+        return _frames(len(self.times))
 
     @property
     def _period(self) -> int | None:

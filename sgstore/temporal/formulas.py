@@ -161,6 +161,11 @@ def operands_of(formula: Formula) -> tuple[Formula, ...]:
             return ()
 
 
+def looks_ahead(formula: Formula) -> bool:
+    """Whether a formula depends on later frames."""
+    return any(isinstance(part, Next | Until) for part in walk(formula))
+
+
 # From text --------------------------------------------------------------------------------------------------
 
 

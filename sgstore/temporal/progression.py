@@ -47,17 +47,44 @@ class Term:
         it is met where no frame follows.
     timed : bool
         Whether a duty in it counts from some frame on.
+    sense : int
+        Of two terms of the same :attr:`shape`, the one all of whose bounds begin no later makes the other true
+        (1), or the one all of whose bounds begin no earlier (-1); 0: that tells nothing.
+    shape : object
+        What it is but for where its bounds begin.
+    begins : tuple of int
+        Where they do.
     """
 
-    __slots__ = ("__weakref__", "operands", "timed", "word")
+    __slots__ = ("__weakref__", "begins", "operands", "sense", "shape", "timed", "word")
 
     def __init__(self, word: str, operands: tuple[Any, ...]) -> None:
         self.word = word
         self.operands = operands
+        self.sense, self.shape, self.begins = 0, None, tuple[int, ...]()
         if word == "duty":
-            self.timed: bool = operands[1] is not None
-        else:
-            self.timed = any(operand.timed for operand in operands)
+            formula, since, _ = operands
+            self.timed: bool = since is not None
+            # Who keeps to the bound that ends first keeps to the other; if they begin here, both do.
+            if since is not None and not formula.bound.low:
+                self.sense, self.shape, self.begins = 1, id(formula), (since,)
+            return
+        self.timed = any(operand.timed for operand in operands)
+        if self.timed:
+            self._liken(operands)
+
+    def _liken(self, operands: tuple[Term, ...]) -> None:
+        senses = {operand.sense for operand in operands if operand.timed}
+        if len(senses) == 1 and 0 not in senses:
+            (sense,) = senses
+            self.sense = -sense if self.word == "not" else sense
+            self.shape = self.word, *(o.shape if o.timed else id(o) for o in operands)
+            self.begins = tuple(since for operand in operands for since in operand.begins)
+
+    def implies(self, other: Term) -> bool:
+        """Whether it makes another one of its shape true; both of sense 1, or -1."""
+        pairs = zip(self.begins, other.begins, strict=True)
+        return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
     @property
     def ended(self) -> bool:
@@ -113,7 +140,11 @@ class Terms:
         return self._made("not", (term,), (id(term),))
 
     def joined(self, word: str, terms: Iterable[Term]) -> Term:
-        """``and`` or ``or`` of some terms, without what does not matter."""
+        """``and`` or ``or`` of some terms, without what does not matter.
+
+        Something and its contrary are left to be told by the frames that follow: verdicts over columns
+        (:mod:`sgstore.temporal.knowing`) do not look for them either, and both are to know the same.
+        """
         neutral, absorbing = (self.true, self.false) if word == "and" else (self.false, self.true)
         parts: dict[int, Term] = {}
         timed = 0
@@ -124,38 +155,33 @@ class Terms:
                 if part is not neutral:
                     parts[id(part)] = part
                     timed += part.timed
-        if any(part.word == "not" and id(part.operands[0]) in parts for part in parts.values()):
-            return absorbing
         if timed > 1:
-            parts = _least(parts, word)
+            parts = {id(part): part for part in least(parts.values(), word)}
         if len(parts) < 2:
             return next(iter(parts.values()), neutral)
         return self._made(word, tuple(parts.values()), tuple(sorted(parts)))
 
 
-def _least(parts: dict[int, Term], word: str) -> dict[int, Term]:
-    """Duties without those that another one makes true, or false, anyway.
+def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
+    """Of some terms that are joined those that matter: without what another one makes true, or false, anyway.
 
-    Of two bounds of one *until* that begin here and end at different times, who keeps to the one that ends
-    first keeps to the other.
+    So what an ``ALWAYS`` owes since many frames is owed once.
     """
-    kept: dict[int, Term] = {}
-    best: dict[tuple[int, bool], Term] = {}
-    for key, part in parts.items():
-        negated = part.word == "not"
-        duty = part.operands[0] if negated else part
-        if duty.word != "duty" or not duty.timed or duty.operands[0].bound.low:
-            kept[key] = part
+    kept: list[Term] = []
+    best: dict[Any, Term] = {}
+    for term in terms:
+        if not term.sense:
+            kept.append(term)
             continue
-        place = id(duty.operands[0]), negated
-        other = best.get(place)
+        other = best.get(term.shape)
         if other is not None:
-            known = (other.operands[0] if negated else other).operands[1]
-            earlier = duty.operands[1] < known
-            if earlier == ((word == "and") == negated):
-                continue
-        best[place] = part
-    return kept | {id(part): part for part in best.values()}
+            strong, weak = (term, other) if term.implies(other) else (other, term)
+            if not strong.implies(weak):
+                kept.append(other)
+            else:
+                term = strong if word == "and" else weak  # noqa: PLW2901 - the better of the two
+        best[term.shape] = term
+    return kept + list(best.values())
 
 
 Entry = tuple[int, int, Term]

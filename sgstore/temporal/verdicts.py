@@ -11,12 +11,14 @@ What no frame can refute, only the end of the trace (``EVENTUALLY p``), is viola
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.temporal.columns import evaluate, evaluate_rows
+from sgstore.temporal.columns import Table, evaluate_rows
+from sgstore.temporal.endings import TooDeep, prefix_values
 from sgstore.temporal.formulas import (
     TRUE,
     WHOLE,
@@ -32,6 +34,7 @@ from sgstore.temporal.formulas import (
     propositions,
     walk,
 )
+from sgstore.temporal.knowing import Known, known
 from sgstore.temporal.online import Online
 
 if TYPE_CHECKING:
@@ -65,7 +68,7 @@ class Violation:
 
 
 class Settled:
-    """A formula with its columns in one trace, the past being worked in: what only looks back is a column.
+    """A formula with its columns in one trace.
 
     Parameters
     ----------
@@ -76,115 +79,56 @@ class Settled:
     """
 
     def __init__(self, formula: Formula, columns: Mapping[str, Bools], times: Ints) -> None:
-        self._columns = dict(columns)
-        self._times = times
-        self._given = columns
-        self.formula = self._without_past(formula)
-        self._values: dict[Formula, Bools] = {}
+        self.formula = formula
+        self._table = Table(columns, times)
+        self._frames = len(times)
 
-    def _without_past(self, formula: Formula) -> Formula:  # noqa: PLR0911 - a case each
-        if isinstance(formula, Previous | Since) and not looks_ahead(formula):
-            name = f":{len(self._columns)}"
-            self._columns[name] = evaluate(formula, self._given, self._times)
-            return Proposition(name)
-        match formula:
-            case Not(operand=operand):
-                return Not(self._without_past(operand))
-            case And(operands=operands):
-                return And(tuple(map(self._without_past, operands)))
-            case Or(operands=operands):
-                return Or(tuple(map(self._without_past, operands)))
-            case Next(operand=operand, weak=weak):
-                return Next(self._without_past(operand), weak)
-            case Until(left=left, right=right, bound=bound):
-                return Until(self._without_past(left), self._without_past(right), bound)
-            case _:
-                return formula
+    @cached_property
+    def value(self) -> Bools:
+        """(F,) where the formula is true."""
+        return self._table.value(self.formula, np.array([[self._frames - 1]]))[0]
 
-    def value(self, formula: Formula | None = None) -> Bools:
-        """Where a formula, the whole one by default, is true."""
-        formula = formula or self.formula
-        if formula not in self._values:
-            self._values[formula] = evaluate(formula, self._columns, self._times)
-        return self._values[formula]
+    @cached_property
+    def _known(self) -> Known:
+        return known(self.formula, self._table)
 
-    def trap(self, start: int, formula: Formula | None = None) -> int | None:
+    def trap(self, start: int) -> int | None:
         """The frame at which it is certain that the formula is false at ``start``; ``None``: at none."""
-        formula = formula or self.formula
-        if self.value(formula)[start]:
-            return None
-        if isinstance(formula, And):
-            found = [self.trap(start, operand) for operand in formula.operands]
-            return min((frame for frame in found if frame is not None), default=None)
-        body = always_true(formula)
-        if body is None or not bounded(body):
-            return self._certain(formula, start, len(self._times))
-        return self._first_broken(body, start)
-
-    def _first_broken(self, body: Formula, start: int) -> int | None:
-        """Where it is first certain that something, which is to be true always, is false at some frame."""
-        broken = start + np.flatnonzero(~self.value(body)[start:])
-        if not looks_ahead(body):
-            return int(broken[0]) if len(broken) else None
-        if not len(broken):
-            return None
-        # One engine tells of all frames from the first that is broken on; the first that it calls false is it.
-        first = int(broken[0])
-        engine = Online(body)
-        names = sorted(propositions(body))
-        rows = zip(*(self._columns[name][first:].tolist() for name in names), strict=True)
-        letters = rows if names else iter([()] * (len(self._times) - first))
-        for number, letter in enumerate(letters, start=first):
-            known = engine.step(dict(zip(names, letter, strict=True)), int(self._times[number]))
-            if any(not value for _, value in known):
-                return number
-        return None
-
-    def _certain(self, formula: Formula, start: int, end: int) -> int | None:
-        """The first frame before ``end`` at which the value of a formula at ``start`` is certain."""
-        for number, verdict, certain in self._steps(formula, start, end):
-            if certain:
-                return None if verdict else number
-        return None
-
-    def _steps(self, formula: Formula, start: int, end: int) -> list[tuple[int, bool, bool]]:
-        """Frames at which something changes: the frame, the verdict if the trace ended there, certainty."""
-        engine = Online(formula, every=False)
-        names = sorted(propositions(formula))
-        letters = np.array([self._columns[name][start:end] for name in names], np.bool_)
-        letters = letters.reshape(len(names), end - start)
-        changes = np.ones(end - start, np.bool_)
-        if engine.plain:
-            changes[1:] = np.any(letters[:, 1:] != letters[:, :-1], axis=0)
-        found: list[tuple[int, bool, bool]] = []
-        places = [*np.flatnonzero(changes).tolist(), end - start]
-        for first, following in pairwise(places):
-            letter = dict(zip(names, letters[:, first].tolist(), strict=True))
-            before: object = None
-            for number in range(first, following):
-                engine.step(letter, int(self._times[start + number]))
-                found.append((start + number, bool(engine.verdict), engine.certain))
-                if engine.certain:
-                    return found
-                if engine.plain and engine.state is before:
-                    break  # nothing changes as long as the letter stays the same
-                before = engine.state
-        return found
+        trap = int(self._known.false[start])
+        return trap if trap < self._frames else None
 
     def statuses(self) -> NDArray[np.int8]:
         """(F,) what is known, as each frame is read, of the formula at the first: places in :data:`STATUS`."""
-        frames = len(self._times)
-        body = always_true(self.formula)
-        if body is not None and not looks_ahead(body):
-            broken = np.logical_or.accumulate(~self.value(body))
-            return np.where(broken, FALSE, PRESUMABLY_TRUE).astype(np.int8)
-        told = np.zeros(frames, np.int8)
-        steps = self._steps(self.formula, 0, frames)
-        ends = [number for number, *_ in steps[1:]] + [frames]
-        for (number, verdict, certain), end in zip(steps, ends, strict=True):
-            code = CERTAINLY_TRUE if certain else PRESUMABLY_TRUE
-            told[number:end] = code if verdict else FALSE if certain else PRESUMABLY_FALSE
+        try:
+            ended = prefix_values(self.formula, self._table)
+        except TooDeep:
+            ended = self._stepped()
+        told = np.where(ended, PRESUMABLY_TRUE, PRESUMABLY_FALSE).astype(np.int8)
+        told[self._known.true[0] :] = CERTAINLY_TRUE
+        told[self._known.false[0] :] = FALSE
         return told
+
+    def _stepped(self) -> Bools:
+        """The value at the first frame if the trace ended at each frame, one after the other."""
+        engine = Online(self.formula, every=False)
+        names = sorted(propositions(self.formula))
+        end = min(int(self._known.true[0]), int(self._known.false[0]), self._frames - 1) + 1
+        letters = np.array([self._table.columns[name][:end] for name in names], np.bool_)
+        letters = letters.reshape(len(names), end)
+        changes = np.ones(end, np.bool_)
+        if engine.plain:
+            changes[1:] = np.any(letters[:, 1:] != letters[:, :-1], axis=0)
+        ended = np.zeros(self._frames, np.bool_)
+        for first, following in pairwise([*np.flatnonzero(changes).tolist(), end]):
+            letter = dict(zip(names, letters[:, first].tolist(), strict=True))
+            before: object = None
+            for number in range(first, following):
+                engine.step(letter, int(self._table.times[number]))
+                ended[number:following] = engine.verdict
+                if engine.plain and engine.state is before:
+                    break  # nothing changes as long as the letter stays the same
+                before = engine.state
+        return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:
         """Where the formula is violated, asked from the first frame on.
@@ -196,22 +140,19 @@ class Settled:
         weak : bool
             Whether what only the end of the trace refutes is forgiven.
         """
-        frames = len(self._times)
+        frames = self._frames
+        resets = np.flatnonzero(reset) if reset is not None else np.zeros(0, np.int64)
         found: list[Violation] = []
         start = 0
-        while start < frames:
-            if self.value()[start]:
-                break
+        while start < frames and not self.value[start]:
             trap = self.trap(start)
             if trap is None:
                 found += [] if weak else [Violation(frames - 1, frames - 1, at_end=True)]
                 break
-            if reset is None:
-                found.append(Violation(trap, frames - 1))
-                break
-            after = np.argmax(reset[trap:]) if reset[trap:].any() else frames - 1 - trap
-            found.append(Violation(trap, int(trap + after)))
-            start = int(trap + after) + 1
+            after = int(np.searchsorted(resets, trap))
+            end = int(resets[after]) if after < len(resets) else frames - 1
+            found.append(Violation(trap, end))
+            start = end + 1
         return found
 
 
@@ -286,11 +227,6 @@ def always_true(formula: Formula) -> Formula | None:
             return right.operand if isinstance(right, Not) else Not(right)
         case _:
             return None
-
-
-def looks_ahead(formula: Formula) -> bool:
-    """Whether a formula depends on later frames."""
-    return any(isinstance(part, Next | Until) for part in walk(formula))
 
 
 def bounded(formula: Formula) -> bool:
