@@ -52,8 +52,10 @@ if TYPE_CHECKING:
 
     Rows = NDArray[np.intp]
 
-MAP_RELATIONS: Final = ("isIn", "travelsTo", "opposes", "toLeftOf", "toRightOf")
-"""Relations among parts of a map that every map answers."""
+MAP_RELATIONS: Final = frozenset(
+    {"isIn", "travelsTo", "laneChange", "opposes", "toLeftOf", "toRightOf", "conflictsWith"}
+)
+"""Relations among parts of a map. Every map answers them: where it has no such edge, there is none."""
 
 
 class SceneGraphGenerator:
@@ -97,10 +99,7 @@ class SceneGraphGenerator:
 
     def _answers(self, road_map: RoadMap | None) -> tuple[str, ...]:
         names = {name for family in self._families for name in family.names(self._config)}
-        of_map: set[str] = set()
-        if road_map is not None:
-            codes = np.unique(road_map.edges.relation).tolist()
-            of_map = {*MAP_RELATIONS, *(VOCABULARY[code] for code in codes)}
+        of_map = MAP_RELATIONS if road_map is not None else frozenset[str]()
         names = self._keeping.names(names, of_map)
         return tuple(name for name in VOCABULARY if name in names)
 

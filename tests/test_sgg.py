@@ -423,7 +423,8 @@ def test_with_a_map_lanes_and_signals_are_known_too() -> None:
 
     assert set(known) == {
         *SceneGraphGenerator(None, Config()).answers,
-        *("isIn", "travelsTo", "opposes", "controlsTrafficOf", "mayAffect", "leads", "follows"),
+        *("isIn", "travelsTo", "opposes", "laneChange", "conflictsWith"),
+        *("controlsTrafficOf", "mayAffect", "leads", "follows"),
     }
 
 

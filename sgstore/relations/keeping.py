@@ -85,7 +85,7 @@ class Keeping:
             used[parent[used[child]]] = True
         return kept & (used | ~(lane | road | junction))
 
-    def names(self, computed: set[str], of_map: set[str]) -> set[str]:
+    def names(self, computed: set[str], of_map: frozenset[str]) -> set[str]:
         """The relations that graphs can hold, of those that are computed and those that come with a map."""
         return ((computed - self._without) | of_map) - self._impossible
 
