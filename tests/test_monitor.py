@@ -77,11 +77,11 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 def watched(
-    text: str, drive: tuple[RoadMap | None, list[SceneGraph]]
+    text: str, drive: tuple[RoadMap | None, list[SceneGraph]], *, sgsm_compat: bool = False
 ) -> tuple[tuple[Verdict, ...], list[Event], Monitor]:
     road_map, graphs = drive
     events: list[Event] = []
-    monitor = Monitor(text, road_map, trace="town", on_event=events.append)
+    monitor = Monitor(text, road_map, trace="town", on_event=events.append, sgsm_compat=sgsm_compat)
     for graph in graphs:
         monitor.look([graph])
     return monitor.finish(), events, monitor
@@ -109,6 +109,29 @@ def test_a_recording_watched_has_the_verdicts_that_it_has_in_a_store(
     violated = Counter(event.name for event in events if event.kind == "violated")
     alone = {v.check: len(v.violations) for v in wanted if not v.witnesses and v.violated}
     assert {name: violated[name] for name in alone} == alone
+
+
+def test_what_sgsm_would_report_is_told_in_the_frames_with_which_the_trace_may_not_end(
+    drive: tuple[RoadMap | None, list[SceneGraph]], town: Store
+) -> None:
+    verdicts, events, monitor = watched(CHECKS, drive, sgsm_compat=True)
+
+    assert told(verdicts) == told(list(town.check(CHECKS, sgsm_compat=True)))
+    assert any(e.kind == "kept again" for e in events)
+    assert monitor.status["due"] == "presumably_false"
+
+
+def test_what_sgsm_reports_is_violated_as_long_as_the_trace_may_not_end() -> None:
+    text = "CHECK slow: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1)"
+    monitor = Monitor(text, sgsm_compat=True)
+    told = [monitor.step(car(t / 10, v)) for t, v in enumerate([0, 2, 2, 0, 0, 2])]
+    spans = [(e.kind, e.start.seq, e.end.seq, e.told.seq) for some in told for e in some]
+
+    assert spans == [("violated", 1, 1, 1), ("kept again", 1, 2, 3), ("violated", 5, 5, 5)]
+    assert monitor.status == {"slow": "presumably_false"}
+    (verdict,) = monitor.finish()
+    assert verdict.verdict == "false"
+    assert [(i.start_seq, i.end_seq) for i in verdict.violations] == [(1, 2), (5, 5)]
 
 
 def test_random_formulas_are_violated_when_columns_say_so() -> None:

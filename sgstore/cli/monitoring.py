@@ -52,6 +52,12 @@ def monitor(
     duration: Annotated[
         str | None, typer.Option("--duration", metavar="TIME", help="Simulation time: 60s.")
     ] = None,
+    sgsm_compat: Annotated[
+        bool,
+        typer.Option(
+            "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
+        ),
+    ] = False,
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if a check is violated.")
     ] = False,
@@ -78,6 +84,7 @@ def monitor(
             parameters=values,
             trace=source.name,
             called=name or "pattern",
+            sgsm_compat=sgsm_compat,
         )
         longest = seconds_of(duration, "--duration") if duration else None
         verdicts = watched.run(source.frames, duration_s=longest)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from sgstore.errors import Span
     from sgstore.lang.bound import Bound, Scope
 
@@ -16,6 +19,15 @@ class Length:
 
     amount: int
     frames: bool
+
+
+_COMPARE: Final[Mapping[str, Callable[[Any, Any], Any]]] = {
+    ">=": operator.ge,
+    ">": operator.gt,
+    "<=": operator.le,
+    "<": operator.lt,
+    "=": operator.eq,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +46,20 @@ class Hold:
     comparison: str
     length: Length
     inclusive: bool
+
+    def fits(self, length: Any) -> Any:
+        """Whether a run that is so long lasts as it must.
+
+        Parameters
+        ----------
+        length : int or (R,) int
+            Nanoseconds, or frames.
+
+        Returns
+        -------
+        bool or (R,) bool
+        """
+        return _COMPARE[self.comparison](length, self.length.amount)
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,14 +150,7 @@ class Held:
         length = last.time - self._start[1] + (period if hold.inclusive else 0)
         if hold.length.frames:
             length = last.number - self._start[0] + 1
-        wanted = hold.length.amount
-        return {
-            ">=": length >= wanted,
-            ">": length > wanted,
-            "<=": length <= wanted,
-            "<": length < wanted,
-            "=": length == wanted,
-        }[hold.comparison]
+        return hold.fits(length)
 
     def _end(self, hold: Hold | None, period: int) -> None:
         if self._waiting and hold is not None and self._long(hold, period):

@@ -54,6 +54,9 @@ class Monitor:
         Time between two frames, from which gaps are told; by default the median of those seen.
     called : str
         What a pattern is called in events; of several each has a number as well.
+    sgsm_compat : bool
+        Whether a check is violated in each frame with which the trace, if it ended there, would violate it; as
+        :meth:`sgstore.query.Store.check` has it. Nothing resets such a violation.
 
     Attributes
     ----------
@@ -84,6 +87,7 @@ class Monitor:
         trace: str = "online",
         period_s: float | None = None,
         called: str = "pattern",
+        sgsm_compat: bool = False,
     ) -> None:
         self.generator = SceneGraphGenerator(road_map, config or Config())
         self.trace = trace
@@ -100,7 +104,8 @@ class Monitor:
         for check in checks:
             if check.relations <= answers or check.unknown_is_false:
                 ego, questions = self._of_ego(check.ego)
-                self._watches.append((ego, Watch(check, questions, self._pulse)))
+                watch = Watch(check, questions, self._pulse, compat=sgsm_compat)
+                self._watches.append((ego, watch))
             else:
                 self._unknown.append(check.name)
         self._follows: list[tuple[int, Follow]] = []

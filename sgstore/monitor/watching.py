@@ -87,6 +87,9 @@ class Watch:
         What is asked of each frame; those of the check become part of them.
     pulse : Pulse
         Told of each frame before this is.
+    compat : bool
+        Whether the check is violated in each frame with which the trace, if it ended there, would violate it;
+        as SGSM reports it.
 
     Raises
     ------
@@ -94,15 +97,20 @@ class Watch:
         What is to be known at once depends on later frames.
     """
 
-    def __init__(self, check: Check, questions: Questions, pulse: Pulse) -> None:
-        self._check, self._pulse = check, pulse
+    def __init__(
+        self, check: Check, questions: Questions, pulse: Pulse, *, compat: bool = False
+    ) -> None:
+        self._check, self._pulse, self._compat = check, pulse, compat
+        self._last: Moment | None = None
         self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
         whole = Query(check.scope, Result(), check.relations, check.injective, check.ego)
         whole = replace(whole, unknown_is_false=check.unknown_is_false)
         absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
         plan = Plan(whole, frozenset(self._variables), absent)
         formula = plan.formula(check.formula)
-        reset = plan.formula(check.reset) if check.reset is not None else None
+        reset = None
+        if check.reset is not None and not compat:
+            reset = plan.formula(check.reset)
         if check.gaps == "unknown":
             raise QueryError(
                 f"USING GAPS unknown of {check.name} is a question about what was recorded",
@@ -145,22 +153,35 @@ class Watch:
         changed: list[Partial] = []
         seen: dict[tuple[State, int], Step] = {}
         tick, automaton, mask = self._pulse.tick, self._automaton, self._automaton.mask
+        stepped = self._as_sgsm if self._compat else _stepped
         for row, letter in letters.items():
             before = known.of(row)
             if before.final:
                 found[row] = before
                 continue
             step = automaton.step(before.state, letter & mask, tick, seen)
-            entry = _stepped(before, step, here, memories.get(row, ()))
+            entry = stepped(before, step, here, memories.get(row, ()))
             if entry is not before:
                 changed.append(row)
                 if automaton.final(entry.state, entry.counted):
                     entry = replace(entry, memory=(), final=True)
             found[row] = entry
         known.keep(found, _same)
+        self._last = here
         if not self._immediate:
             return []
         return list(self._events(here, changed))
+
+    def _as_sgsm(self, entry: _Entry, step: Step, here: Moment, memory: Memory) -> _Entry:
+        """What is known of a binding that is violated as long as the trace may not end."""
+        since, over = entry.since, entry.over
+        if not step.state.ended:
+            since = since or here
+        elif since is not None:
+            since, over = None, (*over, (since, self._last or here))
+        counted = entry.counted | step.guards
+        found = _Entry(step.state, counted, since, over, memory)
+        return entry if _same(entry, found) else found
 
     def _remembered(self, row: Partial) -> Memory | None:
         entry = self._known.of(row)
@@ -249,7 +270,7 @@ class Watch:
         return levels_of(self._check.quantifiers, domains, apart=apart, counts=counts)
 
     def _folded_codes(self, levels: list[Level], entries: list[_Entry]) -> int:
-        rows = [_code(entry) for entry in entries]
+        rows = [_code(entry, compat=self._compat) for entry in entries]
         for number in range(len(levels) - 1, -1, -1):
             level = levels[number]
             every = level.word == "FORALL"
@@ -265,7 +286,8 @@ class Watch:
         levels = self._levels()
         bindings = levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
         entries = [self._of(key) for key in bindings.tolist()]
-        weak = self._check.end == "weak"
+        # Of what SGSM reports every violation is told already: the last frame's, too.
+        weak = self._check.end == "weak" or self._compat
         spans = [_spans(entry, last, weak=weak) for entry in entries]
         truths = folded_values(levels, np.array([not one for one in spans], np.bool_))
         holds = bool(truths[0][0])
@@ -334,8 +356,9 @@ def _stepped(entry: _Entry, step: Step, here: Moment, memory: Memory) -> _Entry:
     return _Entry(step.state, counted, since, over, memory)
 
 
-def _code(entry: _Entry) -> int:
-    if entry.since is not None or entry.over:
+def _code(entry: _Entry, *, compat: bool) -> int:
+    broken = entry.state.word == "broken"
+    if broken or (not compat and (entry.since is not None or entry.over)):
         return FALSE
     if entry.state.word == "kept":
         return CERTAINLY_TRUE

@@ -99,15 +99,7 @@ class Line:
             times = self.clock.times
             length = times[self.frame(places[last])] - times[self.frame(places[first])]
             length = length + (self.clock.period if hold.inclusive else 0)
-        wanted = hold.length.amount
-        fits = {
-            ">=": length >= wanted,
-            ">": length > wanted,
-            "<=": length <= wanted,
-            "<": length < wanted,
-            "=": length == wanted,
-        }[hold.comparison]
-        return places[fits[runs]]
+        return places[hold.fits(length)[runs]]
 
     def window(self, leg: Leg, places: Ints) -> tuple[Ints, Ints]:
         """(R,) and (R,) the first and the last place at which the next step may be, from each place."""
