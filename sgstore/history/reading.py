@@ -179,8 +179,11 @@ def traces(
     asks: Mapping[str, Ask],
     *,
     gaps: str = "break",
+    within: Window | None = None,
 ) -> Iterator[Trace]:
     """The traces that can answer a query, one after the other, with the relations that are asked.
+
+    They are read a few at a time, the more the fewer rows they have, so that memory does not grow with a store.
 
     Parameters
     ----------
@@ -193,12 +196,17 @@ def traces(
         By name.
     gaps : str
         Whether a gap ends a run: ``break``, ``bridge``.
+    within : Window, optional
+        Buckets of whole traces; by default all.
     """
-    steps = windows(file.rows(EXTENTS).values, whole_traces=True)
+    extents = file.rows(EXTENTS).values
+    if within is not None:
+        extents = [one for one in extents if within.low <= one[0] < within.high]
+    steps = windows(extents, whole_traces=True)
     try:
         window = next(steps)
         while True:
-            found, rows = read(file, catalog, whole, asks, window, gaps=gaps)
+            found, rows = read(file, catalog, whole, asks, window or within, gaps=gaps)
             yield from found
             del found
             window = steps.send(rows)

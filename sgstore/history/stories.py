@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.history.joining import Joined, joined
-from sgstore.history.reading import CELLS, WORDS, Ask, Trace, Values, asks_of, read
+from sgstore.history.reading import CELLS, WORDS, Ask, Trace, Values, asks_of, traces
 from sgstore.history.relations import Relation
 from sgstore.lang.bound import Bound, Course, Moment, Query, Result, Scope, Tense
 from sgstore.lang.found import Found, relation, with_places
@@ -148,10 +148,8 @@ class Finder:
         asks = asks_of(self._plan)
         asks |= {f"step {number}": ask for number, ask in enumerate(self._steps)}
         found = _Told(values=[[] for _ in range(len(places) + self._spans * 2)])
-        traces, _ = read(
-            self._file, self._catalog, self._query, asks, window, gaps=self._query.gaps
-        )
-        for trace in traces:
+        about = self._file, self._catalog, self._query, asks
+        for trace in traces(*about, gaps=self._query.gaps, within=window):
             if len(trace):
                 self._find(trace, places, formulas, found)
         return self._collected(found)
