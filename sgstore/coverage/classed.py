@@ -221,10 +221,12 @@ def _window_name(classes: Sequence[str]) -> str:
 
 def shared(*of: Classed) -> tuple[tuple[str, ...], list[Classed]]:
     """The same with one numbering of all their classes."""
-    names = tuple(dict.fromkeys(name for one in of for name in one.names))
-    number = {name: i for i, name in enumerate(names)}
-    renumbered: list[Classed] = []
-    for one in of:
-        codes = np.array([*(number[name] for name in one.names), UNKNOWN], np.int64)
-        renumbered.append(replace(one, names=names, code=codes[one.code]))
-    return names, renumbered
+    if all(one.names == of[0].names for one in of):  # parts of one store
+        return of[0].names, list(of)
+    number: dict[str, int] = {}
+    codes = [[number.setdefault(name, len(number)) for name in one.names] for one in of]
+    names = tuple(number)
+    return names, [
+        replace(one, names=names, code=np.array([*own, UNKNOWN], np.int64)[one.code])
+        for one, own in zip(of, codes, strict=True)
+    ]

@@ -35,18 +35,20 @@ def classes(a: Classed, unit: Unit = Unit.frame) -> Table:
     present = np.flatnonzero(sizes)
     order = present[np.lexsort((first[present], -sizes[present]))]
     total = a.samples(unit) or int(sizes.sum())
-    cumulative = np.cumsum(sizes[order]) / max(total, 1)
+    cumulative: list[float | None] = (np.cumsum(sizes[order]) / max(total, 1)).tolist()
     if unit is Unit.trace:  # a trace has many classes: these shares add up to nothing
-        cumulative = np.full(len(order), np.nan)
-    frames = names_of(a.chosen.store, first[order])
-    rows = [
-        (rank, a.names[code], int(sizes[code]), float(sizes[code]) / total, _known(so_far), frame)
-        for rank, (code, so_far, frame) in enumerate(
-            zip(order.tolist(), cumulative.tolist(), frames, strict=True), start=1
-        )
-    ]
+        cumulative = [None] * len(order)
+    rows = zip(
+        range(1, len(order) + 1),
+        [a.names[code] for code in order.tolist()],
+        sizes[order].tolist(),
+        (sizes[order] / max(total, 1)).tolist(),
+        cumulative,
+        names_of(a.chosen.store, first[order]),
+        strict=True,
+    )
     columns = ("rank", "class", f"{unit}s", "share", "cumulative", "frame")
-    return Table(columns, rows, [*_said(a, unit), *of_unknown(a.unknown, a.chosen.text)])
+    return Table(columns, list(rows), [*_said(a, unit), *of_unknown(a.unknown, a.chosen.text)])
 
 
 def _known(value: float) -> float | None:
@@ -123,11 +125,9 @@ def novel(a: Classed, than: Classed) -> Table:
     sizes, first = a.sizes(), a.first()
     new = np.flatnonzero((sizes > 0) & (than.sizes() == 0))
     order = new[np.lexsort((first[new], sizes[new]))]
+    names = [a.names[code] for code in order.tolist()]
     frames = names_of(a.chosen.store, first[order])
-    rows = [
-        (a.names[code], int(sizes[code]), frame)
-        for code, frame in zip(order.tolist(), frames, strict=True)
-    ]
+    rows = list(zip(names, sizes[order].tolist(), frames, strict=True))
     total, many = int(sizes.sum()), int((sizes > 0).sum())
     said = [
         f"new: {len(new)} of {many} distinct classes of {a.chosen.text},"

@@ -19,6 +19,7 @@ from sgstore.errors import ExportError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
+    from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.world import Ints
 
@@ -118,44 +119,46 @@ def _asked(
         matches = store.find(text, **parameters)
         left_out = {store.file.trace(trace).trace_id for trace in matches.left_out}
         values[~np.isin(wanted >> 24, list(left_out))] = False
-        for frame in matches.frames():
-            row = _row(wanted, frame.frame_id)
-            if row >= 0:
-                values[row] = True
+        found = np.fromiter((frame.frame_id for frame in matches.frames()), np.int64)
+        values[_rows(wanted, found)[1]] = True
         return values
-    seen = np.zeros(len(wanted), np.bool_)
-    for frame_id, value in _answers(store, text, wanted, parameters):
-        row = _row(wanted, frame_id)
-        if row < 0:
-            continue
-        if seen[row] and values[row] != value:
+    for row, answer in _answers(store, text, wanted, parameters):
+        if len(np.unique(row)) < len(row):
             raise ExportError(f"the label {name!r} has several values in one frame: {text}")
-        values[row], seen[row] = value, True
+        values[row] = answer
     return values
 
 
 def _answers(
     store: Store, text: str, wanted: Ints, parameters: Mapping[str, object]
-) -> Iterator[tuple[int, Any]]:
-    """Frames and values of an expression: of those with an ego, then of those without."""
+) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
+    """Rows of frames and values of an expression: of those with an ego, then of those without."""
     value = f"RETURN DISTINCT frame.id AS frame_of_label, ({text}) AS label"
     matches = store.find(f"MATCH (:Ego) {value}", **parameters)
     if matches.columns != ("frame_of_label", "label"):
         raise ExportError(f"not one expression: {text}")
+    row, answer = _columns(matches, wanted)
+    yield row, answer
     answered = np.zeros(len(wanted), np.bool_)
-    for frame_id, value in matches:
-        row = _row(wanted, frame_id)
-        answered[row] |= row >= 0
-        yield frame_id, value
+    answered[row] = True
     left_out = [store.file.trace(trace).trace_id for trace in matches.left_out]
     if answered[~np.isin(wanted >> 24, left_out)].all():
         return
-    for frame_id, label in store.find(f"MATCH (anything) {value}", **parameters):
-        row = _row(wanted, frame_id)
-        if row >= 0 and not answered[row]:
-            yield frame_id, label
+    row, answer = _columns(store.find(f"MATCH (anything) {value}", **parameters), wanted)
+    yield row[~answered[row]], answer[~answered[row]]
 
 
-def _row(wanted: Ints, frame_id: int) -> int:
-    row = int(np.searchsorted(wanted, frame_id))
-    return row if row < len(wanted) and wanted[row] == frame_id else -1
+def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
+    """Rows of the frames that are wanted, and what was found of them."""
+    found = matches.numpy()
+    of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))
+    values = found["label"].astype(object)
+    values[np.ma.getmaskarray(found["label"])] = None
+    return row, np.asarray(values, object)[of]
+
+
+def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
+    """Which of some frames are wanted, and their rows in what is."""
+    row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
+    of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
+    return of, row[of]

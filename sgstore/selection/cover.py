@@ -107,9 +107,14 @@ def greedy(family: Family, budget: float = math.inf) -> Ints:
     int64
         In the order in which they were taken.
     """
-    starts, of_element = family.by_element()
     need = family.need.copy()
     gain = family.gains(need > 0)
+    often = np.bincount(family.members, minlength=len(need))
+    if (often <= need).all() and family.cost.sum() <= budget:
+        # Each is taken, and none makes another one worth less.
+        order = np.lexsort((family.rank, -gain / family.cost))
+        return order[: np.count_nonzero(gain)]
+    starts, of_element = family.by_element()
     cost, rank = family.cost.tolist(), family.rank.tolist()
     heap = [(-gain[i] / cost[i], rank[i], i) for i in np.flatnonzero(gain).tolist()]
     heapq.heapify(heap)

@@ -11,6 +11,14 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats, Ints
 
 
+def distinct(values: Ints) -> Ints:
+    """Values, ascending, each once; quick where they are nearly so."""
+    if (np.diff(values) <= 0).any():
+        values = np.sort(values, kind="stable")
+        values = values[np.append(True, np.diff(values) != 0)]
+    return values
+
+
 @dataclass(frozen=True)
 class Family:
     """Sets of elements.
@@ -49,9 +57,7 @@ class Family:
         rank: Ints | None = None,
     ) -> Family:
         """A family of pairs (2, M) of a set and an element, in any order; a pair may come twice."""
-        key = pairs[0].astype(np.int64) * max(elements, 1) + pairs[1]
-        if (np.diff(key) <= 0).any():
-            key = np.unique(key)
+        key = distinct(pairs[0].astype(np.int64) * max(elements, 1) + pairs[1])
         of_set, members = np.divmod(key, max(elements, 1))
         starts = np.searchsorted(of_set, np.arange(sets + 1))
         often = np.bincount(members, minlength=elements)

@@ -57,13 +57,12 @@ def _force(family: Family, need: Ints, alive: Bools, forced: Bools) -> None:
         rows = alive[family.set_of]
         often = np.bincount(family.members[rows], minlength=len(need))
         tight = (need > 0) & (often <= need)
-        taken = np.unique(family.set_of[rows & tight[family.members]])
-        if not len(taken):
+        taken = np.zeros(len(family), np.bool_)
+        taken[family.set_of[rows & tight[family.members]]] = True
+        if not taken.any():
             return
         forced[taken], alive[taken] = True, False
-        held = np.zeros(len(family), np.bool_)
-        held[taken] = True
-        need -= np.bincount(family.members[held[family.set_of]], minlength=len(need))
+        need -= np.bincount(family.members[taken[family.set_of]], minlength=len(need))
         np.maximum(need, 0, out=need)
 
 

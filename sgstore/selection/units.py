@@ -14,7 +14,7 @@ from sgstore.coverage.asking import is_of_ego
 from sgstore.coverage.classed import GAP, UNKNOWN
 from sgstore.coverage.features import combined, features
 from sgstore.errors import ConfigError
-from sgstore.selection.family import Family
+from sgstore.selection.family import Family, distinct
 from sgstore.store.contents import lengths_of_messages
 from sgstore.store.covering import seq_of, trace_of
 
@@ -415,7 +415,7 @@ def _classes_of(units: Units, of: Classed) -> Ints:
     parts: list[Ints] = []
     for unit, row in units.members():
         known = code[row] != UNKNOWN
-        key = np.unique(unit[known] * max(len(present), 1) + code[row[known]])
+        key = distinct(unit[known] * max(len(present), 1) + code[row[known]])
         parts.append(np.stack(np.divmod(key, max(len(present), 1))))
         held += len(key)
         if held > MOST:

@@ -62,6 +62,16 @@ ORDER BY p.chunk_offset, p.message_offset
 """
 
 
+_LENGTHS: Final = f"""
+SELECT min(f.frame_id) AS frame_id, any_value(p.length) AS length
+FROM frame f JOIN {_WANTED} ON w.frame_id = f.frame_id JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
+GROUP BY f.trace_id, p.chunk_offset, p."offset"
+"""
+
+TOGETHER: Final = 200_000
+"""About how many frames are asked about at once, of whole traces."""
+
+
 @dataclass(frozen=True, slots=True)
 class Mark:
     """What the graphs of a trace were made with.
@@ -205,16 +215,11 @@ def messages_of(file: StoreFile, frame_id: Ints) -> Places:
 
 
 def lengths_of_messages(file: StoreFile, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """Bytes of the messages that belong to frames: frames and lengths, a message once, with its first frame."""
-    for trace in np.unique(trace_of(frame_id)).tolist():
-        own = frame_id[trace_of(frame_id) == trace]
-        seen = np.zeros((0, 2), np.int64)
-        for low in range(0, len(own), WINDOW):
-            found = messages_of(file, own[low : low + WINDOW])
-            place = np.stack([found.chunk_offset, found.offset], axis=1)
-            order = np.argsort(found.frame_id, kind="stable")
-            fresh = order[np.unique(place[order], axis=0, return_index=True)[1]]
-            known = {tuple(row) for row in seen.tolist()}
-            fresh = np.array([i for i in fresh.tolist() if tuple(place[i]) not in known], np.int64)
-            seen = place[fresh] if len(fresh) else seen
-            yield found.frame_id[fresh], found.length[fresh]
+    """Bytes of messages that belong to frames, whose ids ascend; a message once, with its first frame."""
+    ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
+    low = 0
+    while low < len(frame_id):
+        high = int(ends[np.searchsorted(ends, min(low + TOGETHER, len(frame_id)))])
+        found = file.arrays(_LENGTHS, {"frames": frame_id[low:high].tolist()})
+        yield found["frame_id"].astype(np.int64), found["length"].astype(np.int64)
+        low = high

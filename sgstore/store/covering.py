@@ -25,16 +25,15 @@ if TYPE_CHECKING:
 _CLASSES: Final = """
 WITH kept AS (
   SELECT class, bucket, mask FROM frame_class WHERE abstraction = $name
-  UNION ALL SELECT class, bucket, mask FROM later_class WHERE abstraction = $name),
-numbered AS (
-  SELECT class, row_number() OVER (ORDER BY class) - 1 AS code
-  FROM (SELECT DISTINCT class FROM kept WHERE class IS NOT NULL))
+  UNION ALL SELECT class, bucket, mask FROM later_class WHERE abstraction = $name)
 """
-_NAMES: Final = (
-    f"{_CLASSES} SELECT replace(class::VARCHAR, '-', '') AS name FROM numbered ORDER BY code"
-)
+_NAMES: Final = f"""{_CLASSES}
+SELECT replace(class::VARCHAR, '-', '') AS name FROM (SELECT DISTINCT class FROM kept WHERE class IS NOT NULL)
+ORDER BY class
+"""
 _MASKS: Final = f"""{_CLASSES}
-SELECT k.bucket, k.mask, coalesce(n.code, -1) AS code FROM kept k LEFT JOIN numbered n ON n.class = k.class
+SELECT bucket, mask, CASE WHEN class IS NULL THEN -1 ELSE dense_rank() OVER (ORDER BY class NULLS LAST) - 1 END
+  AS code FROM kept
 """
 _IMPORTED: Final = "SELECT graph, frame_id FROM imports"
 _TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
@@ -74,12 +73,12 @@ def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
     name : str
         As the store has it.
     """
-    names = connection.execute(_NAMES, {"name": name}).fetchall()
+    names = connection.execute(_NAMES, {"name": name}).fetchnumpy()["name"]
     rows = connection.execute(_MASKS, {"name": name}).fetchnumpy()
     frame_id, row = frames_of(rows["bucket"].astype(np.int64), rows["mask"].astype(np.int64))
     code = rows["code"].astype(np.int64)[row]
     order = np.argsort(frame_id, kind="stable")
-    return CodedClasses(tuple(one for (one,) in names), frame_id[order], code[order])
+    return CodedClasses(tuple(names.tolist()), frame_id[order], code[order])
 
 
 def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
