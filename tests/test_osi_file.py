@@ -207,6 +207,19 @@ def test_damage_inside_a_message_costs_that_message(tmp_path: Path) -> None:
     assert (loss.messages, loss.bytes) == (1, len(told[2]))
 
 
+def test_a_version_that_only_the_first_message_tells_is_enough(tmp_path: Path) -> None:
+    first, *others = messages(40)
+    others = [part.removeprefix(VERSION) for part in others]
+    assert not any(VERSION in part for part in others)
+
+    path = write(tmp_path / "a.osi", packed([first, *others]))
+    with OsiFile(path) as recording:
+        report = TraceReport()
+        told = [bytes(run.data(i)) for run in recording.walk(report) for i in range(len(run))]
+    assert told == [first, *others]
+    assert not report.losses
+
+
 def test_a_compressed_file_that_is_damaged_keeps_what_comes_before(tmp_path: Path) -> None:
     content = bytearray(in_frames(packed(messages(40)), 5000))
     content[len(content) // 2 : len(content) // 2 + 30] = b"\xa5" * 30

@@ -29,7 +29,7 @@ THREADS: Final = 2
 """As many decompress beside the walk. One processor alone would gain nothing."""
 BATCH: Final = 2 << 20
 """A thread is given chunks of about this size together; bytes."""
-AHEAD: Final = 6 << 20
+AHEAD: Final = 8 << 20
 """Chunks of about this size are begun before they are asked for; bytes."""
 LARGEST: Final = 16 << 20
 """Chunks that are larger, stored or decompressed, wait for their turn; bytes."""

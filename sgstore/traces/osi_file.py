@@ -281,13 +281,13 @@ class _Stream:
         following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
         if self._mark.startswith(following):
             return False
-        within = self._resume(at + 1)
-        return within is not None and within < stop
+        return self._resume(at + 1, stop) is not None
 
-    def _resume(self, start: int) -> int | None:
-        """Where in the buffer the next message seems to begin."""
+    def _resume(self, start: int, stop: int | None = None) -> int | None:
+        """Where in the buffer, before ``stop``, the next message seems to begin."""
+        end = None if stop is None else stop - 1 + PREFIX.size + len(self._mark)
         while self._mark:
-            found = self._buffer.find(self._mark, start + PREFIX.size)
+            found = self._buffer.find(self._mark, start + PREFIX.size, end)
             if found < 0:
                 return None
             start = found - PREFIX.size

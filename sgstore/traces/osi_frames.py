@@ -279,12 +279,13 @@ class FrameDecoder:
         if keys == self._last_keys:  # the same objects as in the last frame, in the same order
             return self._last_nodes.copy(), objects
         nodes = [self._keys.get(key, _UNKNOWN) for key in keys]
-        if _UNKNOWN in nodes:
+        known = _UNKNOWN not in nodes
+        if not known:
             for row, node in enumerate(nodes):
                 if node == _UNKNOWN:
                     nodes[row] = self._node_of(objects[row], keys[row], log_time)
         if len(set(nodes)) == len(nodes) and -1 not in nodes:
-            if all(map(self._keys.__contains__, keys)):
+            if known or all(map(self._keys.__contains__, keys)):
                 self._last_keys, self._last_nodes = keys, nodes.copy()
             return nodes, objects
         rows: dict[int, int] = {}

@@ -59,6 +59,8 @@ _LIGHTS: Final = {
 _STATES: Final = 64
 """More than any state of a light has; states above are not known to the recording's version of OSI."""
 
+_DOUBLE: Final = 9
+"""A double and its tag, which is one byte for fields up to 15; bytes."""
 _VARINT, _FIXED64, _BYTES, _GROUP, _GROUP_END = 0, 1, 2, 3, 4
 _ROUNDS: Final = 64
 """Layouts that are tried for the objects of one length in a block; what is left is read one by one."""
@@ -78,16 +80,15 @@ class _Layout:
     """Where things stand in objects of one shape.
 
     ``compared``, ``mask``, ``expected``: places of all bytes that are no numbers, which of their bits count,
-    and what those are. ``places``: where doubles begin; ``columns``: what they are. ``zero``: columns of
-    sub-messages that are there but leave the number out. ``lights``: where states of lights stand, and what
-    they mean. ``parts``: which sub-messages of the base there are.
+    and what those are. ``runs``: first column, place and number of doubles that follow one another. ``zero``:
+    columns of sub-messages that are there but leave the number out. ``lights``: where states of lights stand,
+    and what they mean. ``parts``: which sub-messages of the base there are.
     """
 
     compared: Ints
     mask: Bytes
     expected: Bytes
-    places: Ints
-    columns: Ints
+    runs: list[tuple[int, int, int]]
     zero: Ints
     lights: list[tuple[int, int, NDArray[np.int64]]]
     parts: set[str]
@@ -159,14 +160,17 @@ class MovingObjects:
             if not len(rows):
                 break
             layout = self._layout_of(content[0])
-            if layout is None:
-                agree = np.arange(len(rows)) == 0
+            agree = None if layout is None else layout.agree(content)
+            if layout is None or agree is None:
                 odd.append(int(rows[0]))
-            else:
-                agree = layout.agree(content)
-                here = rows[agree]
-                values[here], usable[here] = _numbers(layout, content[agree])
-                lights[here] = _lights(layout, content[agree])
+                rows, content = rows[1:], content[1:]
+                continue
+            alike = agree.all()
+            here, found = (rows, content) if alike else (rows[agree], content[agree])
+            values[here], usable[here] = _numbers(layout, found)
+            lights[here] = _lights(layout, found)
+            if alike:
+                return odd
             rows, content = rows[~agree], content[~agree]
         return [*odd, *rows.tolist()]
 
@@ -224,8 +228,7 @@ class MovingObjects:
             compared=compared,
             mask=mask,
             expected=np.frombuffer(content, np.uint8)[compared] & mask,
-            places=np.array(list(found.doubles.values()), np.int64),
-            columns=np.array(list(found.doubles), np.int64),
+            runs=_runs(found.doubles),
             zero=np.array([c for c in found.zero if c not in found.doubles], np.int64),
             lights=found.lights,
             parts={self._parts[number] for number in found.parts},
@@ -302,12 +305,24 @@ def _meanings(told: Any, bit: int) -> NDArray[np.int64]:
 def _numbers(layout: _Layout, content: Bytes) -> tuple[Floats, Bools]:
     values = np.full((len(content), len(POSE)), np.nan)
     values[:, layout.zero] = 0.0
-    if len(layout.places):
-        eight = (layout.places[:, None] + np.arange(8)).ravel()
-        values[:, layout.columns] = np.ascontiguousarray(content[:, eight]).view("<f8")
+    size = content.shape[1]
+    for column, place, count in layout.runs:
+        doubles = np.ndarray((len(content), count), "<f8", content.data, place, (size, _DOUBLE))
+        values[:, column : column + count] = doubles
     if "position" not in layout.parts:
         return values, np.zeros(len(content), np.bool_)
     return values, _near(values, oriented="orientation" in layout.parts)
+
+
+def _runs(doubles: dict[int, int]) -> list[tuple[int, int, int]]:
+    """Doubles by column → place, as runs of columns that stand behind one another, a tag between two."""
+    runs: list[tuple[int, int, int]] = []
+    for column, place in sorted(doubles.items()):
+        if runs and (column, place) == (sum(runs[-1][::2]), runs[-1][1] + _DOUBLE * runs[-1][2]):
+            runs[-1] = (*runs[-1][:2], runs[-1][2] + 1)
+        else:
+            runs.append((column, place, 1))
+    return runs
 
 
 def _near(values: Floats, *, oriented: bool) -> Bools:
