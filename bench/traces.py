@@ -7,10 +7,11 @@
 The recordings are made up. Objects: 60 a frame, in CARLA's messages and in OSI's. Skimming: the same objects in
 a file that is mostly camera and lidar: stored; in zstd, which finds nothing in a JPEG; in zstd of raw pictures
 and points, which it halves, of small ones and of those of CARLA's bridge as it comes. Bytes are counted as they
-are without compression. Files are read from the page cache. Objects are decoded in seconds of a processor. A file
-is skimmed in seconds of the clock, because two threads decompress: the machine should have nothing else to do.
-What is compared takes turns, and the least of each counts. Hashing is left out, because it has a processor of its
-own.
+are without compression. Files are read from the page cache.
+
+Objects are decoded in seconds of a processor. A file is skimmed in seconds of the clock, because two threads
+decompress: the machine should have nothing else to do. What is compared takes turns, and the least of each
+counts. Hashing is left out, because it has a processor of its own.
 """
 
 from __future__ import annotations
