@@ -429,14 +429,20 @@ APART: Final = 1000.0
 """Time between the starts of two scenes of a trace; s."""
 
 
-def store_of(where: Path, traces: Mapping[str, Sequence[Scene]]) -> Store:
+def store_of(
+    where: Path,
+    traces: Mapping[str, Sequence[Scene]],
+    configs: Mapping[str, Config] | None = None,
+) -> Store:
     """A store with traces of scenes.
 
     A trace is of one road; its scenes follow one another, :data:`APART`, so that nothing lasts from one to the
-    next. Things that never move stay, as they do in recordings.
+    next. Things that never move stay, as they do in recordings. ``configs``: of traces that have one of their
+    own.
     """
-    file, config = StoreFile.create(where), Config()
+    file = StoreFile.create(where)
     for number, (name, scenes) in enumerate(traces.items()):
+        config = (configs or {}).get(name, Config())
         info = TraceInfo(
             path=Path(f"/scenes/{name}.mcap"),
             size=1,

@@ -7,14 +7,14 @@ unnamed nodes begin with ``#``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from sgstore.lang.catalog import Attribute, Type
 from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from sgstore.errors import Span
     from sgstore.lang.over_time import Link, Step
@@ -439,6 +439,20 @@ class Result:
     def aggregated(self) -> bool:
         """Whether it counts or sums over matches, rather than listing them."""
         return any(isinstance(e, Aggregate) for c in self.columns for e in walk(c.value))
+
+    def changed(self, change: Callable[[Bound], Bound]) -> Result:
+        """The same with a change made to every value."""
+
+        def key(value: Bound | str) -> Bound | str:
+            return value if isinstance(value, str) else change(value)
+
+        sample = self.sample
+        return replace(
+            self,
+            columns=tuple(replace(column, value=change(column.value)) for column in self.columns),
+            order=tuple(replace(one, value=key(one.value)) for one in self.order),
+            sample=sample and replace(sample, per=sample.per and key(sample.per)),
+        )
 
 
 @dataclass(frozen=True, slots=True)

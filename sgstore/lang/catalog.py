@@ -32,6 +32,8 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from sgstore.lang.reach import Reach
+
 Triple = tuple[str, str, str]
 """Relation, kind of the source, kind of the destination."""
 
@@ -498,12 +500,15 @@ class TraceFacts:
         The simulator's id of the ego; empty without one.
     answers : frozenset of str
         Relations that it can answer; of the others nothing is known.
+    reach : Reach or None
+        Which pairs of entities are related in it; ``None`` where that is not known.
     """
 
     trace_id: int
     name: str
     ego: str
     answers: frozenset[str]
+    reach: Reach | None = None
 
 
 @dataclass(frozen=True, slots=True)

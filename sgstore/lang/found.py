@@ -288,14 +288,4 @@ def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
             case _:
                 return value
 
-    def key(value: Bound | str) -> Bound | str:
-        return value if isinstance(value, str) else placed(value)
-
-    result, sample = query.result, query.result.sample
-    result = replace(
-        result,
-        columns=tuple(replace(c, value=placed(c.value)) for c in result.columns),
-        order=tuple(replace(k, value=key(k.value)) for k in result.order),
-        sample=sample and replace(sample, per=sample.per and key(sample.per)),
-    )
-    return replace(query, result=result), places
+    return replace(query, result=query.result.changed(placed)), places

@@ -11,6 +11,7 @@ from sgstore.lang.catalog import Type
 from sgstore.lang.conditions import bind, number
 from sgstore.lang.datasets import CLASSES, abstraction_named, class_count
 from sgstore.lang.names import Meaning, Names
+from sgstore.lang.reach import in_range
 from sgstore.lang.standard import predicates
 from sgstore.vocabulary import ENTITY_KINDS, folded
 
@@ -40,7 +41,7 @@ _NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
 _EXTREME: Final = frozenset({"min", "max"})
 _AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
 _OTHERS: Final = frozenset(
-    {"class_count", "coalesce", "dataset_classes", "known", "type", "lower", "upper"}
+    {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", "lower", "upper"}
 )
 _COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
 _TEMPORAL: Final = frozenset(map(folded, _COURSES))
@@ -119,6 +120,12 @@ def _entity(function: str, argument: s.Expression, names: Names) -> str:
             "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along",
         )
     return found.node
+
+
+def _in_range(e: s.Call, names: Names) -> b.Bound:
+    _expect(e, 2, 2, names)
+    one, other = (_entity("in_range", argument, names) for argument in e.arguments)
+    return in_range(one, other, names.session.traces)
 
 
 def _numeric(e: s.Call, names: Names) -> b.Operation:
@@ -232,6 +239,7 @@ _FUNCTIONS: Final[dict[str, Callable[[s.Call, Names], b.Bound]]] = {
     **dict.fromkeys(_EXTREME, _extreme),
     "classcount": _class_count,
     "coalesce": _coalesce,
+    "inrange": _in_range,
     CLASSES: _after_in,
     "known": _known,
     "type": _type,

@@ -429,17 +429,7 @@ def _spelled(query: Query, catalog: Catalog) -> Query:
             case _:
                 return value
 
-    def key(value: Bound | str) -> Bound | str:
-        return value if isinstance(value, str) else spelled(value)
-
-    result, sample = query.result, query.result.sample
-    result = replace(
-        result,
-        columns=tuple(replace(c, value=spelled(c.value)) for c in result.columns),
-        order=tuple(replace(k, value=key(k.value)) for k in result.order),
-        sample=sample and replace(sample, per=sample.per and key(sample.per)),
-    )
-    return replace(query, result=result)
+    return replace(query, result=query.result.changed(spelled))
 
 
 def _frame_columns() -> list[tuple[str, str]]:

@@ -63,21 +63,10 @@ def _scopes(change: Callable[[Scope], Scope], query: Query) -> Query:
             case _:
                 return expression
 
-    def named(value: Bound | str) -> Bound | str:
-        return value if isinstance(value, str) else inside(value)
-
     def deep(scope: Scope) -> Scope:
         return change(replace(scope, where=tuple(inside(condition) for condition in scope.where)))
 
-    result = query.result
-    sample = result.sample
-    result = replace(
-        result,
-        columns=tuple(replace(c, value=inside(c.value)) for c in result.columns),
-        order=tuple(replace(key, value=named(key.value)) for key in result.order),
-        sample=sample and replace(sample, per=sample.per and named(sample.per)),
-    )
-    return replace(query, scope=deep(query.scope), result=result)
+    return replace(query, scope=deep(query.scope), result=query.result.changed(inside))
 
 
 # Conditions ----------------------------------------------------------------------------------------
@@ -373,15 +362,21 @@ def ordered(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def labels_to_conditions(query: Query, _: Catalog) -> Query:
-    """A label that a block asks of a node outside it is a condition on that node's attributes."""
-    return _scopes(
+    """A label that a block asks of a node outside it is a condition on that node's attributes.
+
+    So is one that a value which is returned is made of.
+    """
+    query = _scopes(
         lambda scope: replace(scope, where=tuple(_attributes(c) for c in scope.where)), query
     )
+    return replace(query, result=query.result.changed(_attributes))
 
 
 def _attributes(condition: Bound) -> Bound:
     if isinstance(condition, Operation):
         return replace(condition, operands=tuple(_attributes(o) for o in condition.operands))
+    if isinstance(condition, Aggregate) and condition.operand is not None:
+        return replace(condition, operand=_attributes(condition.operand))
     if not isinstance(condition, LabelTest):
         return condition
     kind = NodeAttribute(condition.node, NODE_ATTRIBUTES["kind"], Type.text)

@@ -14,6 +14,7 @@ from sgstore.lang.catalog import Catalog, TraceFacts
 from sgstore.lang.checks import bind_checks
 from sgstore.lang.evaluation import FrameView
 from sgstore.lang.parser import parse
+from sgstore.lang.reach import Reach
 from sgstore.lang.results import GAP
 from sgstore.lang.syntax import Check, Define, Match, Parameter
 from sgstore.monitor.asking import People, Questions
@@ -89,11 +90,13 @@ class Monitor:
         called: str = "pattern",
         sgsm_compat: bool = False,
     ) -> None:
-        self.generator = SceneGraphGenerator(road_map, config or Config())
+        config = config or Config()
+        self.generator = SceneGraphGenerator(road_map, config)
         self.trace = trace
         self._on_event = on_event
         answers = frozenset(self.generator.answers)
-        catalog = Catalog(traces=(TraceFacts(0, trace, "", answers),))
+        reach = Reach.of(config.as_dict())
+        catalog = Catalog(traces=(TraceFacts(0, trace, "", answers, reach),))
         checks, queries = _bound(text, catalog, parameters or {})
         self._egos: list[str] = []
         self._questions: list[Questions] = []

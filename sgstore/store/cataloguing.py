@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sgstore.abstractions.literature import SUBSETS
 from sgstore.lang import Catalog, TraceFacts
+from sgstore.lang.reach import Reach
 from sgstore.store.deriving import sets_of
 from sgstore.store.traces import stored_traces
 from sgstore.vocabulary import folded
@@ -42,7 +43,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         fixed=kinds("entity WHERE is_static"),
         mapped=kinds("map_node"),
         traces=tuple(
-            TraceFacts(t.trace_id, t.name, t.ego, frozenset(t.answers))
+            TraceFacts(t.trace_id, t.name, t.ego, frozenset(t.answers), Reach.of(t.settings))
             for t in stored_traces(connection)
         ),
         classed=tuple(sorted(name for (name,) in classed)),
@@ -100,6 +101,7 @@ def _derived(
 ) -> Catalog:
     """The catalog under a derived set: of the traces that have it."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
+    reaches = {one.trace_id: Reach.of(one.settings) for one in of}
     word = name.replace("'", "''")
     shadows = {
         table: f'SELECT * FROM main."{table}" WHERE trace_id IN'
@@ -127,7 +129,7 @@ def _derived(
         shadows=tuple(shadows.items()),
         edges=_counted(connection, f"({shadows['edge']})"),
         traces=tuple(
-            replace(trace, answers=answers[trace.trace_id])
+            replace(trace, answers=answers[trace.trace_id], reach=reaches[trace.trace_id])
             for trace in whole.traces
             if trace.trace_id in answers
         ),
