@@ -392,7 +392,10 @@ def assignments(match: s.Match, world: World) -> Iterator[tuple[Search, Binding]
     injective = not any(setting.name.lower() == "nodes" for setting in match.settings)
     unknown_is_false = any(setting.name.lower() == "unknown" for setting in match.settings)
     needed = set[str]() if unknown_is_false else relations_of(match)
+    egos = [setting.value for setting in match.settings if setting.name.lower() == "ego"]
     for frame in world.frames:
+        if egos and egos != [frame.trace.hero]:
+            continue
         if not needed <= {answer.lower() for answer in frame.trace.answers}:
             continue
         search = Search(frame, frame.graph, injective)

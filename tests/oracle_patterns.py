@@ -48,15 +48,17 @@ class Writer:
     """Writes one query; the same seed writes the same."""
 
     def __init__(self, seed: int) -> None:
+        self.seed = seed
         self.rng = random.Random(seed)
         self.nodes: list[str] = []
         self.egos = 0
         self.edges: list[str] = []
 
     def query(self) -> str:
-        settings = self.rng.choice(("", "", "USING NODES any "))
+        settings = [*self.rng.choice(([], [], ["NODES any"]))]
+        settings += [f"EGO 'hero{1 + self.seed // 8 % 2}'"] if self.seed % 8 == 5 else []
         block = self.block("abc", depth=2)
-        return f"{settings}MATCH {block}"
+        return f"USING {', '.join(settings)} MATCH {block}" if settings else f"MATCH {block}"
 
     def block(self, letters: str, depth: int) -> str:
         before = list(self.nodes), list(self.edges)

@@ -129,6 +129,11 @@ class Trace:
     entities: dict[int, dict[str, Any]]
     frames: list[Frame] = field(default_factory=list)
 
+    @property
+    def hero(self) -> str:
+        """What the simulator calls the ego."""
+        return f"hero{self.trace_id}"
+
 
 def outward(trace: Trace, node: int, state: dict[str, Any], ego: int | None) -> dict[str, Any]:
     """Attributes of a moving entity as people see them."""
@@ -357,7 +362,7 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
     row = {
         "trace_id": trace.trace_id,
         "name": trace.name,
-        "ego": f"hero{trace.trace_id}",
+        "ego": trace.hero,
         "map_id": 3,
     }
     row |= {

@@ -80,6 +80,22 @@ QUERIES = [
         "MATCH (mask:Car)-[:near]->(bucket) WHERE mask.x < bucket.x", id="names of columns"
     ),
     pytest.param("USING UNKNOWN false MATCH (a:Lane)-[:travelsTo]->(b)", id="unknown is false"),
+    pytest.param("USING EGO 'hero2' MATCH (e:Ego)-[:near]->(v)", id="one of two egos"),
+    pytest.param(
+        "USING EGO 'hero1' MATCH (e:Ego) WHERE COUNT {(e)-[:near|visible]-(b)} >= 1",
+        id="counted around one of two egos",
+    ),
+    pytest.param(
+        "USING EGO 'hero2' MATCH (l:Lane) WHERE COUNT {(b:Car)} >= 2", id="counted of one's frames"
+    ),
+    pytest.param(
+        "USING EGO 'hero1' MATCH (a:Car) WHERE COUNT {(b:Vehicle) WHERE b.x > a.x} = 0",
+        id="counted by values in the frames of one of two egos",
+    ),
+    pytest.param(
+        "USING EGO 'hero1' MATCH (a) WHERE NOT EXISTS {(b:Person)} AND COUNT {(c:Car)} < 2",
+        id="few in the frames of one of two egos",
+    ),
 ]
 
 
