@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sgstore.errors import Span
 from sgstore.lang import syntax as s
+from sgstore.lang.hints import TOLD
+from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,7 +85,11 @@ def _variable(span: Span, children: Children) -> s.Variable:
 def _attribute(span: Span, children: Children) -> s.AttributeOf:
     owner, name = children
     if not isinstance(owner, s.Variable):
-        raise BuildError(f"only variables have attributes, so '.{name.text}' has no meaning here")
+        inner = owner.name if isinstance(owner, s.AttributeOf) else ""
+        raise BuildError(
+            f"only variables have attributes, so '.{name.text}' has no meaning here",
+            hint=TOLD.get(folded(inner)),
+        )
     return s.AttributeOf(owner, name.text, span)
 
 

@@ -22,9 +22,9 @@ from sgstore.lang.catalog import (
     class_attribute,
 )
 from sgstore.lang.datasets import CLASSES, abstraction_named, seen_in
-from sgstore.lang.hints import comparison_hint, hint_at
+from sgstore.lang.hints import TOLD, comparison_hint, hint_at
 from sgstore.lang.names import RESERVED, Names
-from sgstore.vocabulary import KINDS, LANE_TYPES, folded, kinds_labelled
+from sgstore.vocabulary import ENTITY_KINDS, KINDS, LANE_TYPES, folded, kinds_labelled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -122,7 +122,12 @@ def _checked(value: object, e: s.Parameter, names: Names) -> b.Value:
 
 def _variable(e: s.Variable, names: Names) -> b.Bound:
     if e.name in RESERVED:
-        names.session.refuse(f"'{e.name}' has attributes, but is no value itself", e.span)
+        value = "its id is frame.id" if e.name == "frame" else f"its name is {e.name}.name"
+        names.session.refuse(
+            f"'{e.name}' has attributes, but is no value itself",
+            e.span,
+            None if e.name == "env" else value,
+        )
     meaning = names.meaning(e.name)
     if meaning is not None and meaning.value is not None:
         return meaning.value
@@ -197,13 +202,15 @@ def node_attribute(key: str, name: str, span: Span, names: Names) -> b.NodeAttri
     possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds]
     found = NODE_ATTRIBUTES.get(folded(name))
     if found is None:
-        names.session.unknown("attribute", name, span, possible)
+        names.session.unknown("attribute", name, span, possible, TOLD.get(folded(name)))
     if not found.kinds & kinds:
         what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"
         owners = [kind for kind in KINDS if kind in found.kinds]
         hint = hint_at(name, possible)
         if hint is None or not hint.startswith("did"):
             hint = f"it belongs to: {', '.join(owners)}"
+            if owners == ["lane"] and kinds <= frozenset(ENTITY_KINDS):
+                hint = f"the lanes that it is in are nodes: (x)-[:isIn]->(l:Lane), l.{found.name}"
         raise QueryNameError(
             f"a {what} has no attribute '{found.name}'",
             text=names.session.text,
@@ -365,7 +372,8 @@ def _check_regex(pattern: b.Bound, span: Span, names: Names) -> None:
 def _null_test(e: s.NullTest, names: Names) -> b.Operation:
     operand = bind(e.operand, names)
     if operand.type in {Type.node, Type.list}:
-        names.session.refuse(f"a {operand.type.value} is never NULL", e.operand.span)
+        hint = "what may be absent is asked by EXISTS {…}" if operand.type is Type.node else None
+        names.session.refuse(f"a {operand.type.value} is never NULL", e.operand.span, hint)
     word = "IS NOT NULL" if e.negated else "IS NULL"
     return b.Operation(word, (operand,), Type.boolean)
 
@@ -383,7 +391,9 @@ def _membership(e: s.Membership, names: Names) -> b.Bound:
             names.session.refuse("NULL is in no list", e.choices.span)
         if item.type is not operand.type:
             names.session.refuse(
-                f"a {operand.type.value} cannot be in a list with a {item.type.value}", e.span
+                f"a {operand.type.value} cannot be in a list with a {item.type.value}",
+                e.span,
+                comparison_hint(operand.type, item.type, [item.value]),
             )
     items = tuple(_canonical(item, operand, e.choices.span, names) for item in choices.items)
     canonical = b.Choices(tuple(item for item in items if isinstance(item, b.Value)))

@@ -12,7 +12,7 @@ from sgstore.lang.conditions import bind, number
 from sgstore.lang.datasets import CLASSES, abstraction_named, class_count
 from sgstore.lang.names import Meaning, Names
 from sgstore.lang.reach import in_range
-from sgstore.lang.standard import predicates
+from sgstore.lang.standard import pattern_named, predicates
 from sgstore.vocabulary import ENTITY_KINDS, folded
 
 if TYPE_CHECKING:
@@ -75,7 +75,13 @@ def call(e: s.Call, names: Names) -> b.Bound:
     if name in _FUNCTIONS:
         return _FUNCTIONS[name](e, names)
     if name in _AGGREGATES:
-        names.session.refuse(f"{e.name}() may stand after RETURN only", e.span)
+        word = e.name.upper()
+        inner = "(a)-[:near]->(b)" if word == "COUNT" else "(a)-[:near]->(b) | b.speed"
+        names.session.refuse(
+            f"{e.name}() may stand after RETURN only",
+            e.span,
+            f"in a condition: {word} {{{inner}}} > 2",
+        )
     return _standard(name, e, names)
 
 
@@ -96,7 +102,19 @@ def _expect(e: s.Call, low: int, high: int, names: Names) -> None:
         names.session.refuse(
             f"{e.name}() takes {wanted} argument{'s' * (wanted != '1')}, found {len(e.arguments)}",
             e.span,
+            _signature(folded(e.name)),
         )
+
+
+def _signature(name: str) -> str | None:
+    """How a function of two entities, or a predicate of the library, is called, and what it is."""
+    if name in _PAIRS:
+        return f"{_PAIRS[name]}(a, b): {PAIR_FUNCTIONS[_PAIRS[name]]}"
+    found = predicates().get(name)
+    if found is None:
+        return None
+    formals = ", ".join(formal.name for formal in found.parameters)
+    return f"{found.name}({formals}): {pattern_named(found.name).sentence}"
 
 
 def _pair(e: s.Call, names: Names) -> b.PairNumber:

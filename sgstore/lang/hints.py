@@ -21,10 +21,13 @@ SYNTAX: Final = tuple(
         (r"&&?$", "write AND"),
         (r"\|\|?$", "write OR"),
         (r"!$", "write NOT before a condition"),
+        (r"""\bIS\s+['"]$""", "equality is written '='"),
         (r"""['"]$""", "the text in quotes has no end"),
+        (r"\bIN\s*\([^()]*,$", "a list stands in square brackets: IN [1, 2]"),
+        (r"[<>]=?\s*[\w.]+\s*[<>]=?$", "write 3 < x.speed AND x.speed < 5"),
         (r"EXISTS\s*\($", "write EXISTS {(a)-[:near]->(b)}, in braces"),
         (
-            r"\)\s*<?-\[\s*\w*:$",
+            r"[)\w]\s*<?-\[\s*\w*:$",
             "in a condition, a pattern stands in braces: EXISTS {(a)-[:near]->(b)}",
         ),
         (r"\)\s*-\($", "an edge is written -[:near]-> or -->"),
@@ -34,7 +37,7 @@ SYNTAX: Final = tuple(
         (r"\)\s*OPTIONAL$", "what may be absent is asked in a condition: EXISTS {…}, or COUNT {…}"),
         (r"\)\s*WITH$", "there is no WITH: name conditions by DEFINE PREDICATE, results by AS"),
         (r"\)\s*MATCH$", "separate patterns by commas"),
-        (r"\bSELECT$", "SQL is asked by sgstore sql, or store.sql()"),
+        (r"\bSELECT$|^\s*FROM$", "SQL is asked by sgstore sql, or store.sql()"),
         (r"\bMATCH\s+\w+\s*=$", "a path has no name: name its nodes and edges"),
         (r"\bMATCH\s+\w+\s*:$", "a node stands in brackets: MATCH (e:Ego)"),
         (r"\bBETWEEN$", "write x >= 3 AND x <= 5"),
@@ -45,7 +48,7 @@ SYNTAX: Final = tuple(
         (r"\bLIMIT\s+\S+\s+(ORDER|SAMPLE)$", "the order is ORDER BY … SAMPLE … LIMIT …"),
         (r"\d\s*km(/h)?$", "speeds are in m/s: write 30 / 3.6"),
         (r"\d\s*h$|\d\s*min\w+$", "times are written 500ms, 2s or 1min"),
-        (r"\w\s*:\s*[<>]=?$", "a property is a value; write WHERE x.speed > 5"),
+        (r"\w\s*:\s*[<>]=?$|\{\s*\w+\s*[<>]=?$", "a property is a value; write WHERE x.speed > 5"),
         (r"\[\s*\w*\s*:[^\]]*\|\s*:$", "one colon is enough: -[:near|visible]->"),
         (r"\(\s*\w*\s*:[^)]*:$", "labels are joined by & or |: (v:Car&Ego)"),
         (r"\bCOUNT\s*\(\s*\(.*:$", "a pattern is counted in braces: COUNT {(v:Car)}"),
@@ -72,14 +75,38 @@ SYNONYMS: Final[Mapping[str, str]] = {
 }
 """Other words, folded, for attributes of nodes."""
 
+TOLD: Final[Mapping[str, str]] = {
+    **dict.fromkeys(
+        ("color", "colour", "make", "brand"), "what the simulator says of its type is in type_name"
+    ),
+    **dict.fromkeys(
+        ("position", "location", "pose", "transform", "pos"),
+        "the place of a node e is e.x, e.y, e.z",
+    ),
+    **dict.fromkeys(
+        ("size", "extent", "dimensions", "bbox"), "its size is length, width and height"
+    ),
+}
+"""What people ask for, folded, that is no attribute of nodes, and where it is to be found."""
+
+LIKEN: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("police", "ambulance", "fire", "firetruck"), "emergency"),
+    **dict.fromkeys(("cab", "uber"), "taxi"),
+    "bus": "public_transport",
+    "ev": "electric",
+    **dict.fromkeys(("amber", "orange"), "yellow"),
+}
+"""Other words, folded, for words of the closed vocabularies."""
+
 _WORDS: Final = frozenset(folded(w) for w in (*KINDS, *LIGHT_STATES, *SPECIALS, *LANE_TYPES))
 
 
 def hint_at(name: str, known: Iterable[str]) -> str | None:
     """What a name may have meant: that which is most like it or short for it, or else all that is known."""
     names = sorted(known, key=str.lower)
-    other = SYNONYMS.get(folded(name))
-    like = other if other in names else suggestion(name, names) or _short_for(name, names)
+    others = (words.get(folded(name)) for words in (SYNONYMS, LIKEN))
+    other = next((word for word in others if word in names), None)
+    like = other or suggestion(name, names) or _short_for(name, names)
     if like:
         return f"did you mean '{like}'?"
     more = f", … ({len(names)} in all)" if len(names) > MANY else ""
@@ -91,6 +118,42 @@ def _short_for(name: str, names: list[str]) -> str | None:
     whole = folded(name)
     found = [n for n in names if len(n) >= 3 and whole.startswith(folded(n))]
     return max(found, key=len, default=None)
+
+
+def bracket_hint(text: str, position: int, found: str) -> str | None:
+    """Where a bracket that is not closed was opened, if the text ends too soon; or that there is none to close.
+
+    Parameters
+    ----------
+    text : str
+    position : int
+        Where what was not expected begins.
+    found : str
+        What that is; empty at the end.
+    """
+    opened: list[int] = []
+    for part in _BRACKETS.finditer(text, 0, position):
+        if part[0] in _CLOSES:
+            if opened and text[opened[-1]] == _CLOSES[part[0]]:
+                opened.pop()
+        elif len(part[0]) == 1:
+            opened.append(part.start())
+    if found in _CLOSES and _CLOSES[found] not in {text[place] for place in opened}:
+        return f"there is no '{_CLOSES[found]}' that it closes"
+    if found or not opened:
+        return None
+    after = text[opened[-1] + 1 :].strip()
+    after = after if len(after) <= _EXCERPT else f"{after[:_EXCERPT].rstrip()}…"
+    return f"the '{text[opened[-1]]}' before {after or 'the end'} is not closed"
+
+
+_BRACKETS: Final = re.compile(
+    r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|/\*(?:.|\n)*?\*/|[()\[\]{}]"""
+)
+"""Brackets, and what brackets may stand in that do not count."""
+
+_CLOSES: Final = {")": "(", "]": "[", "}": "{"}
+_EXCERPT: Final = 24
 
 
 def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | None:  # noqa: FBT001

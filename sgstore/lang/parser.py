@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QuerySyntaxError, Span
 from sgstore.lang.builders import BUILDERS, BuildError
-from sgstore.lang.hints import SYNTAX
+from sgstore.lang.hints import SYNTAX, bracket_hint
 from sgstore.lang.tables import Rule, Tables, Terminal, tables
 from sgstore.vocabulary import suggestion
 
@@ -264,4 +264,6 @@ def _hint(machine: Tables, names: list[str], text: str, span: Span) -> str | Non
     word = text[span.start : span.end].upper()
     words = [machine.terminals[name].literal for name in names if name in machine.terminals]
     like = suggestion(word, [word for word in words if word.isalpha()]) if word.isalpha() else None
-    return f"did you mean {like}?" if like and like != word else None
+    if like and like != word:
+        return f"did you mean {like}?"
+    return bracket_hint(text, span.start, text[span.start : span.end])
