@@ -1,0 +1,175 @@
+"""Recordings watched as if they were live, against stores of them: ``python oracle_watched.py FOLDER``.
+
+Every recording under the folder is driven frame by frame through monitors, and ingested: verdicts, violations,
+witnesses, and what each pattern of the library finds, must be the same.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sgstore.config import Config
+from sgstore.demo import RECORDING
+from sgstore.errors import SgstoreError
+from sgstore.ingest import ingest
+from sgstore.lang import patterns
+from sgstore.monitor import Monitor
+from sgstore.monitor.sources import opened
+from sgstore.query import Store
+from sgstore.sgg import SceneGraphGenerator
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sgstore.graph import SceneGraph
+    from sgstore.history.checks import Verdict
+    from sgstore.monitor import Event
+    from sgstore.roads import RoadMap
+
+CHECKS = """
+CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 RESET WHEN dist(ego, v) > 9;
+CHECK faster: FORSOME (v:Vehicle) EVENTUALLY (v.speed > 8 AND prev(v.speed) <= 8);
+CHECK met: FORALL (b:Bus|Truck) FORSOME (p:Person) EVENTUALLY dist(b, p) < 20;
+CHECK turning: FORALL (v:Vehicle WHERE v.speed > 5)
+  ALWAYS (delta(v.heading, 1s) < 20 OR run_length(v.speed < 3) < 2s)
+  RESET WHEN age(v) > 3 AND since_true(v.speed > 1) < 1s;
+CHECK fast: FORALL (v:Vehicle) EVENTUALLY v.speed > 10;
+CHECK lately: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS ONCE[0s, 5s] v.speed > 1;
+CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND ALWAYS ego.speed < 9;
+USING END pending CHECK due: EVENTUALLY ego.speed > 40;
+USING END weak CHECK forgiven: EVENTUALLY ego.speed > 40
+"""
+
+SEQUENCES = (
+    "MATCH (e:Ego) WHERE e.speed < 1 THEN MATCH (e) WHERE e.speed > 5",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 12"
+    " THEN WITHIN 2s MATCH (e), (v) WHERE dist(e, v) < 8 FOR >= 0.5s",
+    "MATCH (v:Vehicle) WHERE v.speed > 5 THEN IMMEDIATELY MATCH (v) WHERE v.speed <= 5",
+    "MATCH (v:Vehicle) WHERE v.speed > 3 UNTIL MATCH (v) WHERE v.speed <= 3 FOR < 3s",
+    "MATCH (v:Vehicle) WHERE v.speed < 1 FOR >= 1s"
+    " THEN NOT MATCH (v) WHERE v.speed > 4 THEN WITHIN 8s MATCH (v) WHERE v.speed > 2",
+    "MATCH (v:Vehicle) WHERE v.speed > 5 THEN WITHIN 1s NOT MATCH (v) WHERE v.speed < 4",
+    "MATCH (v:Vehicle) WHERE v.speed > 5 AND prev(v.speed) <= 5"
+    " THEN AFTER 1s WITHIN 4s MATCH (v), (w:Vehicle) WHERE dist(v, w) < 8",
+    "MATCH (v:Vehicle) WHERE v.speed > 2 AND EVENTUALLY[0s, 1s] v.speed < 1"
+    " THEN WITHIN 2s MATCH (v) WHERE v.speed < 0.5",
+    "USING MATCHES longest MATCH (v:Vehicle) WHERE v.speed > 5 THEN WITHIN 2s MATCH (v) WHERE v.speed < 5",
+    "USING MATCHES first MATCH (v:Vehicle) WHERE v.speed < 1 THEN MATCH (v) WHERE v.speed > 4",
+)
+
+
+@dataclass
+class Drive:
+    """A recording: its store, its map, and its graphs, one frame after the other."""
+
+    store: Store
+    name: str
+    road_map: RoadMap | None
+    graphs: list[SceneGraph] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, recording: Path, folder: Path) -> Drive:
+        path = folder / f"{recording.stem}.sgstore"
+        ingest(path, [recording])
+        store = Store(path)
+        ((name,),) = store.sql("SELECT name FROM trace").values
+        with opened(str(recording), Config()) as source:
+            generator = SceneGraphGenerator(source.road_map, Config())
+            graphs = [generator.step(frame) for frame in source.frames]
+            return cls(store, name, source.road_map, graphs)
+
+    def watched(
+        self, text: str, *, sgsm_compat: bool = False
+    ) -> tuple[tuple[Verdict, ...], list[Event], Monitor]:
+        events: list[Event] = []
+        monitor = Monitor(
+            text, self.road_map, trace=self.name, on_event=events.append, sgsm_compat=sgsm_compat
+        )
+        for graph in self.graphs:
+            monitor.look([graph])
+        return monitor.finish(), events, monitor
+
+    def compare_checks(self, text: str, *, sgsm_compat: bool = False) -> int:
+        """Verdicts watched and stored; how many violations there are."""
+        verdicts, events, _ = self.watched(text, sgsm_compat=sgsm_compat)
+        wanted = list(self.store.check(text, sgsm_compat=sgsm_compat))
+        assert told(verdicts) == told(wanted), (self.name, text)
+        violated = Counter(event.name for event in events if event.kind == "violated")
+        alone = {v.check: len(v.violations) for v in wanted if not v.witnesses and v.violated}
+        assert {name: violated[name] for name in alone} == alone, (self.name, text)
+        return sum(len(v.violations) for v in wanted)
+
+    def compare_matches(self, texts: Sequence[str]) -> int:
+        """What is found, by the frame it begins in and who it is; how often."""
+        _, events, monitor = self.watched(";\n".join(texts))
+        total = 0
+        for number, text in enumerate(texts, start=1):
+            name = "pattern" if len(texts) == 1 else f"pattern {number}"
+            found = self.store.find(text)
+            assert (name in monitor.names) == (not found.left_out), (self.name, text)
+            if found.left_out:
+                continue
+            intervals = list(found.intervals())
+            whole = {n for one in intervals for n, v in one.values.items() if isinstance(v, int)}
+            own = [event for event in events if event.name == name]
+            wanted = Counter((i.start_seq, _nodes(i.values, whole)) for i in intervals)
+            assert wanted == Counter((e.start.seq, _nodes(e.nodes, whole)) for e in own), (
+                self.name,
+                text,
+            )
+            assert all(e.start.seq <= e.end.seq <= e.told.seq for e in own), (self.name, text)
+            total += len(intervals)
+        return total
+
+
+def _nodes(values: Any, names: set[str]) -> tuple[tuple[str, int], ...]:
+    return tuple(sorted((name, value) for name, value in values.items() if name in names))
+
+
+def told(verdicts: Sequence[Verdict]) -> list[tuple[Any, ...]]:
+    return [(v.check, v.verdict, v.violations, v.witnesses) for v in sorted(verdicts, key=_name)]
+
+
+def _name(verdict: Verdict) -> str:
+    return verdict.check
+
+
+def library_checks() -> str:
+    found = [p.text for p in patterns().values() if p.is_check]
+    return ";\n".join(text.strip().rstrip(";") for text in found)
+
+
+def library_matches() -> list[str]:
+    found = [p for p in patterns().values() if p.kind != "predicate" and not p.is_check]
+    return [pattern.text.strip().rstrip(";") for pattern in found]
+
+
+def compare(recording: Path, folder: Path) -> tuple[int, int, int]:
+    """Frames, violations and matches of a recording, if nothing differs."""
+    drive = Drive.of(recording, folder)
+    violations = sum(drive.compare_checks(text) for text in (CHECKS, library_checks()))
+    violations += drive.compare_checks(CHECKS, sgsm_compat=True)
+    matches = drive.compare_matches([*SEQUENCES, *library_matches()])
+    return len(drive.graphs), violations, matches
+
+
+def recordings(folder: Path) -> Iterator[Path]:
+    """Those that are whole."""
+    yield RECORDING
+    for path in sorted([*folder.rglob("*.mcap"), *folder.rglob("*.osi")]):
+        if "damaged" not in path.parts:
+            yield path
+
+
+if __name__ == "__main__":
+    for one in recordings(Path(sys.argv[1])):
+        with tempfile.TemporaryDirectory() as made:
+            try:
+                print(one.name, *compare(one, Path(made)), flush=True)
+            except SgstoreError as error:
+                print(one.name, "is not read:", error, flush=True)
