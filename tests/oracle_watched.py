@@ -145,7 +145,9 @@ def library_checks() -> str:
 
 
 def library_matches() -> list[str]:
+    """All but those that ask who is parked, which is known only when the trace has ended."""
     found = [p for p in patterns().values() if p.kind != "predicate" and not p.is_check]
+    found = [pattern for pattern in found if "parked" not in pattern.text]
     return [pattern.text.strip().rstrip(";") for pattern in found]
 
 
@@ -167,9 +169,14 @@ def recordings(folder: Path) -> Iterator[Path]:
 
 
 if __name__ == "__main__":
+    differs = 0
     for one in recordings(Path(sys.argv[1])):
         with tempfile.TemporaryDirectory() as made:
             try:
                 print(one.name, *compare(one, Path(made)), flush=True)
             except SgstoreError as error:
                 print(one.name, "is not read:", error, flush=True)
+            except AssertionError as error:
+                print(one.name, "differs:", error, flush=True)
+                differs += 1
+    sys.exit(f"{differs} recordings differ" if differs else None)
