@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from sgstore.coverage import Classed
-    from sgstore.history import Verdict
+    from sgstore.history.checks import Verdict
     from sgstore.query import Store
     from sgstore.world import Ints
 

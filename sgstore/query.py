@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sgstore.history import CheckRun
+    from sgstore.history.checks import CheckRun
     from sgstore.lang import Catalog
     from sgstore.lang.bound import FrameAttribute
     from sgstore.lang.evaluation import FrameView
@@ -139,7 +139,7 @@ class Store:
         QueryError
             The text has no checks, or names what the store does not know; it says where.
         """
-        from sgstore.history import CheckRun  # with numpy: only for who asks
+        from sgstore.history.checks import CheckRun  # with numpy: only for who asks
 
         return CheckRun(
             self.file, self.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status

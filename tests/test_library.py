@@ -25,7 +25,7 @@ from sgstore.temporal import formula_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.history import Verdict
+    from sgstore.history.checks import Verdict
     from sgstore.temporal import Formula
 
 FOUND = [name for name, one in patterns().items() if one.kind in {"concept", "scenario"}]

@@ -25,7 +25,7 @@ from sgstore.cli.output import Format, say, write_rows
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.history import Verdict
+    from sgstore.history.checks import Verdict
     from sgstore.matches import Interval
 
 COLUMNS = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")

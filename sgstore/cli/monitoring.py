@@ -22,7 +22,7 @@ from sgstore.cli.output import say
 from sgstore.cli.traces import Config, Preset, RoadMap, settings_of
 
 if TYPE_CHECKING:
-    from sgstore.history import Verdict
+    from sgstore.history.checks import Verdict
     from sgstore.monitor import Event, Moment
 
 

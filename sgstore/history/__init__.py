@@ -3,7 +3,3 @@
 Conditions on single frames come from the store by SQL, as columns; what they make over time is worked out by
 :mod:`sgstore.temporal`, a trace at a time, so that memory does not grow with the number of traces.
 """
-
-from sgstore.history.checks import CheckRun, Verdict, Witness
-
-__all__ = ["CheckRun", "Verdict", "Witness"]

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.config import Payloads
 from sgstore.errors import StoreError
 from sgstore.store.packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store.rows import run
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.config import Config
+    from sgstore.config import Config, Payloads
     from sgstore.roads import RoadMap
     from sgstore.world import TraceInfo
 
@@ -86,6 +85,8 @@ class Identity:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
         """The identity that plain values describe."""
+        from sgstore.config import Payloads  # many settings: not for who only reads a store
+
         payloads: Any = Payloads(**values["payloads"])
         return cls(**(values | {"payloads": payloads}))
 
