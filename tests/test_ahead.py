@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from carla_recordings import Bridge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -95,6 +96,19 @@ def test_threads_take_up_what_is_compressed_and_the_messages_are_the_same(
     assert all(
         len(names) == 1 and names[0].startswith("sgstore-chunks") for names in begun.values()
     )
+
+
+def test_what_hardly_becomes_larger_waits_for_its_turn(
+    tmp_path: Path, begun: dict[int, list[str]], in_turn: Callable[[Path], Any]
+) -> None:
+    path, dice = tmp_path / "a.mcap", random.Random(1)
+    with Bridge(path, compression="zstd", chunk_size=2000) as bridge:
+        for i in range(20):
+            content = dice.randbytes(3000) if i < 10 else bytes(3000)
+            bridge.write("/camera", "sensor_msgs/CompressedImage", content, i / 10)
+
+    assert told(path) == in_turn(path)
+    assert sorted(begun) == offsets_of(path)[10:]
 
 
 @pytest.mark.parametrize("seed", range(30))

@@ -13,7 +13,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from sgstore.errors import TraceError
 from sgstore.traces.buffers import Buffers
@@ -22,6 +22,7 @@ from sgstore.traces.chunks import read_chunk_head, read_records, read_stored, re
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable
     from concurrent.futures import Future
+    from io import BufferedReader
 
     from sgstore.traces.chunks import ChunkHead, Records
 
@@ -34,6 +35,8 @@ AHEAD: Final = 8 << 20
 LARGEST: Final = 16 << 20
 """Chunks that are larger, stored or decompressed, wait for their turn; bytes."""
 
+WORTH: Final = 0.9
+"""A chunk waits for its turn that is stored in more than this share of its size: pictures in JPEG."""
 LEAST: Final = 64 << 10
 """What a chunk counts however small it is; bytes."""
 _TRIED: Final = 256  # places of a batch: there need not be a chunk
@@ -56,7 +59,7 @@ class ReadAhead:
     """
 
     def __init__(
-        self, file: BinaryIO, offsets: Iterable[int] = (), verified: Container[int] = ()
+        self, file: BufferedReader, offsets: Iterable[int] = (), verified: Container[int] = ()
     ) -> None:
         self._file = file
         self._offsets = iter(offsets if _processors() > 1 else ())
@@ -84,8 +87,8 @@ class ReadAhead:
             self._found = future.result()
         told, found = self._found.pop(head.offset, (None, b""))
         if told != head:  # not begun, or the file was changed meanwhile
-            into = self._buffers.take(head.size) if _is_apt(head) else None
-            return read_records(self._file, head, verify=self._verifies(head), into=into)
+            memory = self._buffers.take if _cost(head) <= LARGEST else None
+            return read_records(self._file, head, verify=self._verifies(head), memory=memory)
         if isinstance(found, TraceError):
             raise found
         return found
@@ -127,7 +130,7 @@ class ReadAhead:
                     head = read_chunk_head(self._file, offset)
                     if not _is_apt(head):
                         break
-                    stored = read_stored(self._file, head)
+                    stored = read_stored(self._file, head, self._buffers.take)
                     into = self._buffers.take(head.size)
                     chunks.append(_Chunk(head, stored, into, self._verifies(head)))
                     size += _cost(head)
@@ -145,7 +148,7 @@ class _Chunk(NamedTuple):
     """A chunk as it is stored, memory for what it becomes, and whether its checksum is looked at."""
 
     head: ChunkHead
-    stored: bytes
+    stored: Records
     into: memoryview
     verify: bool
 
@@ -165,8 +168,9 @@ def _cost(head: ChunkHead) -> int:
 
 
 def _is_apt(head: ChunkHead) -> bool:
-    """Whether a chunk is worth it: what is stored as it is costs no less beside the walk."""
-    return bool(head.compression) and _cost(head) <= LARGEST
+    """Whether a chunk is worth it."""
+    compressed = bool(head.compression) and head.data_length < WORTH * head.size
+    return compressed and _cost(head) <= LARGEST
 
 
 def _processors() -> int:

@@ -17,7 +17,7 @@ from array import array
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, Final
 
 import lz4.frame
 import numpy as np
@@ -35,10 +35,13 @@ except ImportError:  # the extra [fast], whose checksums are the same, ten times
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from io import BufferedReader
 
     from numpy.typing import NDArray
 
     from sgstore.world import Ints
+
+    Memory = Callable[[int], memoryview]
 
 MAX_CHUNK: Final = 256 << 20
 """Greatest size of a chunk, stored or decompressed, and of a message outside chunks; bytes."""
@@ -187,7 +190,7 @@ class ChunkHead:
     data_length: int
 
 
-def read_chunk_head(file: BinaryIO, offset: int) -> ChunkHead:
+def read_chunk_head(file: BufferedReader, offset: int) -> ChunkHead:
     """The head of the chunk record at an offset, the offset of its data with it.
 
     Raises
@@ -231,7 +234,7 @@ def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | Non
 
 
 def read_records(
-    file: BinaryIO, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
+    file: BufferedReader, head: ChunkHead, *, verify: bool = True, memory: Memory | None = None
 ) -> Records:
     """The records of a chunk, decompressed and, if the chunk has a checksum, verified.
 
@@ -241,18 +244,20 @@ def read_records(
     head : ChunkHead
     verify : bool
         Whether to look at the checksum.
-    into : memoryview, optional
-        Memory of the chunk's size that may be used for them.
+    memory : callable, optional
+        Gives memory of some size, for what is read and what it becomes.
 
     Raises
     ------
     TraceError
         The chunk is too large, cut, not what it declares, or damaged.
     """
-    return records_of(read_stored(file, head), head, verify=verify, into=into)
+    stored = read_stored(file, head, memory)
+    into = memory(head.size) if memory and head.compression else None
+    return records_of(stored, head, verify=verify, into=into)
 
 
-def read_stored(file: BinaryIO, head: ChunkHead) -> bytes:
+def read_stored(file: BufferedReader, head: ChunkHead, memory: Memory | None = None) -> Records:
     """The records of a chunk as they stand in the file.
 
     Raises
@@ -265,16 +270,22 @@ def read_stored(file: BinaryIO, head: ChunkHead) -> bytes:
         reason = f"the chunk declares {largest} bytes; at most {MAX_CHUNK} are read"
         raise TraceError(reason, offset=head.offset)
     file.seek(head.data_offset)
-    stored = file.read(head.data_length)
+    if memory is None:
+        stored = file.read(head.data_length)
+    else:
+        whole = memory(head.data_length)
+        stored = whole[: file.readinto(whole)]
     if len(stored) != head.data_length:
         raise TraceError("the file ends inside this chunk", offset=head.offset)
     return stored
 
 
 def records_of(
-    stored: bytes, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
+    stored: Records, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
 ) -> Records:
-    """The records of a chunk from what :func:`read_stored` gives; otherwise as :func:`read_records`.
+    """The records of a chunk from what :func:`read_stored` gives.
+
+    ``into``: memory of the chunk's size that may be used for them.
 
     Raises
     ------
@@ -292,7 +303,7 @@ def records_of(
 
 
 def decompress(
-    stored: bytes, compression: str, size: int, into: memoryview | None = None
+    stored: Records, compression: str, size: int, into: memoryview | None = None
 ) -> Records:
     """What a chunk's bytes become: exactly ``size`` bytes, and never more of them in memory.
 
@@ -341,7 +352,7 @@ def _zstd(size: int) -> zstandard.ZstdDecompressor:
     return zstandard.ZstdDecompressor(max_window_size=max(size, MIN_WINDOW))
 
 
-def _from_zstd(stored: bytes, size: int, into: memoryview | None) -> Records:
+def _from_zstd(stored: Records, size: int, into: memoryview | None) -> Records:
     declared = zstandard.get_frame_parameters(stored).content_size
     if declared == size and into is not None:
         with _zstd(size).stream_reader(stored) as reader:
@@ -358,7 +369,7 @@ def _from_zstd(stored: bytes, size: int, into: memoryview | None) -> Records:
     return records
 
 
-def _from_lz4(stored: bytes, size: int, _into: memoryview | None) -> Records:
+def _from_lz4(stored: Records, size: int, _into: memoryview | None) -> Records:
     records = bytearray()
     while stored and len(records) <= size:
         decompressor = lz4.frame.LZ4FrameDecompressor()
@@ -378,7 +389,7 @@ def _lz4_piece(records: bytearray, size: int) -> int:
     return min(_LZ4_PIECE, size + 1 - len(records))
 
 
-_DECOMPRESS: Final[dict[str, Callable[[bytes, int, memoryview | None], Records]]] = {
+_DECOMPRESS: Final[dict[str, Callable[[Records, int, memoryview | None], Records]]] = {
     "zstd": _from_zstd,
     "lz4": _from_lz4,
     "": lambda stored, _size, _into: stored,
