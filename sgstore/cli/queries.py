@@ -90,20 +90,21 @@ def find(
         number = _write_answer(answer, form_for(form, output, as_json=as_json), output)
         return NO_MATCH if require and not number else 0
     opened = open_store(store, tables_of(tables))
-    matches = opened.find(text, **values)
-    if explain:
-        typer.echo(matches.explain())
-        return 0
-    say_left_out(matches)
-    if count:
-        number = matches.count()
-        typer.echo(number)
-    else:
-        form = form_for(form, output, as_json=as_json)
-        columns, rows = _as_shown(matches, form)
-        number = write_rows(columns, rows, form, output)
-        if not number and form is Format.table:
-            say("nothing matches")
+    with opened.file.snapshot():  # it is opened once
+        matches = opened.find(text, **values)
+        if explain:
+            typer.echo(matches.explain())
+            return 0
+        say_left_out(matches)
+        if count:
+            number = matches.count()
+            typer.echo(number)
+        else:
+            form = form_for(form, output, as_json=as_json)
+            columns, rows = _as_shown(matches, form)
+            number = write_rows(columns, rows, form, output)
+            if not number and form is Format.table:
+                say("nothing matches")
     return NO_MATCH if require and not number else 0
 
 
