@@ -19,7 +19,7 @@ from sgstore.lang.phases import Window
 from sgstore.lang.results import EXTENTS
 from sgstore.lang.rewrite import rewritten
 from sgstore.lang.subgraphs import Layout, shown
-from sgstore.store import FrameRef, write_parquet
+from sgstore.store import FrameRef, GivenTable, write_parquet
 from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
 from sgstore.world import Clip
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog
-    from sgstore.lang.results import Statement
+    from sgstore.lang.results import Gathered, Statement
     from sgstore.store import StoreFile
 
 FIRST_WINDOW: Final = 64
@@ -141,7 +141,8 @@ class Matches:
             if compiled.limited_to_frames is not None:
                 return len({row[0] for row in self._frames()})
             statement = compiled.count()
-            return self._file.rows(statement.sql, statement.values).values[0][0]
+            given = self._given(statement)
+            return self._file.rows(statement.sql, statement.values, given=given).values[0][0]
 
     def frames(self) -> Iterator[FrameRef]:
         """The distinct frames, in order of trace and number; of limited rows, in the order of the rows."""
@@ -229,7 +230,7 @@ class Matches:
         """All columns as arrays, masked where something is NULL."""
         with self._compiled() as compiled:
             statement = compiled.rows()
-            return self._file.arrays(statement.sql, statement.values)
+            return self._file.arrays(statement.sql, statement.values, given=self._given(statement))
 
     def arrow(self) -> Any:
         """All rows as a ``pyarrow.Table``.
@@ -354,7 +355,8 @@ class Matches:
         window, more = next(steps), True
         while more:
             ready, rows = statement(window), 0
-            with self._file.batches(ready.sql, ready.values) as batches:
+            given = self._given(ready)
+            with self._file.batches(ready.sql, ready.values, given=given) as batches:
                 for batch in batches:
                     rows += len(batch)
                     yield from batch.values
@@ -362,6 +364,21 @@ class Matches:
                 window = steps.send(rows)
             except StopIteration:
                 more = False
+
+    def _given(self, statement: Statement) -> list[GivenTable]:
+        """What a statement is given of what was found otherwise."""
+        return [GivenTable(one.name, one.types, self._blocks(one)) for one in statement.gathered]
+
+    def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
+        steps = windows(self._file.rows(EXTENTS).values, whole_traces=True)
+        window = next(steps)
+        while True:
+            block = gathered.block(window)
+            yield block
+            try:
+                window = steps.send(len(block[0]))
+            except StopIteration:
+                return
 
 
 def windows(

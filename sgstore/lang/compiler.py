@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from sgstore.lang import results
@@ -97,9 +98,12 @@ class Compiled:
         query, places = with_places(query)
         span = SPAN if len(query.steps) > 1 else None
         told = (*places.values(), *(span or ()))
-        find = self.finder
-        found = nothing(query, len(told)) if find is None else find(tuple(places), window)
-        return query, Told(query, self.catalog, found, told), span
+        find, asked = self.finder, tuple(places)
+        if find is None:
+            return query, Told(query, self.catalog, nothing(query, len(told)), told), span
+        if window is not None:
+            return query, Told(query, self.catalog, find(asked, window), told), span
+        return query, Told(query, self.catalog, partial(find, asked), told), span
 
     def frames(self, window: Window | None = None) -> Statement:
         """The frames that match, each once, with their log times."""

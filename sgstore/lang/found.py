@@ -30,11 +30,11 @@ from sgstore.lang.counting import folded
 from sgstore.lang.formulas import Select, columns_of, expression_text, leaves, nested, quoted
 from sgstore.lang.frames import PATTERN, Frames, Join, column_of
 from sgstore.lang.phases import Given, Phases
-from sgstore.lang.results import Statement, rows
+from sgstore.lang.results import Gathered, Statement, rows
 from sgstore.lang.rewrite import rewritten
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from sgstore.lang.bound import Bound, Query
     from sgstore.lang.catalog import Catalog
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from sgstore.lang.phases import Window
 
 FRAME: Final = "frame_id"
+GATHERED: Final = ":gathered"
+"""The table of what is found, where a statement speaks of all of it."""
 
 
 def relation(
@@ -181,16 +183,22 @@ class Told(Frames):
     query : Query
         Of which :func:`with_places` made that its values speak of what is told.
     catalog : Catalog
-    found : Found
+    found : Found or function
+        What finds in a window of whole traces is asked of one after the other, when the statement is asked.
     told : sequence of FrameAttribute
         What stands for the values of ``found``.
     """
 
     def __init__(
-        self, query: Query, catalog: Catalog, found: Found, told: Sequence[FrameAttribute]
+        self,
+        query: Query,
+        catalog: Catalog,
+        found: Found | Callable[[Window | None], Found],
+        told: Sequence[FrameAttribute],
     ) -> None:
         super().__init__(query, catalog, None)
-        self._found = found
+        self._find = None if isinstance(found, Found) else found
+        self._found = found if isinstance(found, Found) else nothing(query, len(told))
         self._told = {leaf: f":value {number}" for number, leaf in enumerate(told)}
         self._table = ""
 
@@ -246,20 +254,39 @@ class Told(Frames):
 
     def _told_rows(self) -> str:
         """What is found, one row a frame."""
-        found, add = self._found, self.values.add
-        columns = [("first", "BIGINT", found.first), ("last", "BIGINT", found.last)]
-        columns += [(f"{key}.id", "BIGINT", ids) for key, ids in found.nodes.items()]
-        columns += [(f"{key}.type", "VARCHAR", words) for key, words in found.edges.items()]
-        for leaf, values in zip(self._told, found.values, strict=True):
-            kind = "BIGINT" if leaf in SPAN else _TYPES[leaf.type]
-            columns.append((self._told[leaf], kind, values))
+        columns = {"first": "BIGINT", "last": "BIGINT"}
+        columns |= {f"{key}.id": "BIGINT" for key in self._found.nodes}
+        columns |= {f"{key}.type": "VARCHAR" for key in self._found.edges}
+        for leaf, name in self._told.items():
+            columns[name] = "BIGINT" if leaf in SPAN else _TYPES[leaf.type]
+        select = Select(['unnest(range("first", "last" + 1)) AS "frame_id"'])
+        select.columns += [quoted(name) for name in list(columns)[2:]]
+        if self._find is not None:
+            find = self._find
+            self.gathered = (
+                Gathered(GATHERED, columns, lambda window: self._columns(find(window))),
+            )
+            select.join(quoted(GATHERED), [])
+            return select.text()
+        told = zip(self._columns(self._found), columns.items(), strict=True)
         parts = [
-            f"unnest(CAST({add(rows)} AS {kind}[])) AS {quoted(n)}" for n, kind, rows in columns
+            f"unnest(CAST({self.values.add(rows)} AS {kind}[])) AS {quoted(name)}"
+            for rows, (name, kind) in told
         ]
-        kept = [quoted(name) for name, *_ in columns[2:]]
-        select = Select(['unnest(range("first", "last" + 1)) AS "frame_id"', *kept])
         select.join(nested("SELECT " + ",\n  ".join(parts), ":runs"), [])
         return select.text()
+
+    def _columns(self, found: Found) -> list[list[Any]]:
+        """All that is known of matches, a column after the other, in the order of :meth:`_told_rows`."""
+        keys = self._found.nodes, self._found.edges
+        nodes = [found.nodes[key] for key in keys[0]]
+        return [
+            found.first,
+            found.last,
+            *nodes,
+            *(found.edges[key] for key in keys[1]),
+            *found.values,
+        ]
 
 
 class _Lenient(Select):

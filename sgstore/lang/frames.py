@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sgstore.lang.catalog import Attribute
+    from sgstore.lang.results import Gathered
 
 PATTERN: Final = '":pattern"'
 FRAME: Final = '":frame"'
@@ -56,7 +57,15 @@ MAP: Final = '":map"'
 
 
 class Frames(Masks):
-    """Writes relations of both phases for one query."""
+    """Writes relations of both phases for one query.
+
+    Attributes
+    ----------
+    gathered : tuple of Gathered
+        Tables that they speak of and the store has not.
+    """
+
+    gathered: tuple[Gathered, ...] = ()
 
     def frames(
         self,

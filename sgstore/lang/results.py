@@ -42,7 +42,7 @@ from sgstore.lang.frames import Frames, column_of
 from sgstore.lang.kinds import Profile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.lang.phases import Window
 
@@ -68,12 +68,31 @@ _T: Final = 'CAST({0} - ":trace"."start_ns" AS DOUBLE) / 1e9'
 
 
 @dataclass(frozen=True, slots=True)
+class Gathered:
+    """A table that a statement speaks of and the store has not: what was found otherwise.
+
+    Attributes
+    ----------
+    name : str
+    types : mapping of str to str
+        The type of each column in the database.
+    block : function
+        The columns of what is found in a window of whole traces.
+    """
+
+    name: str
+    types: Mapping[str, str]
+    block: Callable[[Window | None], list[list[Any]]]
+
+
+@dataclass(frozen=True, slots=True)
 class Statement:
-    """SQL with the values that it binds and the names of its columns."""
+    """SQL with the values that it binds, the names of its columns, and tables that are put together first."""
 
     sql: str
     values: tuple[Any, ...]
     columns: tuple[str, ...]
+    gathered: tuple[Gathered, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -500,4 +519,4 @@ def _finished(writer: Frames, text: str, columns: Iterable[str]) -> Statement:
         for head, body in before
     )
     sql = f"WITH {shared}\n{text}" if shared else text
-    return Statement(sql, tuple(writer.values.items), tuple(columns))
+    return Statement(sql, tuple(writer.values.items), tuple(columns), writer.gathered)

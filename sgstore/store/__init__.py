@@ -11,6 +11,7 @@ users' own tables beside the store.
 
 from sgstore.store.file import StoreFile
 from sgstore.store.folder import Folder
+from sgstore.store.given import GivenTable
 from sgstore.store.joining import UserTables
 from sgstore.store.parquet import write_parquet
 from sgstore.store.rows import Batches, Rows
@@ -22,6 +23,7 @@ __all__ = [
     "Batches",
     "Folder",
     "FrameRef",
+    "GivenTable",
     "Rows",
     "Sealed",
     "Segment",

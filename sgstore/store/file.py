@@ -21,6 +21,7 @@ from sgstore.store.access import (
 from sgstore.store.classes import Abstracted
 from sgstore.store.deriving import Deriving
 from sgstore.store.folder import Folder
+from sgstore.store.given import GivenTable, give
 from sgstore.store.packing import plain
 from sgstore.store.payloads import payload_place
 from sgstore.store.publishing import copy_sorted, publish_in, remove
@@ -124,7 +125,9 @@ class StoreFile:
         with self._reading():
             yield
 
-    def rows(self, sql: str, parameters: Parameters | None = None) -> Rows:
+    def rows(
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+    ) -> Rows:
         """All rows of a statement of ours.
 
         Parameters
@@ -133,6 +136,8 @@ class StoreFile:
             Trusted; users' statements go through :meth:`user_sql`.
         parameters : sequence or mapping, optional
             Values of ``?`` or of ``$name``.
+        given : iterable of GivenTable
+            Tables that it speaks of beside those of the store.
 
         Raises
         ------
@@ -140,21 +145,29 @@ class StoreFile:
             The database refuses it.
         """
         with self._reading() as connection:
+            give(connection, given)
             return rows.run(connection, sql, parameters)
 
     def arrays(
-        self, sql: str, parameters: Parameters | None = None
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
     ) -> dict[str, NDArray[np.generic]]:
         """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL."""
         with self._reading() as connection:
+            give(connection, given)
             return rows.arrays(connection, sql, parameters)
 
     @contextmanager
     def batches(
-        self, sql: str, parameters: Parameters | None = None, size: int = BATCH
+        self,
+        sql: str,
+        parameters: Parameters | None = None,
+        size: int = BATCH,
+        *,
+        given: Iterable[GivenTable] = (),
     ) -> Generator[Batches]:
         """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
         with self._reading() as connection:
+            give(connection, given)
             yield Batches(connection.execute(sql, parameters or None), size)
 
     def user_sql(
