@@ -11,7 +11,7 @@ import duckdb
 import networkx as nx
 import numpy as np
 import pytest
-from oracle import answer
+from oracle import answer, returned
 from oracle_worlds import World, random_world
 
 import sgstore
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 PATTERN = "MATCH (e:Ego)-[:near|visible]->(v:Vehicle)"
+EITHER = "MATCH (e:Ego)-[:near|visible]->(v:Entity)"
 
 
 @pytest.fixture(scope="module")
@@ -245,6 +246,28 @@ def test_intervals_of_nothing_but_frames_ignore_who_it_is(store: Store, world: W
     found = {(row[0], row[1], row[2]) for row in store.find(f"{PATTERN} RETURN INTERVALS")}
 
     assert found == runs({(frame, ()) for frame in frames}, world)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pytest.param("v.name", id="a name"),
+        pytest.param("v.kind", id="what many have"),
+        pytest.param("v.name, v.kind", id="a name and what it is made of"),
+        pytest.param("v.id, e.name", id="an id and another's name"),
+        pytest.param("v.speed > 3", id="a condition"),
+        pytest.param("v.kind, 7, v.x > e.x, v.name", id="some of each"),
+    ],
+)
+def test_intervals_last_as_long_as_what_is_returned_stays_the_same(
+    values: str, store: Store, world: World
+) -> None:
+    rows = returned(f"{EITHER} RETURN frame.id, {values}", world)
+
+    found = {(r[0], *r[8:], r[1], r[2]) for r in store.find(f"{EITHER} RETURN {values}, INTERVALS")}
+
+    assert found == runs({(row[0], row[1:]) for row in rows}, world)
+    assert len(found) > 5
 
 
 def test_an_interval_says_its_length(store: Store, world: World) -> None:
