@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import sgstore
+from sgstore.cli import run
 from sgstore.coverage import Chosen, classed
 from sgstore.errors import ConfigError
 from sgstore.ingest import ingest
@@ -286,6 +289,25 @@ def test_a_lock_has_each_clip_as_a_case_and_what_they_share_once(
     assert list(verify(read, store, payloads=False)) == []
     assert union(read, read).cases == intersect(read, read).cases == read.cases
     assert read.selection["stride_s"] == 0.3
+
+
+def test_each_case_of_a_lock_is_exported_as_a_clip_of_its_own(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL", stride_s=0.3))
+    lock = locked_selection(found, payloads=False)
+    lock.write(tmp_path / "some.lock")
+    asked = ["export", str(store.file.path), "--lock", str(tmp_path / "some.lock")]
+
+    code = run([*asked, "--to", str(tmp_path / "out"), "--format", "parquet", "--json"])
+    frames = pq.read_table(tmp_path / "out" / "frames.parquet").to_pylist()
+    of_clips = Counter(row["clip"] for row in frames)
+
+    assert code == 0
+    assert sorted(of_clips.values()) == sorted(case.frames for case in lock.cases)
+    assert {row["frame_id"] for row in frames} == frames_of(found)
+    assert run([*asked, "MATCH (e:Ego)", "--to", str(tmp_path / "more")]) == 2
+    assert "give one of" in capsys.readouterr().err
 
 
 def test_parts_count_frames_once_and_share_no_recording(store: Store) -> None:

@@ -53,6 +53,12 @@ Frames = Annotated[
     Path | None,
     typer.Option("--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."),
 ]
+LockFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
+    ),
+]
 Form = Annotated[
     str, typer.Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package.")
 ]
@@ -92,6 +98,7 @@ def export(
     name: PatternName = None,
     parameters: Parameters = None,
     frames: Frames = None,
+    lock: LockFile = None,
     form: Form = "mcap",
     before: Before = BEFORE_AFTER,
     after: After = BEFORE_AFTER,
@@ -118,10 +125,12 @@ def export(
     opened = open_store(store)
     values = parameters_of(parameters)
     margins = seconds_of(before, "--before"), seconds_of(after, "--after")
-    if frames is not None and (query or file or name):
-        raise typer.BadParameter("give a QUERY or --frames, not both")
-    text, held = ("", {}) if frames is not None else asked_of(query, file, name, values)
-    clips = _clips(opened, frames, text, held, margins)
+    if sum((frames is not None, lock is not None, bool(query or file or name))) > 1:
+        raise typer.BadParameter("give one of: a QUERY, --frames, --lock")
+    text, held = "", {}
+    if frames is None and lock is None:
+        text, held = asked_of(query, file, name, values)
+    clips = _clips(opened, (frames, lock), text, held, margins)
     if not clips:
         say("nothing matches: nothing to export")
         return 0
@@ -133,7 +142,7 @@ def export(
             with_graph=with_graph,
             channels=tuple(channels or ()),
             clouds=clouds.value,
-            provenance={"query": text} if text else {},
+            provenance=({"query": text} if text else {"lock": lock.name} if lock else {}),
             progress=progress,
         )
         written = write_export(labelled(order, texts, **values), to, form)
@@ -151,12 +160,18 @@ def export(
 
 def _clips(
     store: Store,
-    frames: Path | None,
+    named: tuple[Path | None, Path | None],
     text: str,
     parameters: Mapping[str, Any],
     margins: tuple[float, float],
 ) -> list[Clip]:
-    """The clips around what a query finds, or around frames that are named."""
+    """The clips around what a query finds or frames that are named; or the cases of a lock, as they are."""
+    frames, lock = named
+    if lock is not None:
+        from sgstore.locks import cases_of
+        from sgstore.world import Clip
+
+        return [Clip(*case[:3]) for case in cases_of(lock, store)]
     if frames is not None:
         from sgstore.exporters.stored import around_frames
 

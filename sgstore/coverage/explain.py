@@ -12,7 +12,7 @@ import numpy as np
 
 from sgstore.coverage.asking import query_of_features
 from sgstore.coverage.classed import shared
-from sgstore.coverage.features import features
+from sgstore.coverage.features import features, over, weighted
 from sgstore.coverage.tables import Table, of_unknown
 
 if TYPE_CHECKING:
@@ -122,9 +122,14 @@ def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tupl
         return None
     before = _impurity(np.array([positive]), np.array([total]))[0]
     best: tuple[float, int, int] = (1e-9 * total, -1, 0)
+    most = counts.max(axis=0, initial=0)
     for more_than in _THRESHOLDS:
-        yes = (counts > more_than).astype(np.float64)
-        all_yes, good_yes = weight @ yes, good @ yes
+        columns = np.flatnonzero(most > more_than)
+        if not len(columns):
+            break
+        all_yes, good_yes = np.zeros((2, counts.shape[1]))
+        own = counts if len(columns) == counts.shape[1] else counts[:, columns]
+        all_yes[columns], good_yes[columns] = weighted(own, np.stack([weight, good]), more_than)
         gain = (
             before - _impurity(good_yes, all_yes) - _impurity(positive - good_yes, total - all_yes)
         )
@@ -172,13 +177,14 @@ def explain(
     """
     a, twice = _without(a, b)
     _, (b, a) = shared(b, a)
-    names = tuple(sorted({*features(b, abstraction).names, *features(a, abstraction).names}))
-    of_b, of_a = features(b, abstraction, names), features(a, abstraction, names)
+    of_b, of_a = features(b, abstraction), features(a, abstraction)
+    names = tuple(sorted({*of_b.names, *of_a.names}))
+    of_b, of_a = over(of_b, names), over(of_a, names)
     weights = [
         of.frames.astype(np.float64) if by_frame else np.ones(len(of.codes)) for of in (of_b, of_a)
     ]
     shares = [
-        weight @ of.there / max(float(weight.sum()), 1e-12)
+        weighted(of.counts, weight[None])[0] / max(float(weight.sum()), 1e-12)
         for weight, of in zip(weights, (of_b, of_a), strict=True)
     ]
     order = np.argsort(-np.abs(shares[0] - shares[1]), kind="stable")

@@ -6,7 +6,7 @@ Equal classes have equal features, so one frame of each class is looked at, howe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from math import comb
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.coverage.classed import Classed
-    from sgstore.world import Bools, Ints
+    from sgstore.world import Bools, Floats, Ints
 
 Feature = tuple[str, ...]
 """Labels of an edge's source, of itself and of its destination; or of a node, in abstractions without edges."""
@@ -30,7 +30,8 @@ Feature = tuple[str, ...]
 MOST: Final = 5_000_000
 """Most combinations that are gone through: more are an error, not a part of the answer."""
 
-_NONE: Final = np.zeros(0, np.int64)
+LARGEST: Final = 4_000_000_000
+"""Most bytes that features of classes may take."""
 
 _ROWS: Final = 8_192
 """Classes that are multiplied at once."""
@@ -63,36 +64,63 @@ class Features:
         return self.counts > 0
 
 
-def features(a: Classed, abstraction: str, names: Sequence[Feature] | None = None) -> Features:
+def features(a: Classed, abstraction: str) -> Features:
     """The features of the classes of a selection; ``a`` has classes of this very abstraction.
 
-    Parameters
-    ----------
-    a : Classed
-    abstraction : str
-    names : sequence of Feature, optional
-        Those that are asked for; by default all that occur.
+    Raises
+    ------
+    ConfigError
+        There are more than can be held.
     """
     codes, first = a.present(), a.first()
     order = np.argsort(first[codes], kind="stable")
     number: dict[Feature, int] = {}
-    parts: list[tuple[Ints, Ints, Ints]] = [(_NONE, _NONE, _NONE)]
-    done = 0
-    for some in a.chosen.store.file.abstracted.features(abstraction, first[codes[order]]):
+    parts: list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
+    read = a.chosen.store.file.abstracted.features(abstraction, first[codes[order]])
+    for row, some in read:
         own = np.array([number.setdefault(name, len(number)) for name in some.names] or [0])
-        parts.append((order[done + some.frame], own[some.feature], some.often))
-        done += some.frames
-    rows, columns, often = (np.concatenate(part) for part in zip(*parts, strict=True))
+        rows, columns = order[row[some.frame]].astype(np.int32), own[some.feature].astype(np.int32)
+        parts.append((rows, columns, some.often.astype(np.int32)))
     edges = any(len(name) == 3 for name in number)
     known = {name for name in number if len(name) == 3 or not edges}
-    names = tuple(sorted(known) if names is None else names)
+    names = tuple(sorted(known))
     place = {name: i for i, name in enumerate(names)}
-    at = np.array([place.get(name, -1) if name in known else -1 for name in number] or [-1])
-    counts = np.zeros((len(codes), len(names)), np.min_scalar_type(int(often.max(initial=0))))
-    column = at[columns]
-    kept = np.flatnonzero(column >= 0)
-    counts[rows[kept], column[kept]] = often[kept]
+    at = np.array([place.get(name, -1) for name in number] or [-1])
+    most = max((int(often.max(initial=0)) for *_, often in parts), default=0)
+    counts = zeros((len(codes), len(names)), np.min_scalar_type(most))
+    for rows, columns, often in parts:
+        column = at[columns]
+        kept = np.flatnonzero(column >= 0)
+        counts[rows[kept], column[kept]] = often[kept]
     return Features(names, codes, counts, a.sizes()[codes])
+
+
+def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedinteger[Any]]:
+    """Room for features of classes.
+
+    Raises
+    ------
+    ConfigError
+        There is too little.
+    """
+    if shape[0] * shape[1] * kind.itemsize > LARGEST:
+        raise ConfigError(
+            f"{shape[1]:,} features in {shape[0]:,} classes; at most {LARGEST:,} numbers are held at once: ask"
+            " of fewer frames, or for an abstraction with fewer labels"
+        )
+    return np.zeros(shape, kind)
+
+
+def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
+    """(K, F): the weights, (K, C), of the classes that have each feature more often than so, together."""
+    total = np.zeros((len(weights), counts.shape[1]))
+    # Whole numbers are exact in 32 bits below 2²⁴.
+    small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
+    kind = np.float32 if small else np.float64
+    for first in range(0, len(counts), _ROWS):
+        there = (counts[first : first + _ROWS] > more_than).astype(kind)
+        total += weights[:, first : first + _ROWS].astype(kind) @ there
+    return total
 
 
 @dataclass(frozen=True)
@@ -116,8 +144,8 @@ class Combinations:
 
     def texts(self, rows: Sequence[int] | Ints) -> list[str]:
         """Combinations for people."""
-        names = self.features.names
-        return [" & ".join(" ".join(names[i]) for i in self.members[row].tolist()) for row in rows]
+        names = [" ".join(name) for name in self.features.names]
+        return [" & ".join(names[i] for i in one) for one in self.members[rows].tolist()]
 
 
 def combined(found: Features, k: int) -> Combinations:
@@ -134,7 +162,8 @@ def combined(found: Features, k: int) -> Combinations:
             f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
             " ask for a smaller k, or for an abstraction with fewer labels"
         )
-    members = np.array(list(combinations(range(many), k)), np.int64).reshape(-1, k)
+    listed = chain.from_iterable(combinations(range(many), k))
+    members = np.fromiter(listed, np.int64, comb(many, k) * k).reshape(-1, k)
     if k == 2:
         frames = _together(found)[members[:, 0], members[:, 1]]
     else:
@@ -158,18 +187,30 @@ class Combos:
     Attributes
     ----------
     shares : Table
-    missing : Table
-        ``combination``, ``frames_in_reference`` (``None`` without one), and the ``query`` that would find it.
     found : Combinations
         Of the selection, over the features of both.
+    gaps : int64
+        Those of all combinations that are missing, the most frequent in the reference first.
     reference : Features or None
         Of the reference, over the features of both.
+    there : int64 or None
+        In how many frames of the reference each combination occurs.
     """
 
     shares: Table
-    missing: Table
     found: Combinations
+    gaps: Ints
     reference: Features | None
+    there: Ints | None
+
+    @property
+    def missing(self) -> Table:
+        """``combination``, ``frames_in_reference`` (``None`` without one), ``query``: what would find it."""
+        names, members = self.found.features.names, self.found.members[self.gaps]
+        often = [None] * len(members) if self.there is None else self.there[self.gaps].tolist()
+        queries = [query_of_features([names[i] for i in one]) for one in members.tolist()]
+        rows = zip(self.found.texts(self.gaps), often, queries, strict=True)
+        return Table(("combination", "frames_in_reference", "query"), list(rows))
 
     def covered(self) -> Table:
         """The combinations that occur, the most frequent first: ``combination``, ``frames``."""
@@ -219,8 +260,8 @@ def combos(
     names = tuple(sorted({*own.names, *(other.names if other else ())}))
     if of_ego:
         names = tuple(name for name in names if is_of_ego(name))
-    other = None if other is None else _over(other, names)
-    found = combined(_over(own, names), k)
+    other = None if other is None else over(other, names)
+    found = combined(over(own, names), k)
     name, kinds = (
         a.chosen.text,
         f"combinations of {k} of the {len(names)} features{' of the ego' if of_ego else ''}",
@@ -242,22 +283,13 @@ def combos(
     gaps = np.flatnonzero(wanted & (found.frames == 0))
     if there is not None:
         gaps = gaps[np.argsort(-there[gaps], kind="stable")]
-    rows = [
-        (
-            text,
-            None if there is None else int(there[row]),
-            query_of_features([names[i] for i in found.members[row].tolist()]),
-        )
-        for row, text in zip(gaps.tolist(), found.texts(gaps), strict=True)
-    ]
-    missing = Table(("combination", "frames_in_reference", "query"), rows)
-    return Combos(shares, missing, found, other)
+    return Combos(shares, found, gaps, other, there)
 
 
-def _over(own: Features, names: tuple[Feature, ...]) -> Features:
+def over(own: Features, names: tuple[Feature, ...]) -> Features:
     """The same over other features."""
     place = {name: i for i, name in enumerate(names)}
-    counts = np.zeros((len(own.codes), len(names)), own.counts.dtype)
+    counts = zeros((len(own.codes), len(names)), own.counts.dtype)
     for column, name in enumerate(own.names):
         if name in place:
             counts[:, place[name]] = own.counts[:, column]
@@ -267,7 +299,8 @@ def _over(own: Features, names: tuple[Feature, ...]) -> Features:
 def _together(found: Features) -> Ints:
     """(F, F): frames in which two features occur."""
     total = np.zeros((len(found.names), len(found.names)))
+    kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # whole numbers, exact
     for first in range(0, len(found.codes), _ROWS):
-        there = found.there[first : first + _ROWS].astype(np.float64)
-        total += (there * found.frames[first : first + _ROWS, None]).T @ there
+        there = (found.counts[first : first + _ROWS] > 0).astype(kind)
+        total += (there * found.frames[first : first + _ROWS, None].astype(kind)).T @ there
     return total.astype(np.int64)

@@ -17,7 +17,6 @@ from sgstore.store.covering import (
     Triples,
     coded_classes,
     imported_names,
-    seen_of,
     times,
     triples,
 )
@@ -235,14 +234,20 @@ class Abstracted:
         with self._access.reading() as connection:
             return imported_names(connection)
 
-    def features(self, name: str, frame_id: Ints) -> Iterator[Triples]:
-        """What the graphs of frames are made of in an abstraction, some frames at a time, in their order.
+    def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
+        """What the graphs of frames are made of in an abstraction, some frames at a time.
 
         Parameters
         ----------
         name : str
         frame_id : int64
             Ascending.
+
+        Yields
+        ------
+        rows : int64
+            Which of the frames these are.
+        triples : Triples
 
         Raises
         ------
@@ -251,8 +256,8 @@ class Abstracted:
         """
         function = abstraction_named(name).function
         with self._access.reading() as connection:
-            for row, seen in seen_of(connection, self._graphs, frame_id):
-                yield triples(function(seen), row)
+            for rows, seen in self._graphs.of_ids(connection, frame_id):
+                yield rows, triples(function(seen))
 
     def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
         """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.

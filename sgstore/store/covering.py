@@ -12,14 +12,10 @@ from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
 
     from duckdb import DuckDBPyConnection
-    from numpy.typing import NDArray
 
     from sgstore.abstractions import Labelled
-    from sgstore.abstractions.columns import Seen
-    from sgstore.store.seen import Graphs
     from sgstore.world import Ints
 
 _CLASSES: Final = """
@@ -37,9 +33,6 @@ SELECT bucket, mask, CASE WHEN class IS NULL THEN -1 ELSE dense_rank() OVER (ORD
 """
 _IMPORTED: Final = "SELECT graph, frame_id FROM imports"
 _TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
-
-WINDOW: Final = 32
-"""Buckets that are read at once: for a few frames of each, a question costs more than its rows."""
 
 SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
 """Bits of a frame's id below those of its trace."""
@@ -114,38 +107,12 @@ def imported_names(connection: DuckDBPyConnection) -> dict[str, int]:
     return dict(connection.execute(_IMPORTED).fetchall())
 
 
-def seen_of(
-    connection: DuckDBPyConnection, graphs: Graphs, frame_id: Ints
-) -> Iterator[tuple[NDArray[np.intp], Seen]]:
-    """The graphs of frames, whose ids ascend, some buckets at a time.
-
-    Yields
-    ------
-    row : intp
-        The frames that are in these buckets, in what was seen.
-    seen : Seen
-        Which may hold frames between them, too.
-    """
-    bucket = frame_id >> FRAME_BITS
-    first = 0
-    while first < len(frame_id):
-        same_trace = trace_of(frame_id[first : first + 1])[0]
-        end = int(np.searchsorted(bucket, bucket[first] + WINDOW))
-        end = min(end, int(np.searchsorted(trace_of(frame_id), same_trace, side="right")))
-        ids = frame_id[first:end]
-        seq, seen = graphs.of_frames(connection, int(ids[0]), int(ids[-1]))
-        yield np.searchsorted(seq, seq_of(ids)), seen
-        first = end
-
-
 @dataclass(frozen=True, slots=True)
 class Triples:
     """What some graphs are made of; one row a frame and feature.
 
     Attributes
     ----------
-    frames : int
-        How many frames these are.
     names : list of tuple of str
         Features: labels of an edge's source, of itself and of its destination; or of a node alone.
     frame : (N,) int64
@@ -156,35 +123,23 @@ class Triples:
         How often it occurs.
     """
 
-    frames: int
     names: list[tuple[str, ...]]
     frame: Ints
     feature: Ints
     often: Ints
 
 
-def triples(graphs: Labelled, rows: NDArray[np.intp]) -> Triples:
-    """How often nodes and edges occur in frames: by label, and by the labels of both ends and their own.
-
-    Parameters
-    ----------
-    graphs : Labelled
-    rows : intp
-        Frames, ascending.
-    """
-    place = np.full(graphs.frames, -1)
-    place[rows] = np.arange(len(rows))
+def triples(graphs: Labelled) -> Triples:
+    """How often nodes and edges occur in frames: by label, and by the labels of both ends and their own."""
     size = len(graphs.labels)
-    node = np.flatnonzero(place[graphs.node_frame] >= 0)
-    of_node = place[graphs.node_frame[node]], graphs.node_label[node].astype(np.int64)
-    edge = np.flatnonzero(place[graphs.frame] >= 0)
+    of_node = graphs.node_frame.astype(np.int64), graphs.node_label.astype(np.int64)
     ends = [
-        graphs.node_label[found(graphs.node_frame, graphs.node, graphs.frame[edge], end[edge])]
+        graphs.node_label[found(graphs.node_frame, graphs.node, graphs.frame, end)]
         for end in (graphs.src, graphs.dst)
     ]
-    edge, label, one = _single(graphs, edge)
-    src, dst = (end.astype(np.int64)[one] for end in ends)
-    of_edge = place[graphs.frame[edge]], (src * size + label) * size + dst
+    edge, label = _single(graphs)
+    src, dst = (end.astype(np.int64)[edge] for end in ends)
+    of_edge = graphs.frame[edge].astype(np.int64), (src * size + label) * size + dst
     frame, key, often = _counted(of_node)
     edge_frame, edge_key, edge_often = _counted(of_edge)
     nodes, feature = np.unique(key, return_inverse=True)
@@ -194,7 +149,6 @@ def triples(graphs: Labelled, rows: NDArray[np.intp]) -> Triples:
         rest, last = divmod(code, size)
         names.append(tuple(graphs.labels[part] for part in (*divmod(rest, size), last)))
     return Triples(
-        len(rows),
         names,
         np.concatenate([frame, edge_frame]),
         np.concatenate([feature, len(nodes) + edge_feature]),
@@ -202,22 +156,22 @@ def triples(graphs: Labelled, rows: NDArray[np.intp]) -> Triples:
     )
 
 
-def _single(graphs: Labelled, edge: NDArray[np.intp]) -> tuple[NDArray[np.intp], Ints, Ints]:
-    """Edges with several labels as several: the edge, its label, and which of those that were given it is."""
+def _single(graphs: Labelled) -> tuple[Ints, Ints]:
+    """Edges with several labels as several: the edge, and its label."""
     bundles = [np.array(one, np.int64) for one in graphs.bundles]
-    label = graphs.label[edge].astype(np.int64)
-    many = np.ones(len(edge), np.int64)
+    label = graphs.label.astype(np.int64)
+    many = np.ones(len(label), np.int64)
     several = np.flatnonzero(label < 0)
     lengths = np.array([len(one) for one in bundles] or [0])
     many[several] = lengths[-1 - label[several]]
-    one = np.repeat(np.arange(len(edge)), many)
+    edge = np.repeat(np.arange(len(label)), many)
     flat = np.concatenate([*bundles, np.zeros(0, np.int64)])
     starts = np.cumsum(lengths) - lengths
-    within = np.arange(len(one)) - np.repeat(np.cumsum(many) - many, many)
-    given = label[one]
+    within = np.arange(len(edge)) - np.repeat(np.cumsum(many) - many, many)
+    given = label[edge]
     bundled = given < 0
     given[bundled] = flat[starts[-1 - given[bundled]] + within[bundled]]
-    return edge[one], given, one
+    return edge, given
 
 
 def _counted(of: tuple[Ints, Ints]) -> tuple[Ints, Ints, Ints]:
