@@ -98,6 +98,32 @@ def test_threads_take_up_what_is_compressed_and_the_messages_are_the_same(
     )
 
 
+@pytest.mark.parametrize("cut", [0.5, 0.99, 1.0])
+def test_a_file_without_summary_has_threads_too(
+    cut: float,
+    tmp_path: Path,
+    begun: dict[int, list[str]],
+    in_turn: Callable[[Path], Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = drive(tmp_path / "a.mcap", 60, chunk_size=2000)
+    places, content = offsets_of(path), path.read_bytes()
+    stop = int(cut * content.rindex(bytes([0x0F]) + (4).to_bytes(8, "little")))  # the end of data
+    path.write_bytes(content[:stop])
+
+    messages, report = told(path)
+
+    assert (messages, report) == in_turn(path)
+    assert any("not closed" in words for words in report.warnings)
+    there = [place for place in places if place < stop]
+    assert sorted(begun) == there[: len(begun)]
+    assert len(begun) >= len(there) - 1 > 5  # the last one may be cut
+    monkeypatch.setattr(ahead, "BETWEEN", 0)
+    begun.clear()
+    assert (messages, report) == told(path)
+    assert not begun  # message indexes stand between
+
+
 def test_what_hardly_becomes_larger_waits_for_its_turn(
     tmp_path: Path, begun: dict[int, list[str]], in_turn: Callable[[Path], Any]
 ) -> None:

@@ -15,12 +15,15 @@ from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from mcap.opcode import Opcode
+
 from sgstore.errors import TraceError
 from sgstore.traces.buffers import Buffers
-from sgstore.traces.chunks import read_chunk_head, read_records, read_stored, records_of
+from sgstore.traces.chunks import HEAD, read_chunk_head, read_records, read_stored, records_of
+from sgstore.traces.summary import MAGIC
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable
+    from collections.abc import Container, Iterable, Iterator
     from concurrent.futures import Future
     from io import BufferedReader
 
@@ -39,10 +42,30 @@ WORTH: Final = 0.9
 """A chunk waits for its turn that is stored in more than this share of its size: pictures in JPEG."""
 LEAST: Final = 64 << 10
 """What a chunk counts however small it is; bytes."""
+BETWEEN: Final = 1000
+"""Records between two chunks: message indexes, one for each channel, are usual."""
 _TRIED: Final = 256  # places of a batch: there need not be a chunk
 
 Found = dict[int, "tuple[ChunkHead, Records | TraceError]"]
 """Byte offset of a chunk → its head, and its records or what is wrong with it."""
+
+
+def chunks_in(file: BufferedReader) -> Iterator[int]:
+    """Byte offsets of the chunks of a file whose summary does not tell, as far as its records lead.
+
+    It ends where a chunk is followed by more than :data:`BETWEEN` records that are none.
+    """
+    position, others = len(MAGIC), 0
+    while others <= BETWEEN:
+        file.seek(position)
+        head = file.read(HEAD.size)
+        if len(head) < HEAD.size:
+            return
+        opcode, length = HEAD.unpack(head)
+        if opcode == Opcode.CHUNK:
+            yield position
+        others = 0 if opcode == Opcode.CHUNK else others + 1
+        position += HEAD.size + length
 
 
 class ReadAhead:

@@ -33,7 +33,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema
 
 from sgstore.errors import TraceError
-from sgstore.traces.ahead import ReadAhead
+from sgstore.traces.ahead import ReadAhead, chunks_in
 from sgstore.traces.chunks import (
     HEAD,
     MAX_CHUNK,
@@ -295,7 +295,8 @@ class McapFile:
         """What begins the chunks of a walk before their turn, where they are many and all wanted."""
         if wanted is not None or self.size <= SMALL:
             return ReadAhead(self._file)
-        offsets = (at for at in self._chunk_starts if not self._spool.has(self.path, at))
+        offsets = self._chunk_starts or chunks_in(self._file)
+        offsets = (at for at in offsets if not self._spool.has(self.path, at))
         return ReadAhead(self._file, offsets, self._verified)
 
     # The walk ------------------------------------------------------------------------------------------------
