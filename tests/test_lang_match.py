@@ -49,7 +49,7 @@ def found(text: str, world: World) -> Counter[tuple[Any, ...]]:
     matcher = Matcher(query.bound)
     rows: Counter[tuple[Any, ...]] = Counter()
     for frame in world.frames:
-        if frame.trace.name in query.left_out:
+        if frame.trace.name in query.left_out or query.query.ego not in {None, frame.trace.hero}:
             continue
         for match in matcher.matches(view_of(frame)):
             named = {k: v for k, v in {**match.nodes, **match.edges}.items() if k != "ego"}
