@@ -53,6 +53,7 @@ def in_memory(text: str, world: World) -> Counter[Shape]:
         shape(frame.frame_id, *graph)
         for frame in world.frames
         if frame.trace.name not in compiled.left_out
+        and compiled.query.ego in {None, frame.trace.hero}
         for graph in matcher.graphs(view_of(frame))
     )
 
