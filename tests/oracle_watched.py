@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from sgstore.graph import SceneGraph
     from sgstore.history.checks import Verdict
+    from sgstore.matches import Interval
     from sgstore.monitor import Event
     from sgstore.roads import RoadMap
 
@@ -71,6 +72,8 @@ class Drive:
     name: str
     road_map: RoadMap | None
     graphs: list[SceneGraph] = field(default_factory=list)
+    stored: dict[int, str] = field(default_factory=dict)
+    online: dict[int, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, recording: Path, folder: Path) -> Drive:
@@ -81,7 +84,10 @@ class Drive:
         with opened(str(recording), Config()) as source:
             generator = SceneGraphGenerator(source.road_map, Config())
             graphs = [generator.step(frame) for frame in source.frames]
-            return cls(store, name, source.road_map, graphs)
+        stored = dict(store.sql("SELECT node_id, ident FROM entities").values)
+        nodes = (node for graph in graphs for node in graph.nodes.items())
+        online = {node: about["ident"] for node, about in nodes if "ident" in about}
+        return cls(store, name, source.road_map, graphs, stored, online)
 
     def watched(
         self, text: str, *, sgsm_compat: bool = False
@@ -98,7 +104,11 @@ class Drive:
         """Verdicts watched and stored; how many violations there are."""
         verdicts, events, _ = self.watched(text, sgsm_compat=sgsm_compat)
         wanted = list(self.store.check(text, sgsm_compat=sgsm_compat))
-        assert told(verdicts) == told(wanted), (self.name, text)
+        seen, stored = told(verdicts, self.online), told(wanted, self.stored)
+        assert seen == stored, (
+            self.name,
+            [(a, b) for a, b in zip(seen, stored, strict=True) if a != b],
+        )
         violated = Counter(event.name for event in events if event.kind == "violated")
         alone = {v.check: len(v.violations) for v in wanted if not v.witnesses and v.violated}
         assert {name: violated[name] for name in alone} == alone, (self.name, text)
@@ -117,22 +127,33 @@ class Drive:
             intervals = list(found.intervals())
             whole = {n for one in intervals for n, v in one.values.items() if isinstance(v, int)}
             own = [event for event in events if event.name == name]
-            wanted = Counter((i.start_seq, _nodes(i.values, whole)) for i in intervals)
-            assert wanted == Counter((e.start.seq, _nodes(e.nodes, whole)) for e in own), (
-                self.name,
-                text,
-            )
+            wanted = Counter((i.start_seq, _who(i.values, whole, self.stored)) for i in intervals)
+            seen = Counter((e.start.seq, _who(e.nodes, whole, self.online)) for e in own)
+            assert wanted == seen, (self.name, text)
             assert all(e.start.seq <= e.end.seq <= e.told.seq for e in own), (self.name, text)
             total += len(intervals)
         return total
 
 
-def _nodes(values: Any, names: set[str]) -> tuple[tuple[str, int], ...]:
-    return tuple(sorted((name, value) for name, value in values.items() if name in names))
+def _who(values: Any, names: set[str], idents: dict[int, str]) -> tuple[tuple[str, Any], ...]:
+    """Who is bound to some names, by their own ids: those of nodes are given in another order online."""
+    return tuple(sorted((n, idents.get(v, v)) for n, v in values.items() if n in names))
 
 
-def told(verdicts: Sequence[Verdict]) -> list[tuple[Any, ...]]:
-    return [(v.check, v.verdict, v.violations, v.witnesses) for v in sorted(verdicts, key=_name)]
+def told(verdicts: Sequence[Verdict], idents: dict[int, str]) -> list[tuple[Any, ...]]:
+    found: list[tuple[Any, ...]] = []
+    for verdict in sorted(verdicts, key=_name):
+        who = [
+            (_who(w.nodes, set(w.nodes), idents), w.holds, [_span(one) for one in w.violations])
+            for w in verdict.witnesses
+        ]
+        spans = [_span(one) for one in verdict.violations]
+        found.append((verdict.check, verdict.verdict, spans, sorted(who)))
+    return found
+
+
+def _span(one: Interval) -> tuple[int, int, int, int, int]:
+    return one.start_seq, one.end_seq, one.start_ns, one.end_ns, one.frames
 
 
 def _name(verdict: Verdict) -> str:

@@ -177,9 +177,9 @@ def test_a_limit_looks_at_the_first_windows_only(
     asked: list[Any] = []
     batches = StoreFile.batches
 
-    def counted(self: StoreFile, *args: Any) -> Any:
+    def counted(self: StoreFile, *args: Any, **given: Any) -> Any:
         asked.append(args)
-        return batches(self, *args)
+        return batches(self, *args, **given)
 
     monkeypatch.setattr(StoreFile, "batches", counted)
     store.find(f"{PATTERN} LIMIT 1").rows()

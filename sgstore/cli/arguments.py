@@ -58,6 +58,12 @@ With = Annotated[
     ),
 ]
 RowFormat = Annotated[Format, typer.Option("--format", help="How rows are printed.")]
+SgsmCompat = Annotated[
+    bool,
+    typer.Option(
+        "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Short for --format json.")]
 Output = Annotated[
     Path | None, typer.Option("--output", "-o", help="Write to this file instead of stdout.")

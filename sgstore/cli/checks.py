@@ -13,6 +13,7 @@ from sgstore.cli.arguments import (
     Output,
     Parameters,
     RowFormat,
+    SgsmCompat,
     StorePath,
     app,
     asked_of,
@@ -45,12 +46,7 @@ def check(
         str | None, typer.Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'")
     ] = None,
     parameters: Parameters = None,
-    sgsm_compat: Annotated[
-        bool,
-        typer.Option(
-            "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
-        ),
-    ] = False,
+    sgsm_compat: SgsmCompat = False,
     explain: Annotated[
         bool, typer.Option("--explain", help="Print how the checks are understood, and their SQL.")
     ] = False,

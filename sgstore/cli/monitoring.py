@@ -13,6 +13,7 @@ from sgstore.cli.arguments import (
     NO_MATCH,
     AsJson,
     Parameters,
+    SgsmCompat,
     app,
     asked_of,
     parameters_of,
@@ -52,12 +53,7 @@ def monitor(
     duration: Annotated[
         str | None, typer.Option("--duration", metavar="TIME", help="Simulation time: 60s.")
     ] = None,
-    sgsm_compat: Annotated[
-        bool,
-        typer.Option(
-            "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
-        ),
-    ] = False,
+    sgsm_compat: SgsmCompat = False,
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if a check is violated.")
     ] = False,
