@@ -116,7 +116,8 @@ class _Knowing:
         true = met(right.true, left and left.true, formula.bound, self._table)
         start, end = _asked(formula.bound, self._table)
         # What is behind the bound is known to be nothing when a frame comes that is behind it.
-        false = _chained(right.false, left and left.false, start, end, end, least=False)
+        closed = np.full_like(self._here, self._frames) if end is None else end
+        false = _chained(right.false, left and left.false, start, end, closed, least=False)
         if left is not None and formula.bound.low:
             false = np.minimum(false, -_most(-left.false, self._here, start))
         return Known(true, false)
@@ -129,7 +130,7 @@ class _Knowing:
         right = self._turned(self.of(formula.right))
         near, far = self._table.window(formula.bound, forward=False)
         start = here if near is None else last - np.maximum(near, -1)[::-1]
-        end = np.full_like(here, frames) if far is None else frames - np.maximum(far, 0)[::-1]
+        end = None if far is None else frames - np.maximum(far, 0)[::-1]
         before, never = np.full_like(here, -1), np.full_like(here, frames)
         true = _chained(right.true, left and left.true, start, end, never, least=True)
         false = _chained(right.false, left and left.false, start, end, before, least=False)
@@ -159,16 +160,22 @@ def met(right: Places, left: Places | None, bound: Bound, table: Table) -> Place
     return true if left is None or not bound.low else np.maximum(true, _most(left, here, start))
 
 
-def _asked(bound: Bound, table: Table) -> tuple[Places, Places]:
-    """The first frame that an *until* asks its right side of, and that behind the last one."""
+def _asked(bound: Bound, table: Table) -> tuple[Places, Places | None]:
+    """The first frame that an *until* asks its right side of, and that behind the last one, if there is one."""
     here, frames = table.frames, len(table.times)
     near, far = table.window(bound, forward=True)
     start = here if near is None else np.minimum(near, frames)
-    return start, np.full_like(here, frames) if far is None else np.minimum(far + 1, frames)
+    return start, None if far is None else np.minimum(far + 1, frames)
 
 
 def _chained(
-    right: Places, left: Places | None, start: Places, end: Places, last: Places, *, least: bool
+    right: Places,
+    left: Places | None,
+    start: Places,
+    end: Places | None,
+    last: Places,
+    *,
+    least: bool,
 ) -> Places:
     """The chain max(right, min(left, …)) over places from ``start`` to before ``end``, ``last`` behind them.
 
@@ -177,6 +184,7 @@ def _chained(
     right, left, last : (F,) int
         Without ``left`` only the greatest.
     start, end : (F,) int
+        Without ``end`` up to the last place.
     least : bool
         Whether least and greatest change places.
     """
@@ -185,6 +193,8 @@ def _chained(
         return -_chained(-right, other, start, end, -last, least=False)
     if left is None:
         return np.maximum(_most(right, start, end), last)
+    if end is None:
+        end = np.full_like(start, len(right))
     low, high = right.copy(), np.maximum(right, left)
     found_low = np.full_like(right, np.iinfo(right.dtype).min)
     found_high = np.full_like(right, np.iinfo(right.dtype).max)
@@ -204,9 +214,12 @@ def _chained(
     return np.maximum(found_low, np.minimum(found_high, last))
 
 
-def _most(values: Places, start: Places, end: Places) -> Places:
+def _most(values: Places, start: Places, end: Places | None) -> Places:
     """The greatest value from ``start`` to before ``end``; the least number there is, where that is nothing."""
     nothing = np.iinfo(values.dtype).min
+    if end is None:
+        onward = np.append(np.maximum.accumulate(values[::-1])[::-1], nothing)
+        return onward.astype(values.dtype)[start]
     length = np.maximum(end - start, 0)
     most, size, longest = values.copy(), 1, int(length.max(initial=0))
     found = np.full(len(start), nothing, values.dtype)
