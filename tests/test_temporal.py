@@ -16,6 +16,7 @@ from oracle_temporal import try_formulas
 from sgstore.errors import QueryError
 from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
 from sgstore.temporal.formulas import And, Next, Not, eventually
+from sgstore.temporal.verdicts import PRESUMABLY_TRUE, Settled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -221,3 +222,15 @@ def test_verdicts_that_sgsm_published_are_met_by_columns(data: Path) -> None:
         verdicts += len(told)
 
     assert verdicts == (336_911 if every == 1 else 37_050)
+
+
+@pytest.mark.data
+def test_every_verdict_that_sgsm_published_is_a_status(data: Path) -> None:
+    verdicts = 0
+    for system, name, columns, published_verdicts in published(data):
+        times = np.arange(len(published_verdicts))
+        statuses = Settled(property_named(name), columns, times).statuses()
+        assert np.array_equal(statuses >= PRESUMABLY_TRUE, published_verdicts), (system, name)
+        verdicts += len(statuses)
+
+    assert verdicts == 336_911
