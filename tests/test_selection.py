@@ -98,7 +98,7 @@ def test_the_bound_is_that_of_the_linear_programme_where_that_is_known() -> None
     # Each two of three sets share an element: two are needed, the relaxation takes a half of each.
     triangle = Family.of(np.array([[0, 0, 1, 1, 2, 2], [0, 1, 1, 2, 2, 0]]), 3, 3)
 
-    low, _ = bounded(triangle, np.array([0, 1, 2]))
+    low, *_ = bounded(triangle, np.array([0, 1, 2]))
 
     assert low == pytest.approx(1.5, abs=0.01)
     assert minimal(triangle).cost == minimal(triangle).bound == 2

@@ -36,7 +36,7 @@ _WORK: Final = 200_000_000
 ROUNDING: Final = 1e-7
 
 
-def bounded(family: Family, cover: Ints) -> tuple[float, Ints]:
+def bounded(family: Family, cover: Ints) -> tuple[float, Ints, Floats]:
     """A bound from below, and a cover at most as dear as a given one.
 
     Parameters
@@ -49,13 +49,9 @@ def bounded(family: Family, cover: Ints) -> tuple[float, Ints]:
     -------
     low : float
     cover : int64
+    prices : (E,) float64
+        Those of the elements that give the bound.
     """
-    low, best, _ = _priced(family, cover)
-    return low, best
-
-
-def _priced(family: Family, cover: Ints) -> tuple[float, Ints, Floats]:
-    """The same, with the prices that give the bound."""
     set_of, need, cost = family.set_of, family.need, family.cost
     often = np.diff(family.starts)
     share = cost / np.maximum(often, 1)
@@ -124,7 +120,9 @@ def feasible(family: Family, prices: Floats) -> Floats:
     return prices
 
 
-def searched(family: Family, cover: Ints, steps: int, *, whole: bool) -> tuple[Ints, float, int]:
+def searched(
+    family: Family, cover: Ints, prices: Floats, steps: int, *, whole: bool
+) -> tuple[Ints, float, int]:
     """The cheapest cover by branch and bound, or the best one after so many steps.
 
     Parameters
@@ -133,6 +131,8 @@ def searched(family: Family, cover: Ints, steps: int, *, whole: bool) -> tuple[I
         Each element needs one set.
     cover : int64
         One that is known.
+    prices : (E,) float64
+        Of the elements: :func:`bounded`.
     steps : int
     whole : bool
         Whether all costs are whole numbers.
@@ -145,7 +145,6 @@ def searched(family: Family, cover: Ints, steps: int, *, whole: bool) -> tuple[I
     used : int
         Steps that it took.
     """
-    _, cover, prices = _priced(family, cover)
     search = _Search(family, cover, feasible(family, prices), steps, whole=whole)
     ended = search.run()
     return search.best, (search.upper if ended else 0.0), search.used

@@ -30,6 +30,9 @@ STEPS: Final = 60_000
 """Steps of searching, in all parts together; one with many elements counts as several. They are counted, not
 timed, so that the answer is the same everywhere."""
 
+SEARCHED: Final = 1_000_000
+"""Memberships of a part that is searched at most: in larger ones so few steps find nothing."""
+
 ROUNDING: Final = 1e-7
 """How much of a cost is due to rounding."""
 
@@ -78,12 +81,13 @@ def minimal(family: Family, steps: int = STEPS) -> Cover:
         own = greedy(part)
         plain += float(part.cost[own].sum())
         own = thinned(part, own)
-        low, better = bounded(part, own)
+        low, better, prices = bounded(part, own)
         if part.cost[better].sum() < part.cost[own].sum():
             own = better
         low = math.ceil(low - ROUNDING) if whole else low
-        if steps and part.cost[own].sum() > low + ROUNDING and part.need.max() == 1:
-            own, found, used = searched(part, own, steps, whole=whole)
+        small = len(part.members) <= SEARCHED and part.need.max() == 1
+        if steps and small and part.cost[own].sum() > low + ROUNDING:
+            own, found, used = searched(part, own, prices, steps, whole=whole)
             steps -= used
             low = max(low, found)
         chosen.append(sets[own])

@@ -19,6 +19,13 @@ def distinct(values: Ints) -> Ints:
     return values
 
 
+def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
+    """Ranges, and all whole numbers in each of them."""
+    many = end - begin
+    unit = np.repeat(np.arange(len(many)), many)
+    return unit, np.arange(len(unit)) + np.repeat(begin - (np.cumsum(many) - many), many)
+
+
 @dataclass(frozen=True)
 class Family:
     """Sets of elements.

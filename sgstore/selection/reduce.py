@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.selection.family import Family
+from sgstore.selection.family import Family, spread
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sgstore.world import Bools, Ints
 
-_WORK: Final = 60_000_000
-"""Pairs that may be compared, all together: what is found superfluous by then is dropped, the rest stays."""
+_WORK: Final = 100_000_000
+"""Steps of comparing, all together: what is found superfluous by then is dropped, the rest stays."""
 
 _BATCH: Final = 2_000_000
 """Pairs that are compared at once."""
@@ -105,7 +105,7 @@ def _repeated(*keys: Ints) -> Bools:
 def _drop_larger_elements(
     family: Family, need: Ints, alive: Bools, wanted: Bools, most: int
 ) -> int:
-    """Drop elements that are in all sets that another one is in. Returns how many pairs were compared."""
+    """Drop elements that are in all sets that another one is in. Returns how many steps that took."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -119,7 +119,7 @@ def _drop_larger_elements(
 
 
 def _drop_smaller_sets(family: Family, alive: Bools, wanted: Bools, most: int) -> int:
-    """Drop sets that another one holds for no more. Returns how many pairs were compared."""
+    """Drop sets that another one holds for no more. Returns how many steps that took."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -151,25 +151,32 @@ def _contained(
     superfluous : callable
         Things that are contained in others, and these → those of them that are superfluous.
     most : int
-        Pairs to compare.
+        Steps of comparing.
 
     Returns
     -------
     gone : (ones,) bool
     work : int
-        Pairs that were compared.
+        Steps that it took.
     """
     gone, done = np.zeros(ones, np.bool_), np.zeros(ones, np.bool_)
+    # What is rare tells things apart: it is looked at first.
+    common = np.bincount(other, minlength=others)
+    rare = np.empty(others, np.int64)
+    rare[np.argsort(common, kind="stable")] = np.arange(others)
+    other = rare[other]
     work, batch = 0, _BATCH // 16
     while work < most:
         rows = ~gone[one]
-        one, other = one[rows], other[rows]
+        key = np.sort(one[rows] * others + other[rows])
+        one, other = np.divmod(key, others)
         things, pairs = _compared(one, other, (ones, others), done, batch)
         if not len(things):
             break
         done[things] = True
-        work += len(pairs[0])
-        gone[superfluous(*_holding(one, other, (ones, others), pairs))] = True
+        small, large, used = _holding(key, (ones, others), pairs, most - work)
+        work += used
+        gone[superfluous(small, large)] = True
         batch = _BATCH
     return gone, work
 
@@ -179,52 +186,53 @@ def _compared(
 ) -> tuple[Ints, tuple[Ints, Ints]]:
     """Some things that are not done, the smallest first; each with all that may contain it.
 
-    What contains a thing has all that it is made of: also that which the fewest others have.
+    What contains a thing has all that it is made of: also the first of that, which hardly any others have.
     """
     many = np.bincount(one, minlength=sizes[0])
     common = np.bincount(other, minlength=sizes[1])
-    order = np.lexsort((common[other], one))
-    first = order[np.unique(one[order], return_index=True)[1]]
+    first = np.flatnonzero(np.append(True, np.diff(one) != 0)) if len(one) else one
     first = first[~done[one[first]]]
     first = first[np.argsort(many[one[first]], kind="stable")]
     fits = max(int(np.searchsorted(np.cumsum(common[other[first]]), batch)), 1)
     first = first[:fits]
     by_other = np.argsort(other, kind="stable")
     starts = np.searchsorted(other[by_other], np.arange(sizes[1] + 1))
-    low, size = starts[other[first]], common[other[first]]
-    within = np.arange(int(size.sum())) - np.repeat(np.cumsum(size) - size, size)
-    small = np.repeat(one[first], size)
-    large = one[by_other[np.repeat(low, size) + within]]
+    begin = starts[other[first]]
+    which, place = spread(begin, begin + common[other[first]])
+    small, large = one[first][which], one[by_other[place]]
     kept = (many[large] >= many[small]) & (large != small)
     return one[first], (small[kept], large[kept])
 
 
 def _holding(
-    one: Ints, other: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints]
-) -> tuple[Ints, Ints]:
-    """Those pairs whose second thing has all that the first one is made of."""
+    key: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints], most: int
+) -> tuple[Ints, Ints, int]:
+    """Those pairs whose second thing has all that the first one is made of; and how many steps that took.
+
+    Pairs share the first of it already. What was not found out within so many steps is not among them.
+    """
     small, large = pairs
-    key = np.sort(one * sizes[1] + other)
     starts = np.searchsorted(key, np.arange(sizes[0] + 1) * sizes[1])
     # Looked up in a table as long as there is room for one.
     table = np.zeros(sizes[0] * sizes[1] if sizes[0] * sizes[1] <= _TABLE else 0, np.bool_)
     if len(table):
         table[key] = True
-    place = 0
-    while len(small):
-        more = starts[small] + place < starts[small + 1]
-        if not more.any():
-            break
-        part = key[np.minimum(starts[small] + place, len(key) - 1)] % sizes[1]
-        wanted = large * sizes[1] + part
+    held: list[tuple[Ints, Ints]] = [(small[:0], large[:0])]
+    place, work = 1, len(small)
+    while len(small) and work < most:
+        ended = starts[small] + place >= starts[small + 1]
+        held.append((small[ended], large[ended]))
+        small, large = small[~ended], large[~ended]
+        wanted = large * sizes[1] + key[starts[small] + place] % sizes[1]
         if len(table):
-            kept = ~more | table[wanted]
+            kept = table[wanted]
         else:
-            found = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-            kept = ~more | (key[found] == wanted)
+            kept = key[np.minimum(np.searchsorted(key, wanted), len(key) - 1)] == wanted
+        work += len(small)
         small, large = small[kept], large[kept]
         place += 1
-    return small, large
+    found = np.concatenate([np.stack(some) for some in held], axis=1)
+    return found[0], found[1], work
 
 
 def _parts(family: Family, need: Ints, alive: Bools, wanted: Bools) -> list[tuple[Family, Ints]]:

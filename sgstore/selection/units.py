@@ -14,7 +14,7 @@ from sgstore.coverage.asking import is_of_ego
 from sgstore.coverage.classed import GAP, UNKNOWN
 from sgstore.coverage.features import combined, features
 from sgstore.errors import ConfigError
-from sgstore.selection.family import Family, distinct
+from sgstore.selection.family import Family, distinct, spread
 from sgstore.store.contents import lengths_of_messages
 from sgstore.store.covering import seq_of, trace_of
 
@@ -229,13 +229,6 @@ def _mixed(
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return words ^ (words >> np.uint64(31))
-
-
-def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
-    """Ranges, and all whole numbers in each of them."""
-    many = end - begin
-    unit = np.repeat(np.arange(len(many)), many)
-    return unit, np.arange(len(unit)) + np.repeat(begin - (np.cumsum(many) - many), many)
 
 
 def units_of(
