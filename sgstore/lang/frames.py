@@ -283,9 +283,7 @@ class Frames(Masks):
         if Home.state in homes and state is None:
             state = quoted(key)
             on = [f'{state}."frame_id" = {join.frame}']
-            if not scope.kinds(
-                key
-            ).one_a_frame:  # by one column alone a scan is filtered as it reads
+            if not scope.kinds(key).one_a_frame:  # one column filters the scan as it reads
                 on.append(f'{state}."node_id" = {node}')
             on += self._of_kinds(scope, key, state) + self.within(f'{state}."frame_id"', 64)
             alone = profile.places == 1

@@ -349,7 +349,7 @@ class _Intervals:
         select.columns += [
             f'lag({_FRAME}."seq") {over} AS "seq before"',
             f'lag({_FRAME}."time_ns") {over} AS "time before"',
-            f'CAST(floor(coalesce({_TRACE}."period_ns", 0) * {GAP}) AS BIGINT) AS "longest gap"',
+            f'coalesce({_TRACE}."period_ns", 0) * CAST({GAP} AS DOUBLE) AS "longest gap"',
         ]
         _from_frames(select, inner.text())
         return select.text()
@@ -386,10 +386,15 @@ class _Intervals:
         """Runs of frames, numbered for each key, and then each as one row."""
         apart = '"time_ns" - "time before"'
         follows = f'"seq" = "seq before" + 1 AND {apart} >= 0 AND {apart} <= "longest gap"'
+        held = ["frame_id", "trace_id", "seq", "time_ns", "log_time_ns"]
+        begun = Select(
+            [*map(quoted, held), *keys, f'CASE WHEN NOT ({follows}) THEN 1 END AS "begins"']
+        )
+        begun.join(nested(steps, ":steps"), [])
         same = ", ".join(['"trace_id"', *self.apart])
         over = f'OVER (PARTITION BY {same} ORDER BY "seq" ROWS UNBOUNDED PRECEDING)'
-        numbered = Select(["*", f'sum(CASE WHEN {follows} THEN 0 ELSE 1 END) {over} AS "run"'])
-        numbered.join(nested(steps, ":steps"), [])
+        numbered = Select(["*", f'count("begins") {over} AS "run"'])
+        numbered.join(nested(begun.text(), ":begun"), [])
         ends = [("seq", "seq"), ("time_ns", "time"), ("log_time_ns", "log")]
         select = Select(['"trace_id"', *keys, 'min("frame_id") AS "first"', 'count(*) AS "frames"'])
         select.columns += [
