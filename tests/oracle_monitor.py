@@ -26,9 +26,12 @@ def told(seed: int) -> tuple[Spans, Spans, str] | None:
     with_reset = rng.random() < 0.7
     if with_reset and looks_ahead(reset):
         return None
-    frames = rng.randint(1, 14)
-    times = np.cumsum([rng.randint(1, 25) for _ in range(frames)])
-    columns = {name: np.array([rng.random() < 0.5 for _ in range(frames)]) for name in NAMES}
+    frames, held = rng.randint(1, 24), rng.choice((1, 1, 4, 8))
+    times = np.cumsum([rng.randint(1, rng.choice((6, 25))) for _ in range(frames)])
+    columns = {
+        name: np.repeat([rng.random() < 0.5 for _ in range(frames)], held)[:frames]
+        for name in NAMES
+    }
     resets = evaluate(reset, columns, times) if with_reset else None
     wanted = Settled(formula, columns, times).violations(resets)
     automaton = Automaton(formula, None if resets is None else reset, (), BITS)

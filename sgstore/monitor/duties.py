@@ -10,12 +10,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from weakref import WeakValueDictionary
 
-from sgstore.temporal.formulas import TRUE, And, Formula, propositions
+from sgstore.temporal.formulas import TRUE, And, Formula, Since, propositions
 from sgstore.temporal.progression import Frame, Past, Progression, Term, Tick, least
 from sgstore.temporal.verdicts import always_true, bounded
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+NEVER: Final = 1 << 62
+"""Later than any frame."""
 
 REMEMBERED: Final = 100_000
 """Steps that are remembered before they are begun anew."""
@@ -38,18 +41,28 @@ class State:
         Whether no time is kept in it.
     following : dict of int to Step
         What is remembered of steps, by letter.
+    staying : dict of int to (int, int, int)
+        Of letters that change nothing: the guards that are true, and the last time (ns) and number of a frame
+        of which that is known.
     """
 
-    __slots__ = ("__weakref__", "duties", "following", "past", "timeless", "word")
+    __slots__ = ("__weakref__", "duties", "following", "past", "staying", "timeless", "word")
 
     def __init__(self, word: str, past: Past, duties: Duties) -> None:
         self.word, self.past, self.duties = word, past, duties
-        terms = [term for term, _ in past]
-        for duty in duties:
-            terms += [duty] if isinstance(duty, Term) else duty or ()
-        timed = any(term.timed for term in terms) or any(entries for _, entries in past)
+        timed = any(term.timed for term in self.terms) or any(entries for _, entries in past)
         self.timeless = not timed
         self.following: dict[int, Step] = {}
+        self.staying: dict[int, tuple[int, int, int]] = {}
+
+    @property
+    def terms(self) -> list[Term]:
+        """All that is open."""
+        found = [term for term, _ in self.past]
+        found += [term for _, entries in self.past for *_, term in entries]
+        for duty in self.duties:
+            found += [duty] if isinstance(duty, Term) else duty or ()
+        return found
 
     @property
     def ended(self) -> bool:
@@ -136,13 +149,34 @@ class Automaton:
             What this frame has made of other states already; it is kept by whoever tells frames.
         """
         found = state.following.get(letter) or seen.get((state, letter))
+        if found is None and letter in state.staying:
+            guards, time, number = state.staying[letter]
+            if tick.time <= time and tick.number <= number:
+                return Step(state, started=False, ended=False, guards=guards)
         if found is None:
             found = self._step(state, letter, tick)
+            if found.state is state and not (state.timeless or found.started or found.ended):
+                state.staying[letter] = (found.guards, *self._until(state, tick))
             if state.timeless and found.state.timeless:
                 self._remember(state, letter, found)
             else:
                 seen[state, letter] = found
         return found
+
+    def _until(self, state: State, tick: Tick) -> tuple[int, int]:
+        """Up to which time and number no bound that is open in a state begins or ends."""
+        bounds = [begun for term in state.terms for begun in term.bounds()]
+        for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
+            if isinstance(part, Since):
+                kept = ((n if part.bound.frames else t) for t, n, _ in entries)
+                bounds += [(part.bound, since) for since in kept]
+        last = [NEVER, NEVER]
+        for bound, since in bounds:
+            now = tick.number if bound.frames else tick.time
+            ends = [since + bound.low - 1]
+            ends += [] if bound.high is None else [since + bound.high]
+            last[bound.frames] = min([last[bound.frames], *(end for end in ends if end >= now)])
+        return last[False], last[True]
 
     def _remember(self, state: State, letter: int, step: Step) -> None:
         if self._steps == REMEMBERED:

@@ -18,6 +18,7 @@ from weakref import WeakValueDictionary
 
 from sgstore.temporal.formulas import (
     And,
+    Bound,
     Constant,
     Formula,
     Next,
@@ -32,7 +33,7 @@ from sgstore.temporal.formulas import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
 
 class Term:
@@ -80,6 +81,15 @@ class Term:
             self.sense = -sense if self.word == "not" else sense
             self.shape = self.word, *(o.shape if o.timed else id(o) for o in operands)
             self.begins = tuple(since for operand in operands for since in operand.begins)
+
+    def bounds(self) -> Iterator[tuple[Bound, int]]:
+        """The bounds that have begun in it, and from where each counts."""
+        if self.word == "duty":
+            if self.timed:
+                yield self.operands[0].bound, self.operands[1]
+        elif self.timed:
+            for operand in self.operands:
+                yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
         """Whether it makes another one of its shape true; both of sense 1, or -1."""
