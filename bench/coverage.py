@@ -8,7 +8,8 @@ Two stores are made up, of 800,000 and 200,000 frames: an ego in lanes with up t
 after scene; how often a scene comes falls with its rank as in driving (S3C: a quarter of all images are of one
 class, two thirds of the classes come once). ``--quick`` takes a fiftieth. The baseline is S3C's way: each
 graph is held against the representatives of all classes with as many nodes, edges and labels, by VF2, here
-networkx's. ``SGSTORE_BENCH_COVERAGE=FOLDER`` keeps the stores, and takes them if they are there.
+networkx's. ``SGSTORE_BENCH_COVERAGE=FOLDER`` keeps the stores, and takes them if they are there;
+``SGSTORE_BENCH_STORE=FILE`` takes another store instead, for both.
 """
 
 from __future__ import annotations
@@ -26,7 +27,16 @@ from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 from bench.measure import Measure
 from sgstore.abstractions import Classes, Grounds, Seen, abstraction_named
 from sgstore.config import Config
-from sgstore.coverage import classed, classes, covered, growth, novel, selection_of
+from sgstore.coverage import (
+    classed,
+    classes,
+    combos,
+    covered,
+    explain,
+    growth,
+    novel,
+    selection_of,
+)
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, Presence, named_graph
 from sgstore.importing.blocks import parts_map
 from sgstore.store import StoreFile
@@ -230,6 +240,9 @@ def run(quick: bool = False) -> list[Measure]:
         road_map = parts_map("bench", '{"format": "bench"}', PARTS)
         wanted = {one: folder / f"{one}{'-quick' if quick else ''}.sgstore" for one in FRAMES}
         library = Library(np.random.default_rng(0), road_map)
+        given = os.environ.get("SGSTORE_BENCH_STORE")
+        if given:
+            wanted = dict.fromkeys(FRAMES, Path(given))
         if not all(path.exists() for path in wanted.values()):
             for seed, (one, path) in enumerate(wanted.items(), start=1):
                 frames = FRAMES[one] // (50 if quick else 1)
@@ -271,6 +284,10 @@ def _asked(a: str, b: str) -> list[Measure]:
     measures.append(Measure("    of which reading A's classes, once", reading, "s"))
     growing = best(2, lambda: growth(one))[0]
     measures.append(Measure("growth of A, once its classes are read", growing, "s"))
+    pairs = best(1, lambda: combos(one, "RSV", 2))[0]
+    measures.append(Measure("pairs of features of A", pairs, "s", "wanted: 30 s"))
+    telling = best(1, lambda: explain(other, one, "RSV", by_frame=True))[0]
+    measures.append(Measure("what tells B from A", telling, "s", "wanted: 30 s"))
     return measures
 
 
