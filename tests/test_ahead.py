@@ -19,7 +19,7 @@ from recordings import drive
 
 from sgstore.errors import TraceError
 from sgstore.traces import ahead, chunks, mcap_file, open_trace
-from sgstore.traces.buffers import MOST, Buffers
+from sgstore.traces.buffers import MANY, MOST, Buffers
 from sgstore.traces.mcap_file import McapFile
 from sgstore.world import TraceReport
 
@@ -336,6 +336,10 @@ def test_memory_is_used_again_and_not_hoarded() -> None:
     assert buffers.kept <= MOST
     buffers.clear()
     assert buffers.kept == 0
+
+    many = [buffers.take(size) for size in (*[0] * 1000, *[1] * 1000)]
+    assert all(many[i].nbytes == (i >= 1000) for i in range(2000))
+    assert len(buffers._kept) <= MANY
 
 
 # Checksums ----------------------------------------------------------------------------------------

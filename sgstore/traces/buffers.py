@@ -10,6 +10,8 @@ from typing import Final
 
 MOST: Final = 48 << 20
 """Memory that is kept to be used again; bytes."""
+MANY: Final = 128
+"""Pieces of it."""
 
 
 class Buffers:
@@ -20,6 +22,8 @@ class Buffers:
 
     def take(self, size: int) -> memoryview:
         """Memory of ``size`` bytes, whatever is in it; until the last view of it is gone, nobody else's."""
+        if not size:
+            return memoryview(bytearray())
         for buffer in self._kept:
             if len(buffer) >= size and _is_free(buffer):
                 return memoryview(buffer)[:size]
@@ -28,7 +32,7 @@ class Buffers:
             1 << max(size.bit_length() - 3, 0), 4096
         )  # chunks of a file differ a little in size
         buffer = bytearray(-(-size // grain) * grain)
-        if self.kept + len(buffer) <= MOST:
+        if len(self._kept) < MANY and self.kept + len(buffer) <= MOST:
             self._kept.append(buffer)
         return memoryview(buffer)[:size]
 
@@ -44,8 +48,6 @@ class Buffers:
 
 def _is_free(buffer: bytearray) -> bool:
     """Whether there is no view of it: only then can its size be changed."""
-    if not buffer:
-        return False
     try:
         buffer.append(buffer.pop())
     except BufferError:

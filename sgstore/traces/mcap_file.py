@@ -399,9 +399,10 @@ class McapFile:
             self._define(walk, opcode, content, place.offset)
         yield from self._known(walk, messages)
         if walk.keep is not None and head.compression and not definitions:
-            ids = messages.channel.tolist()
-            keep = {number: number in self.channels and walk.keep(number) for number in set(ids)}
-            self._spool.put(self.path, messages, np.array([keep[i] for i in ids], np.bool_))
+            kept = np.bincount(messages.channel) > 0
+            for number in np.flatnonzero(kept).tolist():
+                kept[number] = number in self.channels and walk.keep(number)
+            self._spool.put(self.path, messages, kept[messages.channel])
 
     def _records(
         self, walk: _Walk, head: ChunkHead
