@@ -11,7 +11,7 @@ import pytest
 
 import sgstore
 from sgstore.coverage import Chosen, classed, selection_of
-from sgstore.errors import ConfigError
+from sgstore.errors import ConfigError, QueryError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
 from sgstore.query import Store
@@ -167,6 +167,22 @@ def classes_in(found: Selection) -> set[int]:
     return {code for frame, code in pairs if frame in frames}
 
 
+def test_features_of_frames_on_several_maps_are_those_of_each_frame_alone(store: Store) -> None:
+    def of(frame_id: np.ndarray) -> dict[int, dict[tuple[str, ...], int]]:
+        found: dict[int, dict[tuple[str, ...], int]] = {}
+        for rows, some in store.file.abstracted.features("RSV", frame_id):
+            columns = (frame_id[rows[some.frame]], some.feature, some.often)
+            for frame, feature, often in zip(*(c.tolist() for c in columns), strict=True):
+                found.setdefault(frame, {})[some.names[feature]] = often
+        return found
+
+    ids = store.file.abstracted.times()[0][::23]
+    alone = [of(ids[i : i + 1]) for i in range(len(ids))]
+
+    assert len(np.unique(trace_of(ids))) == 2
+    assert of(ids) == {frame: what for one in alone for frame, what in one.items()}
+
+
 @pytest.mark.parametrize("piece", list(Piece))
 @pytest.mark.parametrize("least", [Measure.units, Measure.seconds])
 def test_the_minimal_set_keeps_every_class(store: Store, piece: Piece, least: Measure) -> None:
@@ -292,6 +308,21 @@ def test_of_nothing_nothing_is_selected_and_it_is_said(store: Store, way: Way) -
     assert found.said[0].endswith("no frame to select from")
     assert listed(found).rows == []
     assert curve(found).table.rows == []
+
+
+@pytest.mark.parametrize(
+    ("text", "at"), [("ego.speeed > 3", "speeed"), ("ego.speed +", ""), ("ego.speed > > 3", ">")]
+)
+def test_an_expression_that_is_wrong_is_shown_as_it_was_written(
+    store: Store, text: str, at: str
+) -> None:
+    with pytest.raises(QueryError) as caught:
+        select(whole(store), Wish(Way.stratify, each=1, by=text))
+
+    assert caught.value.text == text
+    assert caught.value.span is not None
+    assert at in text[caught.value.span.start : caught.value.span.end]
+    assert "frame_of_label" not in str(caught.value)
 
 
 def test_of_each_stratum_k(store: Store) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import ExportError
+from sgstore.errors import ExportError, QueryError, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -133,8 +133,11 @@ def _answers(
     store: Store, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
     """Rows of frames and values of an expression: of those with an ego, then of those without."""
-    value = f"RETURN DISTINCT frame.id AS frame_of_label, ({text}) AS label"
-    matches = store.find(f"MATCH (:Ego) {value}", **parameters)
+    value = f"{_RETURNED}{text}) AS label"
+    try:
+        matches = store.find(f"MATCH (:Ego) {value}", **parameters)
+    except QueryError as error:
+        raise _of_expression(error, text) from None
     if matches.columns != ("frame_of_label", "label"):
         raise ExportError(f"not one expression: {text}")
     row, answer = _columns(matches, wanted)
@@ -146,6 +149,19 @@ def _answers(
         return
     row, answer = _columns(store.find(f"MATCH (anything) {value}", **parameters), wanted)
     yield row[~answered[row]], answer[~answered[row]]
+
+
+_RETURNED: Final = "RETURN DISTINCT frame.id AS frame_of_label, ("
+
+
+def _of_expression(error: QueryError, text: str) -> QueryError:
+    """What is wrong with an expression, shown in what was written and not in the query that it became."""
+    if error.span is None:
+        return QueryError(error.reason, text=text, hint=error.hint)
+    before, end = len("MATCH (:Ego) ") + len(_RETURNED), len(text)
+    start, stop = (min(max(place - before, 0), end) for place in (error.span.start, error.span.end))
+    reason = error.reason.replace("found ')'", "the text ends") if start == end else error.reason
+    return QueryError(reason, text=text, span=Span(start, stop), hint=error.hint)
 
 
 def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
