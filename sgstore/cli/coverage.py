@@ -26,8 +26,8 @@ A = Annotated[
     str,
     typer.Argument(
         metavar="A",
-        help="Frames: a store, STORE:QUERY for those that match, STORE:TESTS.lock for those of a lock; TESTS.lock"
-        " alone takes the store beside it that has its recordings.",
+        help="Frames: a store, STORE:QUERY for those that match, STORE:TESTS.lock for those of a lock;"
+        " TESTS.lock alone takes the store beside it that has its recordings.",
     ),
 ]
 B = Annotated[str, typer.Argument(metavar="B", help="Frames, as A.")]

@@ -12,7 +12,6 @@ from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
-
     from duckdb import DuckDBPyConnection
 
     from sgstore.abstractions import Labelled
