@@ -1,10 +1,10 @@
 """Made-up drives, as many as wanted: coherent in time, an ego among 14 others, on one of eight streets.
 
 At 10 Hz; the length of a drive is lognormal between 15 s and 200 s (a median of 45 s). The ego keeps to its
-lane and stops now and then, as at lights. Four vehicles go its way, at distances that wander as if drawn by a
-spring; four come towards it, one after the other, in the lane beside; three stand at the kerb, every 150 m; two
-people walk on the sidewalk, and one crosses the street, to and fro. Of the vehicles 3 in 4 are cars, the others
-vans, trucks and buses. Everything follows from the seed.
+lane and stops now and then, as at lights. Four vehicles go its way, clear of it, at distances that wander as if
+drawn by a spring; four come towards it, one after the other, in the lane beside; three stand at the kerb, every
+150 m; two people walk on the sidewalk, and one crosses the street, to and fro. Of the vehicles 3 in 4 are cars,
+the others vans, trucks and buses. Everything follows from the seed.
 """
 
 from __future__ import annotations
@@ -160,8 +160,8 @@ def _motion(random: np.random.Generator, n: int) -> tuple[NDArray[np.float64], .
     ego_x = 200 + random.uniform(0, 200) + np.cumsum(speed, axis=0) / 10
     ego_y = np.full((n, 1), -0.5 * WIDTH)
 
-    ahead = np.array([[14.0, -16.0, 8.0, 30.0]]) + random.normal(0, 5, (1, 4))
-    wander = _followed(random.normal(0, 60, (n, 4)), 0.02)
+    ahead = np.array([[24.0, -24.0, 4.0, 44.0]]) + random.normal(0, 3, (1, 4))
+    wander = _followed(random.normal(0, 40, (n, 4)), 0.02)
     convoy_x = ego_x + ahead + wander
     lane = np.array([[-0.5, -0.5, -1.5, -1.5]]) * WIDTH
     changes = np.sign(np.sin(t / random.uniform(10, 30, (1, 4))))
