@@ -34,8 +34,8 @@ from sgstore.selection import (
 )
 from sgstore.selection.bounds import bounded
 from sgstore.selection.choose import listed
-from sgstore.selection.cover import greedy
 from sgstore.selection.curve import expected
+from sgstore.selection.greedy import greedy
 from sgstore.store.covering import seq_of, trace_of
 
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"

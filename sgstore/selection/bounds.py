@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.selection.greedy import thinned
+
 if TYPE_CHECKING:
     from sgstore.selection.family import Family
     from sgstore.world import Floats, Ints
@@ -34,6 +36,7 @@ _WORK: Final = 200_000_000
 """Memberships that all steps may look at together: fewer steps where there are very many."""
 
 ROUNDING: Final = 1e-7
+"""How much of a cost is due to rounding."""
 
 
 def bounded(family: Family, cover: Ints) -> tuple[float, Ints, Floats]:
@@ -87,8 +90,6 @@ def bounded(family: Family, cover: Ints) -> tuple[float, Ints, Floats]:
 
 def _suggested(family: Family, left: Floats) -> Ints:
     """A cover of the sets that cost least beyond the prices of their elements."""
-    from sgstore.selection.cover import thinned
-
     order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))

@@ -5,21 +5,20 @@ falls into parts that have nothing to do with one another. Each part is covered 
 (:mod:`sgstore.selection.bounds`); a part whose bound is not met is searched, up to a number of steps. So the
 answer is exact where that is cheap, and beside it stands how far from the best it can be at most.
 
-Sources. Greedy and its factor H(n): Chvátal, "A greedy heuristic for the set-covering problem", Mathematics of
-Operations Research 4 (1979). Under a budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem",
-Information Processing Letters 70 (1999).
+Source. Under a budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem", Information Processing
+Letters 70 (1999).
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.selection.bounds import bounded, searched
+from sgstore.selection.bounds import ROUNDING, bounded, searched
+from sgstore.selection.greedy import greedy, met, or_alone, ordered, thinned
 from sgstore.selection.reduce import reduced
 
 if TYPE_CHECKING:
@@ -32,9 +31,6 @@ timed, so that the answer is the same everywhere."""
 
 SEARCHED: Final = 1_000_000
 """Memberships of a part that is searched at most: in larger ones so few steps find nothing."""
-
-ROUNDING: Final = 1e-7
-"""How much of a cost is due to rounding."""
 
 
 @dataclass(frozen=True)
@@ -97,76 +93,6 @@ def minimal(family: Family, steps: int = STEPS) -> Cover:
     return Cover(ordered(family, all_chosen), cost, min(bound, cost), plain)
 
 
-def greedy(family: Family, budget: float = math.inf) -> Ints:
-    """Sets, one after another, each the one that brings most new elements for its cost.
-
-    Parameters
-    ----------
-    family : Family
-    budget : float
-        What all may cost together; sets that do not fit are passed over.
-
-    Returns
-    -------
-    int64
-        In the order in which they were taken.
-    """
-    need = family.need.copy()
-    gain = family.gains(need > 0)
-    often = np.bincount(family.members, minlength=len(need))
-    if (often <= need).all() and family.cost.sum() <= budget:
-        # Each is taken, and none makes another one worth less.
-        order = np.lexsort((family.rank, -gain / family.cost))
-        return order[: np.count_nonzero(gain)]
-    starts, of_element = family.by_element()
-    cost, rank = family.cost.tolist(), family.rank.tolist()
-    heap = [(-gain[i] / cost[i], rank[i], i) for i in np.flatnonzero(gain).tolist()]
-    heapq.heapify(heap)
-    chosen: list[int] = []
-    left = budget
-    while heap:
-        known, own, one = heapq.heappop(heap)
-        value = -gain[one] / cost[one]
-        if not gain[one] or cost[one] > left:
-            continue
-        if value > known:
-            heapq.heappush(heap, (value, own, one))
-            continue
-        chosen.append(one)
-        left -= cost[one]
-        elements = family.elements(one)
-        elements = elements[need[elements] > 0]
-        gain[one] = 0
-        need[elements] -= 1
-        for element in elements[need[elements] == 0].tolist():
-            gain[of_element[starts[element] : starts[element + 1]]] -= family.weight[element]
-        gain[one] = 0
-    return np.array(chosen, np.int64)
-
-
-def thinned(family: Family, chosen: Ints) -> Ints:
-    """Without the sets that the others make superfluous, the dearest and latest first."""
-    spare = family.covered(chosen) - family.need
-    keep = np.ones(len(chosen), np.bool_)
-    order = np.lexsort((-np.arange(len(chosen)), -family.cost[chosen]))
-    for place in order.tolist():
-        elements = family.elements(int(chosen[place]))
-        if (spare[elements] > 0).all():
-            keep[place] = False
-            spare[elements] -= 1
-    return chosen[keep]
-
-
-def ordered(family: Family, chosen: Ints) -> Ints:
-    """Chosen sets in the order in which they bring most for what they cost; then those that bring nothing."""
-    chosen = np.sort(chosen)
-    wanted = np.ones(len(family.need), np.bool_)
-    need = np.minimum(family.need, family.covered(chosen))
-    first = greedy(family.part(chosen, wanted, need))
-    rest = np.setdiff1d(np.arange(len(chosen)), first)
-    return chosen[np.concatenate([first, rest])]
-
-
 @dataclass(frozen=True)
 class Fitted:
     """Sets that were chosen under a budget.
@@ -194,21 +120,11 @@ def within(family: Family, budget: float) -> Fitted:
     The bound is that of submodular functions: whatever has been chosen, the best choice meets no more than that
     and the largest gains of single sets that fit the budget together, the last one in part.
     """
-    chosen = greedy(family, budget)
-    gain = family.gains(family.need > 0)
-    affordable = np.flatnonzero(family.cost <= budget)
-    if len(affordable):
-        best = affordable[np.lexsort((family.rank[affordable], -gain[affordable]))[:1]]
-        if _met(family, best) > _met(family, chosen):
-            chosen = best
+    chosen = or_alone(family, greedy(family, budget), budget)
     at = np.unique(np.linspace(0, len(chosen), 16).astype(np.int64)).tolist()
     most = min(_at_most(family, chosen[:many], budget) for many in at)
-    met = _met(family, chosen)
-    return Fitted(chosen, float(family.cost[chosen].sum()), met, max(most, met))
-
-
-def _met(family: Family, chosen: Ints) -> int:
-    return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
+    reached = met(family, chosen)
+    return Fitted(chosen, float(family.cost[chosen].sum()), reached, max(most, reached))
 
 
 def _at_most(family: Family, chosen: Ints, budget: float) -> float:
@@ -223,4 +139,4 @@ def _at_most(family: Family, chosen: Ints, budget: float) -> float:
     if fits < len(order):
         room = budget - (float(cost[fits - 1]) if fits else 0.0)
         more += float(gain[order[fits]]) * room / float(family.cost[order[fits]])
-    return _met(family, chosen) + min(more, float((left * family.weight).sum()))
+    return met(family, chosen) + min(more, float((left * family.weight).sum()))

@@ -8,16 +8,18 @@ bounds covers by units. Units are chosen greedily, by what they bring for the pi
 
 from __future__ import annotations
 
-import heapq
 import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.selection.cover import Cover, Fitted, minimal, ordered, within
+from sgstore.selection.cover import Cover, Fitted, minimal, within
+from sgstore.selection.greedy import greedy, met, or_alone, ordered, thinned
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from sgstore.selection.family import Family
     from sgstore.selection.units import Holdings, Measure, Units
     from sgstore.world import Bools, Floats, Ints
@@ -89,74 +91,31 @@ def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budge
     """
     parts, spans = pieces(units, measure)
     family = held.family(units, units.costs(measure), 1, rank)
-    chosen = _greedy(family, spans, budget)
-    gain = family.gains(family.need > 0)
-    single = np.flatnonzero(family.cost <= budget)
-    if len(single):
-        best = single[np.lexsort((rank[single], -gain[single]))[:1]]
-        if gain[best].sum() > _met(family, chosen):
-            chosen = best
+    chosen = or_alone(family, _greedy(family, spans, budget), budget)
     alone = held.over(parts).family(parts, spans.cost, 1, np.arange(len(parts)))
-    met = _met(family, chosen)
-    return Fitted(chosen, spans.together(chosen), met, max(within(alone, budget).most, met))
-
-
-def _met(family: Family, chosen: Ints) -> int:
-    return int(family.weight[family.covered(chosen) > 0].sum())
+    reached = met(family, chosen)
+    most = max(within(alone, budget).most, reached)
+    return Fitted(chosen, spans.together(chosen), reached, most)
 
 
 def _greedy(family: Family, spans: Spans, budget: float = math.inf) -> Ints:
     """Units, one after another, each the one that brings most for what it costs beyond those before it."""
-    starts, of_element = family.by_element()
-    open_ = np.ones(len(family.need), np.bool_)
     taken = np.zeros(len(spans.cost), np.bool_)
-    gain, cost = family.gains(open_), family.cost.copy()
-    rank = family.rank.tolist()
-    heap = [(-gain[i] / cost[i], rank[i], i) for i in np.flatnonzero(gain).tolist()]
-    heapq.heapify(heap)
-    chosen: list[int] = []
-    left = budget
-    while heap:
-        known, own, one = heapq.heappop(heap)
-        if not gain[one] or cost[one] > left:
-            continue
-        value = -gain[one] / cost[one]
-        if value > known:
-            heapq.heappush(heap, (value, own, one))
-            continue
-        chosen.append(one)
-        left -= cost[one]
-        elements = family.elements(one)
-        for element in elements[open_[elements]].tolist():
-            gain[of_element[starts[element] : starts[element + 1]]] -= family.weight[element]
-        open_[elements] = False
-        gain[one] = 0
+
+    def cheapened(one: int) -> Iterator[tuple[int, float]]:
+        """What others share with this one is paid."""
         taken[spans.begin[one] : spans.end[one]] = True
         for other in spans.beside(one):
-            # What it shares with this one is paid: it may be worth more now, and fit a budget that it did not.
-            cost[other] = max(spans.left(other, taken), 1e-9)
-            if gain[other]:
-                heapq.heappush(heap, (-gain[other] / cost[other], rank[other], other))
-    return np.array(chosen, np.int64)
+            yield other, max(spans.left(other, taken), 1e-9)
+
+    return greedy(family, budget, cheapened)
 
 
 def _thinned(family: Family, spans: Spans, chosen: Ints) -> Ints:
     """Without the units that the others make superfluous, those first that cost most beyond the others."""
-    often = family.covered(chosen)
     times = np.zeros(len(spans.cost) + 1, np.int64)
     np.add.at(times, spans.begin[chosen], 1)
     np.add.at(times, spans.end[chosen], -1)
-    alone = np.cumsum(times)[:-1] == 1
-    saved = np.array(
-        [
-            spans.cost[spans.begin[i] : spans.end[i]][alone[spans.begin[i] : spans.end[i]]].sum()
-            for i in chosen.tolist()
-        ]
-    )
-    keep = np.ones(len(chosen), np.bool_)
-    for place in np.argsort(-saved, kind="stable").tolist():
-        elements = family.elements(int(chosen[place]))
-        if (often[elements] > 1).all():
-            keep[place] = False
-            often[elements] -= 1
-    return chosen[keep]
+    shared = np.cumsum(times)[:-1] > 1
+    saved = np.array([spans.left(one, shared) for one in chosen.tolist()])
+    return thinned(family, chosen, np.argsort(-saved, kind="stable"))
