@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from sgstore.lang.formulas import quoted
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
@@ -36,14 +38,10 @@ class GivenTable:
 def give(connection: DuckDBPyConnection, given: Iterable[GivenTable]) -> None:
     """Make tables that nobody but this connection sees, until it is closed."""
     for table in given:
-        columns = ", ".join(f"{_quoted(name)} {kind}" for name, kind in table.types.items())
-        name = _quoted(table.name)
+        columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in table.types.items())
+        name = quoted(table.name)
         connection.execute(f"CREATE OR REPLACE TEMP TABLE {name} ({columns})")
         values = ", ".join(f"unnest(CAST(? AS {kind}[]))" for kind in table.types.values())
         for block in table.blocks:
             if len(block[0]):
                 connection.execute(f"INSERT INTO {name} SELECT {values}", list(block))
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'

@@ -12,6 +12,7 @@ import duckdb
 import numpy as np
 
 from sgstore.errors import ExportError
+from sgstore.lang.formulas import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Sequence
@@ -54,7 +55,7 @@ def write_parquet(
     rows = iter(rows)
     batch = list(islice(rows, BATCH))
     types = types or [_type_of([row[i] for row in batch]) for i in range(len(columns))]
-    named = ", ".join(f"{_quoted(n)} {t}" for n, t in zip(columns, types, strict=True))
+    named = ", ".join(f"{quoted(n)} {t}" for n, t in zip(columns, types, strict=True))
     number = 0
     # A file of its own, and not memory, takes what the rows add up to.
     with (
@@ -89,10 +90,6 @@ def _type_of(values: list[Any]) -> str:
         if known and narrow and truth == (name == "BOOLEAN"):
             return name
     return "VARCHAR"
-
-
-def _quoted(name: str) -> str:
-    return f'"{name.replace(chr(34), chr(34) * 2)}"'
 
 
 def _escaped(text: str) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 
 from sgstore.errors import SqlError
+from sgstore.lang.formulas import quoted
 from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
 from sgstore.store.parquet import write_parquet
 
@@ -145,9 +146,9 @@ def arrays(
     """All columns of a statement of ours; masked arrays where something is NULL, enumerations as texts."""
     described = connection.execute(f"DESCRIBE {sql}", parameters or None).fetchall()
     # As enumerations they would come as categories of pandas.
-    listed = [str(row[0]).replace('"', '""') for row in described if "ENUM" in str(row[1])]
+    listed = [quoted(str(row[0])) for row in described if "ENUM" in str(row[1])]
     if listed:
-        texts = ", ".join(f'"{name}"::VARCHAR AS "{name}"' for name in listed)
+        texts = ", ".join(f"{name}::VARCHAR AS {name}" for name in listed)
         sql = f"SELECT * REPLACE ({texts}) FROM ({sql})"
     return connection.execute(sql, parameters or None).fetchnumpy()
 

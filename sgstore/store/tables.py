@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import duckdb
 
 from sgstore.errors import ExportError
+from sgstore.lang.formulas import quoted
 from sgstore.store.rows import Batches
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class ParquetTable:
         self._columns = {
             name: "VARCHAR" if kind.startswith("ENUM") else kind for name, kind in columns.items()
         }
-        named = ", ".join(f"{_quoted(name)} {kind}" for name, kind in self._columns.items())
+        named = ", ".join(f"{quoted(name)} {kind}" for name, kind in self._columns.items())
         self._do(f"CREATE TABLE output ({named})")
 
     def __enter__(self) -> Self:
@@ -120,7 +121,3 @@ def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
             return sum(len(batch) for batch in found), found.columns
     except duckdb.Error as error:
         raise ExportError(f"{file.name}: cannot be read back: {str(error).strip()}") from error
-
-
-def _quoted(name: str) -> str:
-    return f'"{name.replace(chr(34), chr(34) * 2)}"'
