@@ -65,7 +65,7 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
     table = Table.of(formula, columns, times)
     if not len(times):
         return np.zeros(0, np.bool_)
-    return table.value(formula, np.array([[len(times) - 1]]))[0]
+    return table.whole(formula)
 
 
 def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
@@ -138,6 +138,10 @@ class Table:
         if np.any(np.diff(times) <= 0):
             raise ValueError("the times of the frames must ascend")
         return cls(columns, times)
+
+    def whole(self, formula: Formula) -> Bools:
+        """(F,): the value at each frame of the whole trace, which has at least one."""
+        return self.value(formula, np.array([[len(self.times) - 1]]))[0]
 
     def value(self, formula: Formula, last: Ints) -> Bools:  # noqa: PLR0911 - a case each
         """(R, F): the value at each frame, for each end of the trace; meaningless behind the end."""

@@ -90,8 +90,7 @@ class _Endings:
     def _column(self, formula: Formula) -> Bools:
         """The values of what does not look ahead."""
         if formula not in self._known:
-            last = np.array([[self._frames - 1]])
-            self._known[formula] = self._table.value(formula, last)[0]
+            self._known[formula] = self._table.whole(formula)
         return self._known[formula]
 
     def values(self, formula: Formula, at: int) -> Bools:  # noqa: PLR0911 - a case each

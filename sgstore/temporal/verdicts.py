@@ -86,7 +86,7 @@ class Settled:
     @cached_property
     def value(self) -> Bools:
         """(F,) where the formula is true."""
-        return self._table.value(self.formula, np.array([[self._frames - 1]]))[0]
+        return self._table.whole(self.formula)
 
     @cached_property
     def _known(self) -> Known:
