@@ -20,6 +20,7 @@ from sgstore.lang.results import EXTENTS
 from sgstore.lang.rewrite import rewritten
 from sgstore.lang.subgraphs import Layout, shown
 from sgstore.store import FrameRef, GivenTable, write_parquet
+from sgstore.store.covering import SEQ_BITS
 from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
 from sgstore.world import Clip
 
@@ -147,7 +148,7 @@ class Matches:
     def frames(self) -> Iterator[FrameRef]:
         """The distinct frames, in order of trace and number; of limited rows, in the order of the rows."""
         for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
-            yield FrameRef(frame_id, frame_id >> 24, trace, seq, time_ns, log_time_ns, t)
+            yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
         with self._compiled() as compiled:

@@ -268,13 +268,14 @@ def cases_of(lock: Path, store: Store) -> Iterable[Case]:
 def _frames(store: Store, case: Case) -> tuple[FrameRef, ...]:
     from sgstore.exporters.export import ClipFrames, Export
     from sgstore.store import FrameRef
+    from sgstore.store.covering import SEQ_BITS
     from sgstore.world import Clip
 
     clip = Clip(case.trace, case.start_ns, case.end_ns)
     found = ClipFrames.of(Export(store, (clip,)), 1, clip)
     columns = (found.frame_id, found.seq, found.time_ns, found.log_time_ns, found.t)
     return tuple(
-        FrameRef(frame_id, frame_id >> 24, case.trace, seq, time_ns, log_time_ns, t)
+        FrameRef(frame_id, frame_id >> SEQ_BITS, case.trace, seq, time_ns, log_time_ns, t)
         for frame_id, seq, time_ns, log_time_ns, t in zip(
             *(c.tolist() for c in columns), strict=True
         )

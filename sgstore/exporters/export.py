@@ -9,6 +9,7 @@ import numpy as np
 
 from sgstore.errors import ExportError
 from sgstore.exporters.clips import Source
+from sgstore.store.covering import SEQ_BITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -167,8 +168,8 @@ class ClipFrames:
         found = export.store.file.arrays(
             _FRAMES,
             {
-                "first": trace_id << 24,
-                "last": (trace_id + 1 << 24) - 1,
+                "first": trace_id << SEQ_BITS,
+                "last": (trace_id + 1 << SEQ_BITS) - 1,
                 "start": clip.start_ns,
                 "end": clip.end_ns,
             },

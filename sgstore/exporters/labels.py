@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, QueryError, Span
+from sgstore.store.covering import trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -118,7 +119,7 @@ def _asked(
     if _QUERY.match(text):
         matches = store.find(text, **parameters)
         left_out = {store.file.trace(trace).trace_id for trace in matches.left_out}
-        values[~np.isin(wanted >> 24, list(left_out))] = False
+        values[~np.isin(trace_of(wanted), list(left_out))] = False
         found = np.fromiter((frame.frame_id for frame in matches.frames()), np.int64)
         values[_rows(wanted, found)[1]] = True
         return values
@@ -145,7 +146,7 @@ def _answers(
     answered = np.zeros(len(wanted), np.bool_)
     answered[row] = True
     left_out = [store.file.trace(trace).trace_id for trace in matches.left_out]
-    if answered[~np.isin(wanted >> 24, left_out)].all():
+    if answered[~np.isin(trace_of(wanted), left_out)].all():
         return
     row, answer = _columns(store.find(f"MATCH (anything) {value}", **parameters), wanted)
     yield row[~answered[row]], answer[~answered[row]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sgstore.lang.bound import Bound, Course, Moment, Query, Result, Scope, Tens
 from sgstore.lang.found import Found, relation
 from sgstore.lang.phases import Window
 from sgstore.lang.printing import value_text
+from sgstore.store.packing import BUCKET_BITS
 from sgstore.temporal.plans import Plan
 from sgstore.temporal.printing import (
     formula_text,
@@ -37,9 +38,6 @@ if TYPE_CHECKING:
     from sgstore.world import Ints
 
     Keys = NDArray[np.int64]
-
-BUCKETS: Final = 18
-"""``bucket >> 18`` is the trace of a bucket."""
 
 
 @dataclass(slots=True)
@@ -97,8 +95,8 @@ class Finder:
         window : Window or None
         """
         if window is not None:
-            high = ((window.high - 1) >> BUCKETS) + 1
-            window = Window(window.low >> BUCKETS << BUCKETS, high << BUCKETS)
+            high = ((window.high - 1) >> BUCKET_BITS) + 1
+            window = Window(window.low >> BUCKET_BITS << BUCKET_BITS, high << BUCKET_BITS)
         formulas = {p: self._plan.formula(p) for p in places if _is_condition(p)}
         for place in places:
             if place not in formulas and not isinstance(place, Moment):

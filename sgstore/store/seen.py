@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.abstractions import Grounds, Seen
-from sgstore.store.covering import frames_of
-from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
+from sgstore.store.covering import SEQ_BITS, frames_of, trace_of
+from sgstore.store.packing import FRAME_BITS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 WINDOW: Final = 8
 """Buckets that are read at once."""
-
-_TRACE_BITS: Final = BUCKET_BITS + FRAME_BITS
-"""Bits of a frame's id below those of its trace."""
 
 _MAPS: Final = 4
 """Maps that are remembered."""
@@ -95,7 +92,7 @@ class Graphs:
         """Frames of one trace from one id to another: their numbers, and their graphs."""
         rows = connection.execute(_FRAMES, {"first": first, "last": last}).fetchnumpy()
         ids = rows["frame_id"].astype(np.int64)
-        trace_id = first >> _TRACE_BITS
+        trace_id = first >> SEQ_BITS
         parts, _ = self._read(connection, ids, trace_id)
         ((_, seen),) = parts
         return rows["seq"].astype(np.int64), seen
@@ -129,7 +126,7 @@ class Graphs:
         bucket, bit = ids >> FRAME_BITS, ids & ((1 << FRAME_BITS) - 1)
         starts = np.flatnonzero(np.append(True, np.diff(bucket) != 0)) if len(ids) else bucket
         masks = np.bitwise_or.reduceat(1 << bit, starts) if len(ids) else bucket
-        whole = (trace_id or 0) << _TRACE_BITS
+        whole = (trace_id or 0) << SEQ_BITS
         where = (
             {"first": int(ids[0]), "last": int(ids[-1])}
             if len(ids)
@@ -207,7 +204,7 @@ class _Traces:
 
     def rows(self, frame_id: NDArray[np.int64]) -> NDArray[np.int64]:
         """The trace of each frame."""
-        return np.searchsorted(self.trace_id, frame_id >> _TRACE_BITS).astype(np.int64)
+        return np.searchsorted(self.trace_id, trace_of(frame_id)).astype(np.int64)
 
 
 def _each_frame(of: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
