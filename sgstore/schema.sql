@@ -79,13 +79,15 @@ CREATE TABLE entity (                                          -- what does not 
 
 -- Frames ----------------------------------------------------------------------------------------------------------
 
-CREATE TABLE bucket (bucket BIGINT, trace_id BIGINT, map_id INTEGER, valid BIGINT);    -- valid: mask of its frames
+CREATE TABLE bucket (bucket BIGINT, trace_id BIGINT, map_id INTEGER,
+  valid BIGINT,                                                -- mask of its frames
+  joined BIGINT);                                              -- mask of those at most 2.5 periods after the one before
 
 CREATE TABLE frame (                                           -- ordered by frame_id
   frame_id BIGINT, bucket BIGINT, bit TINYINT, trace_id BIGINT, map_id INTEGER, seq INTEGER,
   time_ns BIGINT, log_time_ns BIGINT, ego INTEGER);            -- ego: node_id, NULL where it is absent
 
-CREATE TABLE state (                                           -- ordered by kind, bucket, node_id, frame_id
+CREATE TABLE state (                                           -- ordered by is_ego (first), kind, bucket, node_id, frame_id
   kind kind, frame_id BIGINT, node_id INTEGER, is_ego BOOLEAN,
   x FLOAT, y FLOAT, z FLOAT,                                   -- about the trace's origin
   heading FLOAT, pitch FLOAT, roll FLOAT,                      -- rad

@@ -29,6 +29,8 @@ Bools = NDArray[np.bool_]
 BUCKET_FRAMES = 60
 """Frames that one mask of the store covers; blocks that start at multiples of it are stored best."""
 
+GAP: Final = 2.5
+"""Between frames that are further apart than so many median periods of their trace some are missing."""
 
 POSE: Final = (
     "x",

@@ -438,12 +438,15 @@ def store_masks(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
     masks: dict[tuple[Any, ...], int] = {}
     nodes: dict[tuple[Any, ...], int] = {}
     valid: dict[int, int] = {}
+    joined: dict[int, int] = {}
     kinds = {n: e["kind"] for n, e in trace.entities.items()} | {
         n: m["kind"] for n, m in MAP_NODES.items()
     }
-    for frame in trace.frames:
+    for before, frame in zip([None, *trace.frames], trace.frames, strict=False):
         bucket, bit = frame.frame_id >> 6, 1 << (frame.frame_id & 63)
         valid[bucket] = valid.get(bucket, 0) | bit
+        near = before is not None and frame.time_ns - before.time_ns <= 250_000_000
+        joined[bucket] = joined.get(bucket, 0) | (bit if near else 0)
         for src, relation, dst, _ in frame.edges:
             key = (
                 relation,
@@ -472,7 +475,8 @@ def store_masks(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
     ]
     insert(connection, "node", rows)
     base = {"trace_id": trace.trace_id, "map_id": 3}
-    insert(connection, "bucket", [base | {"bucket": b, "valid": v} for b, v in valid.items()])
+    rows = [base | {"bucket": b, "valid": v, "joined": joined[b]} for b, v in valid.items()]
+    insert(connection, "bucket", rows)
 
 
 def parts_of(mask: int, rng: random.Random) -> list[int]:

@@ -78,7 +78,12 @@ TABLES = {
         "ingested_at": "TIMESTAMP '2026-01-01'",
     },
     "entity": {"trace_id": TRACE, "node_id": "k", "kind": "'car'", "is_static": "FALSE"},
-    "bucket": {"bucket": BUCKET, "trace_id": TRACE, "valid": "(1::BIGINT << 60) - 1"},
+    "bucket": {
+        "bucket": BUCKET,
+        "trace_id": TRACE,
+        "valid": "(1::BIGINT << 60) - 1",
+        "joined": "(1::BIGINT << 60) - 1",
+    },
     "frame": {
         "frame_id": f"{BUCKET} * 64 + bit",
         "bucket": BUCKET,

@@ -15,6 +15,7 @@ import numpy as np
 from sgstore.coverage.frames import Chosen
 from sgstore.coverage.slots import slot_sets
 from sgstore.store.covering import seq_of, trace_of
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
 
 UNKNOWN: Final = -1
 """Code of a frame whose class nobody can tell."""
-
-GAP: Final = 2.5
-"""A step in time of more than so many median periods of a trace is a gap: there frames are missing."""
 
 
 class Missing(StrEnum):

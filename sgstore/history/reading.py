@@ -10,12 +10,14 @@ import numpy as np
 from sgstore.history.relations import Relation
 from sgstore.lang.found import CLOCK, TRACES, relation
 from sgstore.lang.phases import traces_of
-from sgstore.lang.results import EXTENTS, GAP
+from sgstore.lang.results import EXTENTS
 from sgstore.matches import windows
+from sgstore.store.covering import trace_of
 from sgstore.temporal.columns import evaluate_rows
 from sgstore.temporal.formulas import Formula, propositions
 from sgstore.temporal.measures import Clock, Column, Measured
 from sgstore.vocabulary import RELATIONS
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -30,9 +32,6 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Ints
 
     Keys = NDArray[np.int64]
-
-TRACE_SHIFT: Final = 24
-"""``frame_id >> 24`` is the trace of a frame."""
 
 WORDS: Final = np.array(sorted(RELATIONS))
 """Relations in alphabetical order."""
@@ -294,7 +293,7 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
     """The traces of frames in order, and which of them are theirs."""
     if not len(ids):
         return []
-    owners = ids >> TRACE_SHIFT
+    owners = trace_of(ids)
     starts = np.flatnonzero(np.diff(owners, prepend=-1))
     ends = np.append(starts[1:], len(ids))
     return [(int(owners[a]), slice(int(a), int(z))) for a, z in zip(starts, ends, strict=True)]

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.vocabulary import KINDS
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from sgstore.world import FrameBlock
-
-GAP: Final = 2.5
-"""How many median periods are a gap. The same ends an interval of frames (:mod:`sgstore.lang.results`)."""
 
 SHOWN: Final = 20
 """Jumps and gaps that are listed; the others are counted."""

@@ -13,10 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from sgstore.lang.formulas import Select, nested, quoted
 from sgstore.lang.presence import bit_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 WIDTH: Final = 12
 """Bits that a count has to itself; 60 frames are five counts in each of twelve numbers."""
@@ -141,4 +144,20 @@ def folded(text: str, keys: list[str]) -> str:
     select = Select(['"frame_id" >> 6 AS "bucket"', *keys, f'bit_or({bit}) AS "mask"'])
     select.join(nested(text, ":frames"), [])
     select.group = ['"frame_id" >> 6', *keys]
+    return select.text()
+
+
+def merged(text: str, values: Mapping[str, str]) -> str:
+    """A relation of buckets and masks as one with each bucket and combination of values once.
+
+    Parameters
+    ----------
+    text : str
+    values : mapping of str to str
+        Column, quoted → its text in terms of the relation as ``":rows"``.
+    """
+    columns = [f"{value} AS {column}" for column, value in values.items()]
+    select = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
+    select.join(nested(text, ":rows"), [])
+    select.group = ['"bucket"', *values.values()]
     return select.text()

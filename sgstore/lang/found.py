@@ -246,6 +246,9 @@ class Told(Frames):
         rows = Select(['"frame_id"', *keys], [quoted(self._table)], distinct=True)
         return Given(self.share(folded(rows.text(), keys), "pattern"), bound, frozenset())
 
+    def _lasting(self, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
+        return None if scope is self.query.scope else super()._lasting(scope, wanted)
+
     def _say(self, join: Join, scope: Scope, given: Given | None, leaf: Leaf) -> None:
         if isinstance(leaf, FrameAttribute) and leaf in self._told:
             join.texts[leaf] = f"{PATTERN}.{quoted(self._told[leaf])}"

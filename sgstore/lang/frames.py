@@ -21,6 +21,7 @@ from sgstore.lang.bound import (
     nodes_of,
 )
 from sgstore.lang.catalog import Home, Unit
+from sgstore.lang.counting import folded, merged
 from sgstore.lang.formulas import (
     Aliases,
     Leaf,
@@ -38,14 +39,14 @@ from sgstore.lang.formulas import (
     role_text,
 )
 from sgstore.lang.kinds import Profile, homes_of, kind_conditions
-from sgstore.lang.lasting import HELD, join_lasting
+from sgstore.lang.lasting import HELD, is_lasting, join_lasting
 from sgstore.lang.layers import Join, Layers, bounds, column_of, named
 from sgstore.lang.pairs import WAY, way_text
 from sgstore.lang.phases import Given, Phases, apart
 from sgstore.lang.sql import Masks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from sgstore.lang.catalog import Attribute
     from sgstore.lang.results import Gathered
@@ -120,18 +121,62 @@ class Frames(Masks):
         wanted: list[Leaf],
     ) -> str:
         """One row a bucket and binding, with the number of frames that it stands for."""
+        select, texts = self._of_buckets(scope, parts, given, nodes, edges, wanted)
+        texts[HELD] = self.held(PATTERN)
+        columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
+        columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
+        select.columns = [named(text, name) for name, text in columns.items()]
+        return select.text()
+
+    def _of_buckets(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: Given | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+        wanted: Iterable[Leaf],
+    ) -> tuple[Select, dict[Leaf, str]]:
+        """What the first phase leaves, joined with what lasting values come from; how each is computed."""
         select = Select()
         select.join(nested(self.masks(scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
         bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
         bucket = f'{PATTERN}."bucket"'
         texts = join_lasting(select, bucket, bound, scope, self.catalog, wanted)
-        texts[HELD] = self.held(PATTERN)
         for leaf in wanted:
             if isinstance(leaf, EdgeRelation):
                 texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
-        columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
-        columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
-        select.columns = [named(text, name) for name, text in columns.items()]
+        return select, texts
+
+    def in_masks(self, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]) -> str:
+        """In which frames some match has which values: one row a bucket and combination of them.
+
+        Parameters
+        ----------
+        scope : Scope
+        wanted : iterable of Leaf
+            What the values are made of.
+        values : mapping of str to str
+            Column, quoted → its text in terms of a relation ``":rows"`` that has the columns ``wanted``.
+        """
+        rows = self._lasting(scope, wanted)
+        if rows is not None:
+            return merged(rows, values)
+        rows = self.frames(scope, None, frozenset(), frozenset(), wanted)
+        select = Select(['"frame_id"'], [nested(rows, ":rows")])
+        select.columns += [f"{text} AS {column}" for column, text in values.items()]
+        return folded(select.text(), list(values))
+
+    def _lasting(self, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
+        """One row a bucket and match, with values that last as long; ``None`` if frames must be looked at."""
+        parts, wanted = self.phases(scope), list(dict.fromkeys(wanted))
+        if parts.rest or parts.late or not all(is_lasting(v, scope, self.catalog) for v in wanted):
+            return None
+        nodes = frozenset(key for leaf in wanted for key in nodes_of(leaf))
+        edges = frozenset(leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation))
+        select, texts = self._of_buckets(scope, parts, None, nodes, edges, wanted)
+        select.columns = self.in_which(PATTERN)
+        select.columns += [named(texts[leaf], quoted(column_of(leaf))) for leaf in wanted]
         return select.text()
 
     def _ends(self, scope: Scope, needed: list[Leaf]) -> set[str]:

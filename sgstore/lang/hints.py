@@ -14,66 +14,30 @@ if TYPE_CHECKING:
 MANY: Final = 16
 """So many names are listed in a hint."""
 
-SYNTAX: Final = tuple(
-    (re.compile(looks, re.IGNORECASE), hint)
-    for looks, hint in (
-        (r"==$", "equality is written '='"),
-        (r"&&?$", "write AND"),
-        (r"\|\|?$", "write OR"),
-        (r"!$", "write NOT before a condition"),
-        (r"""\bIS\s+['"]$""", "equality is written '='"),
-        (r"""['"]$""", "the text in quotes has no end"),
-        (r"\bIN\s*\([^()]*,$", "a list stands in square brackets: IN [1, 2]"),
-        (r"[<>]=?\s*[\w.]+\s*[<>]=?$", "write 3 < x.speed AND x.speed < 5"),
-        (r"EXISTS\s*\($", "write EXISTS {(a)-[:near]->(b)}, in braces"),
-        (
-            r"[)\w]\s*<?-\[\s*\w*:$",
-            "in a condition, a pattern stands in braces: EXISTS {(a)-[:near]->(b)}",
-        ),
-        (r"\)\s*-\($", "an edge is written -[:near]-> or -->"),
-        (r"\)\s*->?$", "an edge of any relation is written -->"),
-        (r"\]\s*>$", "an edge ends in ]->"),
-        (r"CLIPS\s*\(\s*[+-]?\d+$", "write CLIPS(-3s, +5s)"),
-        (r"\)\s*OPTIONAL$", "what may be absent is asked in a condition: EXISTS {…}, or COUNT {…}"),
-        (r"\)\s*WITH$", "there is no WITH: name conditions by DEFINE PREDICATE, results by AS"),
-        (r"\)\s*MATCH$", "separate patterns by commas"),
-        (r"\bSELECT$|^\s*FROM$", "SQL is asked by sgstore sql, or store.sql()"),
-        (r"\bMATCH\s+\w+\s*=$", "a path has no name: name its nodes and edges"),
-        (r"\bMATCH\s+\w+\s*:$", "a node stands in brackets: MATCH (e:Ego)"),
-        (r"\bBETWEEN$", "write x >= 3 AND x <= 5"),
-        (r"\bI?LIKE$", "write STARTS WITH, ENDS WITH, CONTAINS, or =~ with a regular expression"),
-        (r"\bGROUP$", "values beside COUNT, MIN, … are the groups: RETURN e.kind, AVG(e.speed)"),
-        (r"\bHAVING$", "count in the pattern: WHERE COUNT {…} > 2"),
-        (r"\bSKIP$|\bOFFSET$", "there is no such thing: LIMIT n gives the first ones"),
-        (r"\bLIMIT\s+\S+\s+(ORDER|SAMPLE)$", "the order is ORDER BY … SAMPLE … LIMIT …"),
-        (r"\d\s*km(/h)?$", "speeds are in m/s: write 30 / 3.6"),
-        (r"\d\s*h$|\d\s*min\w+$", "times are written 500ms, 2s or 1min"),
-        (r"\w\s*:\s*[<>]=?$|\{\s*\w+\s*[<>]=?$", "a property is a value; write WHERE x.speed > 5"),
-        (r"\[\s*\w*\s*:[^\]]*\|\s*:$", "one colon is enough: -[:near|visible]->"),
-        (r"\(\s*\w*\s*:[^)]*:$", "labels are joined by & or |: (v:Car&Ego)"),
-        (r"\bCOUNT\s*\(\s*\(.*:$", "a pattern is counted in braces: COUNT {(v:Car)}"),
-    )
-)
-"""What the text up to and with the unexpected part looks like, and what would be right."""
-
 SYNONYMS: Final[Mapping[str, str]] = {
-    "velocity": "speed",
-    "v": "speed",
+    **dict.fromkeys(("velocity", "v", "vel", "kmh", "kph", "mph", "mps"), "speed"),
+    **dict.fromkeys(("acc", "a", "deceleration", "decel"), "accel"),
     "acceleration": "accel",
     "yaw": "heading",
     "orientation": "heading",
     "rotation": "heading",
     "class": "kind",
     "category": "kind",
+    **dict.fromkeys(("label", "labels", "object", "objecttype"), "kind"),
     "model": "type_name",
-    "actorid": "ident",
-    "trackid": "ident",
-    "indicator": "light_left, light_right",
-    "blinker": "light_left, light_right",
+    **dict.fromkeys(("actorid", "trackid", "uuid"), "ident"),
+    **dict.fromkeys(("indicator", "blinker", "turnsignal"), "light_left, light_right"),
+    "brakelight": "light_brake",
     "state": "light_state",
     "limit": "speed_limit",
+    "isego": "is_ego",
 }
 """Other words, folded, for attributes of nodes."""
+
+_PAIRS: Final = (
+    *("dist", "distance", "gap", "ttc", "headway", "bearing", "lon", "lat", "relspeed", "relheading"),
+    *("lanedist", "longap", "latgap", "closingspeed", "apparentheading"),
+)
 
 TOLD: Final[Mapping[str, str]] = {
     **dict.fromkeys(
@@ -86,8 +50,94 @@ TOLD: Final[Mapping[str, str]] = {
     **dict.fromkeys(
         ("size", "extent", "dimensions", "bbox"), "its size is length, width and height"
     ),
+    **dict.fromkeys(("t", "time", "seconds"), "the time since the trace began is frame.t"),
+    "timestamp": "the time of a frame is frame.t or frame.time_ns",
+    **dict.fromkeys(("frame", "frameid", "seq"), "the frame is frame.id, frame.seq or frame.t"),
+    **dict.fromkeys(("trace", "traceid", "scenario", "recording"), "the trace is trace.name"),
+    **dict.fromkeys(("map", "town"), "the map is trace.map"),
+    **dict.fromkeys(("weather", "rain", "fog"), "the weather is env.precipitation, env.fog, …"),
+    **dict.fromkeys(_PAIRS, "it is a number of two nodes, such as dist(ego, v)"),
+    "jerk": "how much a value changes is delta(e.accel, 1s)",
 }
 """What people ask for, folded, that is no attribute of nodes, and where it is to be found."""
+
+OTHER_LABELS: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("ego vehicle", "ego car", "hero", "self"), "Ego"),
+    **dict.fromkeys(("automobile", "sedan", "suv", "pickup", "cab"), "Car"),
+    **dict.fromkeys(("cyclist", "bike", "biker", "rider"), "Bicycle"),
+    **dict.fromkeys(("lorry", "semi"), "Truck"),
+    **dict.fromkeys(("motorbike", "scooter", "motorcyclist"), "Motorcycle"),
+    **dict.fromkeys(("human", "people", "child", "adult"), "Person"),
+    **dict.fromkeys(("agent", "actor", "object", "obstacle", "participant", "roaduser"), "Entity"),
+    "street": "Road",
+    **dict.fromkeys(("crossing", "zebra", "zebracrossing"), "Crosswalk"),
+    **dict.fromkeys(("tree", "bush"), "Vegetation"),
+    **dict.fromkeys(("trafficsign", "roadsign"), "Sign"),
+    **dict.fromkeys(("cone", "trafficcone"), "Prop"),
+}
+"""Other words for labels."""
+
+OTHER_RELATIONS: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("close", "close to", "nearby", "next to"), "near"),
+    **dict.fromkeys(("in front", "in front of", "ahead", "ahead of"), "inDFrontOf"),
+    **dict.fromkeys(("behind", "rear", "rear of", "at rear of", "in rear of"), "atDRearOf"),
+    **dict.fromkeys(("left", "left of"), "toLeftOf"),
+    **dict.fromkeys(("right", "right of"), "toRightOf"),
+    **dict.fromkeys(("on", "inside", "drives on", "located in"), "isIn"),
+    **dict.fromkeys(("controls", "regulates"), "controlsTrafficOf"),
+    **dict.fromkeys(("collision", "hits", "crashes", "collides with"), "collides"),
+    **dict.fromkeys(("see", "can see"), "sees"),
+    **dict.fromkeys(("lead", "leading", "leader of"), "leads"),
+    "following": "follows",
+}
+"""Other words for relations."""
+
+OTHER_FUNCTIONS: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("time to collision", "tte"), "ttc"),
+    **dict.fromkeys(("time headway", "time gap"), "headway"),
+    **dict.fromkeys(("euclidean", "distance to", "euclidean distance"), "dist"),
+    **dict.fromkeys(("angle", "angle to", "azimuth", "relative angle"), "bearing"),
+    **dict.fromkeys(("in front of", "in front", "is ahead", "is in front"), "ahead"),
+    **dict.fromkeys(("at rear", "is behind"), "behind"),
+    **dict.fromkeys(("on left of", "is left of", "left"), "left_of"),
+    **dict.fromkeys(("on right of", "is right of", "right"), "right_of"),
+    **dict.fromkeys(("ceiling",), "ceil"),
+    **dict.fromkeys(("ifnull", "nvl"), "coalesce"),
+    **dict.fromkeys(("to lower", "lcase"), "lower"),
+    **dict.fromkeys(("to upper", "ucase"), "upper"),
+    **dict.fromkeys(("is known", "is not null"), "known"),
+    **dict.fromkeys(("mean", "average"), "avg"),
+    "lag": "prev",
+}
+"""Other words for functions."""
+
+FUNCTIONS_TOLD: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("labels", "kind"), "what a node is: v.kind = 'car', or the label (v:Car)"),
+    "id": "the id of a node v is v.id",
+    **dict.fromkeys(("properties", "keys"), "attributes are named one by one: v.x, v.speed"),
+    **dict.fromkeys(("size", "length", "len"), "matches are counted by COUNT {…}"),
+    **dict.fromkeys(("any", "exists", "some"), "what holds of some node is EXISTS {… WHERE …}"),
+    **dict.fromkeys(("all", "every"), "what holds of all nodes is NOT EXISTS {… WHERE NOT …}"),
+    "none": "what holds of no node is NOT EXISTS {… WHERE …}",
+    **dict.fromkeys(("pow", "power", "square"), "there are no powers: write x * x"),
+    **dict.fromkeys(
+        ("if", "iif", "case"), "there is no IF: ask for each case by itself, or return the value"
+    ),
+    **dict.fromkeys(
+        ("collect", "list", "array agg"), "each match is a row; Matches.df() and SQL can group them"
+    ),
+    **dict.fromkeys(
+        ("stddev", "stdev", "median", "percentile", "quantile", "variance"),
+        "of a store: COUNT, MIN, MAX, AVG, SUM; others in SQL over the rows that a query gives",
+    ),
+    **dict.fromkeys(
+        ("substring", "split", "replace", "trim", "concat"),
+        "texts are asked by STARTS WITH, ENDS WITH, CONTAINS and =~",
+    ),
+    **dict.fromkeys(("cast", "tointeger", "tofloat", "tostring"), "values have one type: leave it out"),
+    "clip": "write CLIPS(-3s, +5s)",
+}
+"""Functions of other languages, and what there is instead."""
 
 LIKEN: Final[Mapping[str, str]] = {
     **dict.fromkeys(("police", "ambulance", "fire", "firetruck"), "emergency"),
@@ -98,14 +148,35 @@ LIKEN: Final[Mapping[str, str]] = {
 }
 """Other words, folded, for words of the closed vocabularies."""
 
+_OF_FRAMES: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("time", "seconds"), "t"),
+    **dict.fromkeys(("number", "index", "no", "sequence", "frame"), "seq"),
+    "timestamp": "time_ns",
+    **dict.fromkeys(("town", "road map"), "map"),
+    "file": "uri",
+    **dict.fromkeys(("rain", "snow", "weather"), "precipitation"),
+    **dict.fromkeys(("light", "daylight", "night", "sun"), "illumination"),
+    "hour": "time_of_day",
+}
+"""Other words for attributes of frames, traces and the weather."""
+
 _WORDS: Final = frozenset(folded(w) for w in (*KINDS, *LIGHT_STATES, *SPECIALS, *LANE_TYPES))
 
 
+_OTHERS: Final = tuple(
+    {folded(word): meant for word, meant in words.items()}
+    for words in (SYNONYMS, LIKEN, OTHER_LABELS, OTHER_RELATIONS, OTHER_FUNCTIONS, _OF_FRAMES)
+)
+
+
 def hint_at(name: str, known: Iterable[str]) -> str | None:
-    """What a name may have meant: that which is most like it or short for it, or else all that is known."""
-    names = sorted(known, key=str.lower)
-    others = (words.get(folded(name)) for words in (SYNONYMS, LIKEN))
-    other = next((word for word in others if word in names), None)
+    """What a name may have meant: that which is most like it or short for it, or else all that is known.
+
+    Names in an order keep it, so that what is common stands first; a set is sorted.
+    """
+    names = list(known) if isinstance(known, list | tuple) else sorted(known, key=str.lower)
+    others = (words.get(folded(name)) for words in _OTHERS)
+    other = next((word for word in others if word and word.split(", ")[0] in names), None)
     like = other or suggestion(name, names) or _short_for(name, names)
     if like:
         return f"did you mean '{like}'?"

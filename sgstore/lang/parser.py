@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QuerySyntaxError, Span
 from sgstore.lang.builders import BUILDERS, BuildError
-from sgstore.lang.hints import SYNTAX, bracket_hint
+from sgstore.lang.hints import bracket_hint
+from sgstore.lang.slips import places, slip_hint
 from sgstore.lang.tables import Rule, Tables, Terminal, tables
-from sgstore.vocabulary import suggestion
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from sgstore.lang.syntax import Statement
 
 MAX_LENGTH: Final = 100_000
@@ -29,7 +31,9 @@ MAX_DEPTH: Final = 200
 _END: Final = "$END"
 _BLANK: Final = re.compile(r"\s+")
 _COMMENT: Final = re.compile(r"--[^\n]*|/\*.*?\*/", re.DOTALL)
-_NEXT: Final = re.compile(r"\w+|&&|\|\||\]\s*>|-\(|\S")
+_NEXT: Final = re.compile(
+    r"""\w+|<?--+>?|&&|\|\||\]\s*>|-\(|'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|\S""", re.DOTALL
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +84,8 @@ def _read(machine: Tables, stack: list[_Entry], text: str, position: int) -> Tok
         if blank := _BLANK.match(text, position):
             position = blank.end()
         best = max(allowed, key=partial(_rank, text, position), default=None)
-        comment = _COMMENT.match(text, position)
+        edge = _reads_as_edge(text, position, actions)
+        comment = None if edge else _COMMENT.match(text, position)
         # Between nodes two dashes are an edge; in an expression they begin a comment.
         signs = comment is not None and best is not None and best.name == "SIGN"
         if best and not signs and (length := best.length_at(text, position)):
@@ -92,6 +97,14 @@ def _read(machine: Tables, stack: list[_Entry], text: str, position: int) -> Tok
     if position == len(text) and _END in actions:
         return Token(_END, "", Span(position, position))
     raise _unexpected(machine, stack, text, position)
+
+
+def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
+    """Whether two dashes are meant as an edge, so that what follows is not taken for a comment and dropped."""
+    if text.startswith("-->", position):
+        return True
+    behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
+    return behind and "BARE_ANY" in actions and text.startswith("--", position)
 
 
 def _rank(text: str, position: int, terminal: Terminal) -> tuple[int, int, bool]:
@@ -180,23 +193,29 @@ _LATER: Final = frozenset(
 
 _STARTS: Final = frozenset({"NUMBER", "STRING", "PARAM", "TRUTH", "NULL", "EXISTS"})
 _SAID: Final = {
-    "NAME": "a name",
-    "NUMBER": "a number",
-    "STRING": "a text in quotes",
-    "DURATION": "a duration such as 2s",
-    "PARAM": "a parameter such as $x",
-    "COMPARE": "a comparison",
-    "BARE_RIGHT": "'-->'",
-    "BARE_LEFT": "'<--'",
-    "BARE_ANY": "'--'",
-    "UPTO": "'..'",
-    "SIGN": "'+' or '-'",
-    "TRUTH": "TRUE or FALSE",
-    "DISTINCT": "DISTINCT",
-    "DIRECTION": "ASC or DESC",
-    _END: "the end",
+    "NAME": ("a name",),
+    "NUMBER": ("a number",),
+    "STRING": ("a text in quotes",),
+    "DURATION": ("a duration such as 2s",),
+    "PARAM": ("a parameter such as $x",),
+    "COMPARE": ("a comparison",),
+    "BARE_RIGHT": ("'-->'",),
+    "BARE_LEFT": ("'<--'",),
+    "BARE_ANY": ("'--'",),
+    "UPTO": ("'..'",),
+    "SIGN": ("'+'", "'-'"),
+    "TRUTH": ("TRUE", "FALSE"),
+    "DIRECTION": ("ASC", "DESC"),
+    "QUANTIFIER": ("FORALL", "FORSOME"),
+    "DEF_KIND": ("PREDICATE", "SCENARIO"),
+    "AGGREGATE": ("MIN", "MAX", "AVG", "SUM"),
+    "BOUND": ("a bound such as [0s, 2s]",),
+    _END: ("the end",),
 }
+"""Terminals in words."""
+
 _MANY: Final = 8
+_LONGEST: Final = 40
 
 
 def _unexpected(machine: Tables, stack: list[_Entry], text: str, position: int) -> QuerySyntaxError:
@@ -206,9 +225,17 @@ def _unexpected(machine: Tables, stack: list[_Entry], text: str, position: int) 
     span = Span(position, found.end() if found else position)
     names = [name for name in machine.states[stack[-1].state] if name.isupper() or name == _END]
     names = [name for name in names if _leads_on(machine, stack, name)]
-    here = f"found '{found[0]}'" if found else "the text ends"
+    here = f"found {_shown(found[0])}" if found else "the text ends"
     reason = f"expected {_listed(machine, names)}, but {here}"
     return QuerySyntaxError(reason, text=text, span=span, hint=_hint(machine, names, text, span))
+
+
+def _shown(found: str) -> str:
+    """What was found, for a message: short, and so that it can be seen."""
+    if not found.isprintable():
+        return " ".join(f"U+{ord(character):04X}" for character in found[:8])
+    short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
+    return short if len(found) > 1 and found[0] in "'\"" else f"'{short}'"
 
 
 def _leads_on(machine: Tables, stack: list[_Entry], name: str) -> bool:
@@ -235,35 +262,28 @@ def _listed(machine: Tables, names: list[str]) -> str:
     if "MATCH" in left:
         left -= {"NOT"}
     if left >= _STARTS:
-        said.append("a value or a condition")
+        said += ["a value", "a condition"]
         left -= _STARTS | {"NAME", "LPAR", "LSQB", "COUNT", "AGGREGATE", "DURATION", "TEMPORAL"}
         left -= {"SIGN", "NOT"}
     elif {"SIGN", "STAR"} <= left:
         said.append("an operator")
         left -= _OPERATORS | {"_RESEMBLES", "DOT"}
-    said += sorted(_said(machine, name) for name in left)
+    said += sorted(word for name in left for word in _said(machine, name))
     if len(said) > _MANY:
         said = [*said[:_MANY], "…"]
     return " or ".join([", ".join(said[:-1]), said[-1]]) if len(said) > 1 else "".join(said)
 
 
-def _said(machine: Tables, name: str) -> str:
+def _said(machine: Tables, name: str) -> tuple[str, ...]:
     terminal = machine.terminals.get(name)
-    if name in _SAID or terminal is None:
-        return _SAID.get(name, name)
-    if not terminal.literal:
-        return name
-    return terminal.literal if terminal.literal.isalpha() else f"'{terminal.literal}'"
+    if name in _SAID or terminal is None or not terminal.literal:
+        return _SAID.get(name, (name,))
+    return (terminal.literal if terminal.literal.isalpha() else f"'{terminal.literal}'",)
 
 
 def _hint(machine: Tables, names: list[str], text: str, span: Span) -> str | None:
-    before = text[max(span.start - 80, 0) : span.end]
-    for looks, hint in SYNTAX:
-        if looks.search(before):
-            return hint
-    word = text[span.start : span.end].upper()
+    bracket = bracket_hint(text, span.start, text[span.start : span.end])
+    if bracket:
+        return bracket
     words = [machine.terminals[name].literal for name in names if name in machine.terminals]
-    like = suggestion(word, [word for word in words if word.isalpha()]) if word.isalpha() else None
-    if like and like != word:
-        return f"did you mean {like}?"
-    return bracket_hint(text, span.start, text[span.start : span.end])
+    return slip_hint(text, span.start, span.end, places(names), words)

@@ -40,14 +40,12 @@ from sgstore.lang.formulas import (
 )
 from sgstore.lang.frames import Frames, column_of
 from sgstore.lang.kinds import Profile
+from sgstore.lang.runs import runs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.lang.phases import Window
-
-GAP: Final = 2.5
-"""A gap of more than so many median periods ends an interval."""
 
 EXTENTS: Final = """
 SELECT min(bucket) AS first, max(bucket) - min(bucket) + 1 AS buckets FROM bucket
@@ -303,19 +301,13 @@ class _Intervals:
 
     def statement(self) -> Statement:
         columns = self.result.columns
-        keys = list(self.keys.values())
         wanted = [leaf for column in columns for leaf in leaves(column.value)]
-        wanted += self.span or ()
-        relation = self.writer.frames(self.query.scope, None, frozenset(), frozenset(), wanted)
-        if self.span is None:
-            runs = self._runs(self._steps(relation, keys), keys)
-        else:
-            runs = self._spans(relation, keys, self.span)
+        spans = self._spans(wanted)
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
         named = [f"{self._told(c.value)} AS {quoted(c.name)}" for c in columns]
         select = Select([_named(text, name) for name, text in own] + named)
-        select.join(nested(runs, ":runs"), [])
+        select.join(nested(self._between(spans), ":runs"), [])
         select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = ":runs"."trace_id"'])
         first = '":runs"."first"'
         order = [_directed(_named_key(k.value), k.descending) for k in self.result.order]
@@ -336,26 +328,8 @@ class _Intervals:
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
 
-    def _steps(self, relation: str, keys: list[str]) -> str:
-        """Frames and keys, with the number and the time of the frame before that has the same keys."""
-        # The relation has a frame with the same values once; what is made of different values may be the same.
-        made = any(isinstance(key, Operation) for key in self.keys)
-        inner = Select(['"frame_id"'], [nested(relation, ":rows")], distinct=made)
-        inner.columns += self._keys()
-        times = ["frame_id", "trace_id", "seq", "time_ns", "log_time_ns"]
-        select = Select([f"{_FRAME}.{quoted(name)}" for name in times] + keys)
-        same = ", ".join([f'{_FRAME}."trace_id"', *self.apart])
-        over = f'OVER (PARTITION BY {same} ORDER BY {_FRAME}."seq")'
-        select.columns += [
-            f'lag({_FRAME}."seq") {over} AS "seq before"',
-            f'lag({_FRAME}."time_ns") {over} AS "time before"',
-            f'coalesce({_TRACE}."period_ns", 0) * CAST({GAP} AS DOUBLE) AS "longest gap"',
-        ]
-        _from_frames(select, inner.text())
-        return select.text()
-
-    def _keys(self) -> list[str]:
-        """The values that stay the same, under their keys."""
+    def _keys(self) -> dict[str, str]:
+        """Key → the value that stays the same."""
         # A word of the vocabulary is a number inside, as long as it is not told.
         texts = [
             _column(value)
@@ -363,47 +337,34 @@ class _Intervals:
             else expression_text(value, _column, self.writer.values)
             for value in self.keys
         ]
-        return [f"{text} AS {key}" for text, key in zip(texts, self.keys.values(), strict=True)]
+        return dict(zip(self.keys.values(), texts, strict=True))
 
-    def _spans(self, relation: str, keys: list[str], span: Span) -> str:
-        """Matches that are intervals themselves, each as one row."""
-        ends = [_column(leaf) for leaf in span]
-        inner = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"', *self._keys()])
-        inner.join(nested(relation, ":rows"), [])
-        inner.distinct = True
-        select = Select(['":from"."trace_id" AS "trace_id"', *keys])
+    def _spans(self, wanted: list[Leaf]) -> str:
+        """The first and the last frame of each interval, with the keys."""
+        scope = self.query.scope
+        if self.span is not None:
+            wanted = [*wanted, *self.span]
+            relation = self.writer.frames(scope, None, frozenset(), frozenset(), wanted)
+            ends = [_column(leaf) for leaf in self.span]
+            select = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"'])
+            select.columns += [f"{text} AS {key}" for key, text in self._keys().items()]
+            select.join(nested(relation, ":rows"), [])
+            select.distinct = True
+            return select.text()
+        keys = list(self.keys.values())
+        return runs(self.writer.in_masks(scope, wanted, self._keys()), keys, self.apart)
+
+    def _between(self, spans: str) -> str:
+        """What is told of the frames at both ends."""
+        select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
         select.columns += ['":from"."frame_id" AS "first"']
         select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
         for column, name in (("seq", "seq"), ("time_ns", "time"), ("log_time_ns", "log")):
             select.columns += [f'":from".{quoted(column)} AS {quoted(f"min {name}")}']
             select.columns += [f'":to".{quoted(column)} AS {quoted(f"max {name}")}']
-        select.join(nested(inner.text(), ":spans"), [])
+        select.join(nested(spans, ":spans"), [])
         select.join('"frame" AS ":from"', ['":from"."frame_id" = ":spans".":from"'])
         select.join('"frame" AS ":to"', ['":to"."frame_id" = ":spans".":to"'])
-        return select.text()
-
-    def _runs(self, steps: str, keys: list[str]) -> str:
-        """Runs of frames, numbered for each key, and then each as one row."""
-        apart = '"time_ns" - "time before"'
-        follows = f'"seq" = "seq before" + 1 AND {apart} >= 0 AND {apart} <= "longest gap"'
-        held = ["frame_id", "trace_id", "seq", "time_ns", "log_time_ns"]
-        begun = Select(
-            [*map(quoted, held), *keys, f'CASE WHEN NOT ({follows}) THEN 1 END AS "begins"']
-        )
-        begun.join(nested(steps, ":steps"), [])
-        same = ", ".join(['"trace_id"', *self.apart])
-        over = f'OVER (PARTITION BY {same} ORDER BY "seq" ROWS UNBOUNDED PRECEDING)'
-        numbered = Select(["*", f'count("begins") {over} AS "run"'])
-        numbered.join(nested(begun.text(), ":begun"), [])
-        ends = [("seq", "seq"), ("time_ns", "time"), ("log_time_ns", "log")]
-        select = Select(['"trace_id"', *keys, 'min("frame_id") AS "first"', 'count(*) AS "frames"'])
-        select.columns += [
-            f"{function}({quoted(column)}) AS {quoted(f'{function} {name}')}"
-            for column, name in ends
-            for function in ("min", "max")
-        ]
-        select.join(nested(numbered.text(), ":numbered"), [])
-        select.group = ['"trace_id"', *keys, '"run"']
         return select.text()
 
     def _interval_columns(self) -> list[tuple[str, str]]:

@@ -29,7 +29,7 @@ from sgstore.lang.bound import (
     Scope,
     blocks_of,
 )
-from sgstore.lang.counting import Range, folded, frames_with
+from sgstore.lang.counting import Range, folded, frames_with, merged
 from sgstore.lang.formulas import (
     Aliases,
     Leaf,
@@ -211,6 +211,10 @@ class Masks(Presence, ABC):
         total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
         return Select([total], [nested(text, ":pattern")]).text()
 
+    def in_which(self, alias: str) -> list[str]:
+        """The columns that say in which frames a row of a relation of the first phase holds."""
+        return [f'{alias}."bucket"', f'{alias}."mask"']
+
     def held(self, alias: str) -> str:
         """In how many frames a row of a relation of the first phase holds."""
         return f'bit_count({alias}."mask")'
@@ -224,10 +228,7 @@ class Masks(Presence, ABC):
         text = self.masks(scope, parts, given, keys)
         if set(scope.nodes) and not parts.blocks:
             return text  # grouped already, for the nodes inside are dropped
-        select = Select(['"bucket"', *columns_of(keys), 'bit_or("mask") AS "mask"'])
-        select.join(nested(text, ":block"), [])
-        select.group = ['"bucket"', *columns_of(keys)]
-        return select.text()
+        return merged(text, {column: column for column in columns_of(keys)})
 
     @property
     def chooses_traces(self) -> bool:

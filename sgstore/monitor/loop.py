@@ -15,7 +15,6 @@ from sgstore.lang.checks import bind_checks
 from sgstore.lang.evaluation import FrameView
 from sgstore.lang.parser import parse
 from sgstore.lang.reach import Reach
-from sgstore.lang.results import GAP
 from sgstore.lang.syntax import Check, Define, Match, Parameter
 from sgstore.monitor.asking import People, Questions
 from sgstore.monitor.events import Event, Moment
@@ -24,6 +23,7 @@ from sgstore.monitor.watching import Watch
 from sgstore.online.stepping import Uncollected
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.temporal.courses import Pulse
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -12,6 +12,7 @@ from sgstore.store.access import spill_folder
 from sgstore.store.packing import plain
 from sgstore.store.staging import quoted, scratch
 from sgstore.store.traces import already_stored, free_name, stored_name
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,9 +28,7 @@ if TYPE_CHECKING:
 MAP_TABLES: Final = ("map", "map_node", "map_edge", "map_reach")
 """Tables of a road map; they come into a store once, whatever the number of traces on it."""
 
-_TRACE: Final = """
-INSERT INTO bucket BY NAME
-SELECT bucket, $trace_id AS trace_id, bit_or(1::BIGINT << bit) AS valid FROM frame GROUP BY bucket;
+_TRACE: Final = f"""
 INSERT INTO trace BY NAME
 WITH steps AS (SELECT time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
 SELECT $trace_id AS trace_id, $uri AS uri, $size AS size, $mtime_ns AS mtime_ns,
@@ -40,6 +39,12 @@ SELECT $trace_id AS trace_id, $uri AS uri, $size AS size, $mtime_ns AS mtime_ns,
        $origin_x AS origin_x, $origin_y AS origin_y, $origin_z AS origin_z, $answers AS answers,
        $report AS report, $version AS version
 FROM frame;
+INSERT INTO bucket BY NAME
+WITH steps AS (
+  SELECT bucket, 1::BIGINT << bit AS one, time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
+SELECT bucket, $trace_id AS trace_id, bit_or(one) AS valid,
+       bit_or(CASE WHEN step BETWEEN 0 AND {GAP} * period_ns THEN one ELSE 0 END) AS joined
+FROM steps CROSS JOIN trace GROUP BY bucket;
 """
 
 
@@ -212,7 +217,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
 
 
 _SORTED: Final = {
-    "state": "SELECT * FROM store.state ORDER BY kind, frame_id >> 6, node_id, frame_id",
+    "state": "SELECT * FROM store.state ORDER BY is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
     "lane_state": "SELECT * FROM store.lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
     "lane_gap": "SELECT * FROM store.lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
     "node": "SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM store.node GROUP BY ALL ORDER BY ALL",

@@ -59,7 +59,7 @@ _GROWING: Final = {
     "state": """
 SELECT s.* REPLACE (e.special AS special, e.subkind AS subkind)
 FROM state s JOIN entity e ON e.node_id = s.node_id
-ORDER BY s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
+ORDER BY s.is_ego DESC, s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
     "lane_state": "SELECT * FROM lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
     "lane_gap": "SELECT * FROM lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
     "node": "SELECT kind, bucket, node_id, mask FROM node ORDER BY ALL",

@@ -15,7 +15,7 @@ from sgstore.store.checksums import Checksum, expressions
 from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
 from sgstore.store.publishing import MAP_TABLES, owned
 from sgstore.store.traces import stored_traces
-from sgstore.world import BUCKET_FRAMES
+from sgstore.world import BUCKET_FRAMES, GAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -84,13 +84,18 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "masks",
-        "a bucket does not have the frames that it says",
-        """
+        "a bucket does not have the frames that it says, or joins others than follow one another",
+        f"""
         SELECT coalesce(b.trace_id, f.trace_id)
         FROM bucket b FULL JOIN (
-          SELECT bucket, any_value(trace_id) AS trace_id, bit_or(1::BIGINT << bit) AS valid
-          FROM frame GROUP BY bucket) f ON f.bucket = b.bucket
-        WHERE b.valid IS DISTINCT FROM f.valid OR b.trace_id IS DISTINCT FROM f.trace_id""",
+          SELECT bucket, any_value(trace_id) AS trace_id, bit_or(one) AS valid,
+                 bit_or(CASE WHEN step BETWEEN 0 AND {GAP} * period_ns THEN one ELSE 0 END) AS joined
+          FROM (SELECT f.bucket, f.trace_id, t.period_ns, 1::BIGINT << f.bit AS one,
+                       f.time_ns - lag(f.time_ns) OVER (PARTITION BY f.trace_id ORDER BY f.frame_id) AS step
+                FROM frame f LEFT JOIN trace t ON t.trace_id = f.trace_id)
+          GROUP BY bucket) f ON f.bucket = b.bucket
+        WHERE b.valid IS DISTINCT FROM f.valid OR b.trace_id IS DISTINCT FROM f.trace_id
+           OR b.joined IS DISTINCT FROM f.joined""",
     ),
     (
         "frames",
