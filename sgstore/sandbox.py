@@ -261,7 +261,6 @@ def _sent_and_read(
 
 
 _QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
-_SPILLED: Final = os.strerror(errno.EFBIG)
 _ERRORS: Final = {"sql": SqlError, "store": StoreError}
 
 
@@ -349,13 +348,16 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
         span = (error.span.start, error.span.end) if error.span else None
         about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
         return {**about, "span": span, "hint": error.hint}
-    text = str(error)
-    if (
-        _SPILLED in text and "duckdb_temp" in text
-    ):  # it would go on in files, which it may not write
+    if _spilled(error):
         error = SqlError("stopped: it took more memory than is allowed")
     kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "sql")
     return {"kind": kind, "error": str(error)}
+
+
+def _spilled(error: SgstoreError) -> bool:
+    """Whether the database would have gone on in temporary files: :func:`_limit` lets it write none."""
+    text = str(error)
+    return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
 
 
 def _send(to: IO[bytes], reply: object) -> None:
