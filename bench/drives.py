@@ -1,16 +1,23 @@
-"""Made-up drives, as many as wanted: coherent in time, an ego among 14 others, on one of eight streets.
+"""Made-up drives, as many as wanted: coherent in time, an ego among others, on one of eight streets.
 
-At 10 Hz; the length of a drive is lognormal between 15 s and 200 s (a median of 45 s). The ego keeps to its
-lane and stops now and then, as at lights. Four vehicles go its way, clear of it, at distances that wander as if
-drawn by a spring; four come towards it, one after the other, in the lane beside; three stand at the kerb, every
-150 m; two people walk on the sidewalk, and one crosses the street, to and fro. Of the vehicles 3 in 4 are cars,
-the others vans, trucks and buses. Everything follows from the seed.
+At 10 Hz; the length of a drive is lognormal between 15 s and 200 s (a median of 45 s). About 17 nodes a frame
+(5 cars, 1 van, truck or bus, 3 people, 5 lanes), and 48 edges as :mod:`bench.patterns` asks for them.
+
+* The ego keeps to its lane, at 4 to 12 m/s, and stops now and then, as at lights; who drives stops with it.
+* Two vehicles go ahead of it and two behind, at distances that wander, and change lanes; the nearer of those
+  behind stays in the lane at the kerb, much of the time beside the ego.
+* In the lane of the other direction one comes every 200 m, and at the kerb a car or van stands every 130 m.
+* A person walks on the sidewalk every 175 m, one stands across the street every 40 m, and where the ego stops,
+  one has waited at the kerb and walks across the street in front of it.
+
+Distances from one to the next are drawn, and so are kinds: of 12 vehicles 9 are cars. Nobody ever comes nearer
+to another than half a metre. Everything follows from the seed.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,6 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    Floats = NDArray[np.float64]
+
 PERIOD_NS = 100_000_000
 BLOCK = 600
 MAPS = 8
@@ -29,10 +38,31 @@ SECTION = 300.0
 """Length of a road; m."""
 ROADS = 12
 WIDTH = 3.5
+SIZE = {
+    "car": (4.5, 1.9, 1.5),
+    "van": (5.5, 2.0, 2.2),
+    "truck": (9.0, 2.5, 3.2),
+    "bus": (12.0, 2.5, 3.2),
+    "person": (0.5, 0.5, 1.75),
+}
 KINDS = ("car", "car", "car", "van", "car", "car", "car", "truck", "car", "car", "car", "bus")
-SIZE = {"car": (4.5, 1.9, 1.5), "van": (5.5, 2.0, 2.2), "truck": (9.0, 2.5, 3.2)}
-SIZE |= {"bus": (12.0, 2.5, 3.2), "person": (0.5, 0.5, 1.75)}
-PEOPLE = 3
+ONCOMING, PARKED, WALKING, WAITING = 200.0, 130.0, 175.0, 40.0
+"""From one to the next in the mean: against the ego, at the kerb, on the sidewalk, across the street; m."""
+LANES = (0.5 * WIDTH, -0.5 * WIDTH, -5.1)
+"""Where one drives: against, ahead, and ahead beside the kerb; y in m."""
+PARKED_Y, WALKING_Y, WAITING_Y = -8.0, -9.8, 24.0
+CROSSING_Y = (-8.0, 5.0)
+CROSSING = 3.65
+"""How far ahead of the middle of the ego one crosses: of its column, none is within 1 m of this; m."""
+WALK = 1.4
+"""Of people; m/s."""
+AHEAD, BEHIND = (13.0, 42.0), (-5.0, -24.0)
+"""Where the rears of those ahead, and the fronts of those behind, would be: from the middle of the ego; m."""
+COLUMN = len(AHEAD) + len(BEHIND)
+CLEAR = 2.5
+"""From one of the column to the next, at least; m."""
+FASTER = 1.3
+"""How much faster than the ego those are that come towards it."""
 
 
 def street(number: int) -> str:
@@ -99,41 +129,40 @@ def info(number: int, frames: int) -> TraceInfo:
 
 def drive(number: int, frames: int) -> Iterator[FrameBlock]:
     """The frames of a drive, in blocks."""
-    x, y, heading, speed = _motion(np.random.default_rng(number), frames)
-    y = y + 1000.0 * (number % MAPS)
-    actors = x.shape[1]
-    kinds = [KINDS[(number + k) % len(KINDS)] if k else "car" for k in range(actors - PEOPLE)]
-    kinds += ["person"] * PEOPLE
-    length, width, height = np.array([SIZE[kind] for kind in kinds]).T
+    random = np.random.default_rng(number)
+    actors = _traffic(random, frames)
+    count = len(actors.kinds)
+    y = actors.y + 1000.0 * (number % MAPS)
+    length, width, height = np.array([SIZE[kind] for kind in actors.kinds]).T
     entities = Entities(
         first=0,
-        ident=tuple(map(str, range(actors))),
-        kind=np.array([KIND_CODE[kind] for kind in kinds], np.int8),
-        special=("",) * actors,
-        subkind=("",) * actors,
-        type_name=("",) * actors,
-        static=np.zeros(actors, np.bool_),
-        map_ref=("",) * actors,
+        ident=tuple(map(str, range(count))),
+        kind=np.array([KIND_CODE[kind] for kind in actors.kinds], np.int8),
+        special=("",) * count,
+        subkind=("",) * count,
+        type_name=("",) * count,
+        static=np.zeros(count, np.bool_),
+        map_ref=("",) * count,
     )
-    nobody = Entities(actors, (), np.zeros(0, np.int8), (), (), (), np.zeros(0, np.bool_), ())
+    nobody = Entities(count, (), np.zeros(0, np.int8), (), (), (), np.zeros(0, np.bool_), ())
     none = np.zeros(0, np.int64)
     for start in range(0, frames, BLOCK):
         rows = slice(start, min(start + BLOCK, frames))
         seq = np.arange(rows.start, rows.stop)
         n = len(seq)
-        velocity = speed[rows].ravel()
-        towards = np.broadcast_to(heading[rows], (n, actors)).ravel()
+        velocity = actors.speed[rows].ravel()
+        towards = actors.heading[rows].ravel()
         states = States.of(
-            node=np.tile(np.arange(actors), n),
-            x=x[rows].ravel(),
+            node=np.tile(np.arange(count), n),
+            x=actors.x[rows].ravel(),
             y=y[rows].ravel(),
             z=np.tile(height / 2, n),
             heading=towards,
-            pitch=np.zeros(n * actors),
-            roll=np.zeros(n * actors),
+            pitch=np.zeros(n * count),
+            roll=np.zeros(n * count),
             vx=velocity * np.cos(towards),
             vy=velocity * np.sin(towards),
-            vz=np.zeros(n * actors),
+            vz=np.zeros(n * count),
             length=np.tile(length, n),
             width=np.tile(width, n),
             height=np.tile(height, n),
@@ -142,7 +171,7 @@ def drive(number: int, frames: int) -> Iterator[FrameBlock]:
             seq=seq,
             time_ns=seq * PERIOD_NS,
             log_time_ns=seq * PERIOD_NS,
-            offsets=np.arange(n + 1) * actors,
+            offsets=np.arange(n + 1) * count,
             states=states,
             ego=np.zeros(n, np.int64),
             entities=nobody if start else entities,
@@ -151,57 +180,139 @@ def drive(number: int, frames: int) -> Iterator[FrameBlock]:
         )
 
 
-def _motion(random: np.random.Generator, n: int) -> tuple[NDArray[np.float64], ...]:
-    """x, y, heading and speed of all actors, (frames, actors): the ego, then the others as the module says."""
-    t = np.arange(n)[:, None] / 10
-    wish = 8 + 4 * np.sin(t[:, 0] / random.uniform(8, 20) + random.uniform(0, 6))
-    wish[np.sin(t[:, 0] / random.uniform(10, 25)) > 0.8] = 0
-    speed = _followed(wish[:, None], 0.05)
-    ego_x = 200 + random.uniform(0, 200) + np.cumsum(speed, axis=0) / 10
-    ego_y = np.full((n, 1), -0.5 * WIDTH)
+class _Actors(NamedTuple):
+    """Some that move: their kinds, and in each frame x, y, heading and speed, (frames, actors)."""
 
-    ahead = np.array([[24.0, -24.0, 4.0, 44.0]]) + random.normal(0, 3, (1, 4))
-    wander = _followed(random.normal(0, 40, (n, 4)), 0.02)
-    convoy_x = ego_x + ahead + wander
-    lane = np.array([[-0.5, -0.5, -1.5, -1.5]]) * WIDTH
-    changes = np.sign(np.sin(t / random.uniform(10, 30, (1, 4))))
-    convoy_y = _followed(np.where(changes > 0, lane, -2 * WIDTH - lane), 0.03)
-    convoy_speed = np.maximum(np.gradient(convoy_x, 0.1, axis=0) if n > 1 else speed, 0)
+    kinds: list[str]
+    x: Floats
+    y: Floats
+    heading: Floats
+    speed: Floats
 
-    towards = 400 * np.arange(4) + random.uniform(0, 300) - 9 * t
-    oncoming_x = ego_x + np.mod(towards, 1600) - 200
-    oncoming_y = np.full((n, 4), 0.5 * WIDTH)
 
-    kerb_x = np.broadcast_to(np.floor(ego_x[:1] / 150) * 150 + 150 * np.array([[0, 1, 3]]), (n, 3))
-    kerb_y = np.full((n, 3), -2.05 * WIDTH)
-
-    walk_x = ego_x[:1] + np.array([[20.0, 70.0]]) + 1.3 * t * np.array([[1, -1]])
-    walk_y = np.full((n, 2), -2.5 * WIDTH)
-    cross_x = np.floor(ego_x / 80) * 80 + 60
-    cross_y = -0.75 * WIDTH + 2.2 * WIDTH * np.sin(t / random.uniform(3, 6))
-
-    zeros = np.zeros((n, 1))
-    x = np.hstack([ego_x, convoy_x, oncoming_x, kerb_x, walk_x, cross_x])
-    y = np.hstack([ego_y, convoy_y, oncoming_y, kerb_y, walk_y, cross_y])
-    speeds = np.hstack(
-        [
-            speed,
-            convoy_speed,
-            np.full((n, 4), 9.0),
-            np.zeros((n, 3)),
-            np.full((n, 2), 1.3),
-            zeros + 1,
-        ]
+def _traffic(random: np.random.Generator, frames: int) -> _Actors:
+    """All actors of a drive: the ego first, then the others as the module says."""
+    t = np.arange(frames)[:, None] / 10
+    speed = _ego_speed(random, t)
+    way = np.cumsum(speed, axis=0) / 10
+    begin = 200 + random.uniform(0, 200)
+    until = begin + way[-1, 0]
+    walked = WALK * t
+    stops = np.flatnonzero((speed[:, 0] == 0) & (np.roll(speed[:, 0], 1) > 0))
+    crossing_x = begin + way[stops, 0] + CROSSING
+    since = np.clip(t - t[stops, 0] - 1, 0, (CROSSING_Y[1] - CROSSING_Y[0]) / WALK)
+    crossing_y = CROSSING_Y[0] + WALK * since
+    crossing = np.diff(crossing_y, axis=0, prepend=CROSSING_Y[0]) > 0
+    oncoming = _places(random, ONCOMING, begin, until + FASTER * way[-1, 0])
+    oncoming = oncoming[_clear(oncoming[:, None] - FASTER * way[stops, 0], crossing_x)]
+    parked = _places(random, PARKED, begin, until)
+    parked = parked[_clear(parked[:, None], crossing_x)]
+    walking = _places(random, WALKING, begin - walked[-1, 0], until)
+    waiting = _places(random, WAITING, begin, until)
+    groups = (
+        _driven(random, begin, oncoming, way, speed),
+        _standing(random, parked, frames),
+        _people(walking + walked, WALKING_Y, 0.0, WALK),
+        _people(waiting + 0 * t, WAITING_Y, -0.5 * np.pi, 0.0),
+        _people(crossing_x, crossing_y, 0.5 * np.pi, WALK * crossing),
     )
-    turned = np.hstack(
-        [zeros, np.zeros((n, 4)), np.full((n, 4), np.pi), np.zeros((n, 3)), zeros, zeros + np.pi, zeros + 1.57]
-    )  # fmt: skip
-    return x, y, turned, speeds
+    kinds = [kind for group in groups for kind in group.kinds]
+    return _Actors(kinds, *(np.hstack([group[i] for group in groups]) for i in range(1, 5)))
 
 
-def _followed(wish: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
-    """What follows a wish, each step by a share of what is missing: a running mean with a long tail."""
-    weights = rate * (1 - rate) ** np.arange(int(6 / rate))
-    weights /= weights.sum()
-    padded = np.vstack([np.repeat(wish[:1], len(weights) - 1, axis=0), wish])
-    return np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
+def _ego_speed(random: np.random.Generator, t: Floats) -> Floats:
+    """From 4 to 12 m/s, and 0 for 13 to 32 s at a time, never in the first frame."""
+    wish = 8 + 4 * np.sin(t / random.uniform(8, 20) + random.uniform(0, 6))
+    light = np.sin(t / random.uniform(10, 25) + random.uniform(2.5, 6.8))
+    return wish * np.clip(4 * (0.8 - light), 0, 1)
+
+
+def _places(random: np.random.Generator, mean: float, begin: float, until: float) -> Floats:
+    """Places along the street, from 60 m before to 60 m behind, every ``mean`` metres or so."""
+    count = int((until - begin + 120) / mean) + 1
+    gaps = mean * random.uniform(0.5, 1.5, 2 * count)
+    found = begin - 60 - mean * random.random() + np.cumsum(gaps)
+    return found[found < until + 60]
+
+
+def _clear(x: Floats, crossing_x: Floats) -> NDArray[np.bool_]:
+    """Which vehicles stand clear of all places where one crosses; the longest is 12 m long."""
+    return np.all(np.abs(x - crossing_x) > 8, axis=1)
+
+
+def _kinds(random: np.random.Generator, count: int) -> list[str]:
+    return [KINDS[i] for i in random.integers(len(KINDS), size=count)]
+
+
+def _standing(random: np.random.Generator, x: Floats, frames: int) -> _Actors:
+    """Cars and vans at the kerb."""
+    shape = (frames, len(x))
+    kinds = [kind if kind == "van" else "car" for kind in _kinds(random, len(x))]
+    still = np.zeros(shape)
+    return _Actors(kinds, np.broadcast_to(x, shape), np.full(shape, PARKED_Y), still, still)
+
+
+def _people(x: Floats, y: float | Floats, heading: float, speed: float | Floats) -> _Actors:
+    shape = np.broadcast_shapes(x.shape, np.shape(y))
+    return _Actors(
+        ["person"] * shape[1],
+        *(np.broadcast_to(value, shape) for value in (x, y, heading, speed)),
+    )
+
+
+def _driven(
+    random: np.random.Generator, begin: float, oncoming: Floats, way: Floats, speed: Floats
+) -> _Actors:
+    """The ego, those that go its way, and those that come towards it: all a function of its way.
+
+    So they stop where it stops, and their speed is in proportion to its own.
+    """
+    kinds = ["car", *_kinds(random, COLUMN + len(oncoming))]
+    length = np.array([SIZE[kind][0] for kind in kinds[1 : COLUMN + 1]])
+    far, near, between = random.uniform([[4], [1], [60]], [[7], [3], [150]], (3, COLUMN))
+    phase = random.uniform(0, 2 * np.pi, (3, COLUMN))
+    swerve = random.uniform(0, 2 * np.pi, len(kinds))
+
+    def placed(way: Floats) -> tuple[Floats, Floats]:
+        slow, fast, change = (
+            np.sin(way / wave + p) for wave, p in zip((40, 15, between), phase, strict=True)
+        )
+        right = 0.5 + 0.5 * np.tanh(5 * change)
+        right[:, len(AHEAD)] = 1
+        y = LANES[1] + (LANES[2] - LANES[1]) * np.hstack([np.zeros(way.shape), right])
+        against = oncoming - FASTER * way
+        x = np.hstack(
+            [begin + way, begin + way + _column(far * slow + near * fast, length), against]
+        )
+        y = np.hstack([y, np.full(against.shape, LANES[0])])
+        return x, y + 0.12 * np.sin(way / 25 + swerve)
+
+    step = 0.1
+    x, y = placed(way)
+    dx, dy = (after - now for now, after in zip((x, y), placed(way + step), strict=True))
+    return _Actors(kinds, x, y, np.arctan2(dy, dx), speed * np.hypot(dx, dy) / step)
+
+
+def _column(wander: Floats, length: Floats) -> Floats:
+    """How far each is ahead of the ego, (frames, vehicles), from middle to middle.
+
+    Nobody passes another, whatever their lanes: each keeps clear of those nearer to the ego. Only the first of
+    those behind may be beside the ego.
+    """
+    x = np.empty(wander.shape)
+    free = np.full(len(x), CROSSING + 1)
+    for k, wish in enumerate(AHEAD):
+        rear = _smooth_max(wish + wander[:, k], free)
+        x[:, k] = rear + length[k] / 2
+        free = rear + length[k] + CLEAR
+    free = np.full(len(x), CROSSING - 1)
+    for k, wish in enumerate(BEHIND, len(AHEAD)):
+        front = -_smooth_max(-wish - wander[:, k], -free)
+        x[:, k] = front - length[k] / 2
+        free = np.minimum(front - length[k], -SIZE["car"][0] / 2) - CLEAR
+    return x
+
+
+def _smooth_max(a: Floats, b: Floats) -> Floats:
+    """At least the greater of both, and at most 2 m more; as one brakes, not as one bounces."""
+    return 0.5 * (a + b + np.hypot(a - b, 4))
