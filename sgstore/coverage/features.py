@@ -105,8 +105,8 @@ def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedint
     """
     if shape[0] * shape[1] * kind.itemsize > LARGEST:
         raise ConfigError(
-            f"{shape[1]:,} features in {shape[0]:,} classes; at most {LARGEST:,} numbers are held at once: ask"
-            " of fewer frames, or for an abstraction with fewer labels"
+            f"{shape[1]:,} features in {shape[0]:,} classes would take more than {LARGEST:,} bytes: ask of"
+            " fewer frames, or for an abstraction with fewer labels"
         )
     return np.zeros(shape, kind)
 
