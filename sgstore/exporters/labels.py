@@ -134,9 +134,9 @@ def _answers(
     store: Store, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
     """Rows of frames and values of an expression: of those with an ego, then of those without."""
-    value = f"{_RETURNED}{text}) AS label"
+    value = f"{text}) AS label"
     try:
-        matches = store.find(f"MATCH (:Ego) {value}", **parameters)
+        matches = store.find(_OF_EGO + value, **parameters)
     except QueryError as error:
         raise _of_expression(error, text) from None
     if matches.columns != ("frame_of_label", "label"):
@@ -148,18 +148,21 @@ def _answers(
     left_out = [store.file.trace(trace).trace_id for trace in matches.left_out]
     if answered[~np.isin(trace_of(wanted), left_out)].all():
         return
-    row, answer = _columns(store.find(f"MATCH (anything) {value}", **parameters), wanted)
+    row, answer = _columns(store.find(_OF_ANYTHING + value, **parameters), wanted)
     yield row[~answered[row]], answer[~answered[row]]
 
 
 _RETURNED: Final = "RETURN DISTINCT frame.id AS frame_of_label, ("
+_OF_EGO: Final = f"MATCH (:Ego) {_RETURNED}"
+_OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
+"""What comes before an expression."""
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
     """What is wrong with an expression, shown in what was written and not in the query that it became."""
     if error.span is None:
         return QueryError(error.reason, text=text, hint=error.hint)
-    before, end = len("MATCH (:Ego) ") + len(_RETURNED), len(text)
+    before, end = len(_OF_EGO), len(text)
     start, stop = (min(max(place - before, 0), end) for place in (error.span.start, error.span.end))
     reason = error.reason.replace("found ')'", "the text ends") if start == end else error.reason
     return QueryError(reason, text=text, span=Span(start, stop), hint=error.hint)
