@@ -28,6 +28,7 @@ from sgstore.temporal.formulas import (
     Proposition,
     Since,
     Until,
+    looks_ahead,
     propositions,
     walk,
 )
@@ -227,11 +228,7 @@ class Progression:
         self.terms = terms or Terms()
         parts = {id(part): part for part in walk(self.formula)}
         self.past = tuple(p for p in parts.values() if isinstance(p, Previous | Since))
-        self.looking = frozenset(
-            id(p)
-            for p in parts.values()
-            if any(isinstance(inner, Next | Until) for inner in walk(p))
-        )
+        self.looking = frozenset(id(p) for p in parts.values() if looks_ahead(p))
         self.begun: Past = tuple((self.terms.false, ()) for _ in self.past)
 
     @property
