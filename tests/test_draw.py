@@ -21,6 +21,7 @@ from sgstore.draw.indexed import FURTHEST
 from sgstore.errors import ExportError, MissingExtraError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from sgstore.graph import SceneGraph
@@ -295,16 +296,16 @@ def test_the_camera_picture_stands_beside(tmp_path: Path, form: str) -> None:
 @pytest.mark.parametrize(
     "picture",
     [
-        pytest.param(b"", id="empty"),
-        pytest.param(b"GIF89a" + bytes(100), id="another format"),
-        pytest.param(camera("PNG")[:100], id="cut short"),
-        pytest.param(camera("JPEG")[:300] + bytes(50), id="damaged"),
-        pytest.param(camera("PNG", (9000, 9000)), id="too many pixels"),
+        pytest.param(lambda: b"", id="empty"),
+        pytest.param(lambda: b"GIF89a" + bytes(100), id="another format"),
+        pytest.param(lambda: camera("PNG")[:100], id="cut short"),
+        pytest.param(lambda: camera("JPEG")[:300] + bytes(50), id="damaged"),
+        pytest.param(lambda: camera("PNG", (9000, 9000)), id="too many pixels"),
     ],
 )
-def test_a_bad_camera_picture_is_refused(tmp_path: Path, picture: bytes) -> None:
+def test_a_bad_camera_picture_is_refused(tmp_path: Path, picture: Callable[[], bytes]) -> None:
     with pytest.raises(ExportError, match="camera picture"):
-        draw_frame(two(), None, tmp_path / "a.png", picture=picture)
+        draw_frame(two(), None, tmp_path / "a.png", picture=picture())
 
 
 def test_the_title_has_trace_frame_and_time_also_where_it_is_a_date() -> None:
