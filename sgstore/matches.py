@@ -352,43 +352,31 @@ class Matches:
         whole_traces: bool,
     ) -> Iterator[tuple[Any, ...]]:
         extents = [] if at_once else self._file.rows(EXTENTS).values
-        steps = windows(extents, whole_traces=whole_traces)
-        window, more = next(steps), True
-        while more:
-            ready, rows = statement(window), 0
+        steps = Windows(extents, whole_traces=whole_traces)
+        for window in steps:
+            ready = statement(window)
             given = self._given(ready)
             with self._file.batches(ready.sql, ready.values, given=given) as batches:
                 for batch in batches:
-                    rows += len(batch)
+                    steps.rows += len(batch)
                     yield from batch.values
-            try:
-                window = steps.send(rows)
-            except StopIteration:
-                more = False
 
     def _given(self, statement: Statement) -> list[GivenTable]:
         """What a statement is given of what was found otherwise."""
         return [GivenTable(one.name, one.types, self._blocks(one)) for one in statement.gathered]
 
     def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
-        steps = windows(self._file.rows(EXTENTS).values, whole_traces=True)
-        window = next(steps)
-        while True:
+        steps = Windows(self._file.rows(EXTENTS).values, whole_traces=True)
+        for window in steps:
             block = gathered.block(window)
+            steps.rows = len(block[0])
             yield block
-            try:
-                window = steps.send(len(block[0]))
-            except StopIteration:
-                return
 
 
-def windows(
-    extents: Iterable[tuple[int, int]], *, whole_traces: bool = False
-) -> Generator[Window | None, int, None]:
+class Windows:
     """Ranges of buckets in order; ``None`` (all) for a small store.
 
-    Each is twice as long as the one before, unless that had so many rows (which are sent) that it would
-    have too many.
+    Each is twice as long as the one before, unless that had so many rows that it would have too many.
 
     Parameters
     ----------
@@ -396,25 +384,37 @@ def windows(
         First bucket and number of buckets of each trace, in order.
     whole_traces : bool
         Whether no range may end within a trace.
+
+    Attributes
+    ----------
+    rows : int
+        Rows of the range that came last; who reads them counts them.
     """
-    extents = list(extents)
-    if sum(buckets for _, buckets in extents) <= FIRST_WINDOW:
-        yield None
-        return
-    size, used, low, high = FIRST_WINDOW, 0, None, 0
-    for first, buckets in extents:
-        start, left = first, buckets
-        while left:
-            taken = left if whole_traces else min(left, size - used)
-            low = start if low is None else low
-            start, left, used = start + taken, left - taken, used + taken
-            high = start
-            if used >= size:
-                rows = yield Window(low, high)
-                size = max(min(2 * used, used * ROWS // max(rows, 1), LAST_WINDOW), 1)
-                used, low = 0, None
-    if low is not None:
-        yield Window(low, high)
+
+    def __init__(self, extents: Iterable[tuple[int, int]], *, whole_traces: bool = False) -> None:
+        self._extents = list(extents)
+        self._whole_traces = whole_traces
+        self.rows = 0
+
+    def __iter__(self) -> Iterator[Window | None]:
+        if sum(buckets for _, buckets in self._extents) <= FIRST_WINDOW:
+            yield None
+            return
+        size, used, low, high = FIRST_WINDOW, 0, None, 0
+        for first, buckets in self._extents:
+            start, left = first, buckets
+            while left:
+                taken = left if self._whole_traces else min(left, size - used)
+                low = start if low is None else low
+                start, left, used = start + taken, left - taken, used + taken
+                high = start
+                if used >= size:
+                    self.rows = 0
+                    yield Window(low, high)
+                    size = max(min(2 * used, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
+                    used, low = 0, None
+        if low is not None:
+            yield Window(low, high)
 
 
 def merged(clips: Iterable[Clip]) -> Iterator[Clip]:

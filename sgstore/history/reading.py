@@ -11,7 +11,7 @@ from sgstore.history.relations import Relation
 from sgstore.lang.found import CLOCK, TRACES, relation
 from sgstore.lang.phases import traces_of
 from sgstore.lang.results import EXTENTS
-from sgstore.matches import windows
+from sgstore.matches import Windows
 from sgstore.store.covering import trace_of
 from sgstore.temporal.columns import evaluate_rows
 from sgstore.temporal.formulas import Formula, propositions
@@ -201,16 +201,11 @@ def traces(
     extents = file.rows(EXTENTS).values
     if within is not None:
         extents = [one for one in extents if within.low <= one[0] < within.high]
-    steps = windows(extents, whole_traces=True)
-    try:
-        window = next(steps)
-        while True:
-            found, rows = read(file, catalog, whole, asks, window or within, gaps=gaps)
-            yield from found
-            del found
-            window = steps.send(rows)
-    except StopIteration:
-        return
+    steps = Windows(extents, whole_traces=True)
+    for window in steps:
+        found, steps.rows = read(file, catalog, whole, asks, window or within, gaps=gaps)
+        yield from found
+        del found
 
 
 def read(

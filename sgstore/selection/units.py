@@ -11,12 +11,13 @@ import numpy as np
 
 from sgstore.coverage import classed
 from sgstore.coverage.asking import is_of_ego
-from sgstore.coverage.classed import GAP, UNKNOWN
+from sgstore.coverage.classed import UNKNOWN
 from sgstore.coverage.features import combined, features
 from sgstore.errors import ConfigError
 from sgstore.selection.family import Family, distinct, spread
 from sgstore.store.contents import lengths_of_messages
 from sgstore.store.covering import seq_of, trace_of
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
