@@ -114,15 +114,16 @@ class Drive:
         assert {name: violated[name] for name in alone} == alone, (self.name, text)
         return sum(len(v.violations) for v in wanted)
 
-    def compare_matches(self, texts: Sequence[str]) -> int:
-        """What is found, by the frame it begins in and who it is; how often."""
+    def compare_matches(self, texts: Sequence[str]) -> list[int]:
+        """What is found, by the frame it begins in and who it is; how often, of each."""
         _, events, monitor = self.watched(";\n".join(texts))
-        total = 0
+        often: list[int] = []
         for number, text in enumerate(texts, start=1):
             name = "pattern" if len(texts) == 1 else f"pattern {number}"
             found = self.store.find(text)
             assert (name in monitor.names) == (not found.left_out), (self.name, text)
             if found.left_out:
+                often.append(0)
                 continue
             intervals = list(found.intervals())
             whole = {n for one in intervals for n, v in one.values.items() if isinstance(v, int)}
@@ -131,8 +132,8 @@ class Drive:
             seen = Counter((e.start.seq, _who(e.nodes, whole, self.online)) for e in own)
             assert wanted == seen, (self.name, text)
             assert all(e.start.seq <= e.end.seq <= e.told.seq for e in own), (self.name, text)
-            total += len(intervals)
-        return total
+            often.append(len(intervals))
+        return often
 
 
 def _who(values: Any, names: set[str], idents: dict[int, str]) -> tuple[tuple[str, Any], ...]:
@@ -177,7 +178,7 @@ def compare(recording: Path, folder: Path) -> tuple[int, int, int]:
     drive = Drive.of(recording, folder)
     violations = sum(drive.compare_checks(text) for text in (CHECKS, library_checks()))
     violations += drive.compare_checks(CHECKS, sgsm_compat=True)
-    matches = drive.compare_matches([*SEQUENCES, *library_matches()])
+    matches = sum(drive.compare_matches([*SEQUENCES, *library_matches()]))
     return len(drive.graphs), violations, matches
 
 
