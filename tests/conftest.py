@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,10 @@ import pytest
 # Who starts the tests in the background of a shell has them ignore Ctrl-C, and so would what they start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tests start hundreds of processes: what these import is compiled once, not in each of them.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -24,3 +31,30 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data folder at {folder} (set SGSTORE_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def town_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of the bundled recording, made by the first process of the run that asks; nobody writes to it."""
+    from sgstore.demo import RECORDING
+    from sgstore.ingest import ingest
+
+    run = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        run = run.parent  # of all processes of the run; without them a folder of all runs
+    store = run / "town_of_the_run.sgstore"
+    with (run / "town_of_the_run.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not store.exists():
+            making = run / "being_made.sgstore"
+            making.unlink(missing_ok=True)
+            (outcome,) = ingest(making, [RECORDING])
+            assert outcome.error is None
+            making.rename(store)
+    return store
+
+
+@pytest.fixture(scope="module")
+def town_store(town_of_the_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of the bundled recording; each file of tests has its own."""
+    return Path(shutil.copy(town_of_the_run, tmp_path_factory.mktemp("town") / "town.sgstore"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from importlib import resources
 
 import networkx as nx
 import numpy as np
@@ -24,7 +23,6 @@ from sgstore.abstractions import (
 )
 from sgstore.abstractions.roadscene2vec import roadscene2vec
 from sgstore.errors import AbstractionError
-from sgstore.ingest import ingest
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE
 
 BETWEEN = {*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf"}
@@ -246,12 +244,8 @@ def only_people(seen: Seen) -> Labelled:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    path = tmp_path_factory.mktemp("abstractions") / "town.sgstore"
-    sample = resources.files("sgstore") / "sample" / "town.mcap"
-    (outcome,) = ingest(path, [str(sample)])
-    assert outcome.error is None
-    return sgstore.open(path)
+def store(town_store):
+    return sgstore.open(town_store)
 
 
 @pytest.fixture

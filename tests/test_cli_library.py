@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sgstore.cli import run
-from sgstore.demo import RECORDING
-from sgstore.ingest import ingest
 from sgstore.lang import pattern_named, patterns
 from sgstore.query import Store
 
@@ -20,10 +18,8 @@ OK, USAGE, NO_MATCH = 0, 2, 4
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("library") / "town.sgstore"
-    ingest(path, [RECORDING])
-    return str(path)
+def store(town_store: Path) -> str:
+    return str(town_store)
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

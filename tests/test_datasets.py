@@ -10,9 +10,7 @@ import pytest
 from oracle_worlds import World, random_world
 
 import sgstore
-from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
-from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
@@ -28,18 +26,16 @@ WHO = "MATCH (e:Ego)"
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def path(town_store: Path) -> Path:
     """A store with weather that changes twice."""
-    path = tmp_path_factory.mktemp("datasets") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    with duckdb.connect(str(path)) as connection:
+    with duckdb.connect(str(town_store)) as connection:
         for seq, detail in DETAILS:
             connection.execute(
                 "INSERT INTO event BY NAME SELECT trace_id, frame_id, time_ns, log_time_ns,"
                 " 'environment' AS kind, ? AS detail FROM frame WHERE seq = ?",
                 [detail, seq],
             )
-    return path
+    return town_store
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,7 @@ import pytest
 
 import sgstore
 from sgstore.config import Config
-from sgstore.demo import RECORDING
 from sgstore.graphs import derive
-from sgstore.ingest import ingest
 from sgstore.monitor import Monitor
 
 ROOT = Path(__file__).parents[1]
@@ -63,16 +61,14 @@ def arguments(block: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> sgstore.Store:
-    folder = tmp_path_factory.mktemp("docs")
-    path = folder / "drives.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    derive(path, Config(), "near")
-    frames = sgstore.open(path).sql(
+def store(town_store: Path) -> sgstore.Store:
+    labels = town_store.with_name("labels.csv")
+    derive(town_store, Config(), "near")
+    frames = sgstore.open(town_store).sql(
         "SELECT frame_id, seq % 5 AS score, 2.0 AS error_deg FROM frames"
     )
-    frames.csv(folder / "labels.csv")
-    return sgstore.open(path, tables={"labels": folder / "labels.csv"})
+    frames.csv(labels)
+    return sgstore.open(town_store, tables={"labels": labels})
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -11,12 +11,10 @@ from drawing import Crossing, crowd, entity, graph_of, related
 from PIL import Image
 
 from sgstore.cli import run
-from sgstore.demo import RECORDING
 from sgstore.draw.film import Film, Shot
 from sgstore.draw.gif import Gif, changed
 from sgstore.draw.stored import FrameRange, draw_clip, draw_stored, range_of
 from sgstore.errors import ExportError, StoreError
-from sgstore.ingest import ingest
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -188,10 +186,8 @@ def test_a_film_that_is_no_gif_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("store") / "town.sgstore"
-    ingest(path, [RECORDING])
-    return path
+def store(town_store: Path) -> Path:
+    return town_store
 
 
 @pytest.mark.parametrize(

@@ -159,10 +159,8 @@ def same_again(store: StoreFile) -> None:
     assert lanes == set(store.rows(sql).values)
 
 
-def test_relations_of_the_sample_are_made_again_from_its_store(tmp_path) -> None:
-    ingest(tmp_path / "s.db", [SAMPLE])
-
-    same_again(StoreFile(tmp_path / "s.db"))
+def test_relations_of_the_sample_are_made_again_from_its_store(town_store) -> None:
+    same_again(StoreFile(town_store))
 
 
 @pytest.mark.data

@@ -9,7 +9,6 @@ import pytest
 
 import sgstore
 from sgstore.config import Config
-from sgstore.ingest import ingest
 from sgstore.lang import compile_query
 from sgstore.lang.match import Matcher
 from sgstore.online import Replay
@@ -23,11 +22,8 @@ BESIDE = "MATCH (x:Vehicle)-[:isIn]->(l:Lane {role: 'Right 1 of Ego Lane'})"
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    path = tmp_path_factory.mktemp("roles") / "town.sgstore"
-    (outcome,) = ingest(path, [RECORDING])
-    assert outcome.error is None
-    return sgstore.open(path)
+def store(town_store):
+    return sgstore.open(town_store)
 
 
 def test_lanes_have_the_roles_that_rsv_calls_them_by(store) -> None:

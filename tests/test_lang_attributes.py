@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import sgstore
-from sgstore.demo import RECORDING
-from sgstore.ingest import ingest
 from sgstore.lang.bound import FrameAttribute, NodeAttribute, TraceAttribute
 from sgstore.lang.catalog import (
     ENV_ATTRIBUTES,
@@ -23,6 +21,8 @@ from sgstore.lang.functions import PAIR_FUNCTIONS
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from sgstore.lang.evaluation import FrameView
     from sgstore.query import Store
 
@@ -30,10 +30,8 @@ SEQ = 300
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    path = tmp_path_factory.mktemp("attributes") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return sgstore.open(path)
+def store(town_store: Path) -> Store:
+    return sgstore.open(town_store)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from oracle_worlds import World, random_world
 from recordings import Recorder, car
 from test_lang_oracle import QUERIES
 
-from sgstore.demo import QUESTIONS, RECORDING
+from sgstore.demo import QUESTIONS
 from sgstore.errors import QueryError
 from sgstore.graph import SceneGraph
 from sgstore.ingest import ingest
@@ -157,10 +157,8 @@ def test_what_a_trace_cannot_answer_is_said(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    path: Path = tmp_path_factory.mktemp("match") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return Store(path)
+def town(town_store: Path) -> Store:
+    return Store(town_store)
 
 
 @pytest.mark.parametrize(

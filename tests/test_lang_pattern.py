@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 import networkx as nx
 import pytest
 
-from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
-from sgstore.ingest import ingest
 from sgstore.lang.pattern import Pattern
 from sgstore.query import Store
 
@@ -23,10 +21,8 @@ WHERE abs(bearing(e, p)) < 45
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    path: Path = tmp_path_factory.mktemp("pattern") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return Store(path)
+def store(town_store: Path) -> Store:
+    return Store(town_store)
 
 
 def test_a_pattern_built_step_by_step_finds_what_its_text_finds(store: Store) -> None:

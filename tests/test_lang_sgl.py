@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
-from sgstore.ingest import ingest
 from sgstore.lang.parser import parse
 from sgstore.lang.sgl import translated
 from sgstore.query import Store
@@ -84,10 +82,8 @@ class Algebra:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    path: Path = tmp_path_factory.mktemp("sgl") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return Store(path)
+def store(town_store: Path) -> Store:
+    return Store(town_store)
 
 
 def test_propositions_hold_where_set_algebra_says(store: Store) -> None:

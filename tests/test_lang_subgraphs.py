@@ -16,14 +16,14 @@ from typer.testing import CliRunner
 
 import sgstore
 from sgstore.cli import app
-from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
-from sgstore.ingest import ingest
 from sgstore.lang import compile_query
 from sgstore.lang.match import Matcher
 from sgstore.lang.parser import parse
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from sgstore.query import Store
 
 Shape = tuple[Any, ...]
@@ -100,10 +100,8 @@ def test_the_nodes_of_the_graphs_are_those_of_exhaustive_search() -> None:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    path = tmp_path_factory.mktemp("subgraphs") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return sgstore.open(path)
+def store(town_store: Path) -> Store:
+    return sgstore.open(town_store)
 
 
 LEADS = "MATCH (e:Ego)-[:isIn]->(l:Lane)<-[r:isIn]-(v:Vehicle) WHERE EXISTS {(v)-[:leads]->(e)}"

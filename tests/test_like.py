@@ -12,9 +12,7 @@ from typer.testing import CliRunner
 
 import sgstore
 from sgstore.cli import app
-from sgstore.demo import RECORDING
 from sgstore.errors import AbstractionError, QueryError, StoreError
-from sgstore.ingest import ingest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,10 +23,8 @@ ALL = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("like") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return path
+def path(town_store: Path) -> Path:
+    return town_store
 
 
 @pytest.fixture(scope="module")

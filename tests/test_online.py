@@ -15,7 +15,6 @@ from builders import PaperMap, Patch, Recording, Thing, thing
 
 from sgstore.config import Config, Range
 from sgstore.demo import RECORDING
-from sgstore.ingest import ingest
 from sgstore.online import Frame, Replay, stepping
 from sgstore.opendrive import read_map
 from sgstore.query import Store
@@ -339,9 +338,8 @@ def same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
             assert ours[name] == value, name
 
 
-def test_the_sample_driven_step_by_step_gives_what_the_store_has(tmp_path: Path) -> None:
-    ingest(tmp_path / "s.sgstore", [RECORDING])
-    store = Store(tmp_path / "s.sgstore")
+def test_the_sample_driven_step_by_step_gives_what_the_store_has(town_store: Path) -> None:
+    store = Store(town_store)
     idents = dict(store.sql("SELECT node_id, ident FROM entities").values)
     replay, compared = Replay(), 0
     with open_trace(RECORDING) as recording, store.file.snapshot():

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
-from sgstore.ingest import ingest
 from sgstore.query import Store
 from sgstore.sandbox import Sandbox
 
@@ -23,12 +22,8 @@ NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from sgstore.demo import RECORDING
-
-    path = tmp_path_factory.mktemp("sandbox") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return path
+def path(town_store: Path) -> Path:
+    return town_store
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import pytest
 from sgstore.cli import run
 from sgstore.demo import RECORDING
 from sgstore.draw.swimlanes import Lane, Span, Timeline, lines_of, timelines
-from sgstore.ingest import ingest
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -20,10 +19,8 @@ CLOSE = "CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 7 RESET WHEN 
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("town") / "town.sgstore"
-    ingest(path, [RECORDING])
-    return path
+def town(town_store: Path) -> Path:
+    return town_store
 
 
 def test_a_letter_is_full_where_most_of_it_is_covered_and_half_where_some_of_it_is() -> None:

@@ -13,9 +13,7 @@ from typer.testing import CliRunner
 
 import sgstore
 from sgstore.cli import app
-from sgstore.demo import RECORDING
 from sgstore.errors import MissingExtraError, QueryError, StoreError
-from sgstore.ingest import ingest
 from sgstore.sandbox import Sandbox
 from sgstore.store import joining as own
 
@@ -28,10 +26,8 @@ FRAMES = "MATCH (e:Ego) RETURN FRAMES"
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("tables") / "town.sgstore"
-    assert ingest(path, [RECORDING])[0].error is None
-    return path
+def path(town_store: Path) -> Path:
+    return town_store
 
 
 @pytest.fixture(scope="module")
