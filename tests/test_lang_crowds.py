@@ -38,6 +38,7 @@ def number(rng: random.Random, depth: int) -> str:
     one, other = number(rng, depth - 1), number(rng, depth - 1)
     unary = ("abs({})", "sqrt({})", "floor({})", "ceil({})", "round({})", "-({})")
     both = ("({} + {})", "({} - {})", "({} * {})", "({} / {})", "({} % {})")
+    both += ("min({}, {})", "max({}, {})")
     if rng.random() < 0.4:
         return rng.choice(unary).format(one)
     return rng.choice(both).format(one, other)
@@ -52,9 +53,9 @@ def condition(rng: random.Random, depth: int) -> str:
         word = rng.choice(("<", "<=", ">", ">=", "=", "<>"))
         return f"{number(rng, 2)} {word} {number(rng, 2)}"
     one, other = condition(rng, depth - 1), condition(rng, depth - 1)
-    return rng.choice(
-        ("(NOT {})", "({} AND {})", "({} OR {})", "({} XOR {})", "({} IMPLIES {})")
-    ).format(one, other)
+    words = ("(NOT {})", "({} AND {})", "({} OR {})", "({} XOR {})", "({} IMPLIES {})")
+    words += ("coalesce({}, {})", "coalesce({}, FALSE)")
+    return rng.choice(words).format(one, other)
 
 
 def test_random_conditions_have_the_same_answers() -> None:
