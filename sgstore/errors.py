@@ -21,8 +21,9 @@ A mistake in calling the library stays ``ValueError`` or ``TypeError``. Anything
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -219,9 +220,28 @@ def _with_carets(reason: str, text: str, span: Span | None, hint: str | None) ->
     lines = [reason]
     if span is not None and text:
         number, column = position(text, span.start)
-        source = (text.splitlines() or [""])[number - 1 : number] or [""]
-        width = max(1, min(span.end - span.start, len(source[0]) - column + 1))
-        lines += [f"  {source[0]}", "  " + " " * (column - 1) + "^" * width]
+        lines += _excerpt(text.split("\n")[number - 1], column - 1, span.end - span.start)
     if hint:
         lines.append(hint)
     return "\n".join(lines)
+
+
+EXCERPT: Final = 160
+"""Longest part of a line of a query that a message shows; characters."""
+
+
+def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
+    """What a line shows around a part of it, and the carets below; what cannot be seen is a dot or a blank."""
+    first = max(0, min(start - EXCERPT // 2, len(line) - EXCERPT))
+    shown = line[first : first + EXCERPT]
+    shown = "".join(c if c.isprintable() else " " if c.isspace() else "·" for c in shown)
+    before, after = "…" * (first > 0), "…" * (first + EXCERPT < len(line))
+    indent = len(before) + _columns(shown[: start - first])
+    width = max(1, _columns(shown[start - first : start - first + max(length, 1)]))
+    return f"  {before}{shown}{after}", "  " + " " * indent + "^" * width
+
+
+def _columns(text: str) -> int:
+    """How wide a text is in a terminal."""
+    wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
+    return len(text) + wide - sum(map(bool, map(unicodedata.combining, text)))

@@ -15,7 +15,8 @@ from sgstore.lang import syntax as s
 from sgstore.lang.catalog import Catalog, Type
 from sgstore.lang.conditions import bind, condition, edge_attribute, node_attribute, parameter
 from sgstore.lang.datasets import asked
-from sgstore.lang.names import RESERVED, Meaning, Names, ScopeBuilder, Session
+from sgstore.lang.functions import FUNCTIONS
+from sgstore.lang.names import RESERVED, THE_EGO, Meaning, Names, ScopeBuilder, Session
 from sgstore.lang.steps import bind_sequence
 from sgstore.lang.tenses import settled
 from sgstore.vocabulary import (
@@ -136,7 +137,7 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.Match:
     found: s.Match | None = None
     for statement in statements:
         if isinstance(statement, s.Define):
-            session.predicates[folded(statement.name)] = statement
+            define(statement, session)
         elif isinstance(statement, s.Check):
             session.refuse(
                 "a CHECK has a verdict, and no matches",
@@ -152,6 +153,23 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.Match:
         hint = f"add MATCH {names[0]}()" if names else "add MATCH …"
         session.refuse("nothing is asked", Span(0, len(session.text)), hint)
     return found
+
+
+def define(statement: s.Define, session: Session) -> None:
+    """Take over a definition.
+
+    Raises
+    ------
+    QueryError
+        The name is taken: by another definition, or by a function. (Predicates of the library are not in the
+        way: a query may define its own.)
+    """
+    name = folded(statement.name)
+    if name in session.predicates:
+        session.refuse(f"'{statement.name}' is defined twice", statement.name_span)
+    if name in {folded(function) for function in FUNCTIONS}:
+        session.refuse(f"'{statement.name}' is a function already", statement.name_span)
+    session.predicates[name] = statement
 
 
 @dataclass(slots=True)
@@ -188,7 +206,8 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
         elif name == "abstraction":
             if folded(value) not in catalog.sets:
                 known = [one.name for one in catalog.sets.values()]
-                session.unknown("abstraction", value, setting.span, known)
+                hint = None if known else "the store has none yet: sgstore derive makes them"
+                session.unknown("abstraction", value, setting.span, known, hint)
         else:
             session.unknown("setting", setting.name, setting.span, SETTINGS)
     return found
@@ -283,6 +302,7 @@ def _node(node: s.NodePattern, names: Names) -> str:
         names.session.refuse("no node can have this label", node.span)
     key = _known_node(node, names)
     if key is None:
+        _refuse_bare_label(node, names)
         key = names.scope.add(node.name, kinds, node.span, named=node.name is not None)
         if node.name is not None:
             names.meanings[node.name] = Meaning(node=key)
@@ -296,6 +316,16 @@ def _node(node: s.NodePattern, names: Names) -> str:
     return key
 
 
+def _refuse_bare_label(node: s.NodePattern, names: Names) -> None:
+    """``(Car)`` would be any node, called Car, and that is not what is meant."""
+    if node.name and node.name[0].isupper() and not node.label and node.name in labels():
+        names.session.refuse(
+            f"({node.name}) would be any node, called {node.name}",
+            node.name_span,
+            f"a label stands behind a colon: (:{node.name})",
+        )
+
+
 def _known_node(node: s.NodePattern, names: Names) -> str | None:
     """The key of a node that the pattern speaks of again; ``None`` for a new one."""
     if node.name is None:
@@ -304,21 +334,22 @@ def _known_node(node: s.NodePattern, names: Names) -> str | None:
         names.session.refuse(f"'{node.name}' cannot name a node", node.name_span)
     meaning = names.meaning(node.name)
     if meaning is None:
-        return _bare_ego(node, names)
+        return _the_ego(node, names)
     if meaning.node is None:
         names.session.refuse(f"'{node.name}' is not a node", node.name_span)
     names.scope.mention(meaning.node)
     return meaning.node
 
 
-def _bare_ego(node: s.NodePattern, names: Names) -> str | None:
-    if node.name != "ego" or node.label:
+def _the_ego(node: s.NodePattern, names: Names) -> str | None:
+    """The key of the ego, if the pattern speaks of it by the name that is always bound."""
+    if node.name != THE_EGO:
         return None
     if names.scope.parent is None:
-        key = names.scope.add("ego", b.EGO, node.span, named=True)
-        names.meanings["ego"] = Meaning(node=key)
+        key = names.scope.add(THE_EGO, b.EGO, node.span, named=True)
+        names.meanings[THE_EGO] = Meaning(node=key)
         return key
-    return names.node("ego", node.name_span)
+    return names.node(THE_EGO, node.name_span)
 
 
 def _edge(edge: s.EdgePattern, left: str, right: str, names: Names) -> str:
@@ -326,10 +357,22 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: Names) -> str:
     if edge.name is not None and names.meaning(edge.name) is not None:
         session.refuse(f"'{edge.name}' is bound already", edge.span)
     if edge.name is not None and edge.low is not None:
-        session.refuse("a repeated edge cannot have a name", edge.span)
+        session.refuse(
+            "a repeated edge cannot have a name", edge.span, "-[:near*1..3]->, or edge by edge"
+        )
+    if edge.name is not None and not edge.label and relation_named(edge.name):
+        session.refuse(
+            f"-[{edge.name}]-> would be an edge of any relation, called {edge.name}",
+            edge.span,
+            f"a relation stands behind a colon: -[:{edge.name}]->",
+        )
     relations = _relations(edge.label, session) if edge.label else b.ANY_RELATION
     if not relations:
-        session.refuse("no edge can have this label: an edge has one relation", edge.span)
+        session.refuse(
+            "no edge can have this label: an edge has one relation",
+            edge.span,
+            "two edges: (a)-[:near]->(b), (a)-[:visible]->(b)",
+        )
     key = session.key(edge.name)
     src, dst = (right, left) if edge.direction == "left" else (left, right)
     low, high = edge.low or 1, edge.high or 1
@@ -486,6 +529,9 @@ def _key(value: s.Expression, result: b.Result, names: Names) -> b.Bound | str:
     if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
         names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
     found = settled(bind(value, names), names.session)
+    if isinstance(found, b.Value):
+        hint = f"name a value, or one of: {', '.join(known)}"
+        names.session.refuse("a constant puts nothing in an order", value.span, hint)
     same = next((column.name for column in result.columns if column.value == found), None)
     if same is not None:
         return same

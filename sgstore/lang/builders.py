@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sgstore.errors import Span
 from sgstore.lang import syntax as s
-from sgstore.lang.hints import TOLD
+from sgstore.lang.hints import METHODS, TOLD
 from sgstore.vocabulary import folded
 
 if TYPE_CHECKING:
@@ -48,8 +48,10 @@ def _number(span: Span, children: Children) -> s.Constant:
 
 
 def _whole(token: Any) -> int:
-    if not token.text.isdigit() or len(token.text) > 9:
+    if not token.text.isdigit():
         raise BuildError("expected a whole number", token.span)
+    if len(token.text) > 9:
+        raise BuildError("too large a number", token.span, "at most 9 digits")
     return int(token.text)
 
 
@@ -86,9 +88,11 @@ def _attribute(span: Span, children: Children) -> s.AttributeOf:
     owner, name = children
     if not isinstance(owner, s.Variable):
         inner = owner.name if isinstance(owner, s.AttributeOf) else ""
+        hint = TOLD.get(folded(inner)) or "what is of a value is a function: abs(x), lower(x)"
+        if isinstance(owner, s.Call):
+            hint = f"the attribute stands in the brackets: {owner.name}(x.{name.text})"
         raise BuildError(
-            f"only variables have attributes, so '.{name.text}' has no meaning here",
-            hint=TOLD.get(folded(inner)),
+            f"only variables have attributes, so '.{name.text}' has no meaning here", hint=hint
         )
     return s.AttributeOf(owner, name.text, span)
 
@@ -97,7 +101,10 @@ def _attribute_in(span: Span, children: Children) -> s.AttributeOf:
     """``frame.class('E')``: another way to write ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
-        raise BuildError(f"'.{name.text}' takes nothing in parentheses; only frame.class does")
+        hint = METHODS.get(folded(name.text), f"what is called stands first: {name.text}(x)")
+        raise BuildError(
+            f"'.{name.text}' takes nothing in parentheses; only frame.class does", hint=hint
+        )
     return s.AttributeOf(owner, f"class_{_unquoted(value.text)}", span)
 
 
@@ -332,6 +339,9 @@ def _absent_step(span: Span, children: Children) -> s.Step:
 def _scenario_step(span: Span, children: Children) -> s.ScenarioStep:
     name, *given = children
     values = tuple(value for value in given if value is not None)
+    named = [folded(value.name) for value in values]
+    if len(set(named)) < len(named):
+        raise BuildError("a parameter is given twice", span)
     return s.ScenarioStep(name.text, values, name.span, span)
 
 
@@ -413,6 +423,9 @@ def _setting(span: Span, children: Children) -> s.Setting:
 def _define(span: Span, children: Children) -> s.Define:
     _, name, parameters, body = children
     formals: tuple[s.Formal, ...] = parameters or ()
+    named = [folded(formal.name) for formal in formals]
+    if len(set(named)) < len(named):
+        raise BuildError("two parameters have one name", span)
     if not isinstance(body, s.Sequence) and any(formal.default for formal in formals):
         raise BuildError("the parameters of a predicate are names, without a value", span)
     return s.Define(name.text, formals, body, name.span, span)

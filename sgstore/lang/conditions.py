@@ -22,9 +22,17 @@ from sgstore.lang.catalog import (
     class_attribute,
 )
 from sgstore.lang.datasets import CLASSES, abstraction_named, seen_in
-from sgstore.lang.hints import TOLD, comparison_hint, hint_at
+from sgstore.lang.hints import TOLD, comparison_hint, condition_hint, hint_at
 from sgstore.lang.names import RESERVED, Names
-from sgstore.vocabulary import ENTITY_KINDS, KINDS, LANE_TYPES, folded, kinds_labelled
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    KINDS,
+    LANE_TYPES,
+    folded,
+    kinds_labelled,
+    labels,
+    relation_named,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -44,8 +52,11 @@ def condition(expression: s.Expression, names: Names) -> b.Bound:
     """
     found = bind(expression, names)
     if found.type not in {Type.boolean, Type.null}:
+        written = names.session.text[expression.span.start : expression.span.end]
         names.session.refuse(
-            f"expected a condition, but this is a {found.type.value}", expression.span
+            f"expected a condition, but this is a {found.type.value}",
+            expression.span,
+            condition_hint(found.type, written),
         )
     return found
 
@@ -122,12 +133,11 @@ def _checked(value: object, e: s.Parameter, names: Names) -> b.Value:
 
 def _variable(e: s.Variable, names: Names) -> b.Bound:
     if e.name in RESERVED:
-        value = "its id is frame.id" if e.name == "frame" else f"its name is {e.name}.name"
-        names.session.refuse(
-            f"'{e.name}' has attributes, but is no value itself",
-            e.span,
-            None if e.name == "env" else value,
-        )
+        hint = {
+            "frame": "its id is frame.id",
+            "env": "it has env.precipitation, env.fog, env.illumination, …",
+        }.get(e.name, f"its name is {e.name}.name")
+        names.session.refuse(f"'{e.name}' has attributes, but is no value itself", e.span, hint)
     meaning = names.meaning(e.name)
     if meaning is not None and meaning.value is not None:
         return meaning.value
@@ -143,6 +153,8 @@ def _attribute(e: s.AttributeOf, names: Names) -> b.Bound:
         found = known.get(folded(e.name))
         if found is None and owner == "frame":
             found = _class_attribute(e.name, names)
+        if found is None and owner == "frame" and e.name.startswith("class_"):
+            abstraction_named(e.name.removeprefix("class_"), _tail(e), names.session)
         if found is None:
             known_names = [attribute.name.removeprefix("env.") for attribute in known.values()]
             if owner == "frame":
@@ -202,15 +214,16 @@ def node_attribute(key: str, name: str, span: Span, names: Names) -> b.NodeAttri
     possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds]
     found = NODE_ATTRIBUTES.get(folded(name))
     if found is None:
-        names.session.unknown("attribute", name, span, possible, TOLD.get(folded(name)))
+        hint = TOLD.get(folded(name)) or _no_attribute(name)
+        names.session.unknown("attribute", name, span, possible, hint)
     if not found.kinds & kinds:
         what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"
         owners = [kind for kind in KINDS if kind in found.kinds]
         hint = hint_at(name, possible)
-        if hint is None or not hint.startswith("did"):
+        if "lane" in owners and kinds <= frozenset(ENTITY_KINDS):
+            hint = f"the lanes that it is in are nodes: (x)-[:isIn]->(l:Lane), l.{found.name}"
+        elif hint is None or not hint.startswith("did"):
             hint = f"it belongs to: {', '.join(owners)}"
-            if owners == ["lane"] and kinds <= frozenset(ENTITY_KINDS):
-                hint = f"the lanes that it is in are nodes: (x)-[:isIn]->(l:Lane), l.{found.name}"
         raise QueryNameError(
             f"a {what} has no attribute '{found.name}'",
             text=names.session.text,
@@ -218,6 +231,15 @@ def node_attribute(key: str, name: str, span: Span, names: Names) -> b.NodeAttri
             hint=hint,
         )
     return b.NodeAttribute(key, found, found.type)
+
+
+def _no_attribute(name: str) -> str | None:
+    """What a name is that is no attribute: a relation, a predicate; ``None``: no idea."""
+    from sgstore.lang.functions import call_hint  # calls hold expressions, and expressions calls
+
+    if relation_named(name):
+        return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
+    return call_hint(name)
 
 
 _OF_PAIRS: Final = frozenset(
@@ -240,6 +262,8 @@ def edge_attribute(key: str, name: str, span: Span, names: Names) -> b.EdgeAttri
     if found is None:
         known = [attribute.name for attribute in EDGE_ATTRIBUTES.values()]
         hint = f"{name}(a, b) is a number of two nodes" if folded(name) in _OF_PAIRS else None
+        if folded(name) in {"type", "label", "relation", "name", "kind"}:
+            hint = "the relation of an edge d is type(d)"
         names.session.unknown("attribute of an edge", name, span, known, hint)
     edge = next((edge for edge in names.scope.edges if edge.key == key), None)
     if edge is None:
@@ -272,35 +296,74 @@ def _list(e: s.ListOf, names: Names) -> b.Choices:
 
 
 def _logic(e: s.Logic, names: Names) -> b.Operation:
+    if e.word == "IMPLIES" and "=>" in _between(e.operands, names):
+        first = bind(e.operands[0], names)
+        if first.type is Type.number:
+            names.session.refuse("=> is IMPLIES, between conditions", e.span, "at least is >=")
     operands = tuple(condition(operand, names) for operand in e.operands)
     return b.Operation(e.word, operands, Type.boolean)
+
+
+def _between(operands: tuple[s.Expression, ...], names: Names) -> str:
+    """What is written between the first operand and the second."""
+    return names.session.text[operands[0].span.end : operands[1].span.start]
 
 
 def _comparison(e: s.Comparison, names: Names) -> b.Operation:
     left, right = bind(e.left, names), bind(e.right, names)
     if e.word in _TEXT_TESTS:
         return _text_test(e, left, right, names)
-    for side, written in ((left, e.left), (right, e.right)):
-        if side.type is Type.null:
-            names.session.refuse(
-                "a comparison with NULL is never true", written.span, "write IS NULL"
-            )
-        if side.type is Type.list:
-            names.session.refuse("a list cannot be compared", written.span, "write IN")
+    _check_sides(e, left, right, names)
     if left.type is not right.type:
         texts = [side.value for side in (left, right) if isinstance(side, b.Value)]
+        hint = _of_name(e.left, left, right, names) or _of_name(e.right, right, left, names)
         names.session.refuse(
             f"a {left.type.value} cannot be compared with a {right.type.value}",
             e.span,
-            comparison_hint(left.type, right.type, texts),
+            hint or comparison_hint(left.type, right.type, texts),
         )
     if e.word in _ORDERED and left.type in {Type.node, Type.boolean}:
         names.session.refuse(f"a {left.type.value} is not more or less than another", e.span)
+    closed = next((side for side in (left, right) if _vocabulary(side)), None)
+    if e.word in _ORDERED and closed is not None:
+        words = ", ".join(f"'{word}'" for word in _vocabulary(closed)[:2])
+        names.session.refuse(
+            f"the words of {_what(closed)} have no order", e.span, f"write IN [{words}, …]"
+        )
     left, right = (
         _canonical(left, right, e.left.span, names),
         _canonical(right, left, e.right.span, names),
     )
     return b.Operation(e.word, (left, right), Type.boolean)
+
+
+def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: Names) -> None:
+    """Refuse to compare with NULL or with a list, as a property would, too."""
+    prop = isinstance(e.left, s.Variable) and not e.left.name
+    where = "in place of the property, behind WHERE: x." if prop else ""
+    if prop:
+        where += names.session.text[e.left.span.start : e.left.span.end]
+    for side, written in ((left, e.left), (right, e.right)):
+        if side.type is Type.null:
+            hint = f"{where} IS NULL" if prop else "write IS NULL"
+            names.session.refuse("a comparison with NULL is never true", written.span, hint)
+        if side.type is Type.list:
+            hint = f"{where} IN […]" if prop else "write IN"
+            names.session.refuse("a list cannot be compared", written.span, hint)
+
+
+def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: Names) -> str | None:
+    """A hint where the id of something is compared with a text, which may be its name."""
+    of_trace = isinstance(side, b.TraceAttribute)
+    ids = isinstance(side, b.NodeAttribute | b.TraceAttribute) and side.attribute.name in {
+        "id",
+        "trace.id",
+    }
+    if not ids or other.type is not Type.text or not isinstance(e, s.AttributeOf):
+        return None
+    kinds = sorted(names.scope.kinds(side.node).every) if isinstance(side, b.NodeAttribute) else []
+    what = "trace" if of_trace else kinds[0] if len(kinds) == 1 else "node"
+    return f"the name of a {what} is {e.owner.name}.name"
 
 
 def _canonical(value: b.Bound, other: b.Bound, span: Span, names: Names) -> b.Bound:
@@ -336,9 +399,8 @@ def _what(expression: b.Bound) -> str:
 def _kind(word: str, span: Span, names: Names) -> str | None:
     kinds = kinds_labelled(word)
     if kinds and len(kinds) > 1:
-        names.session.refuse(
-            f"'{word}' is several kinds", span, f"use it as a label: (x:{word.capitalize()})"
-        )
+        label = next(label for label in labels() if folded(label) == folded(word))
+        names.session.refuse(f"'{word}' is several kinds", span, f"use it as a label: (x:{label})")
     return kinds[0] if kinds else None
 
 
@@ -385,7 +447,10 @@ def _membership(e: s.Membership, names: Names) -> b.Bound:
         return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
     choices = bind(e.choices, names)
     if not isinstance(choices, b.Choices):
-        names.session.refuse("expected a list after IN", e.choices.span, "write IN ['a', 'b']")
+        hint = "write IN ['a', 'b']"
+        if choices.type is Type.text and not isinstance(choices, b.Value):
+            hint = "whether a text is in another: x.name CONTAINS 'a'"
+        names.session.refuse("expected a list after IN", e.choices.span, hint)
     for item in choices.items:
         if item.type is Type.null:
             names.session.refuse("NULL is in no list", e.choices.span)
@@ -430,8 +495,10 @@ def number(expression: s.Expression, names: Names) -> b.Bound:
     """A bound expression that is a number."""
     found = bind(expression, names)
     if found.type is not Type.number:
+        named = expression.name if isinstance(expression, s.Variable) else ""
+        hint = f"one of its attributes: {named}.speed" if found.type is Type.node else None
         names.session.refuse(
-            f"expected a number, but this is a {found.type.value}", expression.span
+            f"expected a number, but this is a {found.type.value}", expression.span, hint
         )
     return found
 
@@ -451,6 +518,8 @@ def _negative(e: s.Negative, names: Names) -> b.Bound:
 
 
 def _count_all(e: s.CountAll, names: Names) -> b.Aggregate:
+    if names.aggregated:
+        names.session.refuse("what is counted of all matches cannot stand in another", e.span)
     if not names.aggregates:
         names.session.refuse(
             "COUNT(*) may stand after RETURN only", e.span, "COUNT {…} counts in a condition"

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryError
 from sgstore.lang import bound as b
 from sgstore.lang import syntax as s
-from sgstore.lang.catalog import Type
+from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
 from sgstore.lang.conditions import bind, number
 from sgstore.lang.datasets import CLASSES, abstraction_named, class_count
+from sgstore.lang.hints import FUNCTIONS_TOLD
 from sgstore.lang.names import Meaning, Names
 from sgstore.lang.reach import in_range
-from sgstore.lang.standard import pattern_named, predicates
-from sgstore.vocabulary import ENTITY_KINDS, folded
+from sgstore.lang.standard import pattern_named, patterns, predicates
+from sgstore.vocabulary import ENTITY_KINDS, folded, relation_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -77,6 +78,8 @@ def call(e: s.Call, names: Names) -> b.Bound:
     if name in _AGGREGATES:
         word = e.name.upper()
         inner = "(a)-[:near]->(b)" if word == "COUNT" else "(a)-[:near]->(b) | b.speed"
+        if names.aggregated:
+            names.session.refuse("what is counted of all matches cannot stand in another", e.span)
         names.session.refuse(
             f"{e.name}() may stand after RETURN only",
             e.span,
@@ -90,10 +93,39 @@ def _standard(name: str, e: s.Call, names: Names) -> b.Bound:
     found = predicates().get(name)
     if found is None:
         defined = [*names.session.predicates.values(), *predicates().values()]
-        known = [*FUNCTIONS, *(one.name for one in defined)]
-        names.session.unknown("function", e.name, e.name_span, known)
+        known = [*PAIR_FUNCTIONS, *sorted(FUNCTIONS - PAIR_FUNCTIONS.keys())]
+        known += [one.name for one in defined]
+        names.session.unknown("function", e.name, e.name_span, known, _no_function(e.name))
     names.session.predicates[name] = found
     return _predicate(e, names)
+
+
+def _no_function(name: str) -> str | None:
+    """What a name is that is no function: an attribute, a relation, a sequence; ``None``: no idea."""
+    word = folded(name)
+    if word in FUNCTIONS_TOLD:
+        return FUNCTIONS_TOLD[word]
+    if relation_named(name):
+        return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
+    if word in NODE_ATTRIBUTES:
+        return f"it is an attribute: x.{NODE_ATTRIBUTES[word].name}"
+    if any(folded(known) == word for known in patterns()):
+        return f"it is a sequence of the library: MATCH {name}()"
+    return None
+
+
+def call_hint(name: str) -> str | None:
+    """How a function or a predicate of that name is written; ``None`` if there is none."""
+    word = folded(name)
+    if word in _AGGREGATES:
+        return None
+    found = predicates().get(word)
+    if found is not None:
+        formals = ", ".join(formal.name for formal in found.parameters)
+        return f"it is a predicate: {found.name}({formals})"
+    if word in _PAIRS:
+        return f"it is a function: {_PAIRS[word]}(a, b)"
+    return None
 
 
 def _expect(e: s.Call, low: int, high: int, names: Names) -> None:
@@ -208,7 +240,7 @@ def _after_in(e: s.Call, names: Names) -> b.Bound:
 
 
 def _aggregate(name: str, e: s.Call, names: Names) -> b.Aggregate:
-    inner = Names(names.session, names.scope, names.meanings, names.parent)
+    inner = Names(names.session, names.scope, names.meanings, names.parent, aggregated=True)
     if name in {"avg", "sum"}:
         return b.Aggregate(name, number(e.arguments[0], inner), distinct=False, type=Type.number)
     operand = bind(e.arguments[0], inner)
@@ -240,7 +272,8 @@ def _predicate(e: s.Call, names: Names) -> b.Bound:
         return bind(definition.body, names.body(meanings))
     except QueryError as error:
         reason = f"in {definition.name}(): {error.reason}"
-        raise type(error)(reason, text=session.text, span=e.span, hint=error.hint) from None
+        hint = error.hint or _signature(folded(definition.name))
+        raise type(error)(reason, text=session.text, span=e.span, hint=hint) from None
     finally:
         session.calls.pop()
 

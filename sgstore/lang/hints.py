@@ -6,12 +6,20 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
-from sgstore.vocabulary import KINDS, LANE_TYPES, LIGHT_STATES, SPECIALS, folded, suggestion
+from sgstore.vocabulary import (
+    KINDS,
+    LANE_TYPES,
+    LIGHT_STATES,
+    SPECIALS,
+    folded,
+    relation_named,
+    suggestion,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-MANY: Final = 16
+MANY: Final = 24
 """So many names are listed in a hint."""
 
 SYNONYMS: Final[Mapping[str, str]] = {
@@ -35,7 +43,18 @@ SYNONYMS: Final[Mapping[str, str]] = {
 """Other words, folded, for attributes of nodes."""
 
 _PAIRS: Final = (
-    *("dist", "distance", "gap", "ttc", "headway", "bearing", "lon", "lat", "relspeed", "relheading"),
+    *(
+        "dist",
+        "distance",
+        "gap",
+        "ttc",
+        "headway",
+        "bearing",
+        "lon",
+        "lat",
+        "relspeed",
+        "relheading",
+    ),
     *("lanedist", "longap", "latgap", "closingspeed", "apparentheading"),
 )
 
@@ -124,7 +143,7 @@ FUNCTIONS_TOLD: Final[Mapping[str, str]] = {
         ("if", "iif", "case"), "there is no IF: ask for each case by itself, or return the value"
     ),
     **dict.fromkeys(
-        ("collect", "list", "array agg"), "each match is a row; Matches.df() and SQL can group them"
+        ("collect", "list", "arrayagg"), "each match is a row; Matches.df() and SQL can group them"
     ),
     **dict.fromkeys(
         ("stddev", "stdev", "median", "percentile", "quantile", "variance"),
@@ -134,10 +153,24 @@ FUNCTIONS_TOLD: Final[Mapping[str, str]] = {
         ("substring", "split", "replace", "trim", "concat"),
         "texts are asked by STARTS WITH, ENDS WITH, CONTAINS and =~",
     ),
-    **dict.fromkeys(("cast", "tointeger", "tofloat", "tostring"), "values have one type: leave it out"),
+    **dict.fromkeys(
+        ("cast", "tointeger", "tofloat", "tostring"), "values have one type: leave it out"
+    ),
     "clip": "write CLIPS(-3s, +5s)",
+    **dict.fromkeys(
+        ("f", "g", "x", "globally", "finally"),
+        "operators of time are words: ALWAYS, EVENTUALLY, NEXT",
+    ),
 }
 """Functions of other languages, and what there is instead."""
+
+METHODS: Final[Mapping[str, str]] = {
+    "startswith": "write x.name STARTS WITH 'a'",
+    "endswith": "write x.name ENDS WITH 'a'",
+    **dict.fromkeys(("contains", "includes", "find"), "write x.name CONTAINS 'a'"),
+    **dict.fromkeys(("match", "matches", "fullmatch"), "write x.name =~ 'a.*'"),
+}
+"""Methods of texts in other languages."""
 
 LIKEN: Final[Mapping[str, str]] = {
     **dict.fromkeys(("police", "ambulance", "fire", "firetruck"), "emergency"),
@@ -152,6 +185,7 @@ _OF_FRAMES: Final[Mapping[str, str]] = {
     **dict.fromkeys(("time", "seconds"), "t"),
     **dict.fromkeys(("number", "index", "no", "sequence", "frame"), "seq"),
     "timestamp": "time_ns",
+    **dict.fromkeys(("duration", "length", "lasts"), "frames"),
     **dict.fromkeys(("town", "road map"), "map"),
     "file": "uri",
     **dict.fromkeys(("rain", "snow", "weather"), "precipitation"),
@@ -164,7 +198,7 @@ _WORDS: Final = frozenset(folded(w) for w in (*KINDS, *LIGHT_STATES, *SPECIALS, 
 
 
 _OTHERS: Final = tuple(
-    {folded(word): meant for word, meant in words.items()}
+    {folded(word.replace(" ", "_")): meant for word, meant in words.items()}
     for words in (SYNONYMS, LIKEN, OTHER_LABELS, OTHER_RELATIONS, OTHER_FUNCTIONS, _OF_FRAMES)
 )
 
@@ -227,6 +261,22 @@ _CLOSES: Final = {")": "(", "]": "[", "}": "{"}
 _EXCERPT: Final = 24
 
 
+_SAID_OTHERWISE: Final = {
+    **dict.fromkeys(
+        ("nan", "none", "nil", "undefined", "missing"), "what is missing is asked by IS NULL"
+    ),
+    **dict.fromkeys(("yes", "no", "on"), "true and false are written TRUE and FALSE"),
+    **dict.fromkeys(
+        ("labels", "meta", "metadata", "splits", "outcomes", "annotations"),
+        "a table of your own is joined by --with {name}=FILE",
+    ),
+    **dict.fromkeys(("interval", "runs"), "write INTERVALS"),
+    **dict.fromkeys(("subgraph", "graph", "graphs"), "write SUBGRAPHS"),
+    **dict.fromkeys(("clip", "clips"), "write CLIPS(-3s, +5s)"),
+}
+"""Words, folded, that stand for a value in other languages or are misspelt, and what is meant."""
+
+
 def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | None:  # noqa: FBT001
     """What a variable that is not known may have meant: an attribute, a text, the time; ``None``: no idea.
 
@@ -240,15 +290,39 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
     """
     if elsewhere:
         return "a variable of a block is known in this block only: bind it in MATCH"
-    if folded(name) in {"t", "time", "seconds"}:
-        return "the time since the trace began is frame.t"
-    if folded(name) in NODE_ATTRIBUTES:
-        owner = next(iter(sorted(set(visible) - {"ego"})), "ego")
+    word = folded(name)
+    if word in _SAID_OTHERWISE:
+        return _SAID_OTHERWISE[word].format(name=name)
+    if relation_named(name):
         return (
-            f"an attribute stands behind a variable: {owner}.{NODE_ATTRIBUTES[folded(name)].name}"
+            f"a relation stands in a pattern, EXISTS {{(a)-[:{name}]->(b)}}, or is a text: '{name}'"
         )
-    if folded(name) in _WORDS:
-        return f"a text stands in quotes: '{name}'"
+    if word in TOLD:
+        return TOLD[word]
+    if word in NODE_ATTRIBUTES and len(word) > 1:
+        owner = next(iter(sorted(set(visible) - {"ego"})), "ego")
+        return f"an attribute stands behind a variable: {owner}.{NODE_ATTRIBUTES[word].name}"
+    return f"a text stands in quotes: '{name}'" if word in _WORDS else None
+
+
+def condition_hint(found: Type, written: str) -> str | None:
+    """What would be right where a value stands for a condition.
+
+    Parameters
+    ----------
+    found : Type
+        Of the value.
+    written : str
+        It, as it is written.
+    """
+    if len(written) > _EXCERPT or found is Type.list:
+        written = "…"
+    if found is Type.number:
+        return f"compare it: {written} > 0"
+    if found is Type.text:
+        return f"compare it: {written} = 'a'"
+    if found is Type.node:
+        return f"ask for something of it: {written}.speed > 3, stopped({written}), EXISTS {{…}}"
     return None
 
 
@@ -263,8 +337,7 @@ def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | N
     """
     types = {left, right}
     if types == {Type.number, Type.text}:
-        plain = [t for t in texts if re.fullmatch(r"\s*[-+]?\d+(\.\d+)?\s*", str(t))]
-        return f"a number has no quotes: {plain[0]}" if plain else None
+        return next(filter(None, map(_number_hint, texts)), None)
     if Type.boolean in types:
         return "it is true or false: write it by itself, or after NOT"
     if types == {Type.node, Type.number}:
@@ -272,3 +345,17 @@ def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | N
     if types == {Type.node, Type.text}:
         return "the name of a node e is e.name, what it is e.kind"
     return None
+
+
+def _number_hint(value: object) -> str | None:
+    """What a text that stands for a number should be, or a number that stands for a text."""
+    if isinstance(value, int | float):
+        return f"a text stands in quotes: '{value}'"
+    found = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*([a-z°/²%]*)\s*", str(value), re.IGNORECASE)
+    if found is None:
+        return None
+    if not found[2]:
+        return f"a number has no quotes: {found[1]}"
+    units = {"m/s": "speeds are in m/s", "km/h": "speeds are in m/s", "mph": "speeds are in m/s"}
+    said = units.get(found[2].lower(), "m, m/s, degrees, s")
+    return f"a number has no unit: {said}"

@@ -193,6 +193,8 @@ class Names:
         Names around these, visible too.
     aggregates : bool
         Whether ``COUNT(*)`` and the like may stand here.
+    aggregated : bool
+        Whether what stands here is inside of one.
     """
 
     session: Session
@@ -200,6 +202,7 @@ class Names:
     meanings: dict[str, Meaning] = field(default_factory=dict[str, Meaning])
     parent: Names | None = None
     aggregates: bool = False
+    aggregated: bool = False
 
     def block(self) -> Names:
         """Names for a block in this place."""
@@ -233,8 +236,7 @@ class Names:
             key = self.scope.top.the_ego(span)
         elif meaning is None:
             known = {*self.visible(), *self.session.tables}
-            elsewhere = name.lower() in self.session.keys
-            hint = variable_hint(name, self.visible(), elsewhere)
+            hint = self._hint(name)
             self.session.unknown("variable", name, span, known, hint)
         elif meaning.node is None:
             self.session.refuse(f"'{name}' is not a node", span)
@@ -242,6 +244,18 @@ class Names:
             key = meaning.node
         self.scope.mention(key)
         return key
+
+    def _hint(self, name: str) -> str | None:
+        """What a name that means nothing here may have meant."""
+        if self.session.calls:
+            return f"{self.session.calls[-1]}() knows its parameters and ego only"
+        elsewhere = name.lower() in self.session.keys
+        hint = variable_hint(name, self.visible(), elsewhere)
+        if hint is None:
+            from sgstore.lang.functions import call_hint  # calls hold names
+
+            hint = call_hint(name)
+        return hint
 
     def visible(self) -> set[str]:
         """All names that may be used here, but those of frame and trace."""
