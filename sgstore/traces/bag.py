@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.traces.chunks import IDS
 from sgstore.traces.fetch import mark_of
 from sgstore.traces.losses import MAX_LOSSES, Place
 from sgstore.traces.mcap_file import McapFile
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
     from sgstore.traces.chunks import Messages
-
-MAX_IDS: Final = 1 << 16
-"""Channels and schemas of all files together; ids have 16 bits."""
 
 
 class McapBag(McapFile):
@@ -174,8 +172,8 @@ class McapBag(McapFile):
     def _free(self, number: int, taken: dict[int, Any]) -> int:
         """The id, or the next one that is free."""
         free = number if number not in taken else max(taken) + 1
-        if free >= MAX_IDS:
-            raise TraceError(f"more than {MAX_IDS} channels or schemas", path=self.path)
+        if free >= IDS:  # of all files together
+            raise TraceError(f"more than {IDS} channels or schemas", path=self.path)
         return free
 
     def _meant(self, keep: Callable[[int], bool], file: McapFile) -> Callable[[int], bool]:

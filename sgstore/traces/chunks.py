@@ -49,6 +49,9 @@ MAX_CHUNK: Final = 256 << 20
 MAX_RECORDS: Final = 2_000_000
 """Greatest number of records in a chunk: more than 60 MB of the smallest messages."""
 
+IDS: Final = 1 << 16
+"""Ids of channels, and of schemas, that a file may have: they have 16 bits."""
+
 MIN_WINDOW: Final = 32 << 20
 """Window that a zstd frame may always ask for; bytes. Larger ones only as large as the chunk itself."""
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 import numpy as np
 
+from sgstore.traces.chunks import IDS
 from sgstore.vocabulary import KIND_CODE
 from sgstore.world import POSE, Entities, FrameBlock, MessageRefs, States
 
@@ -256,7 +257,7 @@ def assemble(
     FrameBlock
         Its messages are those that stand in the file from its first frame up to the next block's.
     """
-    wanted = np.zeros(1 << 16, np.bool_)
+    wanted = np.zeros(IDS, np.bool_)
     wanted[[*channels]] = True
     raw: list[Raw] = []
     done: list[FrameRows] = []  # the frame before the block, and those of it that are complete

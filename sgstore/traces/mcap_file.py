@@ -36,6 +36,7 @@ from sgstore.errors import TraceError
 from sgstore.traces.ahead import ReadAhead, chunks_in
 from sgstore.traces.chunks import (
     HEAD,
+    IDS,
     MAX_CHUNK,
     MESSAGE_HEAD,
     READ_ERRORS,
@@ -161,7 +162,7 @@ class McapFile:
         self.compression = "zstd"
         self._verified: set[int] = set()
         self._aheads: list[ReadAhead] = []
-        self._known_channels = np.zeros(1 << 16, np.bool_)
+        self._known_channels = np.zeros(IDS, np.bool_)
         self._definition_bytes = 0
         self._file = open_regular(path)
         try:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sgstore.traces.chunks import IDS
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class FrameRefs:
 
     def __init__(self, channels: tuple[Channel, ...], window: tuple[int, int]) -> None:
         self._window = window
-        self._index = np.full(1 << 16, -1, np.int64)
+        self._index = np.full(IDS, -1, np.int64)
         for i, channel in enumerate(channels):
             if channel.role in {"ground_truth", "payload"}:
                 self._index[channel.id] = i
