@@ -134,7 +134,7 @@ class FrameView:
         return None if math.isnan(value) else value
 
     def pairs(self, name: str, one: int, *, ahead: bool = True) -> Floats:
-        """(E,) a number of one entity and each other, by :attr:`rows`: most are asked one after the other.
+        """(E,) a number of one entity and each other, by :attr:`rows`; all at once, for most will be asked.
 
         NaN where something that it needs is missing. Unless ``ahead``, of each other and the one.
         """
