@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.coverage.frames import Chosen
+from sgstore.coverage.frames import Chosen, run_begins
 from sgstore.coverage.slots import slot_sets
-from sgstore.store.covering import seq_of, trace_of
-from sgstore.world import GAP
+from sgstore.store.covering import begins, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -94,10 +93,13 @@ class Classed:
         if unit is Unit.trace:
             both = np.stack([trace_of(self.frame_id[rows]), self.code[rows]])
             return rows[np.unique(both, axis=1, return_index=True)[1]]
-        trace, seq, code = trace_of(self.frame_id), seq_of(self.frame_id), self.code
-        fresh = np.ones(len(code), np.bool_)
-        fresh[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1) | (code[1:] != code[:-1])
-        return rows[fresh[rows]]
+        return rows[self.run_begins()[rows]]
+
+    def run_begins(self) -> Bools:
+        """(N,): which frames begin a run of frames of one class."""
+        found = begins(self.frame_id)
+        found[1:] |= self.code[1:] != self.code[:-1]
+        return found
 
     def present(self) -> Ints:
         """Codes of the classes that occur, ascending."""
@@ -162,8 +164,10 @@ def classed(
 def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
     """Each frame with the class of its window."""
     frame_id, code = whole.frame_id, whole.code
-    begins = _begins(whole)
-    within = np.arange(len(code)) - np.maximum.accumulate(np.where(begins, np.arange(len(code)), 0))
+    ids, time_ns = whole.chosen.store.file.abstracted.times()
+    time_ns = time_ns[np.searchsorted(ids, frame_id)]
+    fresh = run_begins(whole.chosen.store, frame_id, time_ns)
+    within = np.arange(len(code)) - np.maximum.accumulate(np.where(fresh, np.arange(len(code)), 0))
     state = code + 1  # 0: missing
     parts = [state]
     complete = code != UNKNOWN
@@ -186,20 +190,6 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
         key[rows] = len(names) + np.arange(len(rows))
         names += [f"{frame:032x}" for frame in frame_id[rows].tolist()]
     return replace(whole, names=tuple(names), code=key)
-
-
-def _begins(whole: Classed) -> Bools:
-    """Which frames come first in a trace, or first after a gap."""
-    ids, time_ns = whole.chosen.store.file.abstracted.times()
-    time_ns = time_ns[np.searchsorted(ids, whole.frame_id)]
-    begins = np.ones(len(time_ns), np.bool_)
-    trace, seq = trace_of(whole.frame_id), seq_of(whole.frame_id)
-    begins[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
-    periods = {one.trace_id: one.period_ns for one in whole.chosen.store.info()}
-    period = np.array([periods.get(one, 0) for one in np.unique(trace).tolist()], np.float64)
-    number = np.unique(trace, return_inverse=True)[1]
-    step = np.diff(time_ns, prepend=time_ns[:1])
-    return begins | (step > GAP * period[number]) | (step < 0)
 
 
 def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:

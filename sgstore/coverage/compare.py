@@ -10,7 +10,7 @@ from sgstore.coverage.classed import UNKNOWN, Unit, shared
 from sgstore.coverage.estimates import estimate, expected_classes
 from sgstore.coverage.frames import names_of
 from sgstore.coverage.tables import SHARES, Table, of_unknown, share
-from sgstore.store.covering import seq_of, trace_of
+from sgstore.store.covering import begins, trace_of
 
 if TYPE_CHECKING:
     from sgstore.coverage.classed import Classed
@@ -166,12 +166,10 @@ def novel_clips(a: Classed, than: Classed) -> Table:
     """
     _, (a, than) = shared(a, than)
     rows = np.flatnonzero(is_novel(a, than))
-    trace, seq = trace_of(a.frame_id[rows]), seq_of(a.frame_id[rows])
-    fresh = np.ones(len(rows), np.bool_)
-    fresh[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
+    ids = a.frame_id[rows]
+    fresh = begins(ids)
     starts = np.flatnonzero(fresh)
     ends = np.append(starts[1:], len(rows)) - 1
-    ids = a.frame_id[rows]
     first, last = names_of(a.chosen.store, ids[starts]), names_of(a.chosen.store, ids[ends])
     number = np.cumsum(fresh) - 1
     pairs = np.unique(np.stack([number, a.code[rows]]), axis=1)[0]
@@ -250,10 +248,7 @@ def curve(a: Classed, unit: Unit = Unit.frame) -> tuple[Ints, Ints]:
     order = a.in_order()
     order = order[a.code[order] != UNKNOWN]
     if unit is Unit.run:
-        trace, seq, code = trace_of(a.frame_id), seq_of(a.frame_id), a.code
-        fresh = np.ones(len(code), np.bool_)
-        fresh[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1) | (code[1:] != code[:-1])
-        order = order[fresh[order]]
+        order = order[a.run_begins()[order]]
     codes = a.code[order]
     new = np.zeros(len(codes), np.int64)
     new[np.unique(codes, return_index=True)[1]] = 1

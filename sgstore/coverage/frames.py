@@ -14,11 +14,13 @@ from sgstore.errors import StoreError
 from sgstore.locks import frames_of_lock, read_lock, store_beside
 from sgstore.locks.lock import ENDING as LOCK
 from sgstore.query import Store
+from sgstore.store.covering import begins, seq_of, trace_of
+from sgstore.world import GAP
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sgstore.world import Ints
+    from sgstore.world import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +99,21 @@ def frames_of(store: Store, query: str) -> Ints:
     return np.unique(np.fromiter(rows, np.int64))
 
 
+def periods_of(store: Store, frame_id: Ints) -> Floats:
+    """(N,): the median period of the trace of each frame; ns."""
+    periods = {one.trace_id: one.period_ns for one in store.info()}
+    traces, number = np.unique(trace_of(frame_id), return_inverse=True)
+    return np.array([periods[one] for one in traces.tolist()], np.float64)[number]
+
+
+def run_begins(store: Store, frame_id: Ints, time_ns: Ints) -> Bools:
+    """(N,): which frames begin a run: the first of a trace, and the first where some are missing before it."""
+    step = np.diff(time_ns, prepend=time_ns[:1])
+    return begins(frame_id) | (step > GAP * periods_of(store, frame_id)) | (step < 0)
+
+
 def names_of(store: Store, frame_id: Sequence[int] | Ints) -> list[str]:
     """Frames as every command takes them: ``TRACE#SEQ``."""
-    from sgstore.store.covering import seq_of, trace_of
-
     traces = {trace.trace_id: trace.name for trace in store.info()}
     ids = np.asarray(frame_id, np.int64)
     return [

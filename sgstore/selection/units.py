@@ -13,11 +13,11 @@ from sgstore.coverage import classed
 from sgstore.coverage.asking import is_of_ego
 from sgstore.coverage.classed import UNKNOWN
 from sgstore.coverage.features import combined, features
+from sgstore.coverage.frames import periods_of, run_begins
 from sgstore.errors import ConfigError
 from sgstore.selection.family import Family, distinct, spread
 from sgstore.store.contents import lengths_of_messages
-from sgstore.store.covering import seq_of, trace_of
-from sgstore.world import GAP
+from sgstore.store.covering import trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -177,10 +177,7 @@ class Units:
             case Measure.units | Measure.frames:
                 return np.ones(len(self.frame_id))
             case Measure.seconds:
-                periods = {one.trace_id: one.period_ns for one in self.chosen.store.info()}
-                traces, number = np.unique(trace_of(self.frame_id), return_inverse=True)
-                period = np.array([periods[one] for one in traces.tolist()], np.float64) / 1e9
-                return period[number]
+                return periods_of(self.chosen.store, self.frame_id) / 1e9
             case Measure.bytes:
                 found = np.zeros(len(self.frame_id))
                 for frame_id, length in lengths_of_messages(self.chosen.store.file, self.frame_id):
@@ -278,12 +275,10 @@ def units_of(
     own = Units(chosen, piece, frame_id[rows], asked[rows], log_time_ns[rows], each, each + 1)
     if piece is Piece.frame or not len(rows):
         return own
-    trace = trace_of(own.frame_id)
-    fresh = np.append(True, trace[1:] != trace[:-1])
     if piece is Piece.clip:
-        begin, end = _clips(own, time_ns[rows], fresh, clip_s, stride_s)
+        begin, end = _clips(own, time_ns[rows], clip_s, stride_s)
     else:
-        begin, end = _ranges(fresh)
+        begin, end = _ranges(np.append(True, np.diff(trace_of(own.frame_id)) != 0))
     return replace(own, begin=begin, end=end)
 
 
@@ -293,17 +288,10 @@ def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
     return begin, np.append(begin[1:], len(fresh))
 
 
-def _clips(
-    frames: Units, time_ns: Ints, fresh: Bools, clip_s: float, stride_s: float
-) -> tuple[Ints, Ints]:
+def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tuple[Ints, Ints]:
     """Where clips begin and end."""
-    periods = {one.trace_id: one.period_ns for one in frames.chosen.store.info()}
-    traces, number = np.unique(trace_of(frames.frame_id), return_inverse=True)
-    period = np.array([periods[one] for one in traces.tolist()], np.float64)[number]
-    seq = seq_of(frames.frame_id)
-    step = np.diff(time_ns, prepend=time_ns[:1])
-    fresh = fresh.copy()
-    fresh[1:] |= (seq[1:] != seq[:-1] + 1) | (step[1:] > GAP * period[1:]) | (step[1:] < 0)
+    period = periods_of(frames.chosen.store, frames.frame_id)
+    fresh = run_begins(frames.chosen.store, frames.frame_id, time_ns)
     starts, ends = _ranges(fresh)
     run = np.cumsum(fresh) - 1
     # Frames stand at whole periods, more or less: what is a hair early belongs to the next clip.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.abstractions import Labelled
-    from sgstore.world import Ints
+    from sgstore.world import Bools, Ints
 
 _CLASSES: Final = """
 WITH kept AS (
@@ -93,6 +93,14 @@ def seq_of(frame_id: Ints) -> Ints:
     """Numbers of frames in their traces."""
     bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
     return bucket * BUCKET_FRAMES + frame_id % (1 << FRAME_BITS)
+
+
+def begins(frame_id: Ints) -> Bools:
+    """(N,): which frames do not come next after the one before them, in its trace."""
+    trace, seq = trace_of(frame_id), seq_of(frame_id)
+    found = np.ones(len(frame_id), np.bool_)
+    found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
+    return found
 
 
 def times(connection: DuckDBPyConnection) -> tuple[Ints, Ints]:
