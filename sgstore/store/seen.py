@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
+    Numbers = NDArray[np.unsignedinteger[Any]]
+
 WINDOW: Final = 8
 """Buckets that are read at once."""
 
@@ -151,13 +153,12 @@ class Graphs:
         moving["heading"] = filled(moving["heading"])
         map_id = traces.map_id[trace]
         maps = np.unique(map_id if trace_id is None else traces.map_id).tolist()
-        number = np.searchsorted(maps, map_id).astype(np.int16)
+        # The fewer bits a number has, the sooner it is sorted.
+        number = np.searchsorted(maps, map_id).astype(np.min_scalar_type(len(maps)))
         divided = [_by_map(of, number, len(maps)) for of in (moving, standing, edges, own)]
         parts = [
             (rows, _seen(len(rows), of_map, self._grounds(connection, one)))
-            for one, rows, *of_map in zip(
-                maps, (np.flatnonzero(map_id == one) for one in maps), *divided, strict=True
-            )
+            for one, rows, *of_map in zip(maps, _places(number, len(maps)), *divided, strict=True)
         ]
         return parts, len(edges["frame"])
 
@@ -213,25 +214,24 @@ def _each_frame(of: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {"frame_id": frame_id, **{name: column[row] for name, column in of.items()}}
 
 
-def _by_map(
-    of: dict[str, NDArray[Any]], number: NDArray[np.int16], maps: int
-) -> list[dict[str, NDArray[Any]]]:
+def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dict[str, Any]]:
     """What belongs to the frames of each map, which are numbered anew there."""
     if maps == 1:
         return [of]
     frame = np.empty(len(number), np.int64)
-    for one in range(maps):
-        rows = np.flatnonzero(number == one)
+    for rows in _places(number, maps):
         frame[rows] = np.arange(len(rows))
-    own = number[of["frame"]]
-    order = np.argsort(own, kind="stable")
-    ends = np.searchsorted(own[order], np.arange(1, maps + 1)).tolist()
-    sorted_ = {name: column[order] for name, column in of.items()}
-    sorted_["frame"] = frame[sorted_["frame"]]
+    anew = of | {"frame": frame[of["frame"]]}
     return [
-        {name: column[low:high] for name, column in sorted_.items()}
-        for low, high in zip([0, *ends[:-1]], ends, strict=True)
+        {name: column[rows] for name, column in anew.items()}
+        for rows in _places(number[of["frame"]], maps)
     ]
+
+
+def _places(number: Numbers, numbers: int) -> list[NDArray[np.int64]]:
+    """Where each of 0 … ``numbers`` - 1 stands."""
+    order = np.argsort(number, kind="stable").astype(np.int64)
+    return np.split(order, np.cumsum(np.bincount(number, minlength=numbers))[:-1])
 
 
 def _seen(frames: int, of: list[dict[str, NDArray[Any]]], grounds: Grounds | None) -> Seen:
