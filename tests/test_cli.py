@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sgstore.cli import run
+from sgstore.cli import VERBS, run
 
 REPOSITORY = Path(__file__).parents[1]
 SAMPLE = REPOSITORY / "sgstore" / "sample" / "town.mcap"
@@ -361,6 +361,25 @@ def test_the_command_line_starts_without_the_heavy_packages() -> None:
     )
 
     assert done.stdout.strip() == "[]"
+
+
+def test_a_command_line_knows_its_verb_alone_and_without_one_all_of_them() -> None:
+    program = (
+        "import sys; from sgstore.cli import VERBS, application;"
+        "known = application(sys.argv[1:]); names = [v.name or v.callback.__name__ for v in"
+        " known.registered_commands] + [g.name for g in known.registered_groups];"
+        "modules = [m for m in VERBS if f'sgstore.cli.{m}' in sys.modules];"
+        "assert sorted(names) == sorted(v for m in modules for v in VERBS[m]), (names, modules);"
+        "print(*modules)"
+    )
+
+    def known(*arguments: str) -> list[str]:
+        command = [sys.executable, "-c", program, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+    assert known("find", "s.sgstore", "MATCH (export)") == ["queries"]
+    assert known("lock", "verify") == ["selection"]
+    assert known() == known("--help") == known("fnd", "find") == list(VERBS)
 
 
 @pytest.mark.parametrize("verb", ["ingest", "info", "find", "sql", "show", "export", "demo"])

@@ -15,7 +15,7 @@ from test_lang_match import view_of
 from typer.testing import CliRunner
 
 import sgstore
-from sgstore.cli import app
+from sgstore.cli import application
 from sgstore.errors import QueryError
 from sgstore.lang import compile_query
 from sgstore.lang.match import Matcher
@@ -168,8 +168,8 @@ def test_frames_and_clips_are_those_of_the_pattern(store: Store) -> None:
 def test_the_command_line_gives_what_networkx_reads(safe: list[str], store: Store) -> None:
     arguments = ["find", str(store.file.path), f"{LEADS} RETURN SUBGRAPHS LIMIT 2", *safe]
 
-    rows = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
-    people = CliRunner().invoke(app, arguments).stdout
+    rows = json.loads(CliRunner().invoke(application(), [*arguments, "--json"]).stdout)
+    people = CliRunner().invoke(application(), arguments).stdout
 
     expected = list(store.find(f"{LEADS} LIMIT 2").subgraphs())
     for row, graph in zip(rows, expected, strict=True):

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sgstore
-from sgstore.cli import app
+from sgstore.cli import application
 from sgstore.errors import AbstractionError, QueryError, StoreError
 
 if TYPE_CHECKING:
@@ -189,8 +189,8 @@ def test_a_pattern_without_what_nothing_is_called_is_refused(store: Store) -> No
 def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
     arguments = ["like", str(path), "town#300", "--limit", "3"]
 
-    table = CliRunner().invoke(app, arguments).stdout
-    rows = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    table = CliRunner().invoke(application(), arguments).stdout
+    rows = json.loads(CliRunner().invoke(application(), [*arguments, "--json"]).stdout)
 
     assert [row["similarity"] for row in rows] == sorted(
         (r["similarity"] for r in rows), reverse=True
@@ -203,8 +203,8 @@ def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
 
 
 def test_the_command_line_prints_a_pattern_that_find_takes(path: Path) -> None:
-    text = CliRunner().invoke(app, ["like", str(path), "town#300", "--pattern"]).stdout
-    found = CliRunner().invoke(app, ["find", str(path), text, "--count"])
+    text = CliRunner().invoke(application(), ["like", str(path), "town#300", "--pattern"]).stdout
+    found = CliRunner().invoke(application(), ["find", str(path), text, "--count"])
 
     assert text.startswith("MATCH (ego:Car&Ego)")
     assert int(found.stdout) >= 1

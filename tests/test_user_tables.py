@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sgstore
-from sgstore.cli import app
+from sgstore.cli import application
 from sgstore.errors import MissingExtraError, QueryError, StoreError
 from sgstore.sandbox import Sandbox
 from sgstore.store import joining as own
@@ -229,7 +229,7 @@ def test_a_label_that_is_misspelt_is_told(path, frames, table) -> None:
 
 
 def run(*arguments: Any) -> Any:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return CliRunner().invoke(application(), [str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("safe", [[], ["--safe", "--timeout", "20s"]])

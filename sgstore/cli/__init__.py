@@ -9,61 +9,62 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from itertools import pairwise
+from typing import TYPE_CHECKING, Final
 
 import typer
 
-from sgstore.cli import (
-    checks,
-    coverage,
-    exports,
-    graphs,
-    imports,
-    library,
-    live,
-    maps,
-    monitoring,
-    payloads,
-    pictures,
-    queries,
-    selection,
-    settings,
-    stores,
-    timelines,
-    tour,
-    traces,
-)
 from sgstore.cli.arguments import ERROR, INTERRUPTED, USAGE, app
 from sgstore.cli.output import say, write_error
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 
-__all__ = ["app", "main"]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
-VERBS = (
-    traces,
-    imports,
-    stores,
-    graphs,
-    maps,
-    live,
-    settings,
-    queries,
-    checks,
-    monitoring,
-    timelines,
-    library,
-    coverage,
-    selection,
-    payloads,
-    pictures,
-    exports,
-    tour,
-)
-"""The modules of the verbs: importing them makes the verbs known; help lists them in this order."""
+__all__ = ["application", "main"]
 
-app.registered_commands.sort(
-    key=lambda verb: [module.__name__ for module in VERBS].index(verb.callback.__module__)
-)
+VERBS: Final = {
+    "traces": ("ingest", "info", "doctor"),
+    "imports": ("import",),
+    "stores": ("verify", "remove"),
+    "graphs": ("derive",),
+    "maps": ("map",),
+    "live": ("record",),
+    "settings": ("config",),
+    "queries": ("find", "why-not", "like", "translate", "sql"),
+    "checks": ("check",),
+    "monitoring": ("monitor",),
+    "timelines": ("timeline",),
+    "library": ("patterns",),
+    "coverage": ("coverage",),
+    "selection": ("select", "diff", "lock"),
+    "payloads": ("payload",),
+    "pictures": ("show",),
+    "exports": ("export",),
+    "tour": ("demo",),
+}
+"""The modules of the verbs, and what is in them; help lists the modules in this order.
+
+A verb is known once its module is imported: :func:`application` imports what is asked for, because to import
+and to build them all takes longer than many an answer.
+"""
+
+
+def application(arguments: Sequence[str] = ()) -> typer.Typer:
+    """The application for a command line.
+
+    Returns
+    -------
+    typer.Typer
+        It knows the verb that is asked for; where none is, or one that there is not, it knows all of them.
+    """
+    asked = [module for module, verbs in VERBS.items() if {*arguments[:1]} & {*verbs}]
+    for module in asked or VERBS:
+        import_module(f"{__name__}.{module}")
+    order = [f"{__name__}.{module}" for module in VERBS]
+    app.registered_commands.sort(key=lambda verb: order.index(verb.callback.__module__))
+    return app
 
 
 def main() -> None:
@@ -87,7 +88,8 @@ def run(arguments: list[str]) -> int:
         The exit code, as the module says.
     """
     try:
-        code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+        asked = application(arguments)
+        code = int(asked(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except SgstoreError as error:
