@@ -289,8 +289,7 @@ class McapFile:
         self.chunk_offsets = summary.chunk_offsets
         self._chunk_starts = array("q", summary.chunk_offsets.tobytes())
         self._summary_fault = summary.fault
-        for number in self.channels:
-            self._known_channels[number] = True
+        self._known_channels[[*self.channels]] = True
 
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
         """What begins the chunks of a walk before their turn, where they are many and all wanted."""
