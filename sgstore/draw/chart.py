@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
@@ -12,7 +13,7 @@ import numpy as np
 from sgstore.draw.palette import FAINT_INK, INK, ROAD_EDGE, RULE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Generator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -71,27 +72,32 @@ class Scale:
         return [step * i for i in range(first, math.floor(self.high / step + 1e-9) + 1)]
 
 
-def sheet(to: Path, title: str, below: str, width: float = _WIDTH, height: float = _HEIGHT) -> Page:
-    """A page with a title and a sentence, of at most two lines, under it.
+@contextmanager
+def sheet(
+    to: Path, title: str, below: str, width: float = _WIDTH, height: float = _HEIGHT
+) -> Generator[Page]:
+    """A page with a title and a sentence, of at most two lines, under it; written when all is drawn.
 
     Raises
     ------
     ExportError
-        The ending of ``to`` is none of a picture.
+        The ending of ``to`` is none of a picture, or the file cannot be written.
     MissingExtraError
         The packages for drawing are not installed.
     """
     from sgstore.draw import check_installed
 
     check_installed()
-    from sgstore.draw.page import Page, check_format
+    from sgstore.draw.page import Page, check_format, own_style
 
     check_format(to)
-    page = Page(width, height)
-    page.text(14, height - 20, title, fontsize=10, weight="bold")
-    for number, line in enumerate(wrap(below, int((width - 28) / _LETTER))[:2]):
-        page.text(14, height - 34 - 10 * number, line, fontsize=7, color=FAINT_INK)
-    return page
+    with own_style():
+        page = Page(width, height)
+        page.text(14, height - 20, title, fontsize=10, weight="bold")
+        for number, line in enumerate(wrap(below, int((width - 28) / _LETTER))[:2]):
+            page.text(14, height - 34 - 10 * number, line, fontsize=7, color=FAINT_INK)
+        yield page
+        page.save(to)
 
 
 def scales(

@@ -51,15 +51,9 @@ def draw_rank_sizes(
     MissingExtraError
         The packages for drawing are not installed.
     """
-    from sgstore.draw import check_installed
-
-    check_installed()
-    from sgstore.draw.page import own_style
-
-    with own_style():
-        once = sum(1 for size in sizes if size == 1)
-        below = f"{len(sizes)} classes, {sum(sizes)} {unit}s; {once} classes come once"
-        page = sheet(to, title, below)
+    once = sum(1 for size in sizes if size == 1)
+    below = f"{len(sizes)} classes, {sum(sizes)} {unit}s; {once} classes come once"
+    with sheet(to, title, below) as page:
         x, y = scales(
             page, (1, max(len(sizes), 10)), (1, max(sizes[0], 10)), right=_RIGHT, log=True
         )
@@ -70,7 +64,6 @@ def draw_rank_sizes(
         page.sheet.plot(
             x.at(ranks), y.at(sizes), color=ROAD_EDGE, linewidth=1.6, marker=".", markersize=2.5
         )
-        page.save(to)
 
 
 def _draw_share(page: Page, x: Scale, share: Scale, cumulative: Sequence[float], unit: str) -> None:
@@ -111,13 +104,7 @@ def draw_growth(
     ExportError, MissingExtraError
         As in :func:`draw_rank_sizes`.
     """
-    from sgstore.draw import check_installed
-
-    check_installed()
-    from sgstore.draw.page import own_style
-
-    with own_style():
-        page = sheet(to, title, below)
+    with sheet(to, title, below) as page:
         x, y = scales(page, (0, max(n)), (0, max(classes) * 1.05))
         paint_axes(page, x, y, (f"{unit}s", "classes"))
         known = [(one, value) for one, value in zip(n, at_random, strict=True) if value is not None]
@@ -128,7 +115,6 @@ def draw_growth(
             key.append((f"{unit}s at random", AT_RANDOM))
         page.sheet.plot(x.at(n), y.at(classes), **CHOSEN)
         paint_key(page, x, y, key)
-        page.save(to)
 
 
 def draw_matrix(
@@ -162,11 +148,6 @@ def draw_matrix(
     -----
     Of more than :data:`MOST_FEATURES` features, those with the most gaps are shown, and the picture says so.
     """
-    from sgstore.draw import check_installed
-
-    check_installed()
-    from sgstore.draw.page import own_style
-
     shown = np.arange(len(names))
     gaps = wanted & (frames == 0)
     pairs = np.triu(wanted, 1)
@@ -176,10 +157,9 @@ def draw_matrix(
         below += f"; the {MOST_FEATURES} of {len(names)} features with the most gaps"
     frames, gaps = frames[np.ix_(shown, shown)], gaps[np.ix_(shown, shown)]
     names = [names[i] for i in shown.tolist()]
-    with own_style():
-        side = len(names) * _CELL
-        label = 12 + 3.7 * max((len(name) for name in names), default=0)
-        page = sheet(to, title, below, max(label + side + 30, 420), side + label + 90)
+    side = len(names) * _CELL
+    label = 12 + 3.7 * max((len(name) for name in names), default=0)
+    with sheet(to, title, below, max(label + side + 30, 420), side + label + 90) as page:
         left, bottom = label, 30.0
         image = _colours(frames, gaps)
         page.sheet.imshow(
@@ -199,7 +179,6 @@ def draw_matrix(
                 across, bottom + side + 4, name, rotation=90, ha="center", va="bottom", fontsize=6
             )
         _key(page, left, gaps)
-        page.save(to)
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -47,16 +47,10 @@ def draw_curve(
     MissingExtraError
         The packages for drawing are not installed.
     """
-    from sgstore.draw import check_installed
-
-    check_installed()
-    from sgstore.draw.page import own_style
-
     most, whole = max((row[0] for row in rows), default=1), max(total, 1)
     random = [(0, 0.0), *((row[0], row[3] / whole) for row in rows)]
     chosen = [(0, 0.0), *((row[0], row[1] / whole) for row in rows if row[1] is not None)]
-    with own_style():
-        page = sheet(to, title, below)
+    with sheet(to, title, below) as page:
         x, y = scales(page, (0, most), (0, 1))
         paint_axes(page, x, y, (f"{unit}s", f"kept, of {total:,}"), up=lambda share: f"{share:.0%}")
         for points, look in ((random, AT_RANDOM), (chosen, CHOSEN)):
@@ -68,4 +62,3 @@ def draw_curve(
         paint_key(
             page, x, y, [(f"selected: {size:,} {unit}s", CHOSEN), (f"{unit}s at random", AT_RANDOM)]
         )
-        page.save(to)
