@@ -37,6 +37,11 @@ class Level:
     parents: Ints
 
 
+def innermost(levels: Sequence[Level]) -> Keys:
+    """(B, n): the bindings of all variables; without quantifiers the one of none."""
+    return levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+
+
 def levels_of(
     quantifiers: Sequence[Quantifier],
     domains: Mapping[str, Ints],

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.history.bindings import Level, folded_values, levels_of
-from sgstore.history.reading import CELLS, Ask, Trace, Values, asks_of, traces
+from sgstore.history.bindings import Level, folded_values, innermost, levels_of
+from sgstore.history.reading import Ask, Trace, Values, asks_of, traces
 from sgstore.lang.bound import Query, Result
 from sgstore.lang.compiler import compile_checks
 from sgstore.lang.found import entities
@@ -233,13 +233,12 @@ class _Check:
 
     def _verdict(self, trace: Trace) -> Verdict:
         levels = self._levels(trace)
-        bindings = levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+        bindings = innermost(levels)
         kinds, members = self._alike(trace, bindings)
         values = np.zeros(len(kinds), np.bool_)
         told = [_NOTHING] * len(kinds)
-        size = max(CELLS // max(len(trace), 1), 1)
-        for low in range(0, len(kinds), size):
-            part = slice(low, low + size)
+        for low in range(0, len(kinds), trace.together):
+            part = slice(low, low + trace.together)
             values[part], told[part] = self._evaluated(trace, kinds[part])
         truths = folded_values(levels, values[members])
         if self._check.gaps == "unknown" and trace.clock.gap_before.any():
@@ -251,10 +250,9 @@ class _Check:
 
     def _bounds(self, trace: Trace, bindings: Keys) -> tuple[Bools, Bools]:
         """The verdict of some bindings, at least and at most, whatever happened in the gaps."""
-        size = max(CELLS // max(len(trace), 1), 1)
         parts: list[tuple[Bools, Bools]] = []
-        for low in range(0, len(bindings), size):
-            some = bindings[low : low + size]
+        for low in range(0, len(bindings), trace.together):
+            some = bindings[low : low + trace.together]
             columns = Values(self._plan, trace, self._variables, some).columns(self._formula)
             times, gaps = trace.clock.times, trace.clock.gap_before
             parts.append(within_bounds(self._formula, columns, times, gaps, len(some)))
@@ -275,7 +273,7 @@ class _Check:
             guard = self._guards.get(self._check.quantifiers.index(quantifier))
             if guard is None or not len(bindings):
                 return np.ones(len(bindings), np.bool_)
-            size = max(CELLS // max(len(trace), 1), 1)
+            size = trace.together
             parts = [
                 Values(self._plan, trace, variables, bindings[low : low + size]).formula(guard)
                 for low in range(0, len(bindings), size)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.history.joining import Joined, joined
-from sgstore.history.reading import CELLS, WORDS, Ask, Trace, Values, asks_of, traces
+from sgstore.history.reading import WORDS, Ask, Trace, Values, asks_of, traces
 from sgstore.history.relations import Relation
 from sgstore.lang.bound import Bound, Course, Moment, Query, Result, Scope, Tense
 from sgstore.lang.found import Found, relation
@@ -180,7 +180,7 @@ class Finder:
     ) -> Any:
         """Whether a formula is true in each row of a relation."""
         true = np.zeros(len(owners), np.bool_)
-        for low, high, rows in _chunks(relation.starts, len(trace)):
+        for low, high, rows in _chunks(relation.starts, trace.together):
             bindings = relation.keys[low:high, : len(ask.variables)]
             values = Values(self._plan, trace, ask.variables, bindings).formula(formula)
             true[rows] = values[owners[rows] - low, relation.frames[rows]]
@@ -199,7 +199,7 @@ class Finder:
         names = self._named(0)
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
         told = [np.zeros(len(owners), object) for _ in places]
-        for low, high, rows in _chunks(relation.starts, len(trace)):
+        for low, high, rows in _chunks(relation.starts, trace.together):
             at = owners[rows] - low, relation.frames[rows]
             values = self._values(trace, names, relation.keys[low:high], places, formulas)
             for number, column in enumerate(values):
@@ -294,7 +294,7 @@ class Finder:
         worked_out = [place for place in places if not isinstance(place, Moment)]
         columns: dict[Bound, Any] = {}
         if worked_out:
-            size = max(CELLS // max(len(trace), 1), 1)
+            size = trace.together
             picked: list[list[Any]] = [[] for _ in worked_out]
             for low in range(0, len(owners), size):
                 some = owners[low : low + size]
@@ -359,9 +359,8 @@ def _is_condition(place: Bound) -> bool:
     return isinstance(place, Tense) or (isinstance(place, Course) and place.word == "exists_now")
 
 
-def _chunks(starts: Ints, frames: int) -> Iterator[tuple[int, int, slice]]:
-    """Keys in parts that are worked on at once, with their rows."""
-    size = max(CELLS // max(frames, 1), 1)
+def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
+    """Keys in parts of so many, with their rows."""
     for low in range(0, len(starts) - 1, size):
         high = min(low + size, len(starts) - 1)
         yield low, high, slice(int(starts[low]), int(starts[high]))

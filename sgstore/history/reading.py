@@ -97,6 +97,11 @@ class Trace:
     def __len__(self) -> int:
         return len(self.frame_ids)
 
+    @property
+    def together(self) -> int:
+        """How many bindings are worked on at once, in all frames."""
+        return max(CELLS // max(len(self), 1), 1)
+
     def seconds(self, frame: int) -> float:
         """The time of a frame since the trace began."""
         return float(self.times[frame] - self.start) / 1e9

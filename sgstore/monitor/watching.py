@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sgstore.errors import QueryError
-from sgstore.history.bindings import Level, folded_values, levels_of
+from sgstore.history.bindings import Level, folded_values, innermost, levels_of
 from sgstore.history.checks import Verdict, Witness
 from sgstore.lang.bound import Query, Result
 from sgstore.matches import Interval
@@ -250,7 +250,7 @@ class Watch:
     def status(self) -> str:
         """What is known of the check, for the entities that were met: one of ``STATUS``."""
         levels = self._levels()
-        bindings = levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+        bindings = innermost(levels)
         return STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]
 
     def _of(self, key: list[int]) -> _Entry:
@@ -284,7 +284,7 @@ class Watch:
     def finish(self, trace: str, last: Moment) -> tuple[Verdict, list[Event]]:
         """The trace has ended: the verdict, and what only the end makes known."""
         levels = self._levels()
-        bindings = levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+        bindings = innermost(levels)
         entries = [self._of(key) for key in bindings.tolist()]
         # Of what SGSM reports every violation is told already: the last frame's, too.
         weak = self._check.end == "weak" or self._compat
