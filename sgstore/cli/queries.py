@@ -87,7 +87,11 @@ def find(
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
         with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.find(text, **values)
-        number = _write_answer(answer, form_for(form, output, as_json=as_json), output)
+        form = form_for(form, output, as_json=as_json)
+        _say_all(answer)
+        number = write_rows(*_as_shown(answer, form), form, output)
+        if not number and form is Format.table:
+            say("nothing matches")
         return NO_MATCH if require and not number else 0
     opened = open_store(store, tables_of(tables))
     with opened.file.snapshot():  # it is opened once
@@ -108,21 +112,23 @@ def find(
     return NO_MATCH if require and not number else 0
 
 
-def _as_shown(matches: Matches, form: Format) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+def _as_shown(
+    answer: Matches | Answer, form: Format
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
+    from sgstore.lang.reading import for_people
+    from sgstore.sandbox import Answer
+
+    rows = answer.rows if isinstance(answer, Answer) else answer
     if form is Format.table:
-        return matches.for_people()
-    return _node_link(matches, matches, form) if matches.graphs else (matches.columns, matches)
+        return for_people(answer.columns, rows, graphs=answer.graphs)
+    return _node_link(answer, rows, form) if answer.graphs else (answer.columns, rows)
 
 
 def _node_link(
     answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Rows that end in a graph: in JSON as networkx reads them, for people as two texts."""
-    if form is Format.table:
-        from sgstore.lang.subgraphs import shown
-
-        return answer.columns, ((*row[:-2], *shown(*row[-2:])) for row in rows)
+    """Rows that end in a graph: in JSON as networkx reads them."""
     if form not in {Format.json, Format.ndjson}:
         return answer.columns, rows
     columns = ("directed", "multigraph", *answer.columns)
@@ -261,7 +267,9 @@ def sql(
     if safe:
         with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))
-        _write_answer(answer, form_for(form, output, as_json=as_json), output)
+        _say_all(answer)
+        form = form_for(form, output, as_json=as_json)
+        write_rows(answer.columns, answer.rows, form, output)
         return 0
     opened = open_store(store, tables_of(tables)).file
     with opened.user_batches(query_of(statement, file)) as batches:
@@ -282,11 +290,8 @@ def _sandbox(store: Path, timeout: str, max_rows: int, tables: list[str] | None)
     )
 
 
-def _write_answer(answer: Answer, form: Format, output: Path | None) -> int:
+def _say_all(answer: Answer) -> None:
+    """Say what an answer lacks."""
     say_left_out(answer)
     if answer.truncated:
         say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
-    columns, rows = answer.columns, answer.rows
-    if answer.graphs:
-        columns, rows = _node_link(answer, rows, form)
-    return write_rows(columns, rows, form, output)

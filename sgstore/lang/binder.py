@@ -500,6 +500,8 @@ def _result(returns: s.Returns | None, names: Names) -> b.Result:
         after=item.after if item else 0,
     )
     _check_result(result, returns, names.session)
+    if result.aggregated:  # each combination comes once, and DISTINCT must not drop what is counted
+        result = replace(result, distinct=False)
     order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
     return replace(result, order=order, sample=_sampling(returns.sample, result, inner))
 
@@ -517,8 +519,27 @@ def _column(item: s.Item, names: Names) -> b.Column:
     value = settled(bind(item.value, names), names.session)
     if value.type is Type.list:
         names.session.refuse("a list cannot be returned", item.span)
+    _refuse_mixed(value, item.value.span, names.session)
     text = names.session.text[item.value.span.start : item.value.span.end]
     return b.Column(item.name or " ".join(text.split()), value)
+
+
+def _refuse_mixed(value: b.Bound, span: Span, session: Session) -> None:
+    """Refuse a value that is of each match and of all matches at once."""
+    counted = any(isinstance(part, b.Aggregate) for part in b.walk(value))
+    if counted and _of_each(value):
+        session.refuse(
+            "a value of each match cannot stand beside one of all matches",
+            span,
+            "return both by themselves: x.speed, AVG(x.speed)",
+        )
+
+
+def _of_each(value: b.Bound) -> bool:
+    """Whether a value speaks of single matches, but for what is counted of all."""
+    if isinstance(value, b.Operation):
+        return any(_of_each(operand) for operand in value.operands)
+    return not isinstance(value, b.Aggregate | b.Value | b.Choices)
 
 
 def _key(value: s.Expression, result: b.Result, names: Names) -> b.Bound | str:
@@ -529,6 +550,7 @@ def _key(value: s.Expression, result: b.Result, names: Names) -> b.Bound | str:
     if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
         names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
     found = settled(bind(value, names), names.session)
+    _refuse_mixed(found, value.span, names.session)
     if isinstance(found, b.Value):
         hint = f"name a value, or one of: {', '.join(known)}"
         names.session.refuse("a constant puts nothing in an order", value.span, hint)

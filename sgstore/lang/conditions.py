@@ -37,6 +37,9 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+MAX_NUMBER: Final = 1e300
+"""Largest number that a query may speak of."""
+
 _ORDERED: Final = frozenset({"<", "<=", ">", ">="})
 _TEXT_TESTS: Final = frozenset({"STARTS WITH", "ENDS WITH", "CONTAINS", "=~"})
 _NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+")
@@ -128,6 +131,12 @@ def _checked(value: object, e: s.Parameter, names: Names) -> b.Value:
             "true or false, or a list of these",
             e.span,
         )
+    if isinstance(value, int | float) and not abs(value) <= MAX_NUMBER:
+        names.session.refuse(
+            f"the parameter '{e.name}' is {value}; expected a number up to 1e300", e.span
+        )
+    if isinstance(value, int) and abs(value) >= 2**63:
+        value = float(value)
     return b.Value(value, _type_of(value))
 
 
@@ -316,7 +325,7 @@ def _comparison(e: s.Comparison, names: Names) -> b.Operation:
     _check_sides(e, left, right, names)
     if left.type is not right.type:
         texts = [side.value for side in (left, right) if isinstance(side, b.Value)]
-        hint = _of_name(e.left, left, right, names) or _of_name(e.right, right, left, names)
+        hint = _of_sides(e, left, right, names)
         names.session.refuse(
             f"a {left.type.value} cannot be compared with a {right.type.value}",
             e.span,
@@ -350,6 +359,18 @@ def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: Names) -
         if side.type is Type.list:
             hint = f"{where} IN […]" if prop else "write IN"
             names.session.refuse("a list cannot be compared", written.span, hint)
+
+
+def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: Names) -> str | None:
+    """A hint where one side is not of the type that its writer took it for; ``None``: no idea."""
+    for written, side, other in ((e.left, left, right), (e.right, right, left)):
+        if isinstance(written, s.Parameter):
+            return f"${written.name} is the {side.type.value} {names.session.parameters[written.name]!r}"
+        if isinstance(written, s.AttributeOf) and written.owner.name in names.session.tables:
+            return f"the column {written.name} of your table holds {side.type.value}s"
+        if (hint := _of_name(written, side, other, names)) is not None:
+            return hint
+    return None
 
 
 def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: Names) -> str | None:
@@ -448,6 +469,8 @@ def _membership(e: s.Membership, names: Names) -> b.Bound:
     choices = bind(e.choices, names)
     if not isinstance(choices, b.Choices):
         hint = "write IN ['a', 'b']"
+        if isinstance(e.choices, s.Parameter):
+            hint = f"give ${e.choices.name} a list: find(…, {e.choices.name}=['a', 'b'])"
         if choices.type is Type.text and not isinstance(choices, b.Value):
             hint = "whether a text is in another: x.name CONTAINS 'a'"
         names.session.refuse("expected a list after IN", e.choices.span, hint)

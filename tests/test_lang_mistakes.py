@@ -1,0 +1,157 @@
+"""What a query is not taken for, and how a message shows where it is wrong."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from test_lang_golden import CATALOG
+
+from sgstore.errors import QueryError, Span
+from sgstore.lang import compile_query
+from sgstore.lang.reading import for_people
+
+
+def refused(text: str, **parameters: object) -> QueryError:
+    with pytest.raises(QueryError) as error:
+        compile_query(text, CATALOG, parameters)
+    return error.value
+
+
+def sql(text: str, **parameters: object) -> str:
+    return compile_query(text, CATALOG, parameters).rows().sql
+
+
+# What is not taken for something else --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (a:Car)-->b",
+        "MATCH (a:Car) --> b",
+        "MATCH (a:Car)--b",
+        "MATCH (a:Car)--[:near]->(b)",
+        "MATCH (a:Car) --[:near]->(b)",
+        "MATCH (a:Car) WHERE a.speed > 3 AND (a)-->(b)",
+    ],
+)
+def test_an_edge_that_is_misspelt_is_not_dropped_as_a_comment(text: str) -> None:
+    assert refused(text).span is not None
+
+
+@pytest.mark.parametrize("blank", ["", " ", "  ", "\t"])
+def test_an_edge_of_two_dashes_may_have_blanks_around_it(blank: str) -> None:
+    assert sql(f"MATCH (a:Car){blank}--{blank}(b:Car)") == sql("MATCH (a:Car)--(b:Car)")
+
+
+@pytest.mark.parametrize("comment", [" -- b", " --b", "\n--\n", " ------", " --- >", " -- a --> b"])
+def test_comments_stay_comments(comment: str) -> None:
+    assert sql(f"MATCH (a:Car){comment}") == sql("MATCH (a:Car)")
+
+
+def test_the_ego_by_its_name_is_the_ego_whatever_it_is_labelled() -> None:
+    inside = "MATCH (p:Person) WHERE EXISTS {{(ego:{})-[:near]->(p)}}"
+
+    assert sql("MATCH (ego:Car)-[:near]->(p:Person)") == sql(
+        "MATCH (ego:Car&Ego)-[:near]->(p:Person)"
+    )
+    assert sql(inside.format("Car")) == sql(inside.format("Car&Ego"))
+    assert "no node" in refused("MATCH (ego:Lane)").reason
+
+
+def test_a_label_or_a_relation_without_its_colon_is_no_name() -> None:
+    assert "(:Car)" in str(refused("MATCH (Car)"))
+    assert "-[:near]->" in str(refused("MATCH (a)-[near]->(b)"))
+    assert sql("MATCH (car)-[near:near]->(b)")
+    assert sql("MATCH (Car:Car)-[:near]->(b), (Car)-[:near]->(c)")
+
+
+def test_what_is_counted_is_counted_with_distinct_as_without() -> None:
+    query = "MATCH (e:Ego)-[:near]->(p:Person) RETURN {} p.name AS who, COUNT(*) AS n, AVG(p.speed)"
+
+    assert sql(query.format("DISTINCT")) == sql(query.format(""))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400])
+def test_a_parameter_is_a_number_that_a_text_could_hold(value: float) -> None:
+    assert "expected a number" in refused("MATCH (e:Ego) WHERE e.speed > $v", v=value).reason
+
+
+def test_a_whole_number_that_is_too_large_for_the_database_is_a_number_all_the_same() -> None:
+    statement = compile_query("MATCH (e:Ego) WHERE e.speed > $v", CATALOG, {"v": 2**70}).rows()
+
+    assert 2.0**70 in statement.values
+    assert all(isinstance(value, float) for value in statement.values if value == 2**70)
+
+
+# Where it is wrong --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "carets"),
+    [
+        ("a\tbad", "  a bad", "    ^^^"),
+        ("'自動車' bad", "  '自動車' bad", "           ^^^"),
+        ("'e\u0301' bad", "  'e\u0301' bad", "      ^^^"),
+        ("a\x00bad", "  a·bad", "    ^^^"),
+        ("\x1b[31m bad", "  ·[31m bad", "        ^^^"),
+        ("one\r\ntwo\u2028 bad\r\nthree", "  two  bad ", "       ^^^"),
+    ],
+)
+def test_carets_stand_below_what_is_wrong(text: str, line: str, carets: str) -> None:
+    start = text.index("bad")
+
+    message = str(QueryError("no", text=text, span=Span(start, start + 3)))
+
+    assert message.split("\n") == ["no", line, carets]
+
+
+@pytest.mark.parametrize("at", [0, 70, 5_000, 9_990])
+def test_of_a_long_line_what_is_around_the_mistake_is_shown(at: int) -> None:
+    text = "x " * 5_000
+    text = f"{text[:at]}bad {text[at:]}"
+
+    _, line, carets = str(QueryError("no", text=text, span=Span(at, at + 3))).split("\n")
+
+    assert len(line) < 170
+    assert line[carets.index("^") : carets.index("^") + 3] == "bad"
+
+
+def test_what_was_found_is_told_in_short_and_so_that_it_can_be_seen() -> None:
+    assert "U+0000" in refused("MATCH (e:Ego)\0").reason
+    assert "U+200B" in refused("MATCH (e:Ego)\u200b").reason
+    assert len(refused(f"MATCH (e:Ego) {'x' * 50_000}").reason) < 200
+
+
+# For people ---------------------------------------------------------------------------------------
+
+
+def test_what_was_asked_for_by_name_is_not_left_out_for_people() -> None:
+    columns = ("frame_id", "trace", "seq", "time_ns", "t", "v", "v.name", "p.id", "q.name")
+
+    shown, rows = for_people(
+        columns, [(7, "a", 3, 1, 0.12345, 5, "car 5", 8, "car 9")], graphs=False
+    )
+
+    assert shown == ("frame", "t", "v", "p.id", "q.name")
+    assert list(rows) == [("a#3", 0.123, "car 5", 8, "car 9")]
+
+
+def test_intervals_for_people_begin_with_their_first_frame() -> None:
+    columns = (
+        "trace",
+        "start_seq",
+        "end_seq",
+        "start_ns",
+        "end_ns",
+        "start",
+        "end",
+        "frames",
+        "who",
+    )
+
+    shown, rows = for_people(columns, [("a", 3, 5, 1, 2, 0.1, 0.3, 3, "x")], graphs=False)
+
+    assert shown == ("from", "start", "end", "frames", "who")
+    assert list(rows) == [("a#3", 0.1, 0.3, 3, "x")]
