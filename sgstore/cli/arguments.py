@@ -15,6 +15,7 @@ from sgstore.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from sgstore.coverage import Chosen
     from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.sandbox import Answer
@@ -208,7 +209,7 @@ def seconds_of(text: str, option: str) -> float:
     return float(match[1]) * _UNIT[match[2]]
 
 
-def say_left_out(matches: Matches | Answer) -> None:
+def say_left_out(matches: Matches | Answer | Chosen) -> None:
     """Say which traces cannot answer a query."""
     if matches.left_out:
         names = ", ".join(matches.left_out)

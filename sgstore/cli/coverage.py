@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sgstore.cli.arguments import AsJson, Output, RowFormat, app, form_of
+from sgstore.cli.arguments import AsJson, Output, RowFormat, app, form_of, say_left_out
 from sgstore.cli.output import Format, say, write_rows
 
 if TYPE_CHECKING:
@@ -406,9 +406,7 @@ def _classed(
     from sgstore.coverage import Missing, classed, read_specifications, selection_of
 
     chosen = selection_of(text)
-    if chosen.left_out:
-        names = ", ".join(chosen.left_out)
-        say(f"left out, because they cannot answer this query (no road map, perhaps): {names}")
+    say_left_out(chosen)
     declared = None
     if slots is not None:
         declared, *more = read_specifications(slots)

@@ -21,6 +21,7 @@ from sgstore.cli.arguments import (
     asked_of,
     form_of,
     parameters_of,
+    say_left_out,
     seconds_of,
 )
 from sgstore.cli.output import Format, say, write_rows
@@ -206,9 +207,8 @@ def _check_output(output: Path | None) -> None:
 
 def _chosen(store: Path, query: str | None, parameters: list[str] | None) -> Chosen:
     """The frames that are selected from."""
-    import numpy as np
-
     from sgstore.coverage import Chosen
+    from sgstore.coverage.frames import frames_of
     from sgstore.query import Store
 
     opened = Store(store)
@@ -216,12 +216,10 @@ def _chosen(store: Path, query: str | None, parameters: list[str] | None) -> Cho
         if parameters:
             raise typer.BadParameter("--param belongs to a QUERY")
         return Chosen(str(store), opened)
-    matches = opened.find(query, **parameters_of(parameters))
-    if matches.left_out:
-        names = ", ".join(matches.left_out)
-        say(f"left out, because they cannot answer this query (no road map, perhaps): {names}")
-    ids = np.unique(np.fromiter((frame.frame_id for frame in matches.frames()), np.int64))
-    return Chosen(f"{store}:{query}", opened, ids, matches.left_out)
+    values = parameters_of(parameters)
+    matches = opened.find(query, **values)
+    say_left_out(matches)
+    return Chosen(f"{store}:{query}", opened, frames_of(opened, query, **values), matches.left_out)
 
 
 def _parts(found: Selection, shares: dict[str, float]) -> tuple[dict[int, str], Table | None]:

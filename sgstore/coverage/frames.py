@@ -90,12 +90,12 @@ def selection_of(text: str) -> Chosen:
     )
 
 
-def frames_of(store: Store, query: str) -> Ints:
-    """Ids of the frames in which a query holds, ascending."""
+def frames_of(store: Store, query: str, /, **parameters: object) -> Ints:
+    """Ids of the frames in which a query holds, ascending. ``**parameters``: values of ``$name`` in it."""
     if block_of(query) is not None:  # in columns
-        found = store.find(f"{query} RETURN FRAMES").numpy()["frame_id"]
+        found = store.find(f"{query} RETURN FRAMES", **parameters).numpy()["frame_id"]
         return np.unique(found.astype(np.int64))
-    rows = (frame.frame_id for frame in store.find(query).frames())
+    rows = (frame.frame_id for frame in store.find(query, **parameters).frames())
     return np.unique(np.fromiter(rows, np.int64))
 
 
