@@ -1,10 +1,12 @@
-"""Verbs about recordings and stores, as a shell runs them."""
+"""Verbs about recordings and stores."""
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import pytest
 from recordings import Recorder, car, drive
 
+from sgstore.cli import run
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
@@ -19,11 +22,16 @@ SAMPLE = Path(str(files("sgstore"))) / "sample" / "town.mcap"
 
 
 def sgstore(*arguments: object, stdin: str = "") -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(
-        [sys.executable, "-m", "sgstore", *map(str, arguments)],
-        input=stdin.encode(),
-        capture_output=True,
-        check=False,
+    """A command line, run in this process: its exit code, and the bytes that it prints."""
+    printed, told, typed = (
+        io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8", write_through=True)
+        for text in ("", "", stdin)
+    )
+    with redirect_stdout(printed), redirect_stderr(told), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdin", typed)
+        code = run([str(argument) for argument in arguments])
+    return subprocess.CompletedProcess(
+        arguments, code, printed.buffer.getvalue(), told.buffer.getvalue()
     )
 
 
