@@ -109,11 +109,10 @@ class Matches:
         self._catalog = catalog
         self._text = text
         self._parameters = parameters
-        self._ready: Compiled | None = None
-        with self._compiled() as compiled:
-            self.graphs = compiled.layout is not None
-            self.columns = compiled.columns
-            self.left_out = compiled.left_out
+        compiled = self._ready = compile_query(text, catalog(), parameters)
+        self.graphs = compiled.layout is not None
+        self.columns = compiled.columns
+        self.left_out = compiled.left_out
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:
@@ -123,7 +122,7 @@ class Matches:
         """
         with self._file.snapshot():
             catalog = self._catalog()
-            if self._ready is None or self._ready.stored is not catalog:
+            if self._ready.stored is not catalog:
                 self._ready = compile_query(self._text, catalog, self._parameters)
             yield self._ready
 

@@ -77,10 +77,10 @@ class Store:
 
     def catalog(self) -> Catalog:
         """What the store holds, as queries need to know it; remembered while the file stays as it is."""
+        if self._held is not None and self._held[0] == _stamp(self.file.path):
+            return self._held[1]  # to open the store costs more than to compile a query
         with self.file.snapshot():
-            stamp = _stamp(self.file.path)
-            if self._held is None or self._held[0] != stamp:
-                self._held = stamp, self.file.catalog()
+            self._held = _stamp(self.file.path), self.file.catalog()
             return self._held[1]
 
     def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> Matches:

@@ -40,7 +40,7 @@ class Stories(Matches):
         at_once: bool,
         whole_traces: bool,
     ) -> Iterator[tuple[Any, ...]]:
-        over_time = self._ready is not None and bool(self._ready.query.steps)
+        over_time = bool(self._ready.query.steps)
         whole = whole_traces or over_time
         yield from super()._windows(statement, at_once=at_once, whole_traces=whole)
 
