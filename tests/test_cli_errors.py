@@ -67,6 +67,16 @@ def test_other_errors_are_data_too(arguments, error, code, store: str, capsys) -
     assert told["reason"]
 
 
+def test_a_parameter_may_be_a_list_as_in_json(store: str, capsys) -> None:
+    query = "MATCH (v:Vehicle) WHERE v.kind IN $kinds"
+
+    assert run(["find", store, query, "--param", 'kinds=["car", "bus"]', "--count"]) == 0
+    assert run(["find", store, query, "--param", 'kinds=["car", "buss"]']) == 2
+    assert "unknown kind 'buss'" in capsys.readouterr().err
+    assert run(["find", store, query, "--param", "kinds=[car"]) == 2
+    assert "expected a list as in JSON" in capsys.readouterr().err
+
+
 def test_for_people_it_is_shown_with_carets(store: str, capsys) -> None:
     assert run(["find", store, "MATCH (e:Eggo)"]) == 2
 

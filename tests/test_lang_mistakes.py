@@ -73,6 +73,13 @@ def test_what_is_counted_is_counted_with_distinct_as_without() -> None:
     assert sql(query.format("DISTINCT")) == sql(query.format(""))
 
 
+@pytest.mark.parametrize("form", ["INTERVALS", "CLIPS(-1s, +1s)", "p.id, INTERVALS"])
+def test_intervals_are_distinct_as_they_are(form: str) -> None:
+    query = "MATCH (e:Ego)-[:near]->(p:Person) RETURN {} {} SAMPLE 3"
+
+    assert sql(query.format("DISTINCT", form)) == sql(query.format("", form))
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400])
 def test_a_parameter_is_a_number_that_a_text_could_hold(value: float) -> None:
     assert "expected a number" in refused("MATCH (e:Ego) WHERE e.speed > $v", v=value).reason

@@ -47,7 +47,11 @@ PatternName = Annotated[
 ]
 Parameters = Annotated[
     list[str] | None,
-    typer.Option("--param", metavar="NAME=VALUE", help="Value of $NAME in the query; repeatable."),
+    typer.Option(
+        "--param",
+        metavar="NAME=VALUE",
+        help="Value of $NAME in the query, a list as [1, 2]; repeatable.",
+    ),
 ]
 With = Annotated[
     list[str] | None,
@@ -176,14 +180,24 @@ def lines_of(file: Path) -> list[str]:
 
 
 def parameters_of(pairs: list[str] | None) -> dict[str, Any]:
-    """``NAME=VALUE`` as values: a number where it is one, ``true`` and ``false``, else a text."""
+    """``NAME=VALUE`` as values: numbers, ``true`` and ``false``, lists as in JSON, all else as texts."""
     values: dict[str, Any] = {}
     for pair in pairs or []:
         name, equals, value = pair.partition("=")
         if not equals or not name.isidentifier():
             raise typer.BadParameter(f"--param {pair!r}: expected NAME=VALUE")
-        values[name] = _parameter(value)
+        values[name] = _listed(pair, value) if value.startswith("[") else _parameter(value)
     return values
+
+
+def _listed(pair: str, value: str) -> Any:
+    import json  # few need it
+
+    try:
+        return json.loads(value)
+    except (ValueError, RecursionError):
+        hint = """expected a list as in JSON: '["car", "bus"]'"""
+        raise typer.BadParameter(f"--param {pair!r}: {hint}") from None
 
 
 def _parameter(value: str) -> Any:

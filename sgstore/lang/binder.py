@@ -500,7 +500,8 @@ def _result(returns: s.Returns | None, names: Names) -> b.Result:
         after=item.after if item else 0,
     )
     _check_result(result, returns, names.session)
-    if result.aggregated:  # each combination comes once, and DISTINCT must not drop what is counted
+    if result.aggregated or result.form in {"intervals", "clips"}:
+        # Each comes once as it is, and DISTINCT must not drop what is counted.
         result = replace(result, distinct=False)
     order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
     return replace(result, order=order, sample=_sampling(returns.sample, result, inner))
@@ -573,7 +574,8 @@ def _sampling(sample: s.Sample | None, result: b.Result, names: Names) -> b.Samp
     if sample is None:
         return None
     if result.aggregated or (result.distinct and not (result.whole or result.framed)):
-        names.session.refuse("SAMPLE chooses among matches, and these are not listed", sample.span)
+        reason = "SAMPLE chooses among matches, and these are not listed"
+        names.session.refuse(reason, sample.span, "LIMIT n gives the first ones, by ORDER BY")
     return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))
 
 
@@ -584,4 +586,7 @@ def _check_result(result: b.Result, returns: s.Returns, session: Session) -> Non
         session.refuse(f"two results are called '{twice}'", returns.span, "name them with AS")
     listed = result.form != "rows" or result.whole or result.framed
     if result.aggregated and listed:
-        session.refuse("matches are either counted or listed, not both", returns.span)
+        hint = "a number for each row is COUNT {(a)-[:near]->(b)} AS n"
+        if result.form in {"intervals", "clips"}:
+            hint = "how many frames each interval has is there anyhow, as frames"
+        session.refuse("matches are either counted or listed, not both", returns.span, hint)
