@@ -1,7 +1,8 @@
 """Made-up drives, as many as wanted: coherent in time, an ego among others, on one of eight streets.
 
 At 10 Hz; the length of a drive is lognormal between 15 s and 200 s (a median of 45 s). About 17 nodes a frame
-(5 cars, 1 van, truck or bus, 3 people, 5 lanes), and 48 edges as :mod:`bench.patterns` asks for them.
+(5 cars with the ego, 1 van, truck or bus, 3 people, 5 lanes, road and off_road), and 48 edges with the settings
+of :mod:`bench.patterns`.
 
 * The ego keeps to its lane, at 4 to 12 m/s, and stops now and then, as at lights; who drives stops with it.
 * Two vehicles go ahead of it and two behind, at distances that wander, and change lanes; the nearer of those
