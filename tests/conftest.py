@@ -8,8 +8,14 @@ import shutil
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.query import Store
 
 # Who starts the tests in the background of a shell has them ignore Ctrl-C, and so would what they start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -58,3 +64,13 @@ def town_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def town_store(town_of_the_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the bundled recording; each file of tests has its own."""
     return Path(shutil.copy(town_of_the_run, tmp_path_factory.mktemp("town") / "town.sgstore"))
+
+
+@pytest.fixture(scope="module")
+def open_town(town_store: Path) -> Iterator[Store]:
+    """The same, and it stays open: to open a store takes longer than most answers."""
+    from sgstore.query import Store
+
+    store = Store(town_store)
+    with store.file.snapshot():
+        yield store

@@ -64,6 +64,10 @@ SEQUENCES = (
 )
 
 
+Watched = tuple[tuple["Verdict", ...], list["Event"], Monitor]
+"""Verdicts, what was told, and by whom."""
+
+
 @dataclass
 class Drive:
     """A recording: its store, its map, and its graphs, one frame after the other."""
@@ -74,11 +78,14 @@ class Drive:
     graphs: list[SceneGraph] = field(default_factory=list)
     stored: dict[int, str] = field(default_factory=dict)
     online: dict[int, str] = field(default_factory=dict)
+    known: dict[tuple[str, bool], Watched] = field(default_factory=dict)
+    """What was watched already."""
 
     @classmethod
     def of(cls, recording: Path, folder: Path) -> Drive:
         path = folder / f"{recording.stem}.sgstore"
-        ingest(path, [recording])
+        if not path.exists():
+            ingest(path, [recording])
         store = Store(path)
         ((name,),) = store.sql("SELECT name FROM trace").values
         with opened(str(recording), Config()) as source:
@@ -89,16 +96,16 @@ class Drive:
         online = {node: about["ident"] for node, about in nodes if "ident" in about}
         return cls(store, name, source.road_map, graphs, stored, online)
 
-    def watched(
-        self, text: str, *, sgsm_compat: bool = False
-    ) -> tuple[tuple[Verdict, ...], list[Event], Monitor]:
+    def watched(self, text: str, *, sgsm_compat: bool = False) -> Watched:
+        if (text, sgsm_compat) in self.known:
+            return self.known[text, sgsm_compat]
         events: list[Event] = []
         monitor = Monitor(
             text, self.road_map, trace=self.name, on_event=events.append, sgsm_compat=sgsm_compat
         )
         for graph in self.graphs:
             monitor.look([graph])
-        return monitor.finish(), events, monitor
+        return self.known.setdefault((text, sgsm_compat), (monitor.finish(), events, monitor))
 
     def compare_checks(self, text: str, *, sgsm_compat: bool = False) -> int:
         """Verdicts watched and stored; how many violations there are."""

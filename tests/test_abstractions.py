@@ -263,7 +263,8 @@ def test_frames_of_a_store_have_equal_classes_exactly_if_networkx_says_isomorphi
     ids, found = classes["frame_id"], classes["class"]
     numbers = np.random.default_rng(3).integers(0, len(ids) - 5, 8)
     pairs = [(i, i + step) for i in numbers.tolist() for step in (1, 4)]
-    graphs = {i: store.graph(int(ids[i]), abstraction=name) for pair in pairs for i in pair}
+    with store.file.snapshot():
+        graphs = {i: store.graph(int(ids[i]), abstraction=name) for pair in pairs for i in pair}
 
     def same_node(a, b):
         return a["base_class"] == b["base_class"]

@@ -8,6 +8,7 @@ import shlex
 from itertools import islice
 from pathlib import Path
 from textwrap import dedent
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -15,6 +16,9 @@ import sgstore
 from sgstore.config import Config
 from sgstore.graphs import derive
 from sgstore.monitor import Monitor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -61,14 +65,16 @@ def arguments(block: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def store(town_store: Path) -> sgstore.Store:
+def store(town_store: Path) -> Iterator[sgstore.Store]:
     labels = town_store.with_name("labels.csv")
     derive(town_store, Config(), "near")
     frames = sgstore.open(town_store).sql(
         "SELECT frame_id, seq % 5 AS score, 2.0 AS error_deg FROM frames"
     )
     frames.csv(labels)
-    return sgstore.open(town_store, tables={"labels": labels})
+    store = sgstore.open(town_store, tables={"labels": labels})
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -7,7 +7,6 @@ from itertools import islice
 
 import pytest
 
-import sgstore
 from sgstore.config import Config
 from sgstore.lang import compile_query
 from sgstore.lang.match import Matcher
@@ -22,8 +21,8 @@ BESIDE = "MATCH (x:Vehicle)-[:isIn]->(l:Lane {role: 'Right 1 of Ego Lane'})"
 
 
 @pytest.fixture(scope="module")
-def store(town_store):
-    return sgstore.open(town_store)
+def store(open_town):
+    return open_town
 
 
 def test_lanes_have_the_roles_that_rsv_calls_them_by(store) -> None:

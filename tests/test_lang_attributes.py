@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import sgstore
 from sgstore.lang.bound import FrameAttribute, NodeAttribute, TraceAttribute
 from sgstore.lang.catalog import (
     ENV_ATTRIBUTES,
@@ -21,8 +20,6 @@ from sgstore.lang.functions import PAIR_FUNCTIONS
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from sgstore.lang.evaluation import FrameView
     from sgstore.query import Store
 
@@ -30,8 +27,8 @@ SEQ = 300
 
 
 @pytest.fixture(scope="module")
-def store(town_store: Path) -> Store:
-    return sgstore.open(town_store)
+def store(open_town: Store) -> Store:
+    return open_town
 
 
 @pytest.fixture(scope="module")

@@ -157,8 +157,8 @@ def test_what_a_trace_cannot_answer_is_said(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def town(town_store: Path) -> Store:
-    return Store(town_store)
+def town(open_town: Store) -> Store:
+    return open_town
 
 
 @pytest.mark.parametrize(

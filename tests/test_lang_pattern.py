@@ -9,10 +9,9 @@ import pytest
 
 from sgstore.errors import QueryError
 from sgstore.lang.pattern import Pattern
-from sgstore.query import Store
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from sgstore.query import Store
 
 TEXT = """
 MATCH (e:Ego)-[:isIn]->(lane:Lane {lane_type: 'driving'})<-[:isIn]-(p:Person)
@@ -21,8 +20,8 @@ WHERE abs(bearing(e, p)) < 45
 
 
 @pytest.fixture(scope="module")
-def store(town_store: Path) -> Store:
-    return Store(town_store)
+def store(open_town: Store) -> Store:
+    return open_town
 
 
 def test_a_pattern_built_step_by_step_finds_what_its_text_finds(store: Store) -> None:

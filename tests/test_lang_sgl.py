@@ -10,12 +10,11 @@ import pytest
 from sgstore.errors import QueryError
 from sgstore.lang.parser import parse
 from sgstore.lang.sgl import translated
-from sgstore.query import Store
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import networkx as nx
+
+    from sgstore.query import Store
 
 PROPERTIES = """
 from functools import partial
@@ -82,8 +81,8 @@ class Algebra:
 
 
 @pytest.fixture(scope="module")
-def store(town_store: Path) -> Store:
-    return Store(town_store)
+def store(open_town: Store) -> Store:
+    return open_town
 
 
 def test_propositions_hold_where_set_algebra_says(store: Store) -> None:

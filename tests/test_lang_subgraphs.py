@@ -14,7 +14,6 @@ from oracle_worlds import World, random_world
 from test_lang_match import view_of
 from typer.testing import CliRunner
 
-import sgstore
 from sgstore.cli import application
 from sgstore.errors import QueryError
 from sgstore.lang import compile_query
@@ -22,8 +21,6 @@ from sgstore.lang.match import Matcher
 from sgstore.lang.parser import parse
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from sgstore.query import Store
 
 Shape = tuple[Any, ...]
@@ -100,8 +97,8 @@ def test_the_nodes_of_the_graphs_are_those_of_exhaustive_search() -> None:
 
 
 @pytest.fixture(scope="module")
-def store(town_store: Path) -> Store:
-    return sgstore.open(town_store)
+def store(open_town: Store) -> Store:
+    return open_town
 
 
 LEADS = "MATCH (e:Ego)-[:isIn]->(l:Lane)<-[r:isIn]-(v:Vehicle) WHERE EXISTS {(v)-[:leads]->(e)}"

@@ -11,6 +11,7 @@ from sgstore.lang import patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.matches import Interval
@@ -21,11 +22,13 @@ RECORDINGS = ("cut-in", "highway_merge", "pedestrian", "traffic_lights")
 
 
 @pytest.fixture(scope="module")
-def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """A store of what esmini played."""
     path = tmp_path_factory.mktemp("esmini") / "esmini.sgstore"
     ingest(path, [data / "traces" / "esmini" / f"{name}.mcap" for name in RECORDINGS])
-    return Store(path)
+    store = Store(path)
+    with store.file.snapshot():
+        yield store
 
 
 def found(store: Store, name: str) -> list[Interval]:

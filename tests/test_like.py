@@ -10,7 +10,6 @@ import networkx as nx
 import pytest
 from typer.testing import CliRunner
 
-import sgstore
 from sgstore.cli import application
 from sgstore.errors import AbstractionError, QueryError, StoreError
 
@@ -28,8 +27,8 @@ def path(town_store: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(path: Path) -> Store:
-    return sgstore.open(path)
+def store(open_town: Store) -> Store:
+    return open_town
 
 
 def features(graph: nx.MultiDiGraph[Any], *ignored: str) -> Counter[str]:

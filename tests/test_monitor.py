@@ -18,9 +18,9 @@ from sgstore.online import Frame
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+def town(town_store: Path) -> Drive:
     """The bundled recording."""
-    return Drive.of(RECORDING, tmp_path_factory.mktemp("town"))
+    return Drive.of(RECORDING, town_store.parent)
 
 
 @pytest.mark.parametrize("text", [CHECKS, library_checks()], ids=["made", "library"])

@@ -11,7 +11,7 @@ import sgstore
 from sgstore.ingest import ingest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from sgstore.query import Store
@@ -23,17 +23,18 @@ pytestmark = pytest.mark.data
 
 
 @pytest.fixture(scope="module")
-def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     path = tmp_path_factory.mktemp("swarm") / "swarm.sgstore"
     (outcome,) = ingest(path, [data / "traces" / "esmini" / "swarm_Town04.mcap"])
     assert outcome.frames == 602
-    return sgstore.open(path)
+    store = sgstore.open(path)
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.fixture(scope="module")
 def graphs(store: Store) -> list[Graph]:
-    with store.file.snapshot():
-        return [store.graph(frame) for frame in store.find("MATCH (n)").frames()]
+    return [store.graph(frame) for frame in store.find("MATCH (n)").frames()]
 
 
 def subgraphs(pattern: nx.DiGraph, graph: Graph) -> bool:
