@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +21,7 @@ from sgstore.lang.functions import PAIR_FUNCTIONS
 from sgstore.lang.parser import parse
 from sgstore.lang.phases import Window
 from sgstore.lang.results import EXTENTS, Statement
-from sgstore.matches import FIRST_WINDOW, windows
+from sgstore.matches import FIRST_WINDOW, Windows
 
 NUMBERS = {
     "dist": "distance",
@@ -346,11 +345,11 @@ def test_windows_by_traces_give_all_intervals(world: World) -> None:
 def test_windows_cover_every_bucket_once(
     rows: int, extents: list[tuple[int, int]], whole_traces: bool
 ) -> None:
-    steps = windows(extents, whole_traces=whole_traces)
-    found = [next(steps)]
-    with suppress(StopIteration):
-        while True:
-            found.append(steps.send(rows))
+    steps = Windows(extents, whole_traces=whole_traces)
+    found: list[Window | None] = []
+    for window in steps:
+        found.append(window)
+        steps.rows = rows
 
     if found == [None]:
         assert sum(count for _, count in extents) <= FIRST_WINDOW
@@ -363,9 +362,11 @@ def test_windows_cover_every_bucket_once(
 
 
 def test_windows_grow_while_rows_are_few_and_shrink_where_they_are_many() -> None:
-    steps = windows([(0, 100_000)])
-    lengths = [length(next(steps))]
-    lengths += [length(steps.send(rows)) for rows in (0, 0, 0, 10_000_000, 10_000_000, 0)]
+    steps = Windows([(0, 100_000)])
+    lengths: list[int] = []
+    for rows, window in zip((0, 0, 0, 10_000_000, 10_000_000, 0, 0), steps, strict=False):
+        lengths.append(length(window))
+        steps.rows = rows
 
     assert lengths == [64, 128, 256, 512, 10, 1, 2]
 
