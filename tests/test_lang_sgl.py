@@ -156,3 +156,17 @@ def test_what_stands_in_one_another_without_end_is_refused() -> None:
         translated(f'a0 = "Ego"\n{doubled}\n{asked.format(40)}')
     with pytest.raises(QueryError, match="too much stands in one another"):
         translated(f"Property('p', '{'(' * 20000}q', [('q', P.gt(1, 0))])")
+
+
+@pytest.mark.parametrize("text", ["", "import os\nos.system('ls')", "# nothing"])
+def test_a_text_without_properties_is_refused(text: str) -> None:
+    with pytest.raises(QueryError, match="no property"):
+        translated(text)
+
+
+def test_what_is_no_python_is_shown_where_it_is_not() -> None:
+    with pytest.raises(QueryError) as error:
+        translated("x = 1\ny = (2 3)\n")
+
+    assert error.value.as_dict()["line"] == 2
+    assert "  y = (2 3)" in str(error.value)

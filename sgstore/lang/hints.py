@@ -211,7 +211,10 @@ def hint_at(name: str, known: Iterable[str]) -> str | None:
     names = list(known) if isinstance(known, list | tuple) else sorted(known, key=str.lower)
     others = (words.get(folded(name)) for words in _OTHERS)
     other = next((word for word in others if word and word.split(", ")[0] in names), None)
-    like = other or suggestion(name, names) or _short_for(name, names)
+    like = suggestion(name, names)
+    if like and len(like) < 3 < len(name):  # two letters are like too much
+        like = None
+    like = other or like or _short_for(name, names)
     if like:
         return f"did you mean '{like}'?"
     more = f", … ({len(names)} in all)" if len(names) > MANY else ""

@@ -85,12 +85,26 @@ def translated(text: str) -> str:
         raise QueryError(f"the text has {len(text)} characters; {MAX_TEXT} are allowed")
     try:
         tree = ast.parse(text)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+    except SyntaxError as error:
+        reason = f"this is no Python: {error.msg}"
+        raise QueryError(reason, text=text, span=_place(text, error)) from None
+    except (ValueError, RecursionError, MemoryError) as error:
         raise QueryError(f"this is no Python: {error}") from None
     try:
-        return _Translation(text).all(tree)
+        found = _Translation(text).all(tree)
     except RecursionError:
         raise QueryError("too much stands in one another, perhaps by way of names") from None
+    if not found.strip():
+        hint = "Property('name', 'G(~a)', [('a', P.gt(P.size(…), 0))])"
+        raise QueryError("no property is in it, and no truth value", hint=hint)
+    return found
+
+
+def _place(text: str, error: SyntaxError) -> Span:
+    """Where Python finds a mistake."""
+    before = text.split("\n")[: (error.lineno or 1) - 1]
+    start = sum(len(line) + 1 for line in before) + max((error.offset or 1) - 1, 0)
+    return Span(min(start, len(text)), min(start, len(text)) + 1)
 
 
 @dataclass
