@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "sgstore"
 # From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
 # one another, except that the files of one folder know each other.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "geometry", "vocabulary"}),
+    frozenset({"errors", "geometry", "quoting", "vocabulary"}),
     frozenset({"config", "world"}),
     frozenset({"roads", "graph"}),
     frozenset({"opendrive", "online"}),

@@ -104,7 +104,7 @@ def test_a_store_of_another_version_is_refused(tmp_path) -> None:
     with duckdb.connect(str(tmp_path / "s.db")) as connection:
         connection.execute("UPDATE store_info SET value = '99' WHERE key = 'schema_version'")
 
-    with pytest.raises(StoreError, match="version 99, expected 2; ingest its recordings again"):
+    with pytest.raises(StoreError, match="version 99, expected 3; ingest its recordings again"):
         StoreFile(tmp_path / "s.db")
 
 

@@ -15,8 +15,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from sgstore.lang.formulas import Select, nested, quoted
+from sgstore.lang.formulas import Select, nested
 from sgstore.lang.presence import bit_of
+from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -30,22 +30,13 @@ from sgstore.lang.bound import (
     Value,
 )
 from sgstore.lang.catalog import DERIVED, Attribute, Home, Type, Unit
+from sgstore.quoting import literal, quoted
 from sgstore.vocabulary import VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.lang.bound import Edge
-
-
-def quoted(name: str) -> str:
-    """An identifier."""
-    return '"' + name.replace('"', '""') + '"'
-
-
-def word(text: str) -> str:
-    """A word of the vocabulary as a literal."""
-    return "'" + text.replace("'", "''") + "'"
 
 
 @dataclass(slots=True)
@@ -232,7 +223,7 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
 
 def _class_text(abstraction: str, frame: str) -> str:
     """The class of a frame in an abstraction."""
-    on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {word(abstraction)}']
+    on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {literal(abstraction)}']
     classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
     return f"({classes.text()})"
 
@@ -242,7 +233,7 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
     column = next(iter(attribute.columns.values()))
     if attribute.unit in {Unit.weather, Unit.clock}:
         return _weather_text(column, frame)
-    held = f'"k"."abstraction" = {word(column)}'
+    held = f'"k"."abstraction" = {literal(column)}'
     if attribute.unit is Unit.seen:
         classes = Select(['"k"."class"'], ['"classes" AS "k"'], [held, '"k"."class" IS NOT NULL'])
         if attribute.table:
@@ -332,7 +323,7 @@ def _value(value: Value, values: Values) -> str:
     if isinstance(value.value, bool):
         return "TRUE" if value.value else "FALSE"
     if value.closed:
-        return word(str(value.value))
+        return literal(str(value.value))
     return values.add(value.value)
 
 

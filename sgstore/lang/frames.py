@@ -35,7 +35,6 @@ from sgstore.lang.formulas import (
     lane_text,
     leaves,
     nested,
-    quoted,
     role_text,
 )
 from sgstore.lang.kinds import Profile, homes_of, kind_conditions
@@ -44,6 +43,7 @@ from sgstore.lang.layers import Join, Layers, bounds, column_of, named
 from sgstore.lang.pairs import WAY, way_text
 from sgstore.lang.phases import Given, Phases, apart
 from sgstore.lang.sql import Masks
+from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

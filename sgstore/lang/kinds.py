@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sgstore.lang.bound import ANY_RELATION
 from sgstore.lang.catalog import Home, Unit
-from sgstore.lang.formulas import word
+from sgstore.quoting import literal
 from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
 
 if TYPE_CHECKING:
@@ -92,8 +92,8 @@ def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str
 
 def _one_of(column: str, words: list[str]) -> str:
     if len(words) == 1:
-        return f"{column} = {word(words[0])}"
-    return f"{column} IN ({', '.join(map(word, words))})" if words else "FALSE"
+        return f"{column} = {literal(words[0])}"
+    return f"{column} IN ({', '.join(map(literal, words))})" if words else "FALSE"
 
 
 def edge_conditions(

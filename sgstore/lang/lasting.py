@@ -16,8 +16,9 @@ from sgstore.lang.bound import (
     TraceAttribute,
 )
 from sgstore.lang.catalog import Attribute, Home, Type, Unit
-from sgstore.lang.formulas import Aliases, Select, attribute_text, frame_text, is_constant, quoted
+from sgstore.lang.formulas import Aliases, Select, attribute_text, frame_text, is_constant
 from sgstore.lang.kinds import Profile
+from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -30,10 +30,9 @@ from sgstore.lang.formulas import (
     expression_text,
     leaves,
     nested,
-    quoted,
-    word,
 )
 from sgstore.lang.pairs import WAY, needed_for, pair_column, pair_text, parts_of, stage_of
+from sgstore.quoting import literal, quoted
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
@@ -189,7 +188,7 @@ class Layers:
         return columns
 
 
-_PLACES: Final = ", ".join(word(kind) for kind in MAP_KINDS)
+_PLACES: Final = ", ".join(literal(kind) for kind in MAP_KINDS)
 
 
 def _raw_text(name: str, at: Aliases) -> str:

@@ -11,7 +11,7 @@ import string
 from functools import cache
 from typing import TYPE_CHECKING, Final
 
-from sgstore.lang.formulas import quoted
+from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

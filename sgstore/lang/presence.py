@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.lang.bound import NodeAttribute
 from sgstore.lang.catalog import Home
-from sgstore.lang.formulas import Aliases, Select, Values, is_position, leaves, node_text
+from sgstore.lang.formulas import (
+    Aliases,
+    Select,
+    Values,
+    is_position,
+    leaves,
+    node_text,
+)
 from sgstore.lang.kinds import homes_of, kind_conditions
 from sgstore.vocabulary import ENTITY_KINDS
 

@@ -36,11 +36,11 @@ from sgstore.lang.formulas import (
     frame_text,
     leaves,
     nested,
-    quoted,
 )
 from sgstore.lang.frames import Frames, column_of
 from sgstore.lang.kinds import Profile
 from sgstore.lang.runs import runs
+from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

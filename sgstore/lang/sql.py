@@ -44,7 +44,6 @@ from sgstore.lang.formulas import (
     leaves,
     nested,
     node_text,
-    quoted,
     trace_text,
 )
 from sgstore.lang.kinds import Profile, alias_of, edge_conditions, kind_conditions
@@ -59,6 +58,7 @@ from sgstore.lang.rewrite import (
     ordered,
     possible,
 )
+from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

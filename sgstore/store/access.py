@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Final
 import duckdb
 
 from sgstore.errors import StoreError
+from sgstore.quoting import literal
 from sgstore.store.joining import tables_folder
 
 try:
@@ -248,14 +249,14 @@ class Access:
                 door.changed.notify_all()
 
     def _attach(self, connection: DuckDBPyConnection, deadline: _Deadline) -> None:
-        place = str(self.path).replace("'", "''")
         while True:
             if not self.path.exists():  # ATTACH would make an empty one
                 raise StoreError(f"{self.path}: no such store; 'sgstore ingest' makes one")
             try:
                 with translated(self.path):
                     connection.execute(
-                        f"ATTACH '{place}' AS store (STORAGE_VERSION '{STORAGE_VERSION}')"
+                        f"ATTACH {literal(str(self.path))} AS store"
+                        f" (STORAGE_VERSION '{STORAGE_VERSION}')"
                     )
                 return
             except BusyError as busy:

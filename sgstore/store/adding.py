@@ -6,10 +6,11 @@ from contextlib import contextmanager
 from glob import escape
 from typing import TYPE_CHECKING, Any
 
+from sgstore.quoting import literal
 from sgstore.store.access import spill_folder
 from sgstore.store.checksums import Checksum, expressions
 from sgstore.store.packing import BUCKET_BITS, FRAME_BITS
-from sgstore.store.staging import Staging, quoted, scratch
+from sgstore.store.staging import Staging, scratch
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
@@ -35,9 +36,9 @@ def add_files(
     """Insert the files that a staging sealed."""
     for table, names in files.items():
         for name in names:
-            file = quoted(escape(str(staging.folder / name)))
+            file = literal(escape(str(staging.folder / name)))
             connection.execute(
-                f"INSERT INTO store.{table} BY NAME SELECT * FROM read_parquet('{file}')"
+                f"INSERT INTO store.{table} BY NAME SELECT * FROM read_parquet({file})"
             )
 
 

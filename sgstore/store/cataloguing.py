@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from sgstore.abstractions.literature import SUBSETS
 from sgstore.lang import Catalog, TraceFacts
 from sgstore.lang.reach import Reach
+from sgstore.quoting import literal
 from sgstore.store.deriving import sets_of
 from sgstore.store.traces import stored_traces
 from sgstore.vocabulary import folded
@@ -102,25 +103,23 @@ def _derived(
     """The catalog under a derived set: of the traces that have it."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
     reaches = {one.trace_id: Reach.of(one.settings) for one in of}
-    word = name.replace("'", "''")
+    word = literal(name)
     shadows = {
         table: f'SELECT * FROM main."{table}" WHERE trace_id IN'
-        f" (SELECT d.trace_id FROM derived AS d WHERE d.name = '{word}')"
+        f" (SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
         for table in ("frame", "bucket")
     }
     shadows["edge"] = (
         "SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask"
-        f" FROM derived_edge WHERE set_name = '{word}'"
+        f" FROM derived_edge WHERE set_name = {word}"
     )
-    shadows["lane_gap"] = (
-        f"SELECT frame_id, src, dst, gap FROM derived_gap WHERE set_name = '{word}'"
-    )
+    shadows["lane_gap"] = f"SELECT frame_id, src, dst, gap FROM derived_gap WHERE set_name = {word}"
     shadows["node"] = (
-        f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = '{word}' AND NOT moves"
+        f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = {word} AND NOT moves"
     )
     shadows["state"] = (
         'SELECT s.* FROM main."state" AS s JOIN derived_node AS d'
-        f" ON d.set_name = '{word}' AND d.moves AND d.bucket = s.frame_id >> 6 AND d.node_id = s.node_id"
+        f" ON d.set_name = {word} AND d.moves AND d.bucket = s.frame_id >> 6 AND d.node_id = s.node_id"
         " AND (d.mask & (CAST(1 AS BIGINT) << CAST(s.frame_id & 63 AS INTEGER))) <> 0"
     )
     return replace(

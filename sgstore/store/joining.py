@@ -27,6 +27,7 @@ import duckdb
 
 from sgstore.errors import StoreError
 from sgstore.lang.catalog import TableFacts, Type
+from sgstore.quoting import literal
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
@@ -109,7 +110,7 @@ class UserTable:
     @property
     def view(self) -> str:
         """The statement whose rows are those of the table, with their ``frame_id``."""
-        rows = f"read_parquet('{_escaped(str(self.place))}')"
+        rows = f"read_parquet({literal(str(self.place))})"
         match self.key:
             case "frame_id":
                 return _BY_FRAME.format(rows)
@@ -261,11 +262,9 @@ def _kept(name: str, given: object, folder: Path) -> UserTable:
     place = folder / f"{name}.parquet"
     with _told(name, source), duckdb.connect(":memory:", config=_config(folder)) as connection:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        connection.execute(
-            f"COPY ({_reading(connection, name, given)}) TO '{_escaped(str(place))}'"
-        )
+        connection.execute(f"COPY ({_reading(connection, name, given)}) TO {literal(str(place))}")
         described = connection.execute(
-            f"DESCRIBE SELECT * FROM read_parquet('{_escaped(str(place))}')"
+            f"DESCRIBE SELECT * FROM read_parquet({literal(str(place))})"
         ).fetchall()
     columns = {str(row[0]): str(row[1]) for row in described}
     return UserTable(name, source, place, columns, _key_of(columns))
@@ -292,7 +291,7 @@ def _reading(connection: DuckDBPyConnection, name: str, given: object) -> str:
 def _literal(path: Path) -> str:
     # A name may hold what stands for other names in a pattern of names.
     text = re.sub(r"([*?\[])", r"[\1]", str(path.resolve()))
-    return f"'{_escaped(text)}'"
+    return literal(text)
 
 
 def _config(folder: Path) -> dict[str, str | bool | int | float | list[str]]:
@@ -312,10 +311,6 @@ def _key_of(columns: Mapping[str, Any]) -> str:
     if "trace" not in names:
         return ""
     return next((key for key in ("seq", "time_ns", "t") if key in names), "trace")
-
-
-def _escaped(text: str) -> str:
-    return text.replace("'", "''")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import duckdb
 import numpy as np
 
 from sgstore.errors import ExportError
-from sgstore.lang.formulas import quoted
+from sgstore.quoting import literal, quoted
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Sequence
@@ -68,7 +68,7 @@ def write_parquet(
             _append(connection, batch, len(columns))
             number += len(batch)
             batch = list(islice(rows, BATCH))
-        connection.execute(f"COPY output TO '{_escaped(str(to))}' (FORMAT parquet)")
+        connection.execute(f"COPY output TO {literal(str(to))} (FORMAT parquet)")
     return number
 
 
@@ -90,10 +90,6 @@ def _type_of(values: list[Any]) -> str:
         if known and narrow and truth == (name == "BOOLEAN"):
             return name
     return "VARCHAR"
-
-
-def _escaped(text: str) -> str:
-    return text.replace("'", "''")
 
 
 @contextmanager

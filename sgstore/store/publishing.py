@@ -8,9 +8,10 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import StoreError
+from sgstore.quoting import literal
 from sgstore.store.access import spill_folder
 from sgstore.store.packing import plain
-from sgstore.store.staging import quoted, scratch
+from sgstore.store.staging import scratch
 from sgstore.store.traces import already_stored, free_name, stored_name
 from sgstore.world import GAP
 
@@ -117,9 +118,9 @@ def _insert(
     select = f"SELECT * REPLACE ({replaced})" if replaced else "SELECT *"
     for name in sealed.files[table]:
         # Reading takes a pattern, and a folder may be called anything.
-        file = quoted(escape(str(sealed.folder / name)))
+        file = literal(escape(str(sealed.folder / name)))
         connection.execute(
-            f"INSERT INTO store.{table} BY NAME {select} FROM read_parquet('{file}')", values
+            f"INSERT INTO store.{table} BY NAME {select} FROM read_parquet({file})", values
         )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 
 from sgstore.errors import SqlError
-from sgstore.lang.formulas import quoted
+from sgstore.quoting import quoted
 from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
 from sgstore.store.parquet import write_parquet
 

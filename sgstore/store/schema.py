@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 import duckdb
 
 from sgstore.errors import StoreError
+from sgstore.quoting import literal
 from sgstore.store.access import STORAGE_VERSION, translated
 from sgstore.store.folder import Folder
 
@@ -72,8 +73,8 @@ def _name(place: Path, path: Path) -> None:
 
 def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
     """Make an empty store and attach it as ``fresh``."""
-    file = str(place).replace("'", "''")
-    connection.execute(f"ATTACH '{file}' AS fresh (STORAGE_VERSION '{STORAGE_VERSION}')")
+    file = literal(str(place))
+    connection.execute(f"ATTACH {file} AS fresh (STORAGE_VERSION '{STORAGE_VERSION}')")
     connection.execute("USE fresh")
     connection.execute(schema_sql())
     about = {"schema_version": SCHEMA_VERSION, "created_by": f"sgstore {version('sgstore')}"}

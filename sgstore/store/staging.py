@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 import numpy as np
 
+from sgstore.quoting import literal
 from sgstore.store.access import memory_setting, translated
 from sgstore.store.checksums import Checksum, expressions
 from sgstore.store.folder import Folder
@@ -186,15 +187,15 @@ class Staging:
 
     def _write(self, table: str, select: str, name: str) -> None:
         file = self.folder / f"{name}.parquet"
-        self.connection.execute(f"COPY ({select}) TO '{quoted(str(file))}' (FORMAT parquet)")
+        self.connection.execute(f"COPY ({select}) TO {literal(str(file))} (FORMAT parquet)")
         self._files.setdefault(table, []).append(file.name)
 
     def all_messages(self) -> str:
         """A statement that gives all messages, in no order."""
         if not self._parts:
             return "SELECT * FROM message"
-        files = f"{quoted(escape(str(self.folder)))}/message-*.parquet"
-        return f"SELECT * FROM read_parquet('{files}') UNION ALL SELECT * FROM message"
+        files = literal(f"{escape(str(self.folder))}/message-*.parquet")
+        return f"SELECT * FROM read_parquet({files}) UNION ALL SELECT * FROM message"
 
     def seal(self) -> tuple[dict[str, list[str]], dict[str, Checksum]]:
         """Write everything into files.
@@ -230,18 +231,13 @@ class Staging:
         checksum = Checksum()
         select = expressions(self.connection, table)
         for name in names:
-            file = quoted(escape(str(self.folder / name)))
-            rows = self.connection.execute(f"SELECT {select} FROM read_parquet('{file}')")
+            file = literal(escape(str(self.folder / name)))
+            rows = self.connection.execute(f"SELECT {select} FROM read_parquet({file})")
             checksum.add(rows.fetchnumpy())
         return checksum
 
     def _sorted(self, table: str) -> str:
         return _MERGED[table] if self.merge and table in _MERGED else _GROWING[table]
-
-
-def quoted(text: str) -> str:
-    """A text as it stands between the quotation marks of SQL."""
-    return text.replace("'", "''")
 
 
 def _values(table: str, columns: Columns) -> str:

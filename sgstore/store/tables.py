@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import duckdb
 
 from sgstore.errors import ExportError
-from sgstore.lang.formulas import quoted
+from sgstore.quoting import literal, quoted
 from sgstore.store.rows import Batches
 
 if TYPE_CHECKING:
@@ -63,8 +63,8 @@ class ParquetTable:
     def __exit__(self, kind: type[BaseException] | None, *_exception: object) -> None:
         try:
             if kind is None:
-                to = str(self._to).replace("'", "''")
-                self._do(f"COPY output TO '{to}' (FORMAT parquet, ROW_GROUP_SIZE {ROW_GROUP})")
+                to = literal(str(self._to))
+                self._do(f"COPY output TO {to} (FORMAT parquet, ROW_GROUP_SIZE {ROW_GROUP})")
         finally:
             self._connection.close()
             self._folder.cleanup()
