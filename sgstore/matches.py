@@ -16,9 +16,10 @@ from sgstore.graph import graph_of_records
 from sgstore.lang import Compiled, compile_query
 from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.lang.phases import Window
+from sgstore.lang.reading import for_people
 from sgstore.lang.results import EXTENTS
 from sgstore.lang.rewrite import rewritten
-from sgstore.lang.subgraphs import Layout, shown
+from sgstore.lang.subgraphs import Layout
 from sgstore.store import FrameRef, GivenTable, write_parquet
 from sgstore.store.covering import SEQ_BITS
 from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
@@ -287,41 +288,9 @@ class Matches:
         with self._compiled() as compiled:
             return compiled.stages()
 
-    def for_people(self) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
-        """Columns and rows as a person wants to read them.
-
-        A frame, and the first one of an interval, comes as ``trace#seq``, which every command takes; a
-        variable as the name of its node.
-        """
-        width = len(INTERVAL_COLUMNS)
-        if self.columns[:width] == INTERVAL_COLUMNS:
-            columns = ("from", "start", "end", "frames", *self.columns[width:])
-            return columns, (
-                (
-                    f"{i.trace}#{i.start_seq}",
-                    round(i.start, 3),
-                    round(i.end, 3),
-                    i.frames,
-                    *i.values.values(),
-                )
-                for i in self.intervals()
-            )
-        if self.columns[: len(FRAME_COLUMNS)] != FRAME_COLUMNS:
-            return self.columns, iter(self)
-        width = len(FRAME_COLUMNS)
-        rest = self.columns[width:]
-        named = {name.removesuffix(".name") for name in rest if name.endswith(".name")}
-        keep = [i for i, name in enumerate(rest) if name.removesuffix(".id") not in named]
-        columns = ("frame", "t", *(rest[i].removesuffix(".name") for i in keep))
-
-        def lines() -> Iterator[tuple[Any, ...]]:
-            for row in self:
-                _, trace, seq, _, t = row[:width]
-                values = [row[width + i] for i in keep]
-                values[-2:] = shown(*values[-2:]) if self.graphs else values[-2:]
-                yield (f"{trace}#{seq}", round(t, 3), *values)
-
-        return columns, lines()
+    def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+        """Columns and rows as a person wants to read them: see :func:`sgstore.lang.reading.for_people`."""
+        return for_people(self.columns, self, graphs=self.graphs)
 
     def _stream(
         self,
