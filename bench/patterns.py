@@ -352,7 +352,7 @@ def _compared(store: Store, folder: Path, frames: int) -> Iterator[Measure]:
     times = []
     for question in QUESTIONS:
         with store.file.snapshot():
-            spent, worked, answer = asked(store, question, 3)
+            spent, worked, answer = asked(store, question, 5)
         times.append(spent)
         notes = [f"processor {1e3 * worked:.0f} ms = {worked / base:.2f} of the reference"]
         if question.rows:
