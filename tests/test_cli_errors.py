@@ -81,3 +81,32 @@ def test_for_people_it_is_shown_with_carets(store: str, capsys) -> None:
     assert run(["find", store, "MATCH (e:Eggo)"]) == 2
 
     assert "^^^^" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("verb", "query"),
+    [("find", "MATCH (e:Ego) RETURN e.speed"), ("check", "--expression=CHECK ego.speed < 9")],
+)
+def test_the_name_of_a_file_says_how_rows_are_written_or_is_refused(
+    verb: str, query: str, store: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    codes = [run([verb, store, query, "-o", str(tmp_path / n)]) for n in ("rows.csv", "rows.xlsx")]
+
+    assert codes == [0, 2]
+    assert (tmp_path / "rows.csv").read_text().startswith(("e.speed\n", "check,trace,"))
+    assert not (tmp_path / "rows.xlsx").exists()
+    assert "expected one of .csv, .json" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_file_that_is_no_store_is_told_so_whatever_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+
+    assert run(["find", str(tmp_path / "x.csv"), "MATCH (e:Ego)"]) == 1
+    assert "not a store; expected a file that 'sgstore ingest' made" in capsys.readouterr().err
+
+
+def test_a_query_in_place_of_a_file_is_seen(store: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", store, "CHECK a: ALWAYS ego.speed < 50"]) == 2
+    assert "this is a query, and no file of that name" in capsys.readouterr().err

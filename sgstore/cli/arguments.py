@@ -105,28 +105,30 @@ def open_store(store: Path, tables: Mapping[str, Path] | None = None) -> Store:
     return opened
 
 
-def form_of(form: Format, *, as_json: bool) -> Format:
-    """What ``--format`` and ``--json`` mean together."""
-    return Format.json if as_json else form
-
-
 _ENDINGS: Final = {
+    ".csv": Format.csv,
     ".json": Format.json,
     ".ndjson": Format.ndjson,
     ".jsonl": Format.ndjson,
-    ".csv": Format.csv,
     ".parquet": Format.parquet,
     ".arrow": Format.arrow,
     ".feather": Format.arrow,
+    ".txt": Format.table,
+    "": Format.table,
 }
 
 
-def form_for(form: Format, output: Path | None, *, as_json: bool) -> Format:
-    """What ``--format`` and ``--json`` mean together; without them a file's name says it."""
-    chosen = form_of(form, as_json=as_json)
-    if chosen is Format.table and output is not None:
-        return _ENDINGS.get(output.suffix.lower(), chosen)
-    return chosen
+def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
+    """What ``--format`` and ``--json`` mean together; without them the name of the file says it."""
+    if as_json or form is not Format.table or output is None:
+        return Format.json if as_json else form
+    found = _ENDINGS.get(output.suffix.lower())
+    if found is None:
+        known = ", ".join(filter(None, _ENDINGS))
+        raise typer.BadParameter(
+            f"--output {output}: nothing is written as '{output.suffix}'; expected one of {known}"
+        )
+    return found
 
 
 def tables_of(given: list[str] | None) -> dict[str, Path]:
@@ -171,7 +173,9 @@ def text_of(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
+        written = re.match(r"\s*(MATCH|CHECK|DEFINE|USING)\b", str(file))
+        hint = "; this is a query, and no file of that name" if written else ""
+        raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}{hint}") from error
 
 
 def lines_of(file: Path) -> list[str]:

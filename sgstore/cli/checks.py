@@ -75,7 +75,7 @@ def check(
             tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
             yield verdict
 
-    form = form_of(form, as_json=as_json)
+    form = form_of(form, output, as_json=as_json)
     if form is Format.table:
         write_rows(COLUMNS, (row for one in counted() for row in _rows(one)), form, output)
         say(", ".join(f"{count} {word}" for word, count in tally.items()))

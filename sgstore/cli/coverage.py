@@ -109,7 +109,7 @@ def classes_(
 
     frames = _classed(a, abstraction, window, incomplete, slots)
     counted = Unit(unit)
-    _write(classes(frames, counted), limit, form_of(form, as_json=as_json), output)
+    _write(classes(frames, counted), limit, form_of(form, output, as_json=as_json), output)
     if picture is not None:
         from sgstore.draw.coverage import draw_rank_sizes
 
@@ -136,7 +136,7 @@ def of_(
     from sgstore.coverage import covered
 
     of, other = (_classed(one, abstraction, window, incomplete, slots) for one in (a, by))
-    _write(covered(of, other), 0, form_of(form, as_json=as_json), output)
+    _write(covered(of, other), 0, form_of(form, output, as_json=as_json), output)
 
 
 @coverage.command("novel")
@@ -164,7 +164,7 @@ def novel_(
         Listing.frames: novel_frames,
         Listing.clips: novel_clips,
     }[listing]
-    _write(listed(of, other), limit, form_of(form, as_json=as_json), output)
+    _write(listed(of, other), limit, form_of(form, output, as_json=as_json), output)
 
 
 @coverage.command("venn")
@@ -183,7 +183,7 @@ def venn_(
     from sgstore.coverage import venn
 
     one, other = (_classed(text, abstraction, window, incomplete, slots) for text in (a, b))
-    _write(venn(one, other), 0, form_of(form, as_json=as_json), output)
+    _write(venn(one, other), 0, form_of(form, output, as_json=as_json), output)
 
 
 @coverage.command("growth")
@@ -205,7 +205,7 @@ def growth_(
 
     frames = _classed(a, abstraction, window, incomplete, slots)
     table = growth(frames, Unit(unit), points)
-    _write(table, 0, form_of(form, as_json=as_json), output)
+    _write(table, 0, form_of(form, output, as_json=as_json), output)
     if picture is not None and table.rows:
         from sgstore.draw.coverage import draw_growth
 
@@ -239,7 +239,7 @@ def combos_(
     """Count the combinations of k features, such as (car near ego), or of values of declared slots."""
     from sgstore.coverage import combos
 
-    form = form_of(form, as_json=as_json)
+    form = form_of(form, output, as_json=as_json)
     if slots is not None:
         if by or picture or of_ego:
             raise typer.BadParameter(
@@ -287,7 +287,7 @@ def spec_(
     """Say how much of a specification is covered: the cells of a query, or all declared slots together."""
     from sgstore.coverage import selection_of, specification
 
-    form = form_of(form, as_json=as_json)
+    form = form_of(form, output, as_json=as_json)
     if (query is None) == (slots is None):
         raise typer.BadParameter("give a query, or a file with --slots FILE")
     if query is None or slots is not None:
@@ -316,7 +316,7 @@ def windows_(
     from sgstore.coverage import classes
 
     table = classes(_classed(a, abstraction, window, incomplete))
-    _write(table, limit, form_of(form, as_json=as_json), output)
+    _write(table, limit, form_of(form, output, as_json=as_json), output)
 
 
 @coverage.command("explain")
@@ -343,7 +343,7 @@ def explain_(
     tables = explain(ours, theirs, abstraction, by_frame=frames, depth=depth)
     for text in tables[0].said if tree else ():
         say(text)
-    _write(tables[1] if tree else tables[0], limit, form_of(form, as_json=as_json), output)
+    _write(tables[1] if tree else tables[0], limit, form_of(form, output, as_json=as_json), output)
 
 
 @coverage.command("failures")
@@ -382,7 +382,7 @@ def failures_(
     shares, listed = failures(one, other, told)
     for text in shares.said if novel else ():
         say(text)
-    _write(listed if novel else shares, limit, form_of(form, as_json=as_json), output)
+    _write(listed if novel else shares, limit, form_of(form, output, as_json=as_json), output)
 
 
 def _fraction(text: str) -> float:

@@ -65,7 +65,7 @@ def list_patterns(
     """
     from sgstore.lang import patterns
 
-    form = form_of(form, as_json=as_json)
+    form = form_of(form, output, as_json=as_json)
     found = [p for p in patterns().values() if kind is None or p.kind == kind]
     if form is Format.table:
         columns = ("name", "kind", "from", "sentence")
@@ -141,7 +141,7 @@ def run_pattern(
             output=output,
         )
     text = found.written(**parameters_of(chosen))
-    form = form_of(form, as_json=as_json)
+    form = form_of(form, output, as_json=as_json)
     matches = open_store(store).find(text)
     say_left_out(matches)
     if clips:

@@ -23,7 +23,7 @@ from sgstore.cli.arguments import (
     With,
     app,
     asked_of,
-    form_for,
+    form_of,
     open_store,
     parameters_of,
     query_of,
@@ -87,7 +87,7 @@ def find(
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
         with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.find(text, **values)
-        form = form_for(form, output, as_json=as_json)
+        form = form_of(form, output, as_json=as_json)
         _say_all(answer)
         number = write_rows(*_as_shown(answer, form), form, output)
         if not number and form is Format.table:
@@ -104,7 +104,7 @@ def find(
             number = matches.count()
             typer.echo(number)
         else:
-            form = form_for(form, output, as_json=as_json)
+            form = form_of(form, output, as_json=as_json)
             columns, rows = _as_shown(matches, form)
             number = write_rows(columns, rows, form, output)
             if not number and form is Format.table:
@@ -189,7 +189,7 @@ def like(
         write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", output)
         return 0
     found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
-    form = form_for(form, output, as_json=as_json)
+    form = form_of(form, output, as_json=as_json)
     if form is Format.table:
         columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
         rows = (
@@ -268,13 +268,13 @@ def sql(
         with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))
         _say_all(answer)
-        form = form_for(form, output, as_json=as_json)
+        form = form_of(form, output, as_json=as_json)
         write_rows(answer.columns, answer.rows, form, output)
         return 0
     opened = open_store(store, tables_of(tables)).file
     with opened.user_batches(query_of(statement, file)) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
-        form = form_for(form, output, as_json=as_json)
+        form = form_of(form, output, as_json=as_json)
         write_rows(batches.columns, rows, form, output, batches.types)
     return 0
 

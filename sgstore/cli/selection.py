@@ -301,7 +301,7 @@ def verify_(
     known = read_lock(path)
     found = list(verify(known, Store(store), payloads=not no_payloads))
     rows = [(one.where, one.what, one.detail) for one in found]
-    write_rows(("where", "what", "detail"), rows, form_of(form, as_json=as_json), output)
+    write_rows(("where", "what", "detail"), rows, form_of(form, output, as_json=as_json), output)
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
     if unread or no_payloads:
@@ -320,7 +320,7 @@ def list_(
 
     columns = ("id", "trace", "first", "last", "frames", "split", "start_ns", "end_ns", "graph")
     rows = [tuple(getattr(c, name) for name in columns) for c in read_lock(path).cases]
-    write_rows(columns, rows, form_of(form, as_json=as_json), output)
+    write_rows(columns, rows, form_of(form, output, as_json=as_json), output)
 
 
 @lock.command("union")
@@ -403,7 +403,7 @@ def diff(
     else:
         compare = differences.by_frame if by_frame else differences.scenes
         table = compare(*(classed(selection_of(one), abstraction) for one in (a, b)))
-    _write(table, form_of(form, as_json=as_json), output)
+    _write(table, form_of(form, output, as_json=as_json), output)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0
 

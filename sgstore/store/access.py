@@ -305,7 +305,9 @@ def translated(path: Path) -> Generator[None]:
 
 
 def _reason(message: str) -> str:
-    if "not a valid DuckDB database file" in message or "Is a directory" in message:
+    # A name that ends in .csv or the like makes DuckDB think of a table that it could read.
+    phrases = "not a valid DuckDB database file", "Is a directory", "in-memory database in read-only"
+    if any(phrase in message for phrase in phrases):
         return "not a store; expected a file that 'sgstore ingest' made"
     if "database does not exist" in message:
         return "no such store; 'sgstore ingest' makes one"
