@@ -183,7 +183,15 @@ def test_a_runaway_statement_does_not_outlive_its_deadline(path: Path, sql: str)
         assert box.sql("SELECT 1").rows == [(1,)]
 
 
-def test_a_runaway_pattern_does_not_outlive_its_deadline(path: Path) -> None:
+def test_a_pattern_that_runs_away_slowly_is_stopped_at_its_deadline(path: Path) -> None:
+    with Sandbox(path, timeout_s=1.5) as box:
+        with pytest.raises(SqlError, match=r"stopped after 1\.5 s"):
+            box.find("MATCH " + "-[:near]->".join(f"(v{i})" for i in range(12)))
+
+        assert len(box.find(f"{NEAR} RETURN FRAMES").rows) > 0
+
+
+def test_a_pattern_that_runs_away_fast_is_stopped_by_its_memory_or_its_deadline(path: Path) -> None:
     with Sandbox(path, timeout_s=1.5) as box:
         with pytest.raises(SqlError, match=r"stopped after 1\.5 s|more memory than is allowed"):
             box.find("MATCH (a), (b), (c), (d), (e), (f) RETURN COUNT(*)")
