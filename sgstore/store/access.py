@@ -306,7 +306,11 @@ def translated(path: Path) -> Generator[None]:
 
 def _reason(message: str) -> str:
     # A name that ends in .csv or the like makes DuckDB think of a table that it could read.
-    phrases = "not a valid DuckDB database file", "Is a directory", "in-memory database in read-only"
+    phrases = (
+        "not a valid DuckDB database file",
+        "Is a directory",
+        "in-memory database in read-only",
+    )
     if any(phrase in message for phrase in phrases):
         return "not a store; expected a file that 'sgstore ingest' made"
     if "database does not exist" in message:
