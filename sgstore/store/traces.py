@@ -188,8 +188,8 @@ class FrameRef:
 _TRACES: Final = """
 SELECT t.trace_id, t.name, t.uri AS path, t.size, t.mtime_ns, t.digest, t.flavour,
        coalesce(t.ego, '') AS ego, t.since, t.until, coalesce(m.name, '') AS map,
-       t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, c.settings, t.ingested_at, t.version
-FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
+       t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, t.config_id, t.ingested_at, t.version
+FROM trace t LEFT JOIN map m ON m.map_id = t.map_id
 ORDER BY t.ingested_at, t.name
 """
 
@@ -197,11 +197,13 @@ ORDER BY t.ingested_at, t.name
 def stored_traces(connection: DuckDBPyConnection) -> tuple[StoredTrace, ...]:
     """All traces of a store, in the order in which they came."""
     found = run(connection, _TRACES).dicts()
+    texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
+    settings = {config_id: json.loads(text) for config_id, text in texts}
     for row in found:
         row["path"] = Path(row["path"])
         row["answers"] = tuple(row["answers"])
         row["report"] = json.loads(row["report"])
-        row["settings"] = json.loads(row["settings"])
+        row["settings"] = settings[row.pop("config_id")]
     return tuple(StoredTrace(**row) for row in found)
 
 
