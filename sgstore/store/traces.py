@@ -189,7 +189,7 @@ _TRACES: Final = """
 SELECT t.trace_id, t.name, t.uri AS path, t.size, t.mtime_ns, t.digest, t.flavour,
        coalesce(t.ego, '') AS ego, t.since, t.until, coalesce(m.name, '') AS map,
        t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, t.config_id, t.ingested_at, t.version
-FROM trace t LEFT JOIN map m ON m.map_id = t.map_id
+FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
 ORDER BY t.ingested_at, t.name
 """
 
