@@ -107,9 +107,10 @@ def classes_(
     from sgstore.coverage import Unit, classes
     from sgstore.coverage.compare import rank_sizes
 
+    form = form_of(form, output, as_json=as_json)
     frames = _classed(a, abstraction, window, incomplete, slots)
     counted = Unit(unit)
-    _write(classes(frames, counted), limit, form_of(form, output, as_json=as_json), output)
+    _write(classes(frames, counted), limit, form, output)
     if picture is not None:
         from sgstore.draw.coverage import draw_rank_sizes
 
@@ -135,8 +136,9 @@ def of_(
     """Say how much of A is covered by B: of its classes, and of its frames."""
     from sgstore.coverage import covered
 
+    form = form_of(form, output, as_json=as_json)
     of, other = (_classed(one, abstraction, window, incomplete, slots) for one in (a, by))
-    _write(covered(of, other), 0, form_of(form, output, as_json=as_json), output)
+    _write(covered(of, other), 0, form, output)
 
 
 @coverage.command("novel")
@@ -158,13 +160,14 @@ def novel_(
     """List the scenes of A that are not in B, the rarest first."""
     from sgstore.coverage import novel, novel_clips, novel_frames
 
+    form = form_of(form, output, as_json=as_json)
     of, other = (_classed(one, abstraction, window, incomplete, slots) for one in (a, than))
     listed = {
         Listing.classes: novel,
         Listing.frames: novel_frames,
         Listing.clips: novel_clips,
     }[listing]
-    _write(listed(of, other), limit, form_of(form, output, as_json=as_json), output)
+    _write(listed(of, other), limit, form, output)
 
 
 @coverage.command("venn")
@@ -182,8 +185,9 @@ def venn_(
     """Count what A and B share, and what only one of them has."""
     from sgstore.coverage import venn
 
+    form = form_of(form, output, as_json=as_json)
     one, other = (_classed(text, abstraction, window, incomplete, slots) for text in (a, b))
-    _write(venn(one, other), 0, form_of(form, output, as_json=as_json), output)
+    _write(venn(one, other), 0, form, output)
 
 
 @coverage.command("growth")
@@ -203,9 +207,10 @@ def growth_(
     """Say how the number of classes grew, beside frames at random; whether more of the same helps."""
     from sgstore.coverage import Unit, growth
 
+    form = form_of(form, output, as_json=as_json)
     frames = _classed(a, abstraction, window, incomplete, slots)
     table = growth(frames, Unit(unit), points)
-    _write(table, 0, form_of(form, output, as_json=as_json), output)
+    _write(table, 0, form, output)
     if picture is not None and table.rows:
         from sgstore.draw.coverage import draw_growth
 
@@ -315,8 +320,9 @@ def windows_(
     """List the classes of windows: of a frame together with those recorded before it."""
     from sgstore.coverage import classes
 
+    form = form_of(form, output, as_json=as_json)
     table = classes(_classed(a, abstraction, window, incomplete))
-    _write(table, limit, form_of(form, output, as_json=as_json), output)
+    _write(table, limit, form, output)
 
 
 @coverage.command("explain")
@@ -339,11 +345,12 @@ def explain_(
     """Say what tells the scenes of B from those of A: the features that differ most."""
     from sgstore.coverage import explain
 
+    form = form_of(form, output, as_json=as_json)
     ours, theirs = (_classed(one, abstraction) for one in (b, versus))
     tables = explain(ours, theirs, abstraction, by_frame=frames, depth=depth)
     for text in tables[0].said if tree else ():
         say(text)
-    _write(tables[1] if tree else tables[0], limit, form_of(form, output, as_json=as_json), output)
+    _write(tables[1] if tree else tables[0], limit, form, output)
 
 
 @coverage.command("failures")
@@ -376,13 +383,14 @@ def failures_(
     """Say which failures of a system are novel, and which coverage would have foretold (S3C)."""
     from sgstore.coverage import S3C_THRESHOLD, Outcomes, failures
 
+    form = form_of(form, output, as_json=as_json)
     limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)
     told = Outcomes.read(outcomes, limits)
     one, other = (_classed(text, abstraction, window, incomplete) for text in (train, test))
     shares, listed = failures(one, other, told)
     for text in shares.said if novel else ():
         say(text)
-    _write(listed if novel else shares, limit, form_of(form, output, as_json=as_json), output)
+    _write(listed if novel else shares, limit, form, output)
 
 
 def _fraction(text: str) -> float:

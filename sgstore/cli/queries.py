@@ -85,9 +85,9 @@ def find(
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
+        form = form_of(form, output, as_json=as_json)
         with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.find(text, **values)
-        form = form_of(form, output, as_json=as_json)
         _say_all(answer)
         number = write_rows(*_as_shown(answer, form), form, output)
         if not number and form is Format.table:
@@ -188,8 +188,8 @@ def like(
     if pattern:
         write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", output)
         return 0
-    found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
     form = form_of(form, output, as_json=as_json)
+    found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
     if form is Format.table:
         columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
         rows = (
@@ -264,17 +264,16 @@ def sql(
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     """
+    form = form_of(form, output, as_json=as_json)
     if safe:
         with _sandbox(store, timeout, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))
         _say_all(answer)
-        form = form_of(form, output, as_json=as_json)
         write_rows(answer.columns, answer.rows, form, output)
         return 0
     opened = open_store(store, tables_of(tables)).file
     with opened.user_batches(query_of(statement, file)) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
-        form = form_of(form, output, as_json=as_json)
         write_rows(batches.columns, rows, form, output, batches.types)
     return 0
 

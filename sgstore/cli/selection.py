@@ -298,10 +298,11 @@ def verify_(
     from sgstore.locks import read_lock, verify
     from sgstore.query import Store
 
+    form = form_of(form, output, as_json=as_json)
     known = read_lock(path)
     found = list(verify(known, Store(store), payloads=not no_payloads))
     rows = [(one.where, one.what, one.detail) for one in found]
-    write_rows(("where", "what", "detail"), rows, form_of(form, output, as_json=as_json), output)
+    write_rows(("where", "what", "detail"), rows, form, output)
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
     if unread or no_payloads:
@@ -395,6 +396,7 @@ def diff(
 
     if (name is not None) + (query is not None) + by_frame > 1:
         raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
+    form = form_of(form, output, as_json=as_json)
     values = parameters_of(parameters)
     if name is not None or query is not None:
         text, values = asked_of(query, None, name, values)
@@ -403,7 +405,7 @@ def diff(
     else:
         compare = differences.by_frame if by_frame else differences.scenes
         table = compare(*(classed(selection_of(one), abstraction) for one in (a, b)))
-    _write(table, form_of(form, output, as_json=as_json), output)
+    _write(table, form, output)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0
 
