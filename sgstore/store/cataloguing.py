@@ -37,9 +37,6 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
     classed = connection.execute(
         "SELECT DISTINCT abstraction FROM frame_class UNION SELECT DISTINCT abstraction FROM later_class"
     ).fetchall()
-    traces = stored_traces(connection)
-    settings = {id(trace.settings): trace.settings for trace in traces}  # few, for many traces
-    reaches = {key: Reach.of(one) for key, one in settings.items()}
     whole = Catalog(
         edges=_counted(connection, "edge"),
         map_edges=_counted(connection, "map_edge"),
@@ -47,8 +44,8 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         fixed=kinds("entity WHERE is_static"),
         mapped=kinds("map_node"),
         traces=tuple(
-            TraceFacts(t.trace_id, t.name, t.ego, frozenset(t.answers), reaches[id(t.settings)])
-            for t in traces
+            TraceFacts(t.trace_id, t.name, t.ego, frozenset(t.answers), Reach.of(t.settings))
+            for t in stored_traces(connection)
         ),
         classed=tuple(sorted(name for (name,) in classed)),
     )
