@@ -103,7 +103,7 @@ def periods_of(store: Store, frame_id: Ints) -> Floats:
     """(N,): the median period of the trace of each frame; ns."""
     periods = {one.trace_id: one.period_ns for one in store.info()}
     traces, number = np.unique(trace_of(frame_id), return_inverse=True)
-    return np.array([periods[one] for one in traces.tolist()], np.float64)[number]
+    return np.array([periods.get(one, 0) for one in traces.tolist()], np.float64)[number]
 
 
 def run_begins(store: Store, frame_id: Ints, time_ns: Ints) -> Bools:
