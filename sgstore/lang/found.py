@@ -27,13 +27,7 @@ from sgstore.lang.bound import (
 )
 from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Attribute, Type, Unit
 from sgstore.lang.counting import folded
-from sgstore.lang.formulas import (
-    Select,
-    columns_of,
-    expression_text,
-    leaves,
-    nested,
-)
+from sgstore.lang.formulas import Select, columns_of, expression_text, leaves, nested
 from sgstore.lang.frames import PATTERN, Frames, Join, column_of
 from sgstore.lang.phases import Given, Phases
 from sgstore.lang.results import Gathered, Statement, rows
