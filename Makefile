@@ -4,15 +4,21 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test lint format bench fuzz pyg oracle patterns sample clean duckdb-versions
+.PHONY: help demo test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
 	@echo "make test    format, lint, types and tests"
+	@echo "make tests   the tests only"
+	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
+	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
 	@echo "make lint    format, lint and types only"
 	@echo "make bench   print speeds and sizes, each beside a baseline measured in the same run"
-	@echo "make fuzz    read 100,000 recordings that were hurt on purpose (about half an hour)"
-	@echo "make kill    kill ingest 200 times at random and look whether the stores are whole and equal"
+	@echo "make fuzz    look at 100,000 recordings, texts and stores that were hurt on purpose (about an hour)"
+	@echo "make fuzz-queries  ask 5,000 random queries of a store of 300 traces (an hour; FUZZ_STORE=FILE keeps the store)"
+	@echo "make frozen  compare rows, verdicts and JSON with those that are kept (minutes)"
+	@echo "make kill    kill verbs that write 200 times while they work, and look whether all is whole and equal (20 minutes)"
+	@echo "make mutants  put faults in on purpose and look whether the tests of their room find them (about an hour)"
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
@@ -49,9 +55,19 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+# Types take one processor a minute or more: the tests run beside them.
+test: $(VENV)/.dev
+	@$(MAKE) --no-print-directory -j2 lint tests
+
 # A file of tests at a time in each process: what its tests share is made once.
-test: lint
+tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+test-wheel: $(VENV)/.dev
+	$(BIN)/python tests/packages.py wheel
+
+test-versions: $(VENV)/.dev
+	$(BIN)/python tests/packages.py versions
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m bench
@@ -59,8 +75,17 @@ bench: $(VENV)/.dev
 fuzz: $(VENV)/.dev
 	$(BIN)/python tests/fuzz.py
 
+fuzz-queries: $(VENV)/.dev
+	$(BIN)/python tests/fuzz_queries.py 5000 $(if $(FUZZ_STORE),--store $(FUZZ_STORE))
+
+frozen: $(VENV)/.dev
+	$(BIN)/python tests/frozen.py
+
 kill: $(VENV)/.dev
 	$(BIN)/python tests/killing.py 200
+
+mutants: $(VENV)/.dev
+	$(BIN)/python tests/mutants.py
 
 soak: $(VENV)/.dev
 	$(BIN)/python tests/soaking.py 600
@@ -74,10 +99,11 @@ pyg: $(VENV)/.base
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000
-	$(BIN)/python tests/oracle.py 100000
+	$(BIN)/python tests/oracle.py 100000 0 2
 	$(BIN)/python tests/oracle_over_time.py 3000
 	$(BIN)/python tests/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces
-	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py
+	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py tests/test_ttc.py tests/test_geometry.py \
+	  tests/test_crowds.py tests/test_cli_ending.py
 	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
 	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py

@@ -22,12 +22,19 @@ from networkx.algorithms.isomorphism import DiGraphMatcher
 
 from bench.ingest import CARS, MINUTE, recording
 from bench.measure import Measure
-from sgstore.abstractions import AT_INGEST, Classes, Grounds, Labelled, Seen, abstraction_named
+from sgstore.abstractions import (
+    AT_INGEST,
+    Classes,
+    GraphColumns,
+    Labelled,
+    MapColumns,
+    abstraction_named,
+)
 from sgstore.config import Config
-from sgstore.ingest.running import BLOCK_FRAMES
+from sgstore.ingest import BLOCK_FRAMES
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.traces import open_trace
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,7 +57,7 @@ def run(quick: bool) -> Iterator[Measure]:
         "the scene graph generator alone", frames / generating, "frames/s", f"{CARS} cars"
     )
     start = time.perf_counter()
-    seen = [Seen.of(graph, kinds, grounds) for graph in blocks]
+    seen = [GraphColumns.of(graph, kinds, grounds) for graph in blocks]
     seeing = time.perf_counter() - start
     total = seeing
     for name in AT_INGEST:
@@ -73,7 +80,7 @@ def run(quick: bool) -> Iterator[Measure]:
     yield Measure("    of the time of generator and classes", share * 100, "%")
 
 
-def _graphs(path: Path) -> tuple[list[GraphBlock], NDArray[np.int8], Grounds | None, float]:
+def _graphs(path: Path) -> tuple[list[GraphBlock], NDArray[np.int8], MapColumns | None, float]:
     with open_trace(path) as trace:
         text = trace.info.map_text
         road_map = read_map(text, trace.info.map_name) if text else None
@@ -83,7 +90,7 @@ def _graphs(path: Path) -> tuple[list[GraphBlock], NDArray[np.int8], Grounds | N
     blocks = [generator.block(frames) for frames in read]
     seconds = time.perf_counter() - start
     kinds = np.concatenate([graph.frames.entities.kind for graph in blocks])
-    return blocks, kinds, Grounds.of(road_map) if road_map else None, seconds
+    return blocks, kinds, MapColumns.of(road_map) if road_map else None, seconds
 
 
 def _networkx(graphs: Labelled, frame: int) -> nx.DiGraph[str]:

@@ -25,7 +25,7 @@ import numpy as np
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 
 from bench.measure import Measure
-from sgstore.abstractions import Classes, Grounds, Seen, abstraction_named
+from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named
 from sgstore.config import Config
 from sgstore.coverage import (
     classed,
@@ -37,8 +37,8 @@ from sgstore.coverage import (
     novel,
     selection_of,
 )
-from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, Presence, named_graph
-from sgstore.importing.blocks import parts_map
+from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence, named_graph
+from sgstore.importing._blocks import parts_map
 from sgstore.store import StoreFile
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE, RELATIONS
 from sgstore.world import Channel, Entities, FrameBlock, MessageRefs, States, TraceInfo, TraceReport
@@ -163,7 +163,7 @@ def block(library: Library, road_map: RoadMap, seq: Ints, scene: Ints) -> GraphB
     )
     gaps = LaneGaps(NONE, NONE, NONE, np.zeros(0))
     edges = Edges(frame, relation.astype(np.int8), src, dst)
-    return GraphBlock(frames, Presence(lane[0], lane[1]), edges, lanes, gaps)
+    return GraphBlock(frames, StaticPresence(lane[0], lane[1]), edges, lanes, gaps)
 
 
 def _pictures(seq: Ints, scene: Ints) -> MessageRefs:
@@ -301,7 +301,7 @@ def _compared(library: Library, road_map: RoadMap) -> list[Measure]:
     """S3C's way on a sample, beside ours on the same frames."""
     scene = driven(np.random.default_rng(9), SAMPLE)
     graph = block(library, road_map, np.arange(SAMPLE), scene)
-    seen = Seen.of(graph, np.array(library.kinds, np.int8), Grounds.of(road_map))
+    seen = GraphColumns.of(graph, np.array(library.kinds, np.int8), MapColumns.of(road_map))
     function = abstraction_named("RSV").function
     start = time.perf_counter()
     labelled = function(seen)

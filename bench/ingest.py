@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING
 from bench.measure import Measure
 from bench.sgg import town
 from sgstore.config import Config
-from sgstore.ingest import ingest
-from sgstore.ingest.running import BLOCK_FRAMES
+from sgstore.ingest import BLOCK_FRAMES, ingest
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.traces import open_trace
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from recordings import Recorder, car

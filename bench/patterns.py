@@ -30,7 +30,7 @@ from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 from bench import drives, peers
 from bench.measure import Measure
 from bench.store import sizes
-from sgstore.config import Config, Pairs
+from sgstore.config import Config, PairSettings
 from sgstore.opendrive import read_map
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
@@ -171,7 +171,7 @@ QUESTIONS = (
 
 def built(path: Path, frames: int) -> tuple[float, float]:
     """Make a store; seconds in all, and of the generator alone."""
-    config = Config(pairs=Pairs(within=7.0, ego_within=25.0))
+    config = Config(pairs=PairSettings(within=7.0, ego_within=25.0))
     maps = [read_map(drives.street(n), f"street {n}") for n in range(drives.MAPS)]
     store = StoreFile.create(path)
     start, graphs = time.perf_counter(), 0.0

@@ -25,20 +25,26 @@ from bench.coverage import PARTS, Library, made
 from bench.measure import Measure
 from sgstore.coverage import selection_of
 from sgstore.errors import ConfigError
-from sgstore.importing.blocks import parts_map
-from sgstore.selection import Budget, Piece, Way, Wish, curve, select
+from sgstore.importing._blocks import parts_map
+from sgstore.selection import Budget, SelectionSpec, SelectionUnit, Strategy, curve, select
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 FRAMES = 1_000_000
 WISHES = {
-    "frames": Wish(Way.minimal),
-    "clips of 2 s": Wish(Way.minimal, Piece.clip, 2.0),
-    "clips of 2 s within 1 h": Wish(Way.minimal, Piece.clip, 2.0, budget=Budget.parse("1h")),
-    "clips of 2 s every 0.5 s": Wish(Way.minimal, Piece.clip, 2.0, stride_s=0.5),
-    "clips of 2 s, pairs of features": Wish(Way.minimal, Piece.clip, 2.0, "ER", combos=2),
-    "frames within 100 MB": Wish(Way.minimal, budget=Budget.parse("100MB")),
+    "frames": SelectionSpec(Strategy.minimal),
+    "clips of 2 s": SelectionSpec(Strategy.minimal, SelectionUnit.clip, 2.0),
+    "clips of 2 s within 1 h": SelectionSpec(
+        Strategy.minimal, SelectionUnit.clip, 2.0, budget=Budget.parse("1h")
+    ),
+    "clips of 2 s every 0.5 s": SelectionSpec(
+        Strategy.minimal, SelectionUnit.clip, 2.0, stride_s=0.5
+    ),
+    "clips of 2 s, pairs of features": SelectionSpec(
+        Strategy.minimal, SelectionUnit.clip, 2.0, "ER", combos=2
+    ),
+    "frames within 100 MB": SelectionSpec(Strategy.minimal, budget=Budget.parse("100MB")),
 }
 
 
@@ -58,7 +64,7 @@ def run(quick: bool = False) -> Iterator[Measure]:
             yield from _selected(str(store), label, wish)
 
 
-def _selected(store: str, label: str, wish: Wish) -> Iterator[Measure]:
+def _selected(store: str, label: str, wish: SelectionSpec) -> Iterator[Measure]:
     start = time.perf_counter()
     try:
         found = select(selection_of(store), wish)

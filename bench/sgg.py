@@ -19,11 +19,11 @@ import numpy as np
 
 import sgstore
 from bench.measure import Measure
-from sgstore.config import Config, Lanes
+from sgstore.config import Config, LaneSettings
 from sgstore.opendrive import read_map
-from sgstore.relations.bearing import BESIDE
+from sgstore.readers import open_trace
+from sgstore.relations._bearing import BESIDE
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.traces import open_trace
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
 from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
 
@@ -278,7 +278,7 @@ def of_sample(seconds: float) -> list[Measure]:
     frames = sum(map(len, blocks))
     entities = sum(len(block.states) for block in blocks) / frames
     lanes = timed(partial(generated, blocks, road_map), seconds)
-    fine = Config(lanes=Lanes(granularity="waypoint", spacing=1.0))
+    fine = Config(lanes=LaneSettings(granularity="waypoint", spacing=1.0))
     points = timed(partial(generated, blocks, road_map, config=fine), seconds)
     return [
         Measure(f"sgg, the sample, {entities:.0f} entities", frames / lanes, "frames/s"),

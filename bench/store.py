@@ -21,12 +21,12 @@ import duckdb
 from bench.ingest import CARS, MINUTE, recording
 from bench.measure import Measure
 from sgstore.config import Config
-from sgstore.ingest.running import BLOCK_FRAMES
+from sgstore.ingest import BLOCK_FRAMES
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.store.schema import tables_sql
-from sgstore.traces import open_trace
+from sgstore.store._schema import tables_sql
 from sgstore.vocabulary import KINDS, RELATIONS
 from sgstore.world import TraceReport
 

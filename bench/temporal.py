@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from bench.measure import Measure
-from sgstore.monitor import Event, Monitor
-from sgstore.online import Frame
-from sgstore.temporal import Online, evaluate, formula_of
-from sgstore.temporal.verdicts import Settled
+from sgstore.step import Frame
+from sgstore.temporal import Monitor, MonitorEvent, OnlineFormula, evaluate, formula_of
+from sgstore.temporal._verdicts import Settled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -185,7 +184,7 @@ def _missing() -> str:
 
 
 def _online(text: str, letters: Sequence[Mapping[str, bool]]) -> tuple[float, bool]:
-    engine = Online(formula_of(text), every=False)
+    engine = OnlineFormula(formula_of(text), every=False)
     began = time.perf_counter()
     for number, letter in enumerate(letters):
         engine.step(letter, number * PERIOD)
@@ -229,7 +228,7 @@ class _Timed(Monitor):
     asked: list[float]
     told: list[float]
 
-    def _step(self, frame: Frame) -> tuple[Event, ...]:
+    def _step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
         times = [time.thread_time()]
         graphs = self.generator.steps(frame, [""])
         times.append(time.thread_time())

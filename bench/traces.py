@@ -30,9 +30,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from bench.measure import Measure
-from sgstore.traces import open_trace
-from sgstore.traces.chunks import read_chunk_head
-from sgstore.traces.mcap_file import McapFile
+from sgstore.mcap import McapFile, read_chunk_head
+from sgstore.readers import open_trace
 from sgstore.world import TraceReport
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))

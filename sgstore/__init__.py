@@ -68,7 +68,13 @@ __all__ = [
 ]
 
 
-def open(path: str | Path, *, memory: int = 0, tables: Mapping[str, object] | None = None) -> Store:
+def open(
+    path: str | Path,
+    *,
+    memory: int = 0,
+    tables: Mapping[str, object] | None = None,
+    max_spill: int = 0,
+) -> Store:
     """The store at a path; see :class:`sgstore.query.Store`.
 
     Raises
@@ -78,7 +84,7 @@ def open(path: str | Path, *, memory: int = 0, tables: Mapping[str, object] | No
     """
     from sgstore.query import Store
 
-    return Store(path, memory=memory, tables=tables)
+    return Store(path, memory=memory, tables=tables, max_spill=max_spill)
 
 
 def __getattr__(name: str) -> Any:

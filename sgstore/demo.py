@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sgstore.draw.stored import draw_stored
+from sgstore.draw import draw_stored
 from sgstore.errors import ExportError, MissingExtraError, TraceError
-from sgstore.exporters.stored import write_stored
+from sgstore.exporters import write_stored
 from sgstore.ingest import ingest
 from sgstore.query import Store
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class DemoQuestion:
     """What a test engineer asks, as a sentence and as a pattern.
 
     Attributes
@@ -38,7 +38,7 @@ class Question:
 
 
 QUESTIONS: Final = (
-    Question(
+    DemoQuestion(
         "crossing-at-red",
         "Does anybody cross in front of the ego, in its own lane, while the light is red?",
         """\
@@ -46,7 +46,7 @@ MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(p:Person),
       (light:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(lane)
 WHERE abs(bearing(e, p)) < 45""",
     ),
-    Question(
+    DemoQuestion(
         "cut-in",
         "Does anybody come over from the lane beside, closely before the ego?",
         """\
@@ -54,7 +54,7 @@ MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(v:Vehicle)-[:isIn]->(beside:Lane),
       (beside)-[:laneChange]->(lane)
 WHERE abs(bearing(e, v)) < 45 AND gap(e, v) < 12 AND v.speed > 1""",
     ),
-    Question(
+    DemoQuestion(
         "jaywalking",
         "Does anybody walk on a driving lane, near the ego and on no crosswalk?",
         """\
@@ -70,14 +70,14 @@ RECORDING: Final = Path(__file__).parent / "sample" / "town.mcap"
 """The recording in a checkout. A wheel is without it: it would be an eighth of all that is installed."""
 
 
-def run_demo(folder: Path, say: Say, recording: Path = RECORDING) -> None:
+def run_demo(folder: str | Path, say: Say, recording: str | Path = RECORDING) -> None:
     """Run the demonstration, and tell what happens.
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         Made if it does not exist; what an earlier run left there is made anew.
-    recording : Path
+    recording : str or Path
         The sample recording.
     say : function
         Takes each line.
@@ -89,6 +89,7 @@ def run_demo(folder: Path, say: Say, recording: Path = RECORDING) -> None:
     SgstoreError
         Anything that the library refuses to do.
     """
+    folder, recording = Path(folder), Path(recording)
     if not recording.is_file():
         raise TraceError(
             "the sample recording is no part of the installed package; take sgstore/sample/town.mcap from the "
@@ -126,7 +127,7 @@ def _ingest(store: Path, sample: Path, say: Say) -> None:
     say(f"  {outcome.frames} scene graphs in {outcome.seconds:.1f} s, of {kinds}.")
 
 
-def _answer(store: Store, question: Question, folder: Path, say: Say) -> Path | None:
+def _answer(store: Store, question: DemoQuestion, folder: Path, say: Say) -> Path | None:
     """Ask, print the intervals, and draw the middle of the first one."""
     say("")
     say(f"{question.sentence}")

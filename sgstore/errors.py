@@ -122,7 +122,7 @@ class SqlError(StoreError):
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class TextSpan:
     """Part of a query text.
 
     Attributes
@@ -144,7 +144,7 @@ class QueryError(SgstoreError):
         What is wrong, in one sentence, without position.
     text : str, optional
         The whole query.
-    span : Span, optional
+    span : TextSpan, optional
         The part of it at fault.
     hint : str, optional
         What would be right: ``did you mean 'near'?``.
@@ -156,7 +156,7 @@ class QueryError(SgstoreError):
     """
 
     def __init__(
-        self, reason: str, *, text: str = "", span: Span | None = None, hint: str | None = None
+        self, reason: str, *, text: str = "", span: TextSpan | None = None, hint: str | None = None
     ) -> None:
         self.reason = reason
         self.text = text
@@ -216,7 +216,7 @@ def position(text: str, offset: int) -> tuple[int, int]:
     return before.count("\n") + 1, offset - (before.rfind("\n") + 1) + 1
 
 
-def _with_carets(reason: str, text: str, span: Span | None, hint: str | None) -> str:
+def _with_carets(reason: str, text: str, span: TextSpan | None, hint: str | None) -> str:
     lines = [reason]
     if span is not None and text:
         number, column = position(text, span.start)

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from itertools import starmap
+from operator import eq
+from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
+from sgstore.vocabulary import RELATIONS
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping
 
     import networkx as nx
+    from numpy.typing import NDArray
 
     from sgstore.world import Codes, Floats, FrameBlock, Ints
 
     Places = Sequence[tuple[int, float]]
+    Whole = NDArray[np.integer[Any]]
+    EdgeRecord = tuple[int, str, int, dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +79,7 @@ class LaneGaps:
 
 
 @dataclass(frozen=True, slots=True)
-class Presence:
+class StaticPresence:
     """Which static nodes are in the graph of which frame; shape (M,).
 
     Attributes
@@ -138,7 +146,7 @@ class GraphBlock:
     ----------
     frames : FrameBlock
         The frames, with only those states that are nodes of their graphs (in range).
-    presence : Presence
+    presence : StaticPresence
         The static nodes of each graph. A static edge of the map holds where both its ends are present.
     edges : Edges
         All other edges.
@@ -146,13 +154,17 @@ class GraphBlock:
         Attributes of the ``isIn`` edges from entities to lanes.
     gaps : LaneGaps
         Attributes of ``leads`` and ``follows`` edges.
+    crowded : tuple of (str, int, int)
+        Frames, counted in the block, whose pairs are too many (:mod:`sgstore.relations._pairs`): what the pairs
+        are, the frame, and how many bodies it has.
     """
 
     frames: FrameBlock
-    presence: Presence
+    presence: StaticPresence
     edges: Edges
     lanes: LaneStates
     gaps: LaneGaps
+    crowded: tuple[tuple[str, int, int], ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -215,7 +227,7 @@ def named_graph(
     return graph
 
 
-class Reach:
+class LaneDistances:
     """Where lanes begin, measured along others: what tells how far it is along the lanes of a map.
 
     Parameters
@@ -256,6 +268,64 @@ class Reach:
         return nearest if abs(nearest) <= self.FARTHEST else None
 
 
+class EdgeColumns(Sequence["EdgeRecord"]):
+    """The edges of one graph, kept as columns: each record is made when it is asked for.
+
+    A record takes some 250 bytes, a row ten. It equals every sequence of the same records.
+
+    Parameters
+    ----------
+    src, dst : (n,) int
+        Node ids.
+    relation : (n,) int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    about : dict
+        Row → attributes, of those that have any.
+    """
+
+    AT_ONCE: Final = 4096
+    """Rows of which the records are made together while one goes over them."""
+
+    def __init__(
+        self, src: Whole, relation: Codes, dst: Whole, about: Mapping[int, dict[str, Any]]
+    ) -> None:
+        self._src, self._relation, self._dst = src, relation, dst
+        self._about = about
+
+    def __len__(self) -> int:
+        return len(self._src)
+
+    def __iter__(self) -> Iterator[EdgeRecord]:
+        for first in range(0, len(self), self.AT_ONCE):
+            yield from self[first : first + self.AT_ONCE]
+
+    @overload
+    def __getitem__(self, index: int) -> EdgeRecord: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[EdgeRecord]: ...
+
+    def __getitem__(self, index: int | slice) -> EdgeRecord | list[EdgeRecord]:
+        rows = range(len(self))[index]
+        if isinstance(rows, int):
+            return self[rows : rows + 1][0]
+        columns = (self._src[index], self._relation[index], self._dst[index])
+        return [
+            (src, RELATIONS[code], dst, self._about.get(row, {}))
+            for src, code, dst, row in zip(*(c.tolist() for c in columns), rows, strict=True)
+        ]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, (EdgeColumns, list, tuple)):
+            return NotImplemented
+        return len(self) == len(other) and all(starmap(eq, zip(self, other, strict=True)))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"<{len(self):,} edges>"
+
+
 @dataclass(frozen=True, slots=True)
 class SceneGraph:
     """The scene graph of one frame: ``(V, E, Ego, kind, rel, att)`` of the paper, as records.
@@ -271,9 +341,10 @@ class SceneGraph:
     nodes : dict
         Node id → attributes in outward units (m, s, m/s, degrees): ``kind``, ``name``, ``is_ego``, and
         whatever is known (``x``, ``y``, ``heading``, ``speed``, ``light_state``, …). Missing ones are left out.
-    edges : list of tuple
-        ``(src, relation, dst, attributes)``.
-    reach : Reach, optional
+    edges : sequence of tuple
+        ``(src, relation, dst, attributes)``. A list; online, where there are more than 65,536 of them, an
+        :class:`EdgeColumns`.
+    reach : LaneDistances, optional
         Of the map that it lies on. Without it nothing is known of ways along lanes.
     """
 
@@ -283,8 +354,8 @@ class SceneGraph:
     time_ns: int
     ego: int | None
     nodes: dict[int, dict[str, Any]]
-    edges: list[tuple[int, str, int, dict[str, Any]]]
-    reach: Reach | None = field(default=None, compare=False, repr=False)
+    edges: Sequence[tuple[int, str, int, dict[str, Any]]]
+    reach: LaneDistances | None = field(default=None, compare=False, repr=False)
 
     def places(self) -> dict[int, list[tuple[int, float]]]:
         """Where entities are along their own lanes: node id → pairs of a lane and the way from its start; m."""

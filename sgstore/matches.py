@@ -8,22 +8,38 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.graph import graph_of_records
-from sgstore.lang import Compiled, compile_query
-from sgstore.lang.bound import FRAME_COLUMNS, INTERVAL_COLUMNS
-from sgstore.lang.phases import Window
-from sgstore.lang.reading import for_people
-from sgstore.lang.results import EXTENTS
-from sgstore.lang.rewrite import rewritten
-from sgstore.lang.subgraphs import Layout
-from sgstore.store import FrameRef, GivenTable, write_parquet
-from sgstore.store.covering import SEQ_BITS
-from sgstore.store.dataframes import arrow_table, pandas_frame, polars_frame, write_csv
-from sgstore.world import Clip
+from sgstore.lang import (
+    EXTENTS,
+    TRACE_OF_BUCKET,
+    Compiled,
+    Layout,
+    Window,
+    compared_in_query,
+    compile_query,
+    for_people,
+    in_order,
+    notes_on,
+    rewritten,
+)
+from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
+from sgstore.store import (
+    SEQ_BITS,
+    FrameRef,
+    GivenTable,
+    arrow_table,
+    pandas_frame,
+    polars_frame,
+    write_csv,
+    write_parquet,
+)
+from sgstore.vocabulary import natural
+from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
@@ -32,8 +48,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog
-    from sgstore.lang.results import Gathered, Statement
+    from sgstore.lang import Catalog, Compared, Gathered, SqlStatement
     from sgstore.store import StoreFile
 
 FIRST_WINDOW: Final = 64
@@ -41,6 +56,9 @@ FIRST_WINDOW: Final = 64
 
 BUCKET_SHIFT: Final = 6
 """``frame_id >> 6`` is the bucket of a frame."""
+
+GROWTH: Final = 4
+"""How many times as long a window is as the one before, if that had few rows."""
 
 LAST_WINDOW: Final = 16_384
 """Buckets of the largest window: a million frames."""
@@ -92,8 +110,9 @@ class Matches:
         Names of the columns of the rows. Without ``RETURN``: ``frame_id``, ``trace``, ``seq``, ``time_ns``,
         ``t`` (seconds since the trace began), then for each variable its node id, and its name under
         ``….name``.
-    left_out : tuple of str
-        Traces that cannot answer the query, because a relation that it names is not known of them.
+    notes : tuple of str
+        What may be a mistake: a text that is compared with a name, say, of which the store has none, and which
+        is the nearest. Asked of the store when it is read.
     graphs : bool
         Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks: its ``nodes`` and its ``edges``, lists
         of dicts in node-link form.
@@ -113,7 +132,16 @@ class Matches:
         compiled = self._ready = compile_query(text, catalog(), parameters)
         self.graphs = compiled.layout is not None
         self.columns = compiled.columns
-        self.left_out = compiled.left_out
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Traces that cannot answer the query, because something that it needs is not known of them."""
+        return tuple(self.reasons)
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why each of the traces in :attr:`left_out` cannot, by name."""
+        return self._ready.reasons
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:
@@ -126,6 +154,13 @@ class Matches:
             if self._ready.stored is not catalog:
                 self._ready = compile_query(self._text, catalog, self._parameters)
             yield self._ready
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What may be a mistake, such as a text that is compared with names and is none of the store's."""
+        with self._compiled() as compiled:
+            compared = compared_in_query(compiled.bound)
+            return notes_in(self._file, compared, self._text, self._parameters)
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         with self._compiled() as compiled:
@@ -146,7 +181,7 @@ class Matches:
             return self._file.rows(statement.sql, statement.values, given=given).values[0][0]
 
     def frames(self) -> Iterator[FrameRef]:
-        """The distinct frames, in order of trace and number; of limited rows, in the order of the rows."""
+        """The distinct frames, by name of the trace and number; of limited rows, in the order of the rows."""
         for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
             yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
 
@@ -180,7 +215,7 @@ class Matches:
 
         Nodes are node ids with all that is known of them, and ``variables``: their names in the pattern. Edges
         have their relation as key and as attribute, beside what else is known of them; see
-        :mod:`sgstore.lang.subgraphs`. The graph has the attributes ``frame_id``, ``trace``, ``seq``,
+        :mod:`sgstore.lang._compile`. The graph has the attributes ``frame_id``, ``trace``, ``seq``,
         ``time_ns`` and ``t``, and what stands beside ``RETURN SUBGRAPHS``.
         """
         with self._compiled() as compiled:
@@ -219,13 +254,21 @@ class Matches:
             if compiled.limited_to_frames is not None:
                 frames = ((row[1], row[-1]) for row in self._frames())
                 around = (Clip(trace, time - start, time + end) for trace, time in frames)
-                yield from merged(sorted(around, key=lambda clip: (clip.trace, clip.start_ns)))
+                clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
+                yield from merged(clips, self._slack)
                 return
 
-            def statement(compiled: Compiled, window: Window | None) -> Statement:
+            def statement(compiled: Compiled, window: Window | None) -> SqlStatement:
                 return compiled.clips(start, end, window)
 
-            yield from merged(Clip(*row[:3]) for row in self._stream(statement, "clips"))
+            clips = (Clip(*row[:3]) for row in self._stream(statement, "clips"))
+            yield from merged(clips, self._slack)
+
+    @property
+    def _slack(self) -> dict[str, int]:
+        """The tolerance of times of each trace, by name; ns."""
+        traces = self._ready.catalog.traces
+        return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def numpy(self) -> dict[str, NDArray[np.generic]]:
         """All columns as arrays, masked where something is NULL."""
@@ -289,12 +332,12 @@ class Matches:
             return compiled.stages()
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Columns and rows as a person wants to read them: see :func:`sgstore.lang.reading.for_people`."""
+        """Columns and rows as a person wants to read them: see :func:`sgstore.lang._humanize.for_people`."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _stream(
         self,
-        statement: Callable[[Compiled, Window | None], Statement],
+        statement: Callable[[Compiled, Window | None], SqlStatement],
         form: str | None = None,
     ) -> Iterator[tuple[Any, ...]]:
         """Rows of a statement, window by window; all windows see the same state of the store.
@@ -314,12 +357,12 @@ class Matches:
 
     def _windows(
         self,
-        statement: Callable[[Window | None], Statement],
+        statement: Callable[[Window | None], SqlStatement],
         *,
         at_once: bool,
         whole_traces: bool,
     ) -> Iterator[tuple[Any, ...]]:
-        extents = [] if at_once else self._file.rows(EXTENTS).values
+        extents = [] if at_once else self._extents()
         steps = Windows(extents, whole_traces=whole_traces)
         for window in steps:
             ready = statement(window)
@@ -329,12 +372,19 @@ class Matches:
                     steps.rows += len(batch)
                     yield from batch.values
 
-    def _given(self, statement: Statement) -> list[GivenTable]:
+    def _extents(self) -> list[tuple[int, int]]:
+        """First bucket and number of buckets of each trace, in the order in which they are told."""
+        return in_order(self._file.rows(EXTENTS).values, self._ready.catalog)
+
+    def _given(self, statement: SqlStatement) -> list[GivenTable]:
         """What a statement is given of what was found otherwise."""
-        return [GivenTable(one.name, one.types, self._blocks(one)) for one in statement.gathered]
+        return [
+            GivenTable(one.name, one.types, partial(self._blocks, one))
+            for one in statement.gathered
+        ]
 
     def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
-        steps = Windows(self._file.rows(EXTENTS).values, whole_traces=True)
+        steps = Windows(self._extents(), whole_traces=True)
         for window in steps:
             block = gathered.block(window)
             steps.rows = len(block[0])
@@ -342,14 +392,15 @@ class Matches:
 
 
 class Windows:
-    """Ranges of buckets in order; ``None`` (all) for a small store.
+    """Ranges of buckets, trace after trace; ``None`` (all) for a small store.
 
-    Each is twice as long as the one before, unless that had so many rows that it would have too many.
+    Each is longer than the one before, unless that had so many rows that it would have too many. A range is a
+    part of one trace, or several whole traces: these may have others between them, for ids follow no order.
 
     Parameters
     ----------
     extents : iterable of (int, int)
-        First bucket and number of buckets of each trace, in order.
+        First bucket and number of buckets of each trace, in the order in which they are to come.
     whole_traces : bool
         Whether no range may end within a trace.
 
@@ -362,34 +413,64 @@ class Windows:
     def __init__(self, extents: Iterable[tuple[int, int]], *, whole_traces: bool = False) -> None:
         self._extents = list(extents)
         self._whole_traces = whole_traces
+        self._size = FIRST_WINDOW
         self.rows = 0
 
     def __iter__(self) -> Iterator[Window | None]:
         if sum(buckets for _, buckets in self._extents) <= FIRST_WINDOW:
             yield None
             return
-        size, used, low, high = FIRST_WINDOW, 0, None, 0
+        group, used = list[tuple[int, int]](), 0
         for first, buckets in self._extents:
-            start, left = first, buckets
-            while left:
-                taken = left if self._whole_traces else min(left, size - used)
-                low = start if low is None else low
-                start, left, used = start + taken, left - taken, used + taken
-                high = start
-                if used >= size:
-                    self.rows = 0
-                    yield Window(low, high)
-                    size = max(min(2 * used, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
-                    used, low = 0, None
-        if low is not None:
-            yield Window(low, high)
+            if group and used + buckets > self._size:
+                yield from self._told(group, used)
+                group, used = [], 0
+            if buckets > self._size and not self._whole_traces:
+                yield from self._parts(first, buckets)
+            else:
+                group.append((first, buckets))
+                used += buckets
+        if group:
+            yield from self._told(group, used)
+
+    def _parts(self, first: int, buckets: int) -> Iterator[Window]:
+        """Ranges of a trace that is longer than one may be."""
+        end = first + buckets
+        while first < end:
+            taken = min(self._size, end - first)
+            yield from self._told([(first, taken)], taken)
+            first += taken
+
+    def _told(self, group: list[tuple[int, int]], used: int) -> Iterator[Window]:
+        """One range; when its rows were read, it is known how long the next one may be."""
+        low, high = min(first for first, _ in group), max(first + many for first, many in group)
+        traces = tuple(first >> TRACE_OF_BUCKET for first, _ in group) if len(group) > 1 else None
+        self.rows = 0
+        yield Window(low, high, traces)
+        grown = GROWTH * max(used, self._size)
+        self._size = max(min(grown, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
 
 
-def merged(clips: Iterable[Clip]) -> Iterator[Clip]:
-    """Clips, ordered by trace and start, with those that overlap or touch made one."""
+def notes_in(
+    file: StoreFile,
+    compared: Iterable[Compared],
+    query: str,
+    parameters: Mapping[str, object],
+) -> tuple[str, ...]:
+    """What is to be said of the texts of a query that a store has not; see :func:`notes_on`."""
+    return notes_on(compared, query, parameters, lambda sql, values: file.rows(sql, values).values)
+
+
+def merged(clips: Iterable[Clip], slack: Mapping[str, int] | None = None) -> Iterator[Clip]:
+    """Clips, ordered by trace and start, with those that overlap or touch made one.
+
+    ``slack`` is how far apart those of a trace may be and still touch; ns, by default nothing.
+    """
+    slack = slack or {}
     last: Clip | None = None
     for clip in clips:
-        if last is not None and clip.trace == last.trace and clip.start_ns <= last.end_ns:
+        same = last is not None and clip.trace == last.trace
+        if last is not None and same and clip.start_ns <= last.end_ns + slack.get(clip.trace, 0):
             last = replace(last, end_ns=max(last.end_ns, clip.end_ns))
             continue
         if last is not None:

@@ -1,4 +1,4 @@
-"""Test sets for pytest: one test for each clip of a store that a query finds, or that a lock names.
+"""Test sets for pytest: one test for each clip that a query finds or a lock names, or for each trace and rule.
 
 ::
 
@@ -12,40 +12,54 @@
         for graph in scene.graphs():
             ...
 
+    @pytest.mark.scenes(check="rules.sgql")
+    def test_no_rule_is_broken(scene):
+        pass
+
 Whoever has sgstore installed has it: pytest finds it by its entry point. Paths count from the folder of the
 test; a lock takes its clips from the store that ``--scenes-store`` or the setting ``scenes_store`` names,
 unless the mark does. The id of a test is the trace and the numbers of the first and the last frame,
 ``town#240-250``: the same whenever and wherever the store is made again, so that results can be compared, and
-the same in all processes of pytest-xdist.
+the same in all processes of pytest-xdist. Of a check it is the trace and the name of the check.
+
+A case of a lock is looked at before its test runs: another number of frames, other times or other graphs are an
+error of that test; so are other messages when the test asks for one. A rule is checked before the body of its
+test: a trace that violates it fails, one that cannot answer it is skipped. A mark that is wrong is an error of
+its tests, not of the session: the others run.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import pytest
 
 from sgstore.errors import SgstoreError
+from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     import networkx as nx
 
+    from sgstore.locks import Lock
     from sgstore.query import Store
+    from sgstore.readers import Media
     from sgstore.store import FrameRef
-    from sgstore.traces.carried import Carried
+    from sgstore.temporal import Verdict
 
 MARK: Final = "scenes"
 OPTION: Final = "scenes_store"
 _EXPLAINED: Final = (
     "scenes(store=PATH, query=TEXT, before=0.0, after=0.0, parameters={}) or scenes(lock=PATH, store=PATH):"
-    " one test for each clip, with a fixture `scene`"
+    " one test for each clip; scenes(check=PATH, store=PATH, parameters={}): one for each trace and CHECK;"
+    " with a fixture `scene`"
 )
-_KNOWN: Final = {"store", "query", "lock", "before", "after", "parameters", "allow_empty"}
+_SOURCES: Final = ("query", "lock", "check")
+_KNOWN: Final = {*_SOURCES, "store", "before", "after", "parameters", "allow_empty"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,21 +82,37 @@ class Case:
     id: str = ""
 
 
-class Scene:
+class ClipScene:
     """A clip as a test sees it: what the fixture ``scene`` is.
 
     Attributes
     ----------
     store : Store
     case : Case
-    frames : tuple of FrameRef
-        The frames of the clip, in order.
     """
 
-    def __init__(self, store: Store, case: Case, frames: tuple[FrameRef, ...]) -> None:
+    def __init__(self, store: Store, case: Case) -> None:
         self.store = store
         self.case = case
-        self.frames = frames
+
+    @cached_property
+    def frames(self) -> tuple[FrameRef, ...]:
+        """The frames of the clip, in order."""
+        return _frames(self.store, self.case)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What the check says of the trace; ``None``: the test is not about a check."""
+        return None
+
+    def verify(self, *, messages: bool = False) -> None:
+        """Look whether it is what it is said to be, or fail the test.
+
+        Parameters
+        ----------
+        messages : bool
+            Whether the messages of sensors are looked at, and not the graphs.
+        """
 
     def __repr__(self) -> str:
         return f"<Scene {self.id}>"
@@ -128,8 +158,7 @@ class Scene:
 
     def graphs(self) -> Iterator[nx.MultiDiGraph[int]]:
         """The scene graphs of all frames, in order."""
-        from sgstore.exporters.export import FEW, Export
-        from sgstore.exporters.scenes import graphs_of
+        from sgstore.exporters import FEW, Export, graphs_of
         from sgstore.world import Clip
 
         export = Export(self.store, (Clip(self.trace, self.case.start_ns, self.case.end_ns),))
@@ -139,10 +168,12 @@ class Scene:
 
     def payload(self, channel: str, frame: int | FrameRef = 0) -> bytes:
         """The message of a channel that belongs to a frame, as it was recorded; ``frame`` as :meth:`graph`."""
+        self.verify(messages=True)
         return self.store.payload(self._frame(frame), channel)
 
-    def carried(self, channel: str, frame: int | FrameRef = 0) -> Carried:
+    def carried(self, channel: str, frame: int | FrameRef = 0) -> Media:
         """What such a message carries: the file of a picture, a video up to it, or the message."""
+        self.verify(messages=True)
         return self.store.file.carried(self._frame(frame).frame_id, channel)
 
     def found(self, query: str, /, **parameters: object) -> list[FrameRef]:
@@ -158,6 +189,76 @@ class Scene:
             return self.frames[frame]
         except IndexError:
             raise IndexError(f"frame {frame} of {len(self.frames)} in {self.id}") from None
+
+
+class LockedScene(ClipScene):
+    """A clip that a lock names.
+
+    Attributes
+    ----------
+    lock : Lock
+    path : Path
+        Of the lock, for messages.
+    number : int
+        Its place among the cases of the lock.
+    """
+
+    def __init__(self, store: Store, case: Case, lock: Lock, path: Path, number: int) -> None:
+        super().__init__(store, case)
+        self.lock, self.path, self.number = lock, path, number
+        self._verified: set[bool] = set()
+
+    def verify(self, *, messages: bool = False) -> None:
+        """Look whether the store has what the lock says, once in a session."""
+        if messages in self._verified:
+            return
+        from sgstore.locks import verify_case
+
+        case = self.lock.cases[self.number]
+        found = verify_case(self.lock, case, self.store, graphs=not messages, payloads=messages)
+        others = [f"  {one.where}: {one.what} {one.detail}" for one in found if one.matters]
+        if others:
+            head = f"{self.path}: {case.id} is not what the lock says:"
+            pytest.fail("\n".join([head, *others]), pytrace=False)
+        self._verified.add(messages)
+
+
+class CheckedTrace(ClipScene):
+    """A trace and a check of it.
+
+    Attributes
+    ----------
+    checks : Checks
+    check : str
+        Name of the check.
+    """
+
+    def __init__(self, store: Store, case: Case, checks: Checks, check: str) -> None:
+        super().__init__(store, case)
+        self.checks, self.check = checks, check
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the check says of the trace."""
+        found = self.checks.verdicts.get((self.trace, self.check))
+        if found is None:  # of another ego
+            from sgstore.temporal import Verdict
+
+            found = Verdict(self.check, self.trace, "unknown")
+        return found
+
+
+class Checks:
+    """The checks of a file, asked once in a process, and not before a test needs a verdict."""
+
+    def __init__(self, store: Store, text: str, parameters: Mapping[str, Any]) -> None:
+        self._run = store.check(text, **parameters)
+        self.names = self._run.names
+
+    @cached_property
+    def verdicts(self) -> Mapping[tuple[str, str], Verdict]:
+        """Verdicts by trace and check."""
+        return {(one.trace, one.check): one for one in self._run}
 
 
 # What pytest calls ----------------------------------------------------------------------------------------
@@ -177,51 +278,93 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """One test for each scene."""
+    """One test for each scene; if the mark is wrong, one that says so."""
     mark = metafunc.definition.get_closest_marker(MARK)
-    if mark is None:
+    if mark is None or "scene" not in metafunc.fixturenames:
         return
-    if "scene" not in metafunc.fixturenames:
-        raise pytest.Collector.CollectError(
-            f"{metafunc.function.__name__}: {MARK} needs the fixture `scene`"
-        )
     try:
-        scenes = _scenes(metafunc.config, metafunc.definition.path.parent, mark)
-    except SgstoreError as error:
-        raise pytest.Collector.CollectError(f"@pytest.mark.{MARK}: {error}") from error
-    metafunc.parametrize("scene", scenes, indirect=True, ids=[scene.id for scene in scenes])
+        scenes: list[Any] = _scenes(metafunc.config, metafunc.definition.path.parent, mark)
+        ids = [scene.id for scene in scenes]
+    except (SgstoreError, OSError, TypeError, ValueError) as error:
+        scenes, ids = [_WrongMark(f"@pytest.mark.{MARK}: {error}")], ["error"]
+    metafunc.parametrize("scene", scenes, indirect=True, ids=ids)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Nothing is tested by a mark whose scenes nobody takes."""
+    lacks = "scene" not in getattr(item, "fixturenames", ("scene",))
+    if lacks and item.get_closest_marker(MARK) is not None:
+        pytest.fail(f"{item.name}: {MARK} needs the fixture `scene`", pytrace=False)
 
 
 @pytest.fixture
-def scene(request: pytest.FixtureRequest) -> Scene:
+def scene(request: pytest.FixtureRequest) -> ClipScene:
     """The clip that a test is about; it needs ``@pytest.mark.scenes(…)``."""
     found = getattr(request, "param", None)
-    if not isinstance(found, Scene):
+    if isinstance(found, _WrongMark):
+        pytest.fail(found.problem, pytrace=False)
+    if not isinstance(found, ClipScene):
         pytest.fail(f"the fixture `scene` needs @pytest.mark.{_EXPLAINED}", pytrace=False)
+    found.verify()
     return found
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
+    """A violated check fails its test, whatever the body says."""
+    found = pyfuncitem.funcargs.get("scene")
+    if not isinstance(found, CheckedTrace):
+        return
+    verdict = found.verdict
+    if verdict.violated:
+        pytest.fail(violations_text(verdict), pytrace=False)
+    if verdict.verdict == "unknown":
+        why = f": {verdict.reason}" if verdict.reason else ""
+        pytest.skip(f"{found.trace} cannot answer {found.check}{why}")
+
+
+def violations_text(verdict: Verdict) -> str:
+    """Where a check is violated, and by whom, a line each."""
+    lines = [f"{verdict.trace} violates {verdict.check}"]
+    for one in verdict.violations:
+        who = ", ".join(map(str, one.values.values()))
+        lines.append(
+            f"  #{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s, {one.frames} frames"
+            + f": {who}" * bool(who)
+        )
+    return "\n".join(lines)
 
 
 # Where scenes come from -----------------------------------------------------------------------------------
 
 
-_FOUND: Final = pytest.StashKey[dict[str, list[Scene]]]()
+_FOUND: Final = pytest.StashKey[dict[str, list[ClipScene]]]()
 """What marks found already, so that many tests of one mark ask once."""
 
 
-def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[Scene]:
+@dataclass(frozen=True, slots=True)
+class _WrongMark:
+    """Stands for the scenes of a mark that has none, so that its test says why."""
+
+    problem: str
+
+
+def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[ClipScene]:
     told = cast("dict[str, Any]", mark.kwargs)
     wrong = sorted(told.keys() - _KNOWN)
-    if mark.args or wrong or ("query" in told) == ("lock" in told):
-        problem = f"unknown: {', '.join(wrong)}" if wrong else "give a query or a lock, by name"
-        raise pytest.Collector.CollectError(f"@pytest.mark.{MARK}: {problem}; {_EXPLAINED}")
+    if mark.args or wrong or sum(source in told for source in _SOURCES) != 1:
+        problem = (
+            f"unknown: {', '.join(wrong)}" if wrong else "give a query, a lock or a check, by name"
+        )
+        raise ValueError(f"{problem}; {_EXPLAINED}")
     key = f"{folder}\0{sorted(told.items(), key=str)}"
     known = config.stash.setdefault(_FOUND, {})
     if key not in known:
         known[key] = _asked(_store(config, folder, told), folder, told)
     if not known[key] and not told.get("allow_empty", False):
-        raise pytest.Collector.CollectError(
-            f"@pytest.mark.{MARK}: no scene was found, so nothing would be tested; say allow_empty=True if"
-            f" that is right: {told.get('query', told.get('lock'))}"
+        source = next(told[source] for source in _SOURCES if source in told)
+        raise ValueError(
+            f"no scene was found, so nothing would be tested; say allow_empty=True if that is right: {source}"
         )
     return known[key]
 
@@ -236,24 +379,24 @@ def _store(config: pytest.Config, folder: Path, told: Mapping[str, Any]) -> Stor
         return Store(config.invocation_params.dir / str(asked))
     if kept:
         return Store(config.rootpath / str(kept))
-    raise pytest.Collector.CollectError(
-        f"@pytest.mark.{MARK}: which store? Say store=PATH, --scenes-store PATH, or {OPTION} in the settings"
+    raise ValueError(
+        f"which store? Say store=PATH, --scenes-store PATH, or {OPTION} in the settings"
     )
 
 
-def _asked(store: Store, folder: Path, told: Mapping[str, Any]) -> list[Scene]:
+def _asked(store: Store, folder: Path, told: Mapping[str, Any]) -> list[ClipScene]:
     if "lock" in told:
-        cases: Iterable[Case] = cases_of(folder / told["lock"], store)
-    else:
-        matches = store.find(told["query"], **told.get("parameters", {}))
-        clips = matches.clips(float(told.get("before", 0.0)), float(told.get("after", 0.0)))
-        cases = [Case(clip.trace, clip.start_ns, clip.end_ns) for clip in clips]
+        return scenes_of(folder / told["lock"], store)
+    if "check" in told:
+        return traces_checked(folder / told["check"], store, told.get("parameters", {}))
+    matches = store.find(told["query"], **told.get("parameters", {}))
     with store.file.snapshot():
-        found = [Scene(store, case, _frames(store, case)) for case in cases]
-    return [scene for scene in found if scene.frames]
+        clips = list(matches.clips(float(told.get("before", 0.0)), float(told.get("after", 0.0))))
+        scenes = [ClipScene(store, Case(c.trace, c.start_ns, c.end_ns)) for c in clips]
+        return [scene for scene in scenes if scene.frames]
 
 
-def cases_of(lock: Path, store: Store) -> Iterable[Case]:
+def scenes_of(path: Path, store: Store) -> list[ClipScene]:
     """The clips that a lock names, as a store has them.
 
     Raises
@@ -261,14 +404,37 @@ def cases_of(lock: Path, store: Store) -> Iterable[Case]:
     SgstoreError
         The lock cannot be read, or the store lacks what it names.
     """
-    selection: Any = import_module("sgstore.selection")
-    return [Case(*case) for case in selection.cases_of(lock, store)]
+    from sgstore.locks import cases_of, read_lock
+
+    lock = read_lock(path)
+    cases = [Case(*case) for case in cases_of(lock, store)]
+    return [LockedScene(store, case, lock, path, number) for number, case in enumerate(cases)]
+
+
+def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> list[ClipScene]:
+    """Every trace of a store with every check of a file.
+
+    Raises
+    ------
+    SgstoreError
+        The checks have no meaning in the store.
+    OSError
+        The file cannot be read.
+    """
+    checks = Checks(store, path.read_text(encoding="utf-8"), parameters)
+    with store.file.snapshot():
+        spans = store.file.rows(
+            "SELECT trace, min(log_time_ns), max(log_time_ns) FROM frames GROUP BY trace"
+        ).values
+    spans = sorted(spans, key=lambda span: natural(span[0]))
+    cases = [Case(*span, id=f"{span[0]}-{name}") for span in spans for name in checks.names]
+    names = checks.names * len(spans)
+    return [CheckedTrace(store, c, checks, name) for c, name in zip(cases, names, strict=True)]
 
 
 def _frames(store: Store, case: Case) -> tuple[FrameRef, ...]:
-    from sgstore.exporters.export import ClipFrames, Export
-    from sgstore.store import FrameRef
-    from sgstore.store.covering import SEQ_BITS
+    from sgstore.exporters import ClipFrames, Export
+    from sgstore.store import SEQ_BITS, FrameRef
     from sgstore.world import Clip
 
     clip = Clip(case.trace, case.start_ns, case.end_ns)

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any, overload
 
 from sgstore.abstractions import abstractions
 from sgstore.graph import named_graph
-from sgstore.lang import compile_query
-from sgstore.lang.results import CONSTANTS, about_frame
+from sgstore.lang import CONSTANTS, about_frame, compile_query
 from sgstore.store import FrameRef, StoreFile, UserTables
-from sgstore.vocabulary import folded
+from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,15 +27,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sgstore.history.checks import CheckRun
-    from sgstore.lang import Catalog
-    from sgstore.lang.bound import FrameAttribute
-    from sgstore.lang.evaluation import FrameView
-    from sgstore.lang.pattern import Pattern
-    from sgstore.lang.whynot import WhyNot, WhyNotSteps
+    from sgstore.lang import Catalog, FrameView, Pattern, WhyNot, WhyNotSteps
+    from sgstore.lang.ir import FrameAttribute
     from sgstore.matches import Matches
-    from sgstore.store import Rows, StoredTrace
-    from sgstore.store.likeness import Like
+    from sgstore.store import Rows, SimilarFrames, StoredTrace
+    from sgstore.temporal import CheckRun
 
 
 class Store:
@@ -49,7 +44,9 @@ class Store:
         Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is less.
     tables : mapping of str to path or data frame, optional
         Tables of one's own that are joined to the frames, in SQL and in patterns: Parquet, CSV or JSON files,
-        or data frames of pandas, polars, pyarrow; see :mod:`sgstore.store.joining`.
+        or data frames of pandas, polars, pyarrow; see :mod:`sgstore.store._joins`.
+    max_spill : int
+        Most that a question may put on disk where memory does not suffice; bytes. 0: 10 GB.
 
     Raises
     ------
@@ -67,10 +64,12 @@ class Store:
         *,
         memory: int = 0,
         tables: Mapping[str, object] | UserTables | None = None,
+        max_spill: int = 0,
     ) -> None:
         self.file = StoreFile(
             path,
             memory=memory,
+            spill=max_spill,
             tables=tables if isinstance(tables, UserTables) else UserTables(tables or {}),
         )
         self._held: tuple[tuple[int, ...], Catalog] | None = None
@@ -90,7 +89,7 @@ class Store:
         ----------
         query : str, Pattern or networkx graph
             ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a pattern that was built
-            step by step, or drawn as a graph: see :class:`sgstore.lang.pattern.Pattern`.
+            step by step, or drawn as a graph: see :class:`sgstore.lang._patterns.Pattern`.
         **parameters
             Values of ``$name``: numbers, texts, truth values, or lists of these.
 
@@ -101,16 +100,16 @@ class Store:
         """
         if isinstance(query, str):
             return self._matches(query, parameters)
-        from sgstore.lang.pattern import Pattern
+        from sgstore.lang import Pattern
 
         pattern = query if isinstance(query, Pattern) else Pattern.of(query)
         given = {**pattern.parameters, **parameters}
         return self._matches(str(pattern), given)
 
     def _matches(self, text: str, parameters: Mapping[str, object]) -> Matches:
-        from sgstore.history.stories import Stories
+        from sgstore.temporal import TemporalMatches
 
-        return Stories(self.file, self.catalog, text, parameters)
+        return TemporalMatches(self.file, self.catalog, text, parameters)
 
     def check(
         self,
@@ -139,7 +138,7 @@ class Store:
         QueryError
             The text has no checks, or names what the store does not know; it says where.
         """
-        from sgstore.history.checks import CheckRun  # with numpy: only for who asks
+        from sgstore.temporal import CheckRun  # with numpy: only for who asks
 
         return CheckRun(
             self.file, self.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
@@ -191,8 +190,11 @@ class Store:
         """
         if abstraction is None:
             return self.file.graph(_ref(frame)).to_networkx()
-        derived = {folded(one.name) for one in self.file.deriving.sets()}
-        if folded(abstraction) in derived and folded(abstraction) not in abstractions():
+        derived = {normalize_name(one.name) for one in self.file.deriving.sets()}
+        if (
+            normalize_name(abstraction) in derived
+            and normalize_name(abstraction) not in abstractions()
+        ):
             whole = self.file.graph(_ref(frame))
             return self.file.deriving.graph(whole, abstraction).to_networkx()
         graph, about = self.file.abstracted.labelled(_ref(frame), abstraction)
@@ -234,7 +236,7 @@ class Store:
         abstraction: str = "RSV",
         ignore: Sequence[str] = (),
         limit: int = 10,
-    ) -> list[Like]:
+    ) -> list[SimilarFrames]:
         """Frames like one that is given: first those of the same class, then the most like, in runs.
 
         Two frames are compared by their graphs in an abstraction, as multisets of nodes by label and of edges
@@ -278,7 +280,7 @@ class Store:
         QueryError
             It has no ego, or nothing is called as what is to be ignored.
         """
-        from sgstore.lang.example import pattern_of
+        from sgstore.lang import pattern_of
 
         return pattern_of(self.file.graph(_ref(frame)), ignore)
 
@@ -295,7 +297,7 @@ class Store:
         return self.file.payload(_ref(frame), channel)
 
     def info(self) -> tuple[StoredTrace, ...]:
-        """The traces of the store, in the order in which they came."""
+        """The traces of the store, by name in natural order (``run2`` before ``run10``)."""
         return self.file.traces()
 
     def explain(self, text: str, /, **parameters: object) -> str:
@@ -328,7 +330,11 @@ class Store:
         StoreError
             There is no such frame.
         """
-        from sgstore.lang.whynot import WhyNot, looked_up, why_not  # with numpy: only for who asks
+        from sgstore.lang import (
+            WhyNot,
+            looked_up,
+            why_not,  # with numpy: only for who asks
+        )
 
         with self.file.snapshot():
             compiled = compile_query(text, self.catalog(), parameters)
@@ -347,7 +353,7 @@ class Store:
 
     def _view(self, frame: FrameRef, asked: Sequence[FrameAttribute]) -> FrameView:
         """A frame as patterns in memory see it, with what they ask that only the store can tell."""
-        from sgstore.lang.evaluation import FrameView
+        from sgstore.lang import FrameView
 
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}

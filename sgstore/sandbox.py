@@ -15,12 +15,13 @@ import errno
 import json
 import os
 import queue
+import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
@@ -29,10 +30,12 @@ from sgstore.errors import (
     QueryNameError,
     QuerySyntaxError,
     SgstoreError,
-    Span,
     SqlError,
     StoreError,
+    TextSpan,
 )
+from sgstore.files import new_place
+from sgstore.processes import command
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -70,17 +73,25 @@ class Answer:
         Numbers, texts, truth values, ``None``, and lists and dicts of these; anything else as text.
     truncated : bool
         Whether there were more rows than allowed.
-    left_out : tuple of str
-        Traces that cannot answer the pattern.
+    reasons : mapping of str to str
+        Why traces are left out that cannot answer the pattern, by name.
     graphs : bool
         Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+    notes : tuple of str
+        What may be a mistake; see :attr:`sgstore.matches.Matches.notes`.
     """
 
     columns: tuple[str, ...]
     rows: list[tuple[Any, ...]]
     truncated: bool
-    left_out: tuple[str, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict[str, str])
     graphs: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Traces that cannot answer the pattern."""
+        return tuple(self.reasons)
 
 
 class Sandbox:
@@ -120,7 +131,7 @@ class Sandbox:
         self._memory = memory
         self._max_rows = max_rows
         self._tables = {name: str(Path(path).resolve()) for name, path in (tables or {}).items()}
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: Path | None = None
         self._turn = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         with self._turn:
@@ -140,7 +151,7 @@ class Sandbox:
     @property
     def folder(self) -> Path | None:
         """Where the process keeps the tables that it has read; ``None`` while there is no process."""
-        return None if self._folder is None else Path(self._folder.name)
+        return self._folder
 
     def sql(self, text: str) -> Answer:
         """The rows of one statement that only reads.
@@ -176,19 +187,20 @@ class Sandbox:
         """The process, started if there is none."""
         if self._child is None or self._child.poll() is not None:
             self._kill()
-            self._child = subprocess.Popen(
-                [sys.executable, "-m", "sgstore.sandbox"],
+            self._child = subprocess.Popen(  # noqa: S603  a module of ours
+                command("sgstore.sandbox"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
             )
-            self._folder = tempfile.TemporaryDirectory(prefix="sgstore-sandbox-")
+            self._folder = new_place("sandbox")
+            self._folder.mkdir(mode=0o700)
             settings = {
                 "store": str(self._store.absolute()),
                 "memory": self._memory,
                 "rows": self._max_rows,
                 "tables": self._tables,
-                "folder": self._folder.name,
+                "folder": str(self._folder),
             }
             wait = START_S + READ_S * len(self._tables)
             reply = self._exchange(self._child, json.dumps(settings), wait)
@@ -238,12 +250,12 @@ class Sandbox:
             _bury(child, folder)
 
 
-def _bury(child: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str] | None) -> None:
+def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
     """Wait for the end of a process, and clear away what it leaves."""
     with child:  # which closes the pipes, too
         pass
     if folder is not None:
-        folder.cleanup()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _sent_and_read(
@@ -266,14 +278,15 @@ _ERRORS: Final = {"sql": SqlError, "store": StoreError}
 
 def _answer(reply: Any) -> Answer:
     if "query" in reply:
-        span = Span(*reply["span"]) if reply["span"] else None
+        span = TextSpan(*reply["span"]) if reply["span"] else None
         kind = _QUERY_ERRORS.get(reply["kind"], QueryError)
         raise kind(reply["reason"], text=reply["query"], span=span, hint=reply["hint"])
     if "error" in reply:
         raise _ERRORS[reply["kind"]](reply["error"])
     rows = [tuple(row) for row in reply["rows"]]
-    columns, left_out = tuple(reply["columns"]), tuple(reply["left_out"])
-    return Answer(columns, rows, reply["truncated"], left_out, reply.get("graphs", False))
+    columns, reasons = tuple(reply["columns"]), dict(reply["reasons"])
+    graphs, notes = reply.get("graphs", False), tuple(reply.get("notes", ()))
+    return Answer(columns, rows, reply["truncated"], reasons, graphs, notes)
 
 
 # The process ------------------------------------------------------------------------------------------------
@@ -300,7 +313,7 @@ def main() -> None:
     except SgstoreError as error:
         _send(replies, _refusal(error))
         return
-    _send(replies, {"columns": [], "rows": [], "truncated": False, "left_out": []})
+    _send(replies, {"columns": [], "rows": [], "truncated": False, "reasons": {}})
     for line in lines:
         question = json.loads(line)
         try:
@@ -310,18 +323,18 @@ def main() -> None:
 
 
 def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
-    graphs = False
+    graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
-        values, columns, truncated, left_out = rows.values, rows.columns, rows.truncated, ()
+        values, columns, truncated, reasons = rows.values, rows.columns, rows.truncated, {}
     else:
         matches = store.find(question["find"], **question["parameters"])
         values = list(_first(matches, most + 1))
         truncated = len(values) > most
-        values, columns, left_out = values[:most], matches.columns, matches.left_out
-        graphs = matches.graphs
+        values, columns, reasons = values[:most], matches.columns, matches.reasons
+        graphs, notes = matches.graphs, matches.notes
     plain = [[_plain(value) for value in row] for row in values]
-    about = {"truncated": truncated, "left_out": left_out, "graphs": graphs}
+    about = {"truncated": truncated, "reasons": reasons, "graphs": graphs, "notes": notes}
     return {"columns": columns, "rows": plain, **about}
 
 

@@ -1,4 +1,4 @@
--- sgstore: what is in a store, version 2.
+-- sgstore: what is in a store, version 4.
 --
 -- Users' SQL sees the VIEWS at the end of this file: frames, nodes, edges, pairs, lanes, entities, payloads.
 -- They are public and keep their columns. The TABLES are inside and may change with the version.
@@ -13,6 +13,9 @@
 -- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
 --
 -- Changes
+--   * Version 4: the kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
+--     Columns that are always known are NOT NULL; store_info holds a digest of these statements.
+--   * Version 3: bucket.joined; the states of the ego lie together (state, lane_state).
 --   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; lane_dists, by lane_state.is_own and map_reach. roles, by lane_role.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
 --     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
@@ -20,7 +23,7 @@
 --   * What may be missing is NULL everywhere: texts too (never the empty string).
 
 CREATE TYPE kind AS ENUM (
-  'car', 'truck', 'van', 'bus', 'motorcycle', 'bicycle', 'trailer', 'train', 'person', 'animal',
+  'car', 'truck', 'van', 'bus', 'motorcycle', 'bicycle', 'trailer', 'train', 'vehicle', 'person', 'animal',
   'traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign', 'prop', 'building', 'pole', 'barrier', 'vegetation', 'unknown',
   'lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint');
 
@@ -33,62 +36,62 @@ CREATE TYPE light_state AS ENUM ('unknown', 'off', 'red', 'yellow', 'green', 're
 
 -- What the store is -----------------------------------------------------------------------------------------------
 
-CREATE TABLE store_info (key VARCHAR, value VARCHAR);          -- schema_version, created_by
+CREATE TABLE store_info (key VARCHAR NOT NULL, value VARCHAR NOT NULL); -- schema_version, created_by
 
-CREATE TABLE config (config_id INTEGER, digest VARCHAR, settings JSON);   -- one row for each set of settings in use
+CREATE TABLE config (config_id INTEGER NOT NULL, digest VARCHAR NOT NULL, settings JSON NOT NULL); -- one row for each set of settings in use
 
 -- Traces ----------------------------------------------------------------------------------------------------------
 
 CREATE TABLE trace (
-  trace_id   BIGINT,      -- 39 bits of sha256(digest, ego)
-  name       VARCHAR,     -- unique; the file's name without its ending
-  uri        VARCHAR,     -- absolute path of the file when it was ingested
-  size       BIGINT,      -- of the file; with mtime_ns it tells that the file was replaced
-  mtime_ns   BIGINT,
-  digest     VARCHAR,     -- SHA-256 of the whole file
-  flavour    VARCHAR,     -- the reader: 'osi'
-  ego        VARCHAR,     -- the simulator's id of the ego, NULL without one
-  since      DOUBLE,      -- seconds of the recording from which on its frames were read, NULL: from the first
-  until      DOUBLE,      -- and up to which, included, NULL: to the last
-  map_id     INTEGER,     -- NULL without a map
-  config_id  INTEGER,
-  frames     INTEGER,
-  start_ns   BIGINT,      -- simulation time of the first and of the last frame
-  end_ns     BIGINT,
-  period_ns  BIGINT,      -- median difference of consecutive frames
-  origin_x   DOUBLE,      -- positions in state are relative to it
-  origin_y   DOUBLE,
-  origin_z   DOUBLE,
-  answers    VARCHAR[],   -- relations that this trace can answer; of the others nothing is known
-  report     JSON,        -- what reading it brought to light: losses, warnings, unknown types
-  ingested_at TIMESTAMP,
-  version    VARCHAR      -- of sgstore
+  trace_id   BIGINT NOT NULL,      -- 39 bits of sha256(digest, ego)
+  name       VARCHAR NOT NULL,     -- unique; the file's name without its ending
+  uri        VARCHAR NOT NULL,     -- absolute path of the file when it was ingested
+  size       BIGINT NOT NULL,      -- of the file; with mtime_ns it tells that the file was replaced
+  mtime_ns   BIGINT NOT NULL,
+  digest     VARCHAR NOT NULL,     -- SHA-256 of the whole file
+  flavour    VARCHAR NOT NULL,     -- the reader: 'osi'
+  ego        VARCHAR,              -- the simulator's id of the ego, NULL without one
+  since      DOUBLE,               -- seconds of the recording from which on its frames were read, NULL: from the first
+  until      DOUBLE,               -- and up to which, included, NULL: to the last
+  map_id     INTEGER,              -- NULL without a map
+  config_id  INTEGER NOT NULL,
+  frames     INTEGER NOT NULL,
+  start_ns   BIGINT NOT NULL,      -- simulation time of the first and of the last frame
+  end_ns     BIGINT NOT NULL,
+  period_ns  BIGINT NOT NULL,      -- median difference of consecutive frames
+  origin_x   DOUBLE NOT NULL,      -- positions in state are relative to it
+  origin_y   DOUBLE NOT NULL,
+  origin_z   DOUBLE NOT NULL,
+  answers    VARCHAR[] NOT NULL,   -- relations that this trace can answer; of the others nothing is known
+  report     JSON NOT NULL,        -- what reading it brought to light: losses, warnings, unknown types
+  ingested_at TIMESTAMP NOT NULL,
+  version    VARCHAR NOT NULL      -- of sgstore
 );
 
 CREATE TABLE channel (                                         -- channels of the traces' files
-  trace_id BIGINT, channel_id INTEGER, topic VARCHAR, schema VARCHAR, schema_encoding VARCHAR, message_encoding VARCHAR,
+  trace_id BIGINT NOT NULL, channel_id INTEGER NOT NULL, topic VARCHAR, schema VARCHAR, schema_encoding VARCHAR, message_encoding VARCHAR,
   role VARCHAR);                                               -- ground_truth, map, payload
 
 CREATE TABLE context (                                         -- messages that later ones depend on: maps, static data
-  trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT, chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
+  trace_id BIGINT NOT NULL, channel_id INTEGER NOT NULL, log_time_ns BIGINT NOT NULL, chunk_offset BIGINT NOT NULL, "offset" BIGINT NOT NULL, length BIGINT NOT NULL);
 
 CREATE TABLE entity (                                          -- what does not change about an entity of a trace
-  trace_id BIGINT, node_id INTEGER, kind kind, ident VARCHAR, special VARCHAR, subkind VARCHAR, type_name VARCHAR,
-  is_static BOOLEAN, map_ref VARCHAR, parked BOOLEAN,          -- parked: of vehicles, NULL where it is not known
+  trace_id BIGINT NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, ident VARCHAR, special VARCHAR, subkind VARCHAR, type_name VARCHAR,
+  is_static BOOLEAN NOT NULL, map_ref VARCHAR, parked BOOLEAN, -- parked: of vehicles, NULL where it is not known
   x FLOAT, y FLOAT, z FLOAT, heading FLOAT, length FLOAT, width FLOAT, height FLOAT);   -- pose of the static ones, else NULL
 
 -- Frames ----------------------------------------------------------------------------------------------------------
 
-CREATE TABLE bucket (bucket BIGINT, trace_id BIGINT, map_id INTEGER,
-  valid BIGINT,                                                -- mask of its frames
-  joined BIGINT);                                              -- mask of those at most 2.5 periods after the one before
+CREATE TABLE bucket (bucket BIGINT NOT NULL, trace_id BIGINT NOT NULL, map_id INTEGER,
+  valid BIGINT NOT NULL,                                       -- mask of its frames
+  joined BIGINT NOT NULL);                                     -- mask of those at most 2.5 periods after the one before
 
 CREATE TABLE frame (                                           -- ordered by frame_id
-  frame_id BIGINT, bucket BIGINT, bit TINYINT, trace_id BIGINT, map_id INTEGER, seq INTEGER,
-  time_ns BIGINT, log_time_ns BIGINT, ego INTEGER);            -- ego: node_id, NULL where it is absent
+  frame_id BIGINT NOT NULL, bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, map_id INTEGER, seq INTEGER NOT NULL,
+  time_ns BIGINT NOT NULL, log_time_ns BIGINT NOT NULL, ego INTEGER); -- ego: node_id, NULL where it is absent
 
 CREATE TABLE state (                                           -- ordered by is_ego (first), kind, bucket, node_id, frame_id
-  kind kind, frame_id BIGINT, node_id INTEGER, is_ego BOOLEAN,
+  kind kind NOT NULL, frame_id BIGINT NOT NULL, node_id INTEGER NOT NULL, is_ego BOOLEAN NOT NULL,
   x FLOAT, y FLOAT, z FLOAT,                                   -- about the trace's origin
   heading FLOAT, pitch FLOAT, roll FLOAT,                      -- rad
   speed FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, ax FLOAT, ay FLOAT, az FLOAT, yaw_rate FLOAT,
@@ -96,85 +99,86 @@ CREATE TABLE state (                                           -- ordered by is_
   lights SMALLINT, light_state light_state, steer FLOAT, throttle FLOAT, brake FLOAT, derived TINYINT,
   special VARCHAR, subkind VARCHAR);                           -- as in entity
 
-CREATE TABLE node (kind kind, bucket BIGINT, node_id INTEGER, mask BIGINT);             -- presence of static nodes
+CREATE TABLE node (kind kind NOT NULL, bucket BIGINT NOT NULL, node_id INTEGER NOT NULL, mask BIGINT NOT NULL); -- presence of static nodes
 
 CREATE TABLE edge (                                            -- ordered by all columns, in this order
-  relation relation, src_is_ego BOOLEAN, dst_is_ego BOOLEAN, src_kind kind, dst_kind kind,
-  bucket BIGINT, src INTEGER, dst INTEGER, mask BIGINT);
+  relation relation NOT NULL, src_is_ego BOOLEAN NOT NULL, dst_is_ego BOOLEAN NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL,
+  bucket BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, mask BIGINT NOT NULL);
 
 CREATE TABLE lane_state (                                      -- attributes of isIn edges from entities to lanes
-  kind kind, frame_id BIGINT, node_id INTEGER, lane INTEGER,
-  overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN,    -- offset to the left, m; rad
+  kind kind NOT NULL, frame_id BIGINT NOT NULL, node_id INTEGER NOT NULL, lane INTEGER NOT NULL,
+  overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN NOT NULL, -- offset to the left, m; rad
   along FLOAT,                                                 -- of the centre, from the start of the lane, m
-  is_own BOOLEAN, is_ego BOOLEAN);                             -- one by which ways along the lanes are told; as in state
+  is_own BOOLEAN NOT NULL, is_ego BOOLEAN NOT NULL);           -- one by which ways along the lanes are told; as in state
 
 CREATE TABLE lane_gap (                                        -- attribute of the edges src follows dst and dst leads src
-  frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);       -- from bumper to bumper along the lanes, m
+  frame_id BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT); -- from bumper to bumper along the lanes, m
 
 CREATE TABLE frame_class (                                     -- ordered by all columns; made at ingest
-  abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);  -- class: NULL where too symmetric to be told
+  abstraction VARCHAR NOT NULL, class UUID, bucket BIGINT NOT NULL, mask BIGINT NOT NULL); -- class: NULL where too symmetric to be told
 
 CREATE TABLE lane_role (                                       -- ordered by all columns; what lanes are to the ego in RSV
-  role VARCHAR, bucket BIGINT, node_id INTEGER, mask BIGINT);
+  role VARCHAR NOT NULL, bucket BIGINT NOT NULL, node_id INTEGER NOT NULL, mask BIGINT NOT NULL);
 
 CREATE TABLE later_class (                                     -- the same of abstractions that were asked for later
-  abstraction VARCHAR, class UUID, bucket BIGINT, mask BIGINT);
+  abstraction VARCHAR NOT NULL, class UUID, bucket BIGINT NOT NULL, mask BIGINT NOT NULL);
 
 -- Other relations from the same states: sets that were derived, each under its name
 
 CREATE TABLE derived (                                         -- one row for each set and trace
-  name VARCHAR, trace_id BIGINT, settings JSON, digest VARCHAR, answers VARCHAR[], derived_at TIMESTAMP, version VARCHAR);
+  name VARCHAR NOT NULL, trace_id BIGINT NOT NULL, settings JSON NOT NULL, digest VARCHAR NOT NULL, answers VARCHAR[] NOT NULL, derived_at TIMESTAMP NOT NULL, version VARCHAR NOT NULL);
 
 CREATE TABLE derived_node (                                    -- all nodes of its graphs, those that move too
-  set_name VARCHAR, moves BOOLEAN, kind kind, bucket BIGINT, node_id INTEGER, mask BIGINT);
+  set_name VARCHAR NOT NULL, moves BOOLEAN NOT NULL, kind kind NOT NULL, bucket BIGINT NOT NULL, node_id INTEGER NOT NULL, mask BIGINT NOT NULL);
 
 CREATE TABLE derived_edge (                                    -- as edge
-  set_name VARCHAR, relation relation, src_is_ego BOOLEAN, dst_is_ego BOOLEAN, src_kind kind, dst_kind kind,
-  bucket BIGINT, src INTEGER, dst INTEGER, mask BIGINT);
+  set_name VARCHAR NOT NULL, relation relation NOT NULL, src_is_ego BOOLEAN NOT NULL, dst_is_ego BOOLEAN NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL,
+  bucket BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, mask BIGINT NOT NULL);
 
 CREATE TABLE derived_gap (                                     -- as lane_gap
-  set_name VARCHAR, frame_id BIGINT, src INTEGER, dst INTEGER, gap FLOAT);
+  set_name VARCHAR NOT NULL, frame_id BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT);
 
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
-  bucket BIGINT, bit TINYINT, trace_id BIGINT, channel_id INTEGER, log_time_ns BIGINT,
-  chunk_offset BIGINT, "offset" BIGINT, length BIGINT);
+  bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, channel_id INTEGER NOT NULL, log_time_ns BIGINT NOT NULL,
+  chunk_offset BIGINT NOT NULL, "offset" BIGINT NOT NULL, length BIGINT NOT NULL);
 
 CREATE TABLE event (                                           -- what the simulator says has happened
-  trace_id BIGINT, frame_id BIGINT,                            -- of the frame that is nearest in time
-  time_ns BIGINT, log_time_ns BIGINT, kind VARCHAR, ident VARCHAR, other VARCHAR, value DOUBLE, detail VARCHAR);
+  trace_id BIGINT NOT NULL, frame_id BIGINT NOT NULL,          -- of the frame that is nearest in time
+  time_ns BIGINT, log_time_ns BIGINT, kind VARCHAR NOT NULL, ident VARCHAR, other VARCHAR, value DOUBLE, detail VARCHAR);
 
 CREATE TABLE imported (                                        -- frames that came as graphs: what their file calls them
-  bucket BIGINT, bit TINYINT, trace_id BIGINT, graph VARCHAR, place BIGINT, images BIGINT);   -- place: row or line
+  bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, graph VARCHAR, place BIGINT NOT NULL, images BIGINT NOT NULL); -- place: row or line
 
 -- Maps: once each, whatever the number of traces on them ----------------------------------------------------------
 
-CREATE TABLE map (map_id INTEGER, digest VARCHAR, name VARCHAR, text VARCHAR);
+CREATE TABLE map (map_id INTEGER NOT NULL, digest VARCHAR NOT NULL, name VARCHAR NOT NULL, text VARCHAR);
 
 CREATE TABLE map_node (
-  map_id INTEGER, node_id INTEGER, kind kind, name VARCHAR,   -- name: 'road/section/lane' of a lane, else the id in the map
+  map_id INTEGER NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, name VARCHAR, -- name: 'road/section/lane' of a lane, else the id in the map
   x DOUBLE, y DOUBLE, z DOUBLE, heading DOUBLE,                -- a point on it, and its direction there
   lane_type VARCHAR, road VARCHAR, section INTEGER, lane INTEGER, junction VARCHAR, turn VARCHAR,
   length DOUBLE, width DOUBLE, speed_limit DOUBLE, curvature DOUBLE);   -- m, m (mean), m/s, 1/m
 
 CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
-  map_id INTEGER, relation relation, src_kind kind, dst_kind kind, src INTEGER, dst INTEGER);
+  map_id INTEGER NOT NULL, relation relation NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL);
 
 CREATE TABLE map_reach (                                       -- for each two lanes that a way of up to 200 m joins
-  map_id INTEGER, src INTEGER, dst INTEGER,                    -- lanes, a lane and itself among them
-  start DOUBLE);                                               -- of dst, from the start of src; below 0: one drives back to src; m
+  map_id INTEGER NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, -- lanes, a lane and itself among them
+  start DOUBLE NOT NULL);                                      -- of dst, from the start of src; below 0: one drives back to src; m
 
 -- For sgstore verify ------------------------------------------------------------------------------------------------
 
 CREATE TABLE manifest (                                        -- what was published: rows of a trace, or of a map
-  trace_id BIGINT, map_id INTEGER, "table" VARCHAR, rows BIGINT, checksum BIGINT);     -- store/checksums.py says how
+  trace_id BIGINT, map_id INTEGER, "table" VARCHAR NOT NULL, rows BIGINT NOT NULL, checksum BIGINT NOT NULL); -- store/checksums.py says how
 
 -- For the compiler ------------------------------------------------------------------------------------------------
 
-CREATE TABLE bits (bit TINYINT, m BIGINT);                     -- 0 … 59 and 1 << bit
+CREATE TABLE bits (bit TINYINT NOT NULL, m BIGINT NOT NULL);   -- 0 … 59 and 1 << bit
 INSERT INTO bits SELECT range::TINYINT, 1::BIGINT << range FROM range(60);
 
 -- The public views -------------------------------------------------------------------------------------------------
 --
+-- No NOT IN: versions of DuckDB write it down in different ways, and views are compared by their text.
 -- One row per thing per frame; metres, seconds, m/s, degrees; a heading or bearing is counter-clockwise, in (-180, 180].
 -- They are written so that filters on frame_id, relation and kinds reach the scans of the tables, and so that joining
 -- them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).
@@ -201,20 +205,21 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
 FROM state s JOIN trace t ON t.trace_id = s.frame_id >> 24
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
-       NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
+       NULL, NULL, n.still, n.still, n.still, n.still, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
        n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature
 FROM frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
-         m.length, m.width, NULL::FLOAT AS height, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature
+         m.length, m.width, NULL::FLOAT AS height,
+         CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature
   FROM bucket b JOIN node k ON k.bucket = b.bucket JOIN map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL
   SELECT k.bucket, k.mask, k.node_id, k.kind, k.kind || ' ' || k.node_id, e.special, e.subkind,
-         t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+         t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, 0::FLOAT, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
   FROM node k JOIN trace t ON t.trace_id = k.bucket >> 18 JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s; accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
 
 CREATE VIEW edges AS
 SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego
@@ -242,32 +247,44 @@ COMMENT ON VIEW lane_gaps IS 'How far it is along the lanes: one row for each ed
 
 -- Pairs are not stored: they are functions of two states. The same formulas as geometry.py (a test holds them together);
 -- each layer names what the next one needs, because DuckDB shares named columns and not repeated expressions. Around the
--- centre of a lies the octagon that both boxes make (Minkowski sum); s1 … s4: how far b's centre is beyond the edges across
--- a's axes and b's, t1 … t4: how far past their ends.
+-- centre of a lies the octagon that both boxes make (Minkowski sum). Its edges lie at r1 and r2 along and across a's axis and
+-- at r3 and r4 along and across b's; s1 … s4: how far b's centre is beyond them, t1 … t4: how far past their ends; o1 … o4
+-- and w1 … w4: b's centre and its speed against a's along each axis, which is turned so that the speed is positive (and never
+-- 0: what stands on an axis meets there in ages or has met for ages). On axis 1 the boxes overlap from (-r1 - o1) / w1 to
+-- (r1 - o1) / w1; they touch while they overlap on all four.
 CREATE VIEW pairs AS
 SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * ceil((bearing - 180) / 360) AS bearing,
        turned - 360 * ceil((turned - 180) / 360) AS rel_heading, px AS lon, py AS lat, closing_speed,
-       CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS ttc,
-       CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
+       CASE WHEN meets <= parts AND parts >= 0 AND (rel_speed >= 1e-6 OR meets <= 0) AND r1 + r2 IS NOT NULL THEN greatest(meets, 0) END AS ttc,
+       CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, rel_speed,
        src_kind, dst_kind, src_is_ego, dst_is_ego,
        CASE WHEN s1 < 0 THEN 0 ELSE s1 END AS lon_gap, CASE WHEN s2 < 0 THEN 0 ELSE s2 END AS lat_gap,
-       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading
+       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading,
+       CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS closing_time
 FROM (
-  SELECT *, CASE WHEN la + wa + lb + wb IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
+  SELECT *, greatest((-r1 - o1) / w1, (-r2 - o2) / w2, (-r3 - o3) / w3, (-r4 - o4) / w4) AS meets,
+      least((r1 - o1) / w1, (r2 - o2) / w2, (r3 - o3) / w3, (r4 - o4) / w4) AS parts,
+      CASE WHEN r1 + r2 IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
       CASE WHEN s1 > 0 THEN s1 * s1 + greatest(t1, 0) * greatest(t1, 0) END, CASE WHEN s2 > 0 THEN s2 * s2 + greatest(t2, 0) * greatest(t2, 0) END,
       CASE WHEN s3 > 0 THEN s3 * s3 + greatest(t3, 0) * greatest(t3, 0) END, CASE WHEN s4 > 0 THEN s4 * s4 + greatest(t4, 0) * greatest(t4, 0) END)) END AS gap
   FROM (
     SELECT *,
-        abs(px) - la - lb * co - wb * si AS s1, abs(CASE WHEN px < 0 THEN -py ELSE py END - k * (lb * si - wb * co)) - wa AS t1,
-        abs(py) - wa - lb * si - wb * co AS s2, abs(CASE WHEN py < 0 THEN -px ELSE px END - k * (lb * co - wb * si)) - la AS t2,
-        abs(qx) - lb - la * co - wa * si AS s3, abs(CASE WHEN qx < 0 THEN -qy ELSE qy END + k * (la * si - wa * co)) - wb AS t3,
-        abs(qy) - wb - la * si - wa * co AS s4, abs(CASE WHEN qy < 0 THEN -qx ELSE qx END + k * (la * co - wa * si)) - lb AS t4
+        abs(px) - r1 AS s1, abs(CASE WHEN px < 0 THEN -py ELSE py END - k * (lb * si - wb * co)) - wa AS t1,
+        abs(py) - r2 AS s2, abs(CASE WHEN py < 0 THEN -px ELSE px END - k * (lb * co - wb * si)) - la AS t2,
+        abs(qx) - r3 AS s3, abs(CASE WHEN qx < 0 THEN -qy ELSE qy END + k * (la * si - wa * co)) - wb AS t3,
+        abs(qy) - r4 AS s4, abs(CASE WHEN qy < 0 THEN -qx ELSE qx END + k * (la * co - wa * si)) - lb AS t4,
+        CASE WHEN ux < 0 THEN -px ELSE px END AS o1, CASE WHEN uy < 0 THEN -py ELSE py END AS o2,
+        CASE WHEN vx < 0 THEN -qx ELSE qx END AS o3, CASE WHEN vy < 0 THEN -qy ELSE qy END AS o4,
+        abs(ux) + 1e-200 AS w1, abs(uy) + 1e-200 AS w2, abs(vx) + 1e-200 AS w3, abs(vy) + 1e-200 AS w4
     FROM (
       SELECT *, dx * ca + dy * sa AS px, dy * ca - dx * sa AS py, dx * cb + dy * sb AS qx, dy * cb - dx * sb AS qy,
-          abs(c) AS co, abs(s) AS si, CASE WHEN c * s < 0 THEN -1 ELSE 1 END AS k,
-          -(dx * dvx + dy * dvy) / nullif(sqrt(dd), 0) AS closing_speed
+          dvx * ca + dvy * sa AS ux, dvy * ca - dvx * sa AS uy, dvx * cb + dvy * sb AS vx, dvy * cb - dvx * sb AS vy,
+          la + lb * co + wb * si AS r1, wa + lb * si + wb * co AS r2, lb + la * co + wa * si AS r3, wb + la * si + wa * co AS r4,
+          CASE WHEN c * s < 0 THEN -1 ELSE 1 END AS k, -(dx * dvx + dy * dvy) / nullif(sqrt(dd), 0) AS closing_speed
       FROM (
-        SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd,
+        SELECT *, abs(c) AS co, abs(s) AS si
+        FROM (
+          SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
             CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned, degrees(hb - atan2(dy, dx)) AS sighted
         FROM (
           SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
@@ -276,9 +293,9 @@ FROM (
               cos(a.heading::DOUBLE) AS ca, sin(a.heading::DOUBLE) AS sa, cos(b.heading::DOUBLE) AS cb, sin(b.heading::DOUBLE) AS sb,
               a.length::DOUBLE / 2 AS la, a.width::DOUBLE / 2 AS wa, b.length::DOUBLE / 2 AS lb, b.width::DOUBLE / 2 AS wb,
               sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
-          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id)))));
+          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id))))));
 
-COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: gap at closing_speed, s, NULL where they do not approach; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; for how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: time until the footprints first touch if both keep their velocity, s, 0 where they overlap, NULL where they never touch or their velocities differ by less than 1e-6 m/s; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; closing_time: gap at closing_speed, s, NULL where the centres do not approach; for how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
 
 -- A view of its own, and no column of pairs: who asks for other numbers should not pay for these joins.
 CREATE VIEW lane_dists AS

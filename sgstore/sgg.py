@@ -1,12 +1,12 @@
 """The scene graph generator: frames of a trace and a road map in, scene graphs out, a block at a time.
 
 What is in a graph. The range of an ego is a disc about its centre, or another area, as
-:mod:`sgstore.relations.extent` says; an entity is in it when its footprint meets it. What has no extent counts
+:mod:`sgstore.relations._extent` says; an entity is in it when its footprint meets it. What has no extent counts
 as a point, and what has no position is in no range; the ego always is. *Frames without an ego*, or with one
 whose position is missing, have no range: their graphs hold all entities and the whole map, and no relations of
-an ego. Parts of the map are present as :meth:`sgstore.relations.survey.Survey.ground` says; the static edges
-among them are the map's own. What the client does not want (:mod:`sgstore.relations.keeping`) is as if it were
-not there.
+an ego. Parts of the map are present as :meth:`sgstore.relations._map_context.LaneContact.ground` says; the
+static edges among them are the map's own. What the client does not want (:mod:`sgstore.relations._filters`)
+is as if it were not there.
 
 A relation that cannot be computed, because a heading or a position is missing, is absent; what a trace cannot
 answer at all is said by :attr:`SceneGraphGenerator.answers`.
@@ -20,42 +20,61 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.abstractions import Classes, Grounds, Seen, abstraction_named, lane_roles
-from sgstore.graph import Edges, GraphBlock, LaneStates, Presence
-from sgstore.online import Online
-from sgstore.relations import RELATIONS
-from sgstore.relations.contact import contacts
-from sgstore.relations.extent import Extent, Places
-from sgstore.relations.following import gaps
-from sgstore.relations.keeping import Keeping, renamed
-from sgstore.relations.pairs import joined_pairs, near_pairs, of_kinds, related_pairs
-from sgstore.relations.parking import Parking
-from sgstore.relations.scene import IS_SIGNAL, Bodies, Scene
-from sgstore.relations.still import StillPairs
-from sgstore.relations.survey import Survey
-from sgstore.relations.waypoints import waypoints_of
+from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
+from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
+from sgstore.relations import (
+    IS_SIGNAL,
+    NEAR,
+    RELATIONS,
+    TOUCHING,
+    BlockScene,
+    Bodies,
+    Crowds,
+    EgoPoses,
+    Extent,
+    Keeping,
+    LaneContact,
+    Parking,
+    StillPairs,
+    contacts,
+    contacts_of,
+    gaps,
+    gathered,
+    joined_pairs,
+    near_pairs,
+    of_kinds,
+    pieces,
+    related_pairs,
+    renamed,
+    waypoints_of,
+)
+from sgstore.step import Stepper
+from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 from sgstore.vocabulary import RELATIONS as VOCABULARY
 from sgstore.world import States
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from sgstore.config import Config
     from sgstore.graph import SceneGraph
-    from sgstore.online import Frame
-    from sgstore.relations.extent import Areas
-    from sgstore.relations.scene import Ground, Standing
+    from sgstore.relations import Areas, MapContext, Standing
     from sgstore.roads import RoadMap
-    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
+    from sgstore.step import Frame
+    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints, Loss
 
     Rows = NDArray[np.intp]
+    Gathered = tuple[tuple[Rows, Rows], Bools]
 
 MAP_RELATIONS: Final = frozenset(
     {"isIn", "travelsTo", "laneChange", "opposes", "toLeftOf", "toRightOf", "conflictsWith"}
 )
 """Relations among parts of a map. Every map answers them: where it has no such edge, there is none."""
+
+
+_OF_PAIRS: Final = frozenset({*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf"})
 
 
 class SceneGraphGenerator:
@@ -84,8 +103,11 @@ class SceneGraphGenerator:
         self._road_map = road_map
         waypoints = waypoints_of(road_map, config.lanes)
         road_map = road_map if waypoints is None else waypoints.road_map
-        self._online: Online | None = None
-        self._survey = None if road_map is None else Survey(road_map, config.lanes.ahead, waypoints)
+        self._online: Stepper | None = None
+        self._crowds = Crowds()
+        self._survey = (
+            None if road_map is None else LaneContact(road_map, config.lanes.ahead, waypoints)
+        )
         self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
         self._extent = Extent(config.range, road_map)
         self._keeping = Keeping(config, road_map)
@@ -93,7 +115,7 @@ class SceneGraphGenerator:
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self._still = StillPairs(config)
         self._parking = Parking()
-        self._grounds: Grounds | None = None
+        self._grounds: MapColumns | None = None
         self._classes = Classes()
         self.answers = self._answers(road_map)
 
@@ -108,6 +130,19 @@ class SceneGraphGenerator:
         """(n,) int8: of each entity whether it is parked, as all blocks so far tell: 1 or 0; -1: not known."""
         return self._parking.parked
 
+    def pieces(self, frames: FrameBlock, egos: int = 1) -> Iterator[FrameBlock]:
+        """The next frames as blocks whose graphs fit into memory, however crowded they are.
+
+        Parameters
+        ----------
+        frames : FrameBlock
+        egos : int
+            For how many egos graphs are made.
+        """
+        entities = renamed(frames.entities, self._config.types)
+        kinds = np.concatenate([self._kinds[: entities.first], entities.kind])
+        return pieces(frames, kinds, self._config, egos)
+
     def block(self, frames: FrameBlock) -> GraphBlock:
         """The scene graphs of the next frames, as their ego has them.
 
@@ -119,8 +154,6 @@ class SceneGraphGenerator:
         """
         return self.blocks(frames, [frames.ego])[0]
 
-    # Positions come from files and may be absurd; what cannot be computed of them is absent.
-    @np.errstate(over="ignore", invalid="ignore")
     def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
         """The scene graphs of the next frames as several egos have them; work that they share is done once.
 
@@ -141,12 +174,22 @@ class SceneGraphGenerator:
         ValueError
             As for :meth:`block`.
         """
+        return list(self.one_by_one(frames, egos))
+
+    def one_by_one(self, frames: FrameBlock, egos: Sequence[Ints]) -> Iterator[GraphBlock]:
+        """The same, one after another: who lets go of each needs the memory of one."""
+        views, world = self._views(frames, egos)
+        for view in views:
+            yield self._graphs(view, world)
+
+    # Positions come from files and may be absurd; what cannot be computed of them is absent.
+    @np.errstate(over="ignore", invalid="ignore")
+    def _views(self, frames: FrameBlock, egos: Sequence[Ints]) -> tuple[list[_View], _World]:
         frames = replace(frames, entities=renamed(frames.entities, self._config.types))
         self._learn(frames)
         views = [self._view(replace(frames, ego=ego)) for ego in egos]
         keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(view.keys for view in views)]))
-        world = self._world(frames, keys)
-        return [self._graphs(view, world) for view in views]
+        return views, self._world(frames, keys)
 
     def _view(self, frames: FrameBlock) -> _View:
         ego, states = _ego_rows(frames), len(frames.states)
@@ -158,7 +201,7 @@ class SceneGraphGenerator:
 
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
-        still = self._still.among(keys, len(frames.states), len(self._scenery))
+        rows = keys, len(frames.states), len(self._scenery)
         standing = None
         if self._survey is not None:
             standing = self._survey.standing(bodies)
@@ -166,26 +209,61 @@ class SceneGraphGenerator:
         return _World(
             keys=keys,
             bodies=bodies,
-            near=joined_pairs([near_pairs(bodies, self._config), still]),
-            contacts=contacts(bodies),
+            rows=rows,
+            near=self._near(bodies, rows, len(frames)),
+            contacts=gathered(partial(contacts, bodies), bodies.frame, len(frames)),
             standing=standing,
         )
 
-    def _graphs(self, view: _View, world: _World) -> GraphBlock:
+    def _near(self, bodies: Bodies, rows: tuple[Ints, int, int], frames: int) -> Gathered:
+        """Pairs of bodies that are near one another, ``rows`` as of :meth:`StillPairs.among`."""
+
+        def chunks(unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
+            yield from near_pairs(bodies, self._config, unwanted)
+            yield from self._still.among(bodies, *rows, unwanted)
+
+        return gathered(chunks, bodies.frame, frames)
+
+    def _of_view(self, view: _View, world: _World) -> _World:
+        """The part of the world that one ego sees; what is a crowd for all of them need be none for it."""
         part = world.of(view.keys)
+        if part is world:
+            return world
+        bodies, frames = part.bodies, len(view.frames)
+        (near, over_near), (touching, over_touching) = part.near, part.contacts
+        if over_near.any():
+            rows = np.flatnonzero(over_near[bodies.frame])
+            keys, states, scenery = part.rows
+            few = bodies.take(rows), (keys[rows], states, scenery)
+            found, over_near = self._near(*few, frames)
+            near = joined_pairs([near, (rows[found[0]], rows[found[1]])])
+        if over_touching.any():
+            rows = np.flatnonzero(over_touching[bodies.frame])
+            few = bodies.take(rows)
+            found, over_touching = gathered(partial(contacts, few), few.frame, frames)
+            touching = joined_pairs([touching, (rows[found[0]], rows[found[1]])])
+        return replace(part, near=(near, over_near), contacts=(touching, over_touching))
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _graphs(self, view: _View, world: _World) -> GraphBlock:
+        part = self._of_view(view, world)
         bodies, standing = part.bodies, part.standing
+        (near, over_near), (touching, over_touching) = part.near, part.contacts
         ground = None
         if self._survey is not None and standing is not None:
             ground = self._survey.ground(bodies, standing, view.areas, self._keeping.parts)
-        pairs = related_pairs(bodies, view.ego, part.near, self._config)
-        touching = of_kinds(bodies, view.ego, part.contacts, self._config.pairs)
-        scene = Scene(self._config, bodies, view.ego, pairs, touching, ground)
+        pairs = related_pairs(bodies, view.ego, near, self._config)
+        if over_touching.any():
+            touching = joined_pairs([touching, contacts_of(bodies, view.ego, over_touching)])
+        touching = of_kinds(bodies, view.ego, touching, self._config.pairs)
+        scene = BlockScene(self._config, bodies, view.ego, pairs, touching, ground)
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground and self._keeping.present(ground.present)),
             edges=self._keeping.edges(Edges.chained([f.edges(scene) for f in self._families])),
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
             gaps=self._keeping.gaps(gaps(bodies, ground)),
+            crowded=_crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}, self.answers),
         )
 
     def step(self, frame: Frame) -> SceneGraph:
@@ -201,7 +279,7 @@ class SceneGraphGenerator:
         Parameters
         ----------
         frame : Frame
-            See :class:`sgstore.online.Frame`.
+            See :class:`sgstore.step.Frame`.
         egos : sequence of str
             Ids of the egos. Empty: the ego of the frame, else that of the config.
 
@@ -219,13 +297,21 @@ class SceneGraphGenerator:
 
         Notes
         -----
-        Memory does not grow with time: see :mod:`sgstore.online`. Steps and blocks do not know of one another.
+        Memory does not grow with time: see :mod:`sgstore.step`. Steps and blocks do not know of one another.
         """
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
             shown = map_of_graphs(self._road_map, self._config)
-            self._online = Online(fresh, shown, self._config.ego)
-        return self._online.step(frame.meant(self._config.types), egos)
+            self._online = Stepper(fresh, shown, self._config.ego)
+        graphs = self._online.step(frame.meant(self._config.types), egos)
+        for graph in self._online.last[0] if self._online.last else ():
+            self._crowds.see(graph)
+        return graphs
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What the graphs of the steps so far lack: the pairs of frames that were too crowded."""
+        return self._crowds.losses(self._config)
 
     def class_of(self, abstraction: str = "RSV", number: int = 0) -> str | None:
         """The class of the graph of the last step in an abstraction; the one that it would have in a store.
@@ -274,15 +360,15 @@ class SceneGraphGenerator:
         _, lanes, roles = lane_roles(self._seen(number))
         return dict(zip(lanes.tolist(), roles, strict=True))
 
-    def _seen(self, number: int) -> Seen:
+    def _seen(self, number: int) -> GraphColumns:
         """A graph of the last step as abstractions see it."""
         if self._online is None or self._online.last is None:
             raise ValueError("there was no step yet")
         graphs, kinds = self._online.last
         if self._grounds is None and self._road_map is not None:
             shown = map_of_graphs(self._road_map, self._config)
-            self._grounds = None if shown is None else Grounds.of(shown)
-        return Seen.of(graphs[number], kinds, self._grounds)
+            self._grounds = None if shown is None else MapColumns.of(shown)
+        return GraphColumns.of(graphs[number], kinds, self._grounds)
 
     @property
     def kinds(self) -> Codes:
@@ -406,8 +492,9 @@ class _World:
 
     keys: Ints
     bodies: Bodies
-    near: tuple[Rows, Rows]
-    contacts: tuple[Rows, Rows]
+    rows: tuple[Ints, int, int]
+    near: Gathered
+    contacts: Gathered
     standing: Standing | None
 
     def of(self, keys: Ints) -> _World:
@@ -420,8 +507,9 @@ class _World:
         return _World(
             keys=keys,
             bodies=self.bodies.take(rows),
-            near=_among(place, self.near),
-            contacts=_among(place, self.contacts),
+            rows=(keys, *self.rows[1:]),
+            near=(_among(place, self.near[0]), self.near[1]),
+            contacts=(_among(place, self.contacts[0]), self.contacts[1]),
             standing=None if self.standing is None else self.standing.take(place),
         )
 
@@ -431,6 +519,18 @@ def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
     a, b = place[pairs[0]], place[pairs[1]]
     both = (a >= 0) & (b >= 0)
     return a[both], b[both]
+
+
+def _crowded(
+    bodies: Bodies, over: Mapping[str, Bools], answers: tuple[str, ...]
+) -> tuple[tuple[str, int, int], ...]:
+    """The frames with too many pairs, and how many bodies they have; none where no such relation is wanted."""
+    found: list[tuple[str, int, int]] = []
+    for what, frames in over.items():
+        wanted = "overlaps" in answers if what == TOUCHING else bool(_OF_PAIRS & set(answers))
+        rows = np.flatnonzero(frames & wanted).tolist()
+        found += [(what, frame, int((bodies.frame == frame).sum())) for frame in rows]
+    return tuple(found)
 
 
 def _ego_rows(frames: FrameBlock) -> Rows:
@@ -443,11 +543,11 @@ def _ego_rows(frames: FrameBlock) -> Rows:
     return ego
 
 
-def _places(frames: FrameBlock, ego: Rows) -> Places:
+def _places(frames: FrameBlock, ego: Rows) -> EgoPoses:
     """Where the egos of the frames are; NaN where there is none."""
     of = frames.states
     columns = (of.x, of.y, of.heading, _bottom(of))
-    return Places(*(np.append(column, np.nan)[ego] for column in columns))
+    return EgoPoses(*(np.append(column, np.nan)[ego] for column in columns))
 
 
 def _boxes(states: States) -> Floats:
@@ -460,17 +560,17 @@ def _bottom(states: States) -> Floats:
     return states.z - np.nan_to_num(states.height) / 2
 
 
-def _presence(bodies: Bodies, present: Bools | None) -> Presence:
+def _presence(bodies: Bodies, present: Bools | None) -> StaticPresence:
     """The static nodes of the graphs: scenery, and parts of the map."""
     still = np.flatnonzero(~bodies.moves)
     frame, column = np.nonzero(present) if present is not None else (still[:0], still[:0])
-    return Presence(
+    return StaticPresence(
         np.concatenate([bodies.frame[still], frame]),
         np.concatenate([bodies.node[still], -1 - column]),
     )
 
 
-def _lane_states(bodies: Bodies, ground: Ground | None) -> LaneStates:
+def _lane_states(bodies: Bodies, ground: MapContext | None) -> LaneStates:
     if ground is None:
         none = np.zeros(0, np.int64)
         empty = np.zeros(0)

@@ -12,6 +12,7 @@ the canonical spelling is stored and printed.
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from dataclasses import dataclass
 from functools import cache
@@ -30,6 +31,7 @@ ENTITY_KINDS: Final = (
     "bicycle",
     "trailer",
     "train",
+    "vehicle",
     "person",
     "animal",
     "traffic_light",
@@ -44,14 +46,24 @@ ENTITY_KINDS: Final = (
     "vegetation",
     "unknown",
 )
-"""Kinds of entities: what has a pose and, mostly, a box."""
+"""Kinds of entities: what has a pose and, mostly, a box. ``vehicle``: a vehicle, and no more is told of it."""
 
 MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint")
 """Kinds of the parts of a road map. ``off_road`` is a single node: whatever is not a driving lane."""
 
 KINDS: Final = ENTITY_KINDS + MAP_KINDS
 
-VEHICLES: Final = ("car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train")
+VEHICLES: Final = (
+    "car",
+    "truck",
+    "van",
+    "bus",
+    "motorcycle",
+    "bicycle",
+    "trailer",
+    "train",
+    "vehicle",
+)
 SIGNALS: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
 
 SUPER_KINDS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -61,7 +73,10 @@ SUPER_KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "signal": SIGNALS,
     "entity": ENTITY_KINDS,
 }
-"""Labels that stand for several kinds. ``vru``: vulnerable road users."""
+"""Labels that stand for several kinds. ``vru``: vulnerable road users.
+
+As a label ``Vehicle`` is every vehicle; as a kind, ``vehicle`` is one of which no more is told.
+"""
 
 LABEL_ALIASES: Final[Mapping[str, str]] = {"pedestrian": "person", "walker": "person"}
 """Other words for a kind, as users of Scenic, CARLA and nuScenes know them."""
@@ -166,41 +181,76 @@ RELATION_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerat
 LIGHT_STATE_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(LIGHT_STATES)}
 
 
-def folded(name: str) -> str:
+def normalize_name(name: str) -> str:
     """A name without case and underscores, as names are compared."""
     return name.replace("_", "").lower()
 
 
-_RELATIONS_FOLDED: Final = {folded(name): name for name in RELATIONS} | {
-    folded(alias): name for alias, name in RELATION_ALIASES.items()
+_RELATIONS_FOLDED: Final = {normalize_name(name): name for name in RELATIONS} | {
+    normalize_name(alias): name for alias, name in RELATION_ALIASES.items()
 }
+_KINDS_FOLDED: Final = {normalize_name(name): name for name in KINDS}
 _LABELS_FOLDED: Final[Mapping[str, tuple[str, ...]]] = (
-    {folded(name): (name,) for name in KINDS}
-    | {folded(name): kinds for name, kinds in SUPER_KINDS.items()}
-    | {folded(alias): (name,) for alias, name in LABEL_ALIASES.items()}
+    {normalize_name(name): (name,) for name in KINDS}
+    | {normalize_name(name): kinds for name, kinds in SUPER_KINDS.items()}
+    | {normalize_name(alias): (name,) for alias, name in LABEL_ALIASES.items()}
 )
 
 
 def relation_named(name: str) -> str | None:
     """The relation that a user's name means, or ``None``."""
-    return _RELATIONS_FOLDED.get(folded(name))
+    return _RELATIONS_FOLDED.get(normalize_name(name))
 
 
 def kinds_labelled(label: str) -> tuple[str, ...] | None:
     """The kinds that a label stands for, or ``None``. ``Ego`` is a mark, not a label of kinds."""
-    return _LABELS_FOLDED.get(folded(label))
+    return _LABELS_FOLDED.get(normalize_name(label))
+
+
+def kind_named(word: str) -> str | None:
+    """The one kind that a word names: a kind, or another word for one; ``None`` if it is none or several.
+
+    ``vehicle`` is the kind of that name here, although the label stands for every vehicle.
+    """
+    exact = _KINDS_FOLDED.get(normalize_name(word))
+    if exact is not None:
+        return exact
+    kinds = kinds_labelled(word) or ()
+    return kinds[0] if len(kinds) == 1 else None
+
+
+def vague_kind(type_name: str) -> str:
+    """The kind of what bears a type name that no table has: ``vehicle`` if the name says that much.
+
+    ``TYPE_VEHICLE`` is OSI's word for it; CARLA's and nuScenes' names begin with ``vehicle.``.
+    """
+    word = type_name.lower()
+    says_vehicle = word == "type_vehicle" or word.partition(".")[0] == "vehicle"
+    return "vehicle" if says_vehicle else "unknown"
 
 
 def labels() -> tuple[str, ...]:
     """Every label that a pattern may use, in CamelCase, ``Ego`` first."""
-    names = (*KINDS, *SUPER_KINDS, *LABEL_ALIASES)
+    names = dict.fromkeys((*KINDS, *SUPER_KINDS, *LABEL_ALIASES))
     return ("Ego", *("".join(part.capitalize() for part in name.split("_")) for name in names))
+
+
+def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
+    """What names of traces are ordered by: as people count, so ``run2`` comes before ``run10``.
+
+    Digits count as the numbers that they are, letters without regard to case; what is the same then is told
+    apart by its characters.
+    """
+    parts = re.split(r"(\d+)", name)
+    told = (p.lstrip("0") if place % 2 else p.casefold() for place, p in enumerate(parts))
+    keyed = tuple((len(p) if place % 2 else 0, p) for place, p in enumerate(told))
+    return keyed, name
 
 
 def suggestion(name: str, known: Iterable[str]) -> str | None:
     """The known name that is most like ``name``, or ``None`` if none is alike."""
-    by_folded = {folded(candidate): candidate for candidate in known}
-    close = difflib.get_close_matches(folded(name), by_folded, n=1, cutoff=0.6)
+    by_folded = {normalize_name(candidate): candidate for candidate in known}
+    close = difflib.get_close_matches(normalize_name(name), by_folded, n=1, cutoff=0.6)
     return by_folded[close[0]] if close else None
 
 

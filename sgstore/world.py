@@ -32,6 +32,37 @@ BUCKET_FRAMES = 60
 GAP: Final = 2.5
 """Between frames that are further apart than so many median periods of their trace some are missing."""
 
+TOLERANCE_NS: Final = 1_000
+"""Times that differ by no more than this are the same; ns."""
+
+TOLERANCE_SHARE: Final = 100
+"""So are those that differ by no more than this part of the median period of their trace."""
+
+
+def tolerance_ns(period_ns: int) -> int:
+    """How much two times of a trace may differ and still count as the same: clocks jitter, and are truncated.
+
+    Every bound of time is compared with this tolerance, in favour of equality: ``>= 3 s`` holds of 2.9999 s,
+    ``< 3 s`` does not.
+
+    Parameters
+    ----------
+    period_ns : int
+        Median time between two frames; ns.
+
+    Returns
+    -------
+    int
+        ns; a hundredth of the period, at least a microsecond.
+    """
+    return max(TOLERANCE_NS, period_ns // TOLERANCE_SHARE)
+
+
+def longest_step_ns(period_ns: int) -> float:
+    """The longest time between two frames of a trace between which none is missing; ns."""
+    return GAP * period_ns + tolerance_ns(period_ns)
+
+
 POSE: Final = (
     "x",
     "y",
@@ -304,6 +335,8 @@ class TraceInfo:
         must bring the ones before its start.
     mapping : str
         Digest of the mapping by which it is understood, of flavours that need one.
+    lost_lanes : tuple of str
+        Lanes that the trace tells and that its map of lanes does not have, and why.
     """
 
     path: Path
@@ -317,6 +350,7 @@ class TraceInfo:
     map_name: str
     context: MessageRefs
     mapping: str = ""
+    lost_lanes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,6 +455,10 @@ class Clip:
     start_ns: int
     end_ns: int
 
+    def widened(self, by: int) -> Clip:
+        """The same, longer at both ends; ns."""
+        return Clip(self.trace, self.start_ns - by, self.end_ns + by)
+
 
 # What a store keeps of it: float32 about an origin
 
@@ -432,6 +470,8 @@ KEPT: Final = (
     *("length", "width", "height", "steer", "throttle", "brake"),
 )
 """Columns of :class:`States` that a store keeps as they are, cut to float32."""
+
+_VELOCITY: Final = slice(KEPT.index("vx"), KEPT.index("vz") + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -464,7 +504,7 @@ def _middle(states: States) -> Origin:
     return Origin(float(x), float(y), float(round(float(np.median(z)))) if len(z) else 0.0)
 
 
-def as_kept(frames: FrameBlock, origin: Origin) -> FrameBlock:
+def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
     """The frames with the numbers that a store gives back of them, so that graphs made of either are equal."""
     return replace(
         frames,
@@ -488,6 +528,9 @@ def _as_kept(states: States, origin: Origin) -> States:
     given += [turned(states.heading), states.x, states.y, states.z]
     kept = number(np.stack(given) - shift).astype(np.float64)
     kept[~np.isfinite(kept)] = np.nan
+    # A traffic light changes, so it has states; but it stands for ever.
+    velocity = kept[_VELOCITY]
+    kept[_VELOCITY] = np.where((states.light_state >= 0) & np.isnan(velocity), 0.0, velocity)
     kept[-3:] += shift[-3:]
     return replace(states, **dict(zip(names, kept, strict=True)))
 

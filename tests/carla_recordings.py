@@ -21,7 +21,7 @@ from mcap_ros2._dynamic import serialize_dynamic
 from opendrive_maps import a_map, a_road, element, line
 from recordings import COMPRESSIONS
 
-from sgstore.traces import open_trace
+from sgstore.readers import open_trace
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:

@@ -12,6 +12,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+try:
+    from hypothesis import HealthCheck, settings
+except ImportError:  # the short tests of an installed wheel do without
+    pass
+else:
+    # How fast the machine is decides about no example.
+    settings.register_profile("here", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("here")
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 

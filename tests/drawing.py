@@ -9,8 +9,7 @@ import numpy as np
 import shapely
 
 from sgstore.graph import SceneGraph
-from sgstore.roads import MapEdges, MapNodes, RoadMap
-from sgstore.roads.ribbons import Ribbons
+from sgstore.roads import MapEdges, MapNodes, Ribbons, RoadMap
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
 
 WIDTH = 3.5

@@ -50,7 +50,7 @@ def questions() -> list[str]:
     from test_lang_oracle import QUERIES
 
     from bench.patterns import QUESTIONS
-    from sgstore.lang.standard import predicates
+    from sgstore.lang.library import predicates
 
     page = (REPOSITORY / "docs" / "language.md").read_text(encoding="utf-8")
     found = re.findall(r"```sgql\n(.*?)```", page, re.DOTALL)

@@ -1,13 +1,14 @@
-"""Recordings of every flavour, hurt where it hurts: reading them ends in a result or a ``TraceError``.
+"""Recordings, texts and stores, hurt where it hurts: looking at them ends in a result or an error of sgstore's.
 
 ::
 
     python tests/fuzz.py [--runs 100000] [--seed 0] [--keep FOLDER] [FLAVOUR …]
 
-A case is a sample of a flavour with one to four mutations that know what they hurt: fields of protobuf
-messages, values of JSON, numbers and lengths of CDR, descriptors and definitions, times and order of messages,
-records and chunks of the file. It is made from its seed alone, so a seed that fails can be run again; its file
-is kept. In every second case threads decompress chunks ahead, as they do in large files.
+Recordings: a case is a sample of a flavour with one to four mutations that know what they hurt: fields of
+protobuf messages, values of JSON, numbers and lengths of CDR, descriptors and definitions, times and order of
+messages, records and chunks of the file. It is made from its seed alone, so a seed that fails can be run again;
+its file is kept. In every second case threads decompress chunks ahead, as they do in large files; and one of
+sixteen goes the whole way: into a store, which is verified and asked. Texts and stores: see ``fuzz_texts.py``.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 import carla_recordings
+import fuzz_texts
 import numpy as np
 import recordings
 import zstandard
@@ -40,9 +42,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from recordings import bulb, car, ground_truth, house, sign
 
+import sgstore
+import sgstore.mcap._reader as mcap_file
 from sgstore.errors import TraceError
-from sgstore.traces import mcap_file, open_trace
-from sgstore.traces.osi_fields import fields_of
+from sgstore.ingest import ingest
+from sgstore.readers import open_trace
+from sgstore.readers.osi._schema import fields_of
 from sgstore.world import States
 
 if TYPE_CHECKING:
@@ -51,6 +56,8 @@ if TYPE_CHECKING:
 SECONDS = 10.0
 """Longest that a case may take, of the process's own time."""
 FRAMES = 6
+WHOLE_WAY = 16
+"""One of so many recordings goes the whole way."""
 
 
 @dataclass
@@ -152,6 +159,9 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "carla": lambda path: carla_recordings.drive(path, FRAMES, everything=True),
 }
 FLAVOURS = [*WRITERS, ".osi", ".osi.zst"]
+"""Flavours of recordings."""
+KINDS = [*FLAVOURS, *fuzz_texts.LAWS]
+"""All that is hurt."""
 
 
 # Mutations of messages ------------------------------------------------------------------------------------
@@ -467,6 +477,26 @@ def check(path: Path) -> str:
     return ending
 
 
+def whole_way(path: Path) -> None:
+    """Bring a recording into a store: what is in the store then is whole, and can be asked."""
+    place = path.with_name("whole.sgstore")
+    for left in path.parent.glob("whole.sgstore*"):
+        left.unlink()
+    (outcome,) = ingest(place, [path])
+    assert outcome.error is None or str(outcome.error)
+    assert (outcome.error is None) == place.exists(), "a store without a trace, or none with one"
+    if outcome.error is None:
+        store = sgstore.open(place)
+        found = store.file.verify()
+        assert found.faults == [], found.faults
+        (trace,) = store.info()
+        assert trace.frames == outcome.frames
+        for _ in store.find(fuzz_texts.QUERIES[0]):
+            pass
+    beside = [one.name for one in path.parent.glob("whole.sgstore?*")]
+    assert beside == [], beside
+
+
 def read_whole(trace: Any) -> str:
     frames = known = 0
     for block in trace.blocks(4):
@@ -499,12 +529,10 @@ def run(flavours: list[str], runs: int, seed: int, keep: Path) -> dict[str, dict
     with tempfile.TemporaryDirectory() as folder:
         for flavour in flavours:
             counts = endings.setdefault(flavour, {})
-            path = Path(folder) / f"case{sample(flavour).ending}"
+            path = Path(folder) / f"case{ending_of(flavour)}"
             for number in range(seed, seed + runs):
-                case(flavour, number, path)
                 try:
-                    with mock.patch.object(mcap_file, "SMALL", number % 2 * mcap_file.SMALL):
-                        ending = check(path)
+                    ending = one_case(flavour, number, path)
                 except Exception:  # noqa: BLE001  (whatever it is, it is what was sought)
                     ending = "FAILED"
                     keep.mkdir(parents=True, exist_ok=True)
@@ -516,17 +544,41 @@ def run(flavours: list[str], runs: int, seed: int, keep: Path) -> dict[str, dict
     return endings
 
 
+def ending_of(kind: str) -> str:
+    """The ending of the name of a case's file."""
+    law = fuzz_texts.LAWS.get(kind)
+    return sample(kind).ending if law is None else law.ending
+
+
+def share_of(kind: str) -> float:
+    """How many cases of a kind there are for each of another."""
+    law = fuzz_texts.LAWS.get(kind)
+    return 1.0 if law is None else law.share
+
+
+def one_case(kind: str, number: int, path: Path) -> str:
+    """Make a case and look at it; how it ended."""
+    if kind in fuzz_texts.LAWS:
+        return fuzz_texts.look(kind, number, path)
+    case(kind, number, path)
+    with mock.patch.object(mcap_file, "SMALL", number % 2 * mcap_file.SMALL):
+        ending = check(path)
+        if number % WHOLE_WAY == 0:
+            whole_way(path)
+    return ending
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("flavours", nargs="*", metavar="FLAVOUR", help=", ".join(FLAVOURS))
+    parser.add_argument("flavours", nargs="*", metavar="KIND", help=", ".join(KINDS))
     parser.add_argument("--runs", type=int, default=100_000, help="cases in all")
     parser.add_argument("--seed", type=int, default=0, help="the first one")
     parser.add_argument("--keep", type=Path, default=Path("fuzz-failures"), metavar="FOLDER")
     options = parser.parse_args()
-    flavours = options.flavours or FLAVOURS
+    flavours = options.flavours or KINDS
     start, failed = time.monotonic(), 0
     for flavour in flavours:
-        runs = math.ceil(options.runs / len(flavours))
+        runs = math.ceil(options.runs * share_of(flavour) / sum(map(share_of, flavours)))
         counts = run([flavour], runs, options.seed, options.keep)[flavour]
         told = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
         print(f"{flavour:20} {told}", flush=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.config import Config
-from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, Presence
+from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
 from sgstore.roads import MapEdges, MapNodes
 from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.world import (
@@ -213,13 +213,13 @@ class RandomTrace:
         columns["derived"] = rng.integers(0, 8, count)
         return States.of(node=np.asarray(node, np.int64), **columns)
 
-    def _presence(self, count: int) -> Presence:
+    def _presence(self, count: int) -> StaticPresence:
         parts = [np.arange(self.moving, self.moving + self.standing)]
         if self.road_map is not None:
             parts.append(-1 - np.arange(len(self.road_map.nodes)))
         nodes = np.concatenate(parts)
         frame, column = np.nonzero(self.rng.random((count, len(nodes))) < 0.6)
-        return Presence(frame, nodes[column])
+        return StaticPresence(frame, nodes[column])
 
     def _edges(self, here: Any) -> Edges:
         rng = self.rng

@@ -23,9 +23,8 @@ from torch_geometric.nn import HeteroConv, RGCNConv, SAGEConv, global_add_pool, 
 
 import sgstore
 from sgstore.demo import RECORDING
-from sgstore.exporters.export import Export
+from sgstore.exporters import Export, labelled, write_export
 from sgstore.exporters.graph_data import GraphData, GraphDataset
-from sgstore.exporters.stored import labelled, write_export
 from sgstore.ingest import ingest
 from sgstore.world import Clip
 

@@ -1,22 +1,24 @@
 """Exhaustive search over networkx graphs, as plain as can be: what the compiler's SQL is held against.
 
-``python -m oracle 10000`` (in this folder) tries that many random patterns on random worlds.
+``python -m oracle 10000`` (in this folder) tries that many random patterns on random worlds; ``python -m oracle
+100000 0 2`` so many from the first on, in two processes.
 
-A pattern is searched by assigning every node of the graph to every node of the pattern, in order. Nothing is
-clever here: what a label, an edge or a condition means is written down once more, from the documentation.
+A pattern is searched by assigning every node of the graph to every node of the pattern, in order; what is cut
+off early is only what no edge of the pattern joins. Nothing else is clever here: what a label, an edge or a
+condition means is written down once more, from the documentation.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 import sys
+import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from sgstore.lang import parse
 from sgstore.lang import syntax as s
-from sgstore.lang.parser import parse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     import networkx as nx
     from oracle_worlds import Frame, World
 
-VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train"}
+VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"}
 MAP_KINDS = {"lane", "road", "junction", "crosswalk", "offroad", "waypoint"}
 GROUPS = {
     "vehicle": VEHICLES,
@@ -42,27 +44,71 @@ class Search:
     frame: Frame
     graph: nx.MultiDiGraph
     injective: bool
+    pairs: dict[int, set[tuple[Any, Any]]] = field(default_factory=dict)
 
     # Matches
 
-    def matches(self, block: s.Block, outside: Binding) -> Iterator[Binding]:
-        """Every assignment of nodes (and named edges) that makes the whole block true."""
+    def matches(
+        self, block: s.Block, outside: Binding, apart: tuple[str, ...] = ()
+    ) -> Iterator[Binding]:
+        """Every assignment of nodes (and named edges) that makes the whole block true.
+
+        ``apart``: names from outside that its nodes differ from, even if it does not speak of them.
+        """
         nodes: dict[str, list[s.NodePattern]] = {}
         names: dict[int, str] = {}
-        for path in block.paths:
-            for node in path.nodes:
-                name = node.name or f"#{id(node)}"
-                names[id(node)] = name
-                nodes.setdefault(name, []).append(node)
+        for name, node in named_nodes(block):
+            names[id(node)] = name
+            nodes.setdefault(name, []).append(node)
         own = [name for name in nodes if name not in outside]
         spoken_of = {n for n in free_names(block) if n in outside and outside[n] in self.graph}
+        spoken_of = (spoken_of - {"ego"} if labels_ego(block) else spoken_of) | {*apart}
         choices = [[n for n in self.graph.nodes if self.fits(n, nodes[name])] for name in own]
         if not all(self.fits(outside[name], nodes[name]) for name in nodes if name in outside):
             return
-        for chosen in itertools.product(*choices):
-            binding = outside | dict(zip(own, chosen, strict=True))
-            if not self.injective or differ(binding, own, spoken_of):
-                yield from self.edges(block, names, binding, 0)
+        taken = {outside[name] for name in spoken_of} if self.injective else set()
+        links = [(edge, names[a], names[b]) for edge, a, b in links_of(block)]
+        for binding in self.assigned(own, choices, links, outside, taken):
+            yield from self.edges(block, names, binding, 0)
+
+    def assigned(
+        self,
+        own: list[str],
+        choices: list[list[Any]],
+        links: list[tuple[s.EdgePattern, str, str]],
+        binding: Binding,
+        taken: set[Any],
+    ) -> Iterator[Binding]:
+        """Every way to bind the nodes that are left, as far as edges may join them."""
+        if not own:
+            yield binding
+            return
+        name = own[0]
+        done = {*binding, name}
+        tied = [link for link in links if name in link[1:] and {*link[1:]} <= done]
+        for node in choices[0]:
+            if node in taken:
+                continue
+            bound = {**binding, name: node}
+            if all((bound[a], bound[b]) in self.joined(edge) for edge, a, b in tied):
+                more = {*taken, node} if self.injective else taken
+                yield from self.assigned(own[1:], choices[1:], links, bound, more)
+
+    def joined(self, edge: s.EdgePattern) -> set[tuple[Any, Any]] | Everything:
+        """The pairs of nodes, left and right, that have an edge of such a relation, if it is a single one."""
+        if edge.low is not None:
+            return EVERYTHING
+        if id(edge) not in self.pairs:
+            found = {
+                (src, dst)
+                for relation, ends in self.frame.by_relation.items()
+                if edge.label is None or related(relation, edge.label)
+                for src, dst in ends
+            }
+            back = {(dst, src) for src, dst in found}
+            ways = {"right": found, "left": back, "any": found | back}
+            self.pairs[id(edge)] = ways[edge.direction]
+        return self.pairs[id(edge)]
 
     def fits(self, node: Any, patterns: list[s.NodePattern]) -> bool:
         return all(
@@ -204,7 +250,8 @@ class Search:
                 name
             ]
         if owner == "trace" and owner not in binding:
-            return {"name": self.frame.trace.name, "id": self.frame.trace.trace_id}[name]
+            trace = self.frame.trace
+            return {"name": trace.name, "id": trace.trace_id, "map": trace.map_name}[name]
         bound = binding[owner]
         if isinstance(bound, Edge):
             return bound.attributes.get(attribute_name(name))
@@ -245,6 +292,34 @@ class Search:
         return {"MIN": min, "MAX": max, "AVG": lambda v: sum(v) / len(v)}[e.word](values)
 
 
+class Everything:
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
+EVERYTHING = Everything()
+
+
+def only_ego(label: s.LabelExpression) -> bool:
+    """Whether a label leaves nothing but the ego."""
+    if isinstance(label, s.Label):
+        return label.name.lower() == "ego"
+    parts = [only_ego(operand) for operand in label.operands]
+    return {"!": False, "&": any(parts), "|": all(parts)}[label.word]
+
+
+def named_nodes(block: s.Block) -> list[tuple[str, s.NodePattern]]:
+    """The nodes of a block as they are written; each that has no name gets one of its own."""
+    nodes = [node for path in block.paths for node in path.nodes]
+    return [(node.name or f"#{id(node)}", node) for node in nodes]
+
+
+def labels_ego(block: s.Block) -> bool:
+    """Whether a node of a block has a label that only the ego has: then that is what ``ego`` names."""
+    labels = [node.label for name, node in named_nodes(block) if name != "ego"]
+    return any(label is not None and only_ego(label) for label in labels)
+
+
 @dataclass(frozen=True)
 class Edge:
     relation: str
@@ -253,12 +328,6 @@ class Edge:
 
 def attribute_name(name: str) -> str:
     return {"primary": "is_primary", "offset": "lane_offset"}.get(name, name)
-
-
-def differ(binding: Binding, own: list[str], spoken_of: set[str]) -> bool:
-    nodes = [binding[name] for name in own]
-    others = {binding[name] for name in spoken_of}
-    return len(set(nodes)) == len(nodes) and not others & set(nodes)
 
 
 def related(relation: str, label: s.LabelExpression) -> bool:
@@ -288,17 +357,17 @@ def links_of(block: s.Block) -> list[tuple[s.EdgePattern, int, int]]:
 LINKS: dict[int, tuple[s.Block, list[tuple[s.EdgePattern, int, int]]]] = {}
 
 
-def free_names(block: s.Block | s.Match) -> set[str]:
+def free_names(block: s.Block | s.MatchClause) -> set[str]:
     """All names that occur in a block, or in blocks in it."""
     if id(block) not in FREE:
         FREE[id(block)] = block, names_in(block)
     return FREE[id(block)][1]
 
 
-FREE: dict[int, tuple[s.Block | s.Match, set[str]]] = {}
+FREE: dict[int, tuple[s.Block | s.MatchClause, set[str]]] = {}
 
 
-def names_in(block: s.Block | s.Match) -> set[str]:
+def names_in(block: s.Block | s.MatchClause) -> set[str]:
     found: set[str] = set()
 
     def visit(part: Any) -> None:
@@ -387,7 +456,7 @@ def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     raise NotImplementedError(name)
 
 
-def assignments(match: s.Match, world: World) -> Iterator[tuple[Search, Binding]]:
+def assignments(match: s.MatchClause, world: World) -> Iterator[tuple[Search, Binding]]:
     """Every match of a query in every frame of the traces that can answer it; ``ego`` bound if named."""
     injective = not any(setting.name.lower() == "nodes" for setting in match.settings)
     unknown_is_false = any(setting.name.lower() == "unknown" for setting in match.settings)
@@ -400,19 +469,21 @@ def assignments(match: s.Match, world: World) -> Iterator[tuple[Search, Binding]
             continue
         search = Search(frame, frame.graph, injective)
         outside: Binding = {}
-        # It stands for a node of its own, as if (ego:Ego) were written.
+        apart: tuple[str, ...] = ()
+        # Named anywhere, it is a node of the pattern: the one that has that label, or (ego:Ego).
         if "ego" in free_names(match):
             if frame.ego is None:
                 continue
             outside["ego"] = frame.ego
-        for binding in search.matches(match.block, outside):
+            apart = () if labels_ego(match.block) else ("ego",)
+        for binding in search.matches(match.block, outside, apart):
             yield search, binding
 
 
 def answer(text: str, world: World) -> tuple[Counter[tuple[Any, ...]], set[int]]:
     """Rows (frame, named nodes and relations of named edges) and frames of a query, whatever it returns."""
     match = parse(text)[-1]
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     rows: set[tuple[Any, ...]] = set()
     for search, binding in assignments(match, world):
         named = {k: v for k, v in binding.items() if not k.startswith("#") and k != "ego"}
@@ -424,26 +495,44 @@ def answer(text: str, world: World) -> tuple[Counter[tuple[Any, ...]], set[int]]
 def returned(text: str, world: World) -> Counter[tuple[Any, ...]]:
     """The values after ``RETURN``, as often as they are returned."""
     match = parse(text)[-1]
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     assert match.returns is not None
     items = [item.value for item in match.returns.items]
     found = list(assignments(match, world))
     counted = [is_counted(item) for item in items]
+    plain = [item for item, c in zip(items, counted, strict=True) if not c]
     if not any(counted):
-        rows = [tuple(search.value(item, binding) for item in items) for search, binding in found]
-        return Counter(dict.fromkeys(rows, 1)) if match.returns.distinct else Counter(rows)
+        rows = [tuple(identity(item, *at) for item in items) for at in found]
+        return Counter(map(shown, dict.fromkeys(rows) if match.returns.distinct else rows))
     groups: dict[tuple[Any, ...], list[tuple[Search, Binding]]] = {}
-    for search, binding in found:
-        key = tuple(search.value(i, binding) for i, c in zip(items, counted, strict=True) if not c)
-        groups.setdefault(key, []).append((search, binding))
+    for at in found:
+        groups.setdefault(tuple(identity(item, *at) for item in plain), []).append(at)
     if all(counted):
         groups.setdefault((), [])
     rows = []
     for key, members in groups.items():
-        plain = iter(key)
-        row = [over(i, members) if c else next(plain) for i, c in zip(items, counted, strict=True)]
+        told = iter(shown(key))
+        row = [over(i, members) if c else next(told) for i, c in zip(items, counted, strict=True)]
         rows.append(tuple(row))
     return Counter(rows)
+
+
+@dataclass(frozen=True)
+class Entity:
+    """A node, told apart from those of other traces: by the trace, or, a part of the map, by the map."""
+
+    owner: int
+    node: int
+
+
+def identity(item: Any, search: Search, binding: Binding) -> Any:
+    """A value, or which entity it is."""
+    value = search.value(item, binding)
+    return Entity(search.frame.trace.owner(value), value) if isinstance(item, s.Variable) else value
+
+
+def shown(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple(value.node if isinstance(value, Entity) else value for value in row)
 
 
 def is_counted(item: Any) -> bool:
@@ -456,7 +545,7 @@ def over(item: Any, members: list[tuple[Search, Binding]]) -> Any:
     """A count, or a value of all matches of a group."""
     if isinstance(item, s.CountAll):
         return len(members)
-    values = [search.value(item.arguments[0], binding) for search, binding in members]
+    values = [identity(item.arguments[0], *at) for at in members]
     known = [value for value in values if value is not None]
     if item.name.lower() == "count":
         return len(set(known)) if item.distinct else len(known)
@@ -486,24 +575,25 @@ def labels_in(label: s.LabelExpression) -> list[s.Label]:
     return [found for operand in label.operands for found in labels_in(operand)]
 
 
-def disagreement(text: str, world: World) -> tuple[str, int]:
+def disagreement(text: str, world: World, *, counted: bool = True) -> tuple[str, int]:
     """What the compiled query and the search do not agree on (nothing, if all is well); number of frames."""
     from sgstore.lang import compile_query
 
+    compiled = compile_query(text, world.catalog)  # refused, before anything is searched
     wanted, frames = answer(text, world)
-    compiled = compile_query(text, world.catalog)
     statement = compiled.rows()
     found = world.connection.execute(statement.sql, list(statement.values)).fetchall()
-    names = [name for name in statement.columns[5:] if not name.endswith(".name")]
+    names = [name for name in statement.columns[5:] if not name.endswith(".name") and name != "ego"]
     order = sorted(range(len(names)), key=lambda i: names[i])
     keep = [statement.columns.index(names[i]) for i in order]
     rows = Counter((row[0], *(row[i] for i in keep)) for row in found)
     if rows != wanted:
         return difference("rows", rows, wanted), 0
-    statement = compiled.count()
-    counted = world.connection.execute(statement.sql, list(statement.values)).fetchone()
-    if counted is None or counted[0] != len(frames):
-        return f"frames: counted {counted}, wanted {len(frames)}", 0
+    if counted:
+        statement = compiled.count()
+        many = world.connection.execute(statement.sql, list(statement.values)).fetchone()
+        if many is None or many[0] != len(frames):
+            return f"frames: counted {many}, wanted {len(frames)}", 0
     return "", len(frames)
 
 
@@ -511,8 +601,8 @@ def disagreement_of_results(text: str, world: World) -> tuple[str, int]:
     """As above, of a query that returns values."""
     from sgstore.lang import compile_query
 
-    wanted = rounded(returned(text, world))
     statement = compile_query(text, world.catalog).rows()
+    wanted = rounded(returned(text, world))
     found = world.connection.execute(statement.sql, list(statement.values)).fetchall()
     rows = rounded(Counter(found))
     return ("" if rows == wanted else difference("results", rows, wanted)), len(wanted)
@@ -530,8 +620,15 @@ def difference(what: str, found: Counter[Any], wanted: Counter[Any]) -> str:
     return f"{what}: {len(found)}, wanted {len(wanted)}\n too many {more}\n missing {less}"
 
 
+WORLD = 50
+"""Patterns that are tried on one world."""
+
+
 def try_many(first: int, count: int) -> dict[str, int]:
-    """Random queries on random worlds; how many, how many have a match, how many are refused."""
+    """Random queries on random worlds; how many, how many have a match, how many are refused.
+
+    Of three queries one returns values. The frames are counted, too, of every fourth.
+    """
     from oracle_patterns import Writer
     from oracle_worlds import random_world
 
@@ -539,13 +636,19 @@ def try_many(first: int, count: int) -> dict[str, int]:
 
     seen = Counter[str]()
     for number in range(first, first + count):
-        if (number - first) % 25 == 0:
-            world = random_world(number, static=number % 2 == 0)
+        if (number - first) % WORLD == 0:
+            seed = number // WORLD
+            world = random_world(
+                number, traces=3, frames=6, static=seed % 2 == 0, maps=1 + seed // 2 % 2
+            )
+            world.connection.execute("SET threads = 1")
         writer = Writer(number)
         text = writer.query()
+        LINKS.clear()
+        FREE.clear()
         try:
             if number % 3:
-                problem, frames = disagreement(text, world)
+                problem, frames = disagreement(text, world, counted=number % 4 == 0)
             else:
                 text += writer.results()
                 problem, frames = disagreement_of_results(text, world)
@@ -554,14 +657,53 @@ def try_many(first: int, count: int) -> dict[str, int]:
             seen[error.reason.split("'")[0]] += 1
             continue
         except Exception as error:
-            error.add_note(f"pattern {number}, world {number - (number - first) % 25}: {text}")
+            error.add_note(f"pattern {number}, world {number - (number - first) % WORLD}: {text}")
             raise
         seen["tried"] += 1
         seen["matched"] += frames > 0
-        assert not problem, f"pattern {number}: {text}\n{problem}"
+        world_of = number - (number - first) % WORLD
+        assert not problem, f"pattern {number}, world {world_of}: {text}\n{problem}"
     return dict(seen)
 
 
+def tried(first: int, count: int, jobs: int) -> Counter[str]:
+    """The same, in several processes; each takes whole worlds. The first difference ends it."""
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from multiprocessing import get_context
+
+    size = WORLD * max(1, min(4, count // (WORLD * jobs)))
+    starts = range(first, first + count, size)
+    seen, done, began, said = Counter[str](), 0, time.perf_counter(), 0.0
+    # Not forked: the database has threads.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        sizes = {start: min(size, first + count - start) for start in starts}
+        futures = {pool.submit(try_many, start, sizes[start]): start for start in starts}
+        for future in as_completed(futures):
+            try:
+                seen.update(future.result())
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            done += sizes[futures[future]]
+            spent = time.perf_counter() - began
+            if spent - said > SAY_S or done == count:
+                said = spent
+                told = f"{seen['tried']} tried, {seen['matched']} with a match, {seen['refused']} refused"
+                print(f"{done}/{count}, {spent:.0f} s: {told}; no difference", flush=True)
+    return seen
+
+
+SAY_S = 10.0
+"""How often it is said how far it is; s."""
+
+
+def main(arguments: list[int]) -> None:
+    count, first, jobs = (*arguments, *(1000, 0, 1)[len(arguments) :])
+    began = time.perf_counter()
+    seen = tried(first, count, jobs)
+    print(dict(seen))
+    print(f"{count / (time.perf_counter() - began):.1f} patterns/s")
+
+
 if __name__ == "__main__":
-    arguments = [int(argument) for argument in sys.argv[1:]] or [1000]
-    print(try_many(arguments[1] if len(arguments) > 1 else 0, arguments[0]))
+    main([int(argument) for argument in sys.argv[1:]])

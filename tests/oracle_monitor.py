@@ -8,11 +8,11 @@ import sys
 import numpy as np
 from oracle_temporal import NAMES, random_formula
 
-from sgstore.monitor.duties import Automaton
 from sgstore.temporal import evaluate
-from sgstore.temporal.formulas import looks_ahead
-from sgstore.temporal.progression import Tick
-from sgstore.temporal.verdicts import Settled
+from sgstore.temporal._check_monitor import Automaton
+from sgstore.temporal._formula import looks_ahead
+from sgstore.temporal._progression import Tick
+from sgstore.temporal._verdicts import Settled
 
 Spans = list[tuple[int, int, bool]]
 

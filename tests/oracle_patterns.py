@@ -77,12 +77,16 @@ class Writer:
         """What to return of a query that was just written."""
         names = [name for name in self.nodes if name != "ego"] or ["ego"]
         a, b = self.rng.choice(names), self.rng.choice(names)
-        plain = [f"{a}.id", f"{b}.kind", "frame.seq", f"{a}.x + 1", f"{b}.name", "trace.name", a]
+        plain = [f"{a}.id", f"{b}.kind", "frame.seq", f"{a}.x + 1", f"{b}.name", "trace.name", a, b]
+        plain += ["trace.map", f"{a} = {b}"]
+        keys = len(plain)
         plain += [
             f"{a}.speed",
             f"COUNT {{({a})-[:near]->()}}",
             f"EXISTS {{({b})-[:isIn]->(:Lane)}}",
         ]
+        if self.rng.random() < 0.1:
+            plain += ["ego", "ego.speed", f"dist(ego, {a})", f"COUNT {{(ego)-[:near]-({b})}}"]
         counted = [
             "COUNT(*)",
             f"COUNT({a}.speed)",
@@ -91,14 +95,17 @@ class Writer:
             f"AVG({b}.y)",
             f"MIN({a}.kind)",
             f"MAX({b}.name)",
+            f"COUNT(DISTINCT {a})",
+            f"COUNT(DISTINCT {b})",
+            f"COUNT({a})",
         ]
+        counted += ["COUNT(DISTINCT ego)"] if self.rng.random() < 0.05 else []
         of_edges = [f"type({edge})" for edge in self.edges]
         plain[:0] = of_edges
         counted += [f"{word}({edge})" for word in ("MIN", "MAX") for edge in of_edges]
         chosen = self.rng.sample(plain, self.rng.choice((1, 2)))
         if self.rng.random() < 0.4:
-            keys = plain[: 6 + len(of_edges)]
-            chosen = self.rng.sample(keys, self.rng.choice((0, 1, 2)))
+            chosen = self.rng.sample(plain[: keys + len(of_edges)], self.rng.choice((0, 1, 2)))
             chosen += self.rng.sample(counted, self.rng.choice((1, 2)))
             return f" RETURN {', '.join(chosen)}"
         return f" RETURN {self.rng.choice(('', 'DISTINCT '))}{', '.join(chosen)}"
@@ -122,6 +129,8 @@ class Writer:
                 if new
                 else ""
             )
+            if self.rng.random() < 0.02:
+                return "(ego)"
             again = name in self.nodes
             if name and not again:
                 self.nodes.append(name)
@@ -161,6 +170,8 @@ class Writer:
         nodes = self.nodes or ([] if self.egos else ["ego"])
         if not nodes:
             return f"frame.seq % 2 = {self.rng.choice('01')}"
+        if self.rng.random() < 0.04:
+            nodes = ["ego", *nodes]
         a, b = self.rng.choice(nodes), self.rng.choice(nodes)
         number = self.rng.choice(("0", "1", "5", "2.5"))
         sign = self.rng.choice(("=", "<>", "<", "<=", ">", ">="))

@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.temporal import Online, evaluate, prefix_verdicts
-from sgstore.temporal.formulas import (
+from sgstore.temporal import Formula, OnlineFormula, evaluate, prefix_verdicts
+from sgstore.temporal._formula import (
     And,
     Bound,
-    Constant,
-    Formula,
     Next,
     Not,
     Or,
     Previous,
     Proposition,
     Since,
+    TruthConstant,
     Until,
     always,
     eventually,
@@ -27,7 +26,7 @@ from sgstore.temporal.formulas import (
     once,
     release,
 )
-from sgstore.temporal.verdicts import PRESUMABLY_TRUE, Settled
+from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,7 +39,7 @@ def holds(formula: Formula, word: Word, times: Sequence[int], i: int) -> bool:  
     """Whether a formula is true at frame i of a finite word."""
     n = len(word)
     match formula:
-        case Constant(value=value):
+        case TruthConstant(value=value):
             return value
         case Proposition(name=name):
             return word[i][name]
@@ -78,7 +77,7 @@ def within(bound: Bound, frames: int, time: int) -> bool:
 def random_formula(rng: random.Random, depth: int) -> Formula:
     if depth == 0 or rng.random() < 0.1:
         return rng.choice(
-            (Proposition(rng.choice(NAMES)), Proposition(rng.choice(NAMES)), Constant(True))
+            (Proposition(rng.choice(NAMES)), Proposition(rng.choice(NAMES)), TruthConstant(True))
         )
 
     def inner() -> Formula:
@@ -130,7 +129,7 @@ def try_formulas(first: int, count: int, depth: int = 4) -> int:
         clock = np.array(times, np.int64)
         assert evaluate(formula, columns, clock).tolist() == wanted, (seed, formula)
 
-        engine, told = Online(formula), {}
+        engine, told = OnlineFormula(formula), {}
         verdicts = []
         for letter, time in zip(word, times, strict=True):
             for number, value in engine.step(letter, time):

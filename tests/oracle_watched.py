@@ -18,19 +18,17 @@ from sgstore.demo import RECORDING
 from sgstore.errors import SgstoreError
 from sgstore.ingest import ingest
 from sgstore.lang import patterns
-from sgstore.monitor import Monitor
-from sgstore.monitor.sources import opened
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
+from sgstore.temporal import Monitor, opened
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from sgstore.graph import SceneGraph
-    from sgstore.history.checks import Verdict
     from sgstore.matches import Interval
-    from sgstore.monitor import Event
     from sgstore.roads import RoadMap
+    from sgstore.temporal import MonitorEvent, Verdict
 
 CHECKS = """
 CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 RESET WHEN dist(ego, v) > 9;
@@ -64,7 +62,7 @@ SEQUENCES = (
 )
 
 
-Watched = tuple[tuple["Verdict", ...], list["Event"], Monitor]
+Watched = tuple[tuple["Verdict", ...], list["MonitorEvent"], Monitor]
 """Verdicts, what was told, and by whom."""
 
 
@@ -99,7 +97,7 @@ class Drive:
     def watched(self, text: str, *, sgsm_compat: bool = False) -> Watched:
         if (text, sgsm_compat) in self.known:
             return self.known[text, sgsm_compat]
-        events: list[Event] = []
+        events: list[MonitorEvent] = []
         monitor = Monitor(
             text, self.road_map, trace=self.name, on_event=events.append, sgsm_compat=sgsm_compat
         )
@@ -141,6 +139,40 @@ class Drive:
             assert all(e.start.seq <= e.end.seq <= e.told.seq for e in own), (self.name, text)
             often.append(len(intervals))
         return often
+
+    def compare_edges(self, questions: Sequence[tuple[str, list[str]]]) -> int:
+        """Patterns with conditions on an edge variable, told where a store has them true; how many runs.
+
+        Each question is a pattern, whose edge variable is the only other name than e and v, and conditions.
+        """
+        texts = [f"MATCH {pattern} WHERE {one}" for pattern, made in questions for one in made]
+        _, events, _ = self.watched(";\n".join(texts))
+        number, runs = 0, 0
+        for pattern, made in questions:
+            told = ", ".join(
+                f"ONCE[0frames, 0frames] ({one}) AS y{n}" for n, one in enumerate(made)
+            )
+            edge = "d" if "[d:" in pattern else "r"
+            asked = f"MATCH {pattern} RETURN frame.seq, e, v, type({edge}) AS w, {told}"
+            rows = list(self.store.find(asked))
+            for place, one in enumerate(made, start=4):
+                number += 1
+                true = {(seq, e, v, w) for seq, e, v, w, *y in rows if y[place - 4]}
+                begun = [row for row in true if (row[0] - 1, *row[1:]) not in true]
+                wanted = Counter(
+                    (seq, self.stored.get(e, e), self.stored.get(v, v)) for seq, e, v, _ in begun
+                )
+                seen = Counter(
+                    (
+                        event.start.seq,
+                        *(self.online.get(event.nodes[n], event.nodes[n]) for n in "ev"),
+                    )
+                    for event in events
+                    if event.name == f"pattern {number}"
+                )
+                assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)
+                runs += len(begun)
+        return runs
 
 
 def _who(values: Any, names: set[str], idents: dict[int, str]) -> tuple[tuple[str, Any], ...]:

@@ -10,16 +10,20 @@ import math
 import random
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any
+from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import networkx as nx
 
 from sgstore.lang import Catalog, TraceFacts
-from sgstore.store.access import without_faults
+from sgstore.store._locking import without_faults
+from sgstore.vocabulary import MAP_KINDS
 
-SCHEMA = (Path(__file__).parents[1] / "sgstore" / "schema.sql").read_text(encoding="utf-8")
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SCHEMA = resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
 
 MAP_NODES: dict[int, dict[str, Any]] = {
     -1: {"kind": "off_road", "name": "off_road"},
@@ -52,6 +56,27 @@ MAP_EDGES = [
     (-3, "travelsTo", -2),
     (-8, "controlsTrafficOf", -2),
 ]
+# Another map, whose parts have the same numbers and are something else.
+OTHER_NODES: dict[int, dict[str, Any]] = {
+    -1: {"kind": "off_road", "name": "off_road"},
+    -2: {"kind": "lane", "name": "9/0/-1", "lane_type": "driving", "width": 4.0, "road": "9"},
+    -3: {"kind": "crosswalk", "name": "c9"},
+    -4: {"kind": "lane", "name": "9/0/1", "lane_type": "parking", "width": 2.5, "turn": "right"},
+    -5: {"kind": "lane", "name": "9/0/2", "lane_type": "driving", "width": 3.0, "junction": "1"},
+    -6: {"kind": "road", "name": "9"},
+}
+OTHER_EDGES = [
+    (-2, "isIn", -6),
+    (-4, "isIn", -6),
+    (-5, "isIn", -6),
+    (-2, "opposes", -4),
+    (-2, "travelsTo", -5),
+    (-5, "travelsTo", -4),
+]
+MAPS: dict[int, tuple[str, dict[int, dict[str, Any]], list[tuple[int, str, int]]]] = {
+    3: ("town", MAP_NODES, MAP_EDGES),
+    8: ("other", OTHER_NODES, OTHER_EDGES),
+}
 KINDS = ("car", "car", "truck", "person", "bicycle", "traffic_light")
 RELATIONS = ("near", "near", "visible", "inDFrontOf", "toLeftOf")
 ORIGIN = (100.0, 200.0, 0.0)
@@ -114,10 +139,18 @@ class Frame:
             graph.add_node(node, **lasting(self.trace, node))
         for src, relation, dst, attributes in self.edges:
             graph.add_edge(src, dst, key=relation, relation=relation, **attributes)
-        for src, relation, dst in MAP_EDGES:
+        for src, relation, dst in self.trace.map_edges:
             if {src, dst} <= self.present:
                 graph.add_edge(src, dst, key=relation, relation=relation)
         return graph
+
+    @cached_property
+    def by_relation(self) -> dict[str, list[tuple[int, int]]]:
+        """The ends of the edges of each relation, those of the map among them."""
+        found: dict[str, list[tuple[int, int]]] = {}
+        for src, dst, relation in self.graph.edges(keys=True):
+            found.setdefault(relation, []).append((src, dst))
+        return found
 
 
 @dataclass
@@ -128,11 +161,28 @@ class Trace:
     answers: tuple[str, ...]
     entities: dict[int, dict[str, Any]]
     frames: list[Frame] = field(default_factory=list)
+    map_id: int = 3
 
     @property
     def hero(self) -> str:
         """What the simulator calls the ego."""
         return f"hero{self.trace_id}"
+
+    @property
+    def map_name(self) -> str:
+        return MAPS[self.map_id][0]
+
+    @property
+    def map_nodes(self) -> dict[int, dict[str, Any]]:
+        return MAPS[self.map_id][1]
+
+    @property
+    def map_edges(self) -> list[tuple[int, str, int]]:
+        return MAPS[self.map_id][2]
+
+    def owner(self, node: int) -> int:
+        """Whose number a node id is: that of the trace, or below 0 that of its map."""
+        return self.trace_id if node >= 0 else -self.map_id
 
 
 def outward(trace: Trace, node: int, state: dict[str, Any], ego: int | None) -> dict[str, Any]:
@@ -151,21 +201,24 @@ def outward(trace: Trace, node: int, state: dict[str, Any], ego: int | None) -> 
     return found
 
 
+STILL = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
+
+
 def lasting(trace: Trace, node: int) -> dict[str, Any]:
     """Attributes of a static entity or of a part of the map."""
     common = {"id": node, "is_ego": False, "is_static": True}
     if node < 0:
-        found = {**MAP_NODES[node], **common}
+        found = {**trace.map_nodes[node], **common}
         if "heading" in found:
             found["heading"] = math.degrees(found["heading"])
         if found["kind"] == "lane":
             found["in_junction"] = "junction" in found
-        return found
+        return found | ({} if found["kind"] in MAP_KINDS else STILL)
     entity = trace.entities[node]
     found = {key: value for key, value in entity.items() if value is not None and key != "static"}
     found |= {axis: found[axis] + shift for axis, shift in zip("xyz", ORIGIN, strict=True)}
     found["heading"] = math.degrees(found["heading"])
-    return {**found, **common, "name": f"{entity['kind']} {node}"}
+    return {**found, **common, **STILL, "name": f"{entity['kind']} {node}"}
 
 
 @dataclass
@@ -204,11 +257,29 @@ def catalog_of(connection: duckdb.DuckDBPyConnection) -> Catalog:
 
 
 def random_world(
-    seed: int, *, traces: int = 2, frames: int = 9, static: bool = True, path: Path | None = None
+    seed: int,
+    *,
+    traces: int = 2,
+    frames: int = 9,
+    static: bool = True,
+    maps: int = 1,
+    path: Path | None = None,
 ) -> World:
-    """A world whose frames lie on both sides of the end of a bucket; in memory, or in an empty store's file."""
+    """A world whose frames lie on both sides of the end of a bucket; in memory, or in an empty store's file.
+
+    With two maps the last trace has the second one, and the others share the first.
+    """
     rng = random.Random(seed)
-    made = [random_trace(rng, number + 1, frames, static=static) for number in range(traces)]
+    made = [
+        random_trace(
+            rng,
+            number + 1,
+            frames,
+            static=static,
+            map_id=8 if maps == 2 and number == traces - 1 else 3,
+        )
+        for number in range(traces)
+    ]
     connection = duckdb.connect(str(path or ":memory:"))
     without_faults(connection)
     if path is None:
@@ -217,7 +288,9 @@ def random_world(
     return World(made, connection)
 
 
-def random_trace(rng: random.Random, number: int, frames: int, *, static: bool) -> Trace:
+def random_trace(
+    rng: random.Random, number: int, frames: int, *, static: bool, map_id: int = 3
+) -> Trace:
     count = rng.randint(3, 5)
     entities: dict[int, dict[str, Any]] = {}
     for node in range(count):
@@ -243,7 +316,7 @@ def random_trace(rng: random.Random, number: int, frames: int, *, static: bool) 
         r for r in ("isIn", "near", "visible", "opposes", "travelsTo") if rng.random() < 0.95
     )
     answers += ("inDFrontOf", "toLeftOf", "controlsTrafficOf", "leads", "follows")
-    trace = Trace(number, f"trace{number}", 0, answers, entities)
+    trace = Trace(number, f"trace{number}", 0, answers, entities, map_id=map_id)
     first = 60 - rng.randint(1, frames - 1)
     time_ns = 0
     for seq in range(first, first + frames):
@@ -255,7 +328,10 @@ def random_trace(rng: random.Random, number: int, frames: int, *, static: bool) 
 def random_frame(rng: random.Random, trace: Trace, seq: int, time_ns: int) -> Frame:
     moving = [n for n, e in trace.entities.items() if not e["static"] and rng.random() < 0.85]
     still = {n for n, e in trace.entities.items() if e["static"] and rng.random() < 0.8}
-    present = still | {node for node in MAP_NODES if rng.random() < 0.85}
+    parts = trace.map_nodes
+    present = still | {node for node in parts if rng.random() < 0.85}
+    lanes = [node for node in parts if parts[node]["kind"] == "lane"]
+    places = {n for n in parts if parts[n]["kind"] in {"lane", "off_road", "crosswalk"}}
     states = {node: random_state(rng, trace.entities[node]) for node in moving}
     edges: list[tuple[int, str, int, dict[str, Any]]] = []
     everything = [*moving, *still]
@@ -263,14 +339,14 @@ def random_frame(rng: random.Random, trace: Trace, seq: int, time_ns: int) -> Fr
         for dst in everything:
             chosen = dict.fromkeys((rng.choice(RELATIONS), rng.choice(RELATIONS)))
             edges += [(src, r, dst, {}) for r in chosen if src != dst and rng.random() < 0.35]
-        for place in sorted(present & {-1, -2, -3, -4, -7}):
+        for place in sorted(present & places):
             if rng.random() < 0.35:
-                lane = MAP_NODES[place]["kind"] == "lane"
+                lane = place in lanes
                 edges.append((src, "isIn", place, lane_state(rng) if lane else {}))
         if trace.entities[src]["kind"] == "traffic_light":
             edges += [
                 (src, "controlsTrafficOf", n, {})
-                for n in sorted(present & {-2, -3})
+                for n in sorted(present & set(lanes[:2]))
                 if rng.random() < 0.6
             ]
     edges += following(random.Random(time_ns + seq), moving)
@@ -296,6 +372,7 @@ def lane_state(rng: random.Random) -> dict[str, Any]:
         "lane_offset": rng.choice((-0.5, 0.0, 0.5)),
         "heading_error": 0.0,
         "is_primary": rng.random() < 0.5,
+        "is_own": False,
     }
 
 
@@ -326,7 +403,6 @@ def random_state(rng: random.Random, entity: dict[str, Any]) -> dict[str, Any]:
 def store_all(
     connection: duckdb.DuckDBPyConnection, traces: list[Trace], rng: random.Random
 ) -> None:
-    connection.execute("INSERT INTO map (map_id, digest, name, text) VALUES (3, 'd', 'town', '')")
     connection.execute("INSERT INTO config VALUES (1, 'c', '{}')")
     columns = (
         "lane_type",
@@ -341,18 +417,22 @@ def store_all(
         "heading",
         "width",
     )
-    for node, attributes in MAP_NODES.items():
-        row = {"map_id": 3, "node_id": node, "kind": attributes["kind"], "name": attributes["name"]}
-        insert(connection, "map_node", [row | {c: attributes.get(c) for c in columns}])
-    insert(
-        connection,
-        "map_edge",
-        [
-            {"map_id": 3, "relation": r, "src": s, "dst": d}
-            | {"src_kind": MAP_NODES[s]["kind"], "dst_kind": MAP_NODES[d]["kind"]}
-            for s, r, d in MAP_EDGES
-        ],
-    )
+    for map_id in sorted({trace.map_id for trace in traces}):
+        name, parts, edges = MAPS[map_id]
+        row = {"map_id": map_id, "digest": f"d{map_id}", "name": name, "text": ""}
+        insert(connection, "map", [row])
+        rows = [
+            {"map_id": map_id, "node_id": node, "kind": about["kind"], "name": about["name"]}
+            | {column: about.get(column) for column in columns}
+            for node, about in parts.items()
+        ]
+        insert(connection, "map_node", rows)
+        rows = [
+            {"map_id": map_id, "relation": r, "src": s, "dst": d}
+            | {"src_kind": parts[s]["kind"], "dst_kind": parts[d]["kind"]}
+            for s, r, d in edges
+        ]
+        insert(connection, "map_edge", rows)
     for trace in traces:
         store_trace(connection, trace, rng)
 
@@ -363,7 +443,7 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
         "trace_id": trace.trace_id,
         "name": trace.name,
         "ego": trace.hero,
-        "map_id": 3,
+        "map_id": trace.map_id,
     }
     row |= {
         "frames": len(times),
@@ -399,7 +479,8 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
 
 
 def frame_row(frame: Frame) -> dict[str, Any]:
-    row = {"trace_id": frame.trace.trace_id, "map_id": 3, "bucket": frame.frame_id >> 6}
+    row = {"trace_id": frame.trace.trace_id, "map_id": frame.trace.map_id}
+    row |= {"bucket": frame.frame_id >> 6}
     row |= {"frame_id": frame.frame_id, "bit": frame.frame_id & 63, "seq": frame.seq}
     return row | {"time_ns": frame.time_ns, "log_time_ns": frame.time_ns + 5, "ego": frame.ego}
 
@@ -440,7 +521,7 @@ def store_masks(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
     valid: dict[int, int] = {}
     joined: dict[int, int] = {}
     kinds = {n: e["kind"] for n, e in trace.entities.items()} | {
-        n: m["kind"] for n, m in MAP_NODES.items()
+        n: m["kind"] for n, m in trace.map_nodes.items()
     }
     for before, frame in zip([None, *trace.frames], trace.frames, strict=False):
         bucket, bit = frame.frame_id >> 6, 1 << (frame.frame_id & 63)
@@ -474,7 +555,7 @@ def store_masks(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
         for k, m in nodes.items()
     ]
     insert(connection, "node", rows)
-    base = {"trace_id": trace.trace_id, "map_id": 3}
+    base = {"trace_id": trace.trace_id, "map_id": trace.map_id}
     rows = [base | {"bucket": b, "valid": v, "joined": joined[b]} for b, v in valid.items()]
     insert(connection, "bucket", rows)
 
@@ -484,10 +565,27 @@ def parts_of(mask: int, rng: random.Random) -> list[int]:
     return [part for part in (one, mask - one) if part] if rng.random() < 0.2 else [mask]
 
 
+FILLING = {
+    "VARCHAR": "x",
+    "JSON": "{}",
+    "VARCHAR[]": [],
+    "BOOLEAN": False,
+    "TIMESTAMP": "2026-01-01",
+}
+"""What stands in columns that a world does not tell of and a store must have; else 0."""
+
+
 def insert(connection: duckdb.DuckDBPyConnection, table: str, rows: list[dict[str, Any]]) -> None:
     if not rows:
         return
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    known = dict.fromkeys(name for row in rows for name in row)
+    needed = connection.execute(
+        "SELECT column_name, data_type FROM duckdb_columns() WHERE table_name = ? AND NOT is_nullable",
+        [table],
+    ).fetchall()
+    rest = {name: FILLING.get(kind, 0) for name, kind in needed if name not in known}
+    rows = [rest | row for row in rows]
+    names = [*known, *rest]
     columns = ", ".join(f'"{name}"' for name in names)
     marks = f"({', '.join('?' for _ in names)})"
     for start in range(0, len(rows), 200):

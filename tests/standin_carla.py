@@ -16,7 +16,7 @@ import numpy as np
 from mcap.reader import make_reader
 
 from sgstore.demo import RECORDING
-from sgstore.traces.osi_schema import message_class
+from sgstore.readers import message_class
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -165,10 +165,12 @@ class StandInSnapshot:
 class StandInWorld:
     """A town with things in it; ``tick`` moves what has a velocity."""
 
-    def __init__(self, *actors: StandInActor, objects: tuple[StandInObject, ...] = ()) -> None:
+    def __init__(
+        self, *actors: StandInActor, objects: tuple[StandInObject, ...] = (), map_text: str = ""
+    ) -> None:
         self.actors = list(actors)
         self.objects = list(objects)
-        self.map = carla.Map("Carla/Maps/town", town_xodr())
+        self.map = carla.Map("Carla/Maps/town", map_text or town_xodr())
         self.clock = carla.Timestamp(100, 5.0, 0.05, 0.0)
         self.lists = 0
         self.script: Callable[[StandInWorld], None] = lambda _: None

@@ -10,18 +10,18 @@ import pytest
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 
 import sgstore
-from sgstore.abstractions import _REGISTERED as REGISTERED
 from sgstore.abstractions import (
     ABSTRACTIONS,
     AT_INGEST,
-    Grounds,
+    GraphColumns,
     Labelled,
-    Seen,
+    MapColumns,
     abstraction_named,
     classes_of,
     register,
 )
-from sgstore.abstractions.roadscene2vec import roadscene2vec
+from sgstore.abstractions._literature import roadscene2vec
+from sgstore.abstractions._registry import _REGISTERED as REGISTERED
 from sgstore.errors import AbstractionError
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE
 
@@ -30,7 +30,7 @@ EGO, CAR, BUS, PERSON = range(4)
 LEFT, OWN, RIGHT, AGAINST, AHEAD, WALK, ROAD = range(-2, -9, -1)
 
 
-def grounds() -> Grounds:
+def grounds() -> MapColumns:
     """Three lanes one way, one against them, one that follows the ego's, a sidewalk; a road."""
     kinds = ["off_road", *["lane"] * 6, "road"]
     types = ["", *["driving"] * 5, "sidewalk", ""]
@@ -46,7 +46,7 @@ def grounds() -> Grounds:
         *(("isIn", lane, ROAD) for lane in range(LEFT, ROAD, -1)),
     ]
     empty = np.array([""] * 8, object)
-    return Grounds(
+    return MapColumns(
         kind=np.array([KIND_CODE[kind] for kind in kinds], np.int8),
         name=np.array(["off_road", *"abcdef", "7"], object),
         lane_type=np.array(types, object),
@@ -59,7 +59,9 @@ def grounds() -> Grounds:
     )
 
 
-def scene(*edges, places=(), present=(OWN, LEFT, RIGHT, AGAINST, ROAD), ego_lane=OWN) -> Seen:
+def scene(
+    *edges, places=(), present=(OWN, LEFT, RIGHT, AGAINST, ROAD), ego_lane=OWN
+) -> GraphColumns:
     """One frame: an ego, a car, a bus and a person, and edges ``(src, relation, dst)``."""
     kinds = [KIND_CODE[k] for k in ("car", "car", "bus", "person")]
     count = len(kinds) + len(present)
@@ -67,7 +69,7 @@ def scene(*edges, places=(), present=(OWN, LEFT, RIGHT, AGAINST, ROAD), ego_lane
     x, y, z = (np.full(count, np.nan) for _ in range(3))
     places = places or ((0, 0), (10, 3.5), (20, 0), (5, -9))
     x[:4], y[:4], z[:4] = (*zip(*places, strict=True), (0, 0, 0, 0))
-    return Seen.sorted(
+    return GraphColumns.sorted(
         1,
         {
             "node_frame": np.zeros(count, np.int64),
@@ -88,7 +90,7 @@ def scene(*edges, places=(), present=(OWN, LEFT, RIGHT, AGAINST, ROAD), ego_lane
     )
 
 
-def lanes_of(seen: Seen) -> dict[str, str]:
+def lanes_of(seen: GraphColumns) -> dict[str, str]:
     """Entity → the one lane that ``EL`` puts it in."""
     _, edges = abstraction_named("EL").function(seen).named(0)
     return {a: b for a, label, b in edges if label == "isIn" and b != "Root Road"}
@@ -237,7 +239,7 @@ def test_an_unknown_abstraction_is_refused_with_a_suggestion() -> None:
             register(name, lambda seen: Labelled.assembled(seen.frames, [], [], []))
 
 
-def only_people(seen: Seen) -> Labelled:
+def only_people(seen: GraphColumns) -> Labelled:
     rows = np.flatnonzero(seen.kind == KIND_CODE["person"])
     nodes = (seen.node_frame[rows], seen.node[rows], np.zeros(len(rows), np.int64))
     return Labelled.assembled(seen.frames, [nodes], [], ["person"])
@@ -292,7 +294,7 @@ def test_classes_made_at_ingest_are_those_made_of_what_is_stored(store) -> None:
 
 
 def windows(store):
-    from sgstore.store.seen import Graphs
+    from sgstore.store._graphs import Graphs
 
     (trace,) = store.info()
     with store.file._access.reading() as connection:

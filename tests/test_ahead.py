@@ -17,18 +17,21 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from recordings import drive
 
+import sgstore.mcap._chunks as chunks
+import sgstore.mcap._read_ahead as ahead
+import sgstore.mcap._reader as mcap_file
 from sgstore.errors import TraceError
-from sgstore.traces import ahead, chunks, mcap_file, open_trace
-from sgstore.traces.buffers import MANY, MOST, Buffers
-from sgstore.traces.mcap_file import McapFile
+from sgstore.mcap import McapFile
+from sgstore.mcap._read_ahead import MANY, MOST, Buffers
+from sgstore.readers import open_trace
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from sgstore.traces.chunks import ChunkHead
-    from sgstore.traces.recording import Recording
+    from sgstore.mcap import Recording
+    from sgstore.mcap._chunks import ChunkHead
 
 COMPRESSIONS = ["zstd", "lz4", ""]
 
@@ -246,8 +249,8 @@ def test_no_thread_is_left_where_a_recording_cannot_be_opened(
     def failing(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sgstore.traces.osi_survey.ref_of", failing)
-    monkeypatch.setattr("sgstore.traces.spool.Spool.put", failing)
+    monkeypatch.setattr("sgstore.readers.osi._survey.ref_of", failing)
+    monkeypatch.setattr("sgstore.mcap._read_ahead.Spool.put", failing)
     with pytest.raises(KeyboardInterrupt) as caught:
         open_trace(path)
     assert caught.traceback
@@ -362,7 +365,7 @@ def test_checksums_are_looked_at_with_and_without_the_extra(
         pytest.importorskip("isal.isal_zlib")
     else:
         monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
-    spec = importlib.util.find_spec("sgstore.traces.chunks")
+    spec = importlib.util.find_spec("sgstore.mcap._chunks")
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)

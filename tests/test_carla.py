@@ -16,8 +16,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from sgstore.config import Config
 from sgstore.opendrive import read_map
+from sgstore.readers import read_message
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.traces import read_message
 from sgstore.vocabulary import KINDS, LIGHT_STATES
 
 if TYPE_CHECKING:

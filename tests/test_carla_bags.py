@@ -15,13 +15,12 @@ from mcap.writer import Writer
 import sgstore
 from sgstore.cli import run
 from sgstore.errors import TraceError
-from sgstore.exporters import Source
-from sgstore.exporters.mcap import write_clips
-from sgstore.ingest import ingest
-from sgstore.ingest.files import recordings
-from sgstore.traces import digest_of, open_trace, read_message
-from sgstore.traces.mcap_file import McapFile
-from sgstore.traces.parts import read_metadata
+from sgstore.exporters import ClipSource
+from sgstore.exporters._mcap import write_clips
+from sgstore.ingest import ingest, recordings
+from sgstore.mcap import McapFile, digest_of
+from sgstore.mcap._fetch import read_metadata
+from sgstore.readers import open_trace, read_message
 from sgstore.world import Clip, TraceReport
 
 if TYPE_CHECKING:
@@ -172,7 +171,7 @@ def test_a_clip_of_a_bag_is_the_clip_of_the_whole(tmp_path: Path, path: Path) ->
         with open_trace(source) as trace:
             info = trace.info
         cut = Clip("drive", 1_000_000_000, 1_500_000_000)
-        given = {"drive": Source(source, info.digest, info.context)}
+        given = {"drive": ClipSource(source, info.digest, info.context)}
         (clip,) = write_clips([cut], given, tmp_path / f"clips{len(clips)}")
         with clip.file.open("rb") as stream:
             clips.append(

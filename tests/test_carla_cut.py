@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from carla_recordings import HERO, Bridge, vehicle, walker
 
 from sgstore.errors import TraceError
-from sgstore.traces import open_trace
-from sgstore.traces.mcap_file import McapFile
+from sgstore.mcap import McapFile
+from sgstore.readers import open_trace
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from carla_recordings import (
 )
 
 from sgstore.errors import TraceError
-from sgstore.traces.carla_actors import meaning_of
+from sgstore.readers.carla._actors import meaning_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -181,13 +181,13 @@ def test_a_blueprint_that_nothing_maps_is_what_the_bridge_says_unless_that_is_a_
     path: Path,
 ) -> None:
     with Bridge(path) as bridge:
-        bridge.actors({i: (f"vehicle.my.own{i}", "") for i in range(1, 4)})
-        bridge.objects(0.0, [vehicle(i, classification=5 + i) for i in range(1, 4)])
+        bridge.actors({i: (f"vehicle.my.own{i}", "") for i in range(1, 5)})
+        bridge.objects(0.0, [vehicle(i, classification=5 + i) for i in range(1, 5)])
 
     _, blocks, report = read(path)
 
-    assert kinds(blocks) == {"1": "unknown", "2": "truck", "3": "motorcycle"}
-    assert report.unknown_types == {"vehicle.my.own1": 1}
+    assert kinds(blocks) == {"1": "vehicle", "2": "truck", "3": "motorcycle", "4": "vehicle"}
+    assert report.unknown_types == {"vehicle.my.own1": 1, "vehicle.my.own4": 1}
 
 
 def test_without_a_list_of_actors_the_bridge_is_believed_and_that_is_said(path: Path) -> None:

@@ -14,8 +14,9 @@ from standin_carla import StandInActor, at_red, box, transform  # noqa: E402
 
 from sgstore.config import Config  # noqa: E402
 from sgstore.errors import MissingExtraError, TraceError  # noqa: E402
+from sgstore.readers import LiveWorld, connect  # noqa: E402
+from sgstore.readers.carla._live import LIGHTS, in_world  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
-from sgstore.traces.carla_live import LIGHTS, LiveWorld, connect, in_world  # noqa: E402
 from sgstore.vocabulary import VEHICLE_LIGHTS  # noqa: E402
 
 

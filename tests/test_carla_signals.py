@@ -22,14 +22,15 @@ from carla_recordings import (
 )
 from opendrive_maps import a_map, a_road, element, lane, line, link, section
 
-from sgstore.exporters import Source
-from sgstore.exporters.mcap import write_clips
-from sgstore.ingest import examine, ingest
+from sgstore.doctor import examine
+from sgstore.exporters import ClipSource
+from sgstore.exporters._mcap import write_clips
+from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
+from sgstore.readers.carla._signals import Light, signals_of
 from sgstore.roads import lanes_ref
 from sgstore.store import StoreFile
-from sgstore.traces import open_trace
-from sgstore.traces.carla_lights import Light, signals_of
 from sgstore.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.world import Clip, Event
 
@@ -295,7 +296,7 @@ def test_a_light_is_the_signal_that_stands_where_it_stands_and_faces_its_way() -
 def test_a_light_that_stands_elsewhere_is_the_signal_of_the_lanes_in_its_box(
     box: tuple[float, ...], signal: str | None
 ) -> None:
-    assert signals_of({1: Light(120, 20, 5, 0, box)}, crossing()).get(1) == signal
+    assert signals_of({1: Light(120, 20, 5, 0, (box,))}, crossing()).get(1) == signal
 
 
 def test_the_box_of_a_light_lies_in_the_light_s_own_axes(path: Path) -> None:
@@ -333,8 +334,8 @@ def without_signals() -> RoadMap:
 def test_a_light_that_the_map_does_not_have_applies_to_the_lanes_of_its_box() -> None:
     road_map = without_signals()
     lights = {
-        1: Light(120, 20, 5, 0, (97.0, -1.75, 0.0, 0.0, 3.0, 3.0)),
-        2: Light(120, 20, 5, 0, (97.0, -8.0, 0.0, 0.0, 3.0, 3.0)),
+        1: Light(120, 20, 5, 0, ((97.0, -1.75, 0.0, 0.0, 3.0, 3.0),)),
+        2: Light(120, 20, 5, 0, ((97.0, -8.0, 0.0, 0.0, 3.0, 3.0),)),
     }
 
     found = signals_of(lights, road_map)
@@ -409,7 +410,7 @@ def test_a_clip_keeps_what_lasts_and_only_its_own_frames(tmp_path: Path, path: P
     with open_trace(drive(path)) as trace:
         info, whole = trace.info, list(trace.blocks())
     start, end = (int(whole[0].log_time_ns[i]) for i in (8, 12))
-    source = Source(path, info.digest, info.context)
+    source = ClipSource(path, info.digest, info.context)
     (clip,) = write_clips([Clip("drive", start, end)], {"drive": source}, tmp_path / "clips")
 
     ours, blocks, report = read(clip.file)

@@ -16,8 +16,20 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
 from sgstore.errors import TraceError
-from sgstore.traces.cdr import MAX_ROWS, MAX_VALUES, Fields, Table, decode, number, records, text
-from sgstore.traces.ros2msg import NUMBERS, Sequence, Struct, Text, parse_definition
+from sgstore.readers import decode, parse_definition
+from sgstore.readers._ros2 import (
+    MAX_ROWS,
+    MAX_VALUES,
+    NUMBERS,
+    ColumnReader,
+    Fields,
+    Sequence,
+    Struct,
+    Text,
+    number,
+    records,
+    text,
+)
 
 RULE = "=" * 80
 OBJECTS = "derived_object_msgs/msg/ObjectArray"
@@ -220,9 +232,9 @@ def objects_of(things: list[dict[str, Any]], frame: str = "map") -> bytes:
     return bytes(serialize_dynamic(OBJECTS, content)[OBJECTS](message))
 
 
-def table() -> Table:
+def table() -> ColumnReader:
     content = definition("derived_object_msgs/ObjectArray")
-    return Table(parse_definition(OBJECTS, content.encode()), "objects", COLUMNS)
+    return ColumnReader(parse_definition(OBJECTS, content.encode()), "objects", COLUMNS)
 
 
 sizes = st.sampled_from([[], [1.0], [1.0, 2.0], [1.0, 2.0, 3.0]])
@@ -276,9 +288,9 @@ def test_a_table_of_too_many_rows_is_refused() -> None:
     data = b"\0\1\0\0" + struct.pack("<I", MAX_ROWS + 1) + bytes(MAX_ROWS + 1)
 
     with pytest.raises(TraceError, match="at most 100000 are read"):
-        Table(kind, "f", ("a",)).read(data)
+        ColumnReader(kind, "f", ("a",)).read(data)
     with pytest.raises(TraceError, match="no sequence of structures 'g'"):
-        Table(kind, "g", ("a",))
+        ColumnReader(kind, "g", ("a",))
 
 
 # Definitions --------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -259,3 +260,52 @@ def test_a_store_is_verified_and_traces_are_removed(tmp_path) -> None:
     assert (none.returncode, "no trace 'b'" in none.stderr.decode()) == (1, True)
     assert [trace.name for trace in StoreFile(store).traces()] == ["a"]
     assert sgstore("verify", store).returncode == 0
+
+
+# Names of recordings
+
+
+def started(*arguments: object) -> subprocess.CompletedProcess[bytes]:
+    """A command line in a process of its own, whose output takes what is no Unicode."""
+    command = [sys.executable, "-m", "sgstore", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, check=False)
+
+
+@pytest.mark.parametrize(
+    "name", [b"mon\xffday.mcap", b"fold\xe9/drive.mcap", b"a/\x80/b/drive.mcap"]
+)
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_recording_whose_name_is_no_utf_8_is_refused_and_the_others_come_in(
+    name: bytes, jobs: int, tmp_path: Path
+) -> None:
+    good, bad = tmp_path / "good.mcap", tmp_path / os.fsdecode(name)
+    try:
+        bad.parent.mkdir(parents=True, exist_ok=True)
+        drive(bad, frames=5)
+    except OSError:
+        pytest.skip("a file system of Unicode alone")
+    drive(good, frames=4)
+
+    run = started("ingest", tmp_path / "s.db", tmp_path, "--jobs", jobs)
+
+    told = run.stderr.decode()
+    assert run.returncode == 1
+    assert "rename it" in told
+    (odd,) = [part for part in name.split(b"/") if not part.isascii()]
+    assert repr(odd)[2:-1] in told
+    (row,) = in_json("info", tmp_path / "s.db")
+    assert (row["trace"], row["file"]) == ("good", str(good))
+
+
+def test_graphs_in_a_file_whose_name_is_no_utf_8_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / os.fsdecode(b"g\xff.csv")
+    try:
+        file.write_text("graph,src,relation,dst\na,car_1,near,ego\n")
+    except OSError:
+        pytest.skip("a file system of Unicode alone")
+
+    run = started("import", tmp_path / "s.db", file, "--format", "csv")
+
+    assert run.returncode == 1
+    assert r"'g\xff.csv' is none: rename it" in run.stderr.decode()
+    assert not (tmp_path / "s.db").exists()

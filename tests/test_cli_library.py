@@ -83,7 +83,7 @@ def test_run_takes_parameters(capsys: pytest.CaptureFixture[str], store: str) ->
             row["frames"]
             for row in json.loads(said(capsys, "run", store, "low_ttc", f"ttc={t}", "--json"))
         )
-        for t in (0.8, 3)
+        for t in (1.2, 3)
     )
 
     assert 0 < few < many

@@ -11,8 +11,8 @@ from opendrive_maps import a_map, a_road, arc, element, lane, line, section
 from recordings import Recorder, car
 
 from sgstore.cli import run
-from sgstore.roads.lanetext import lane_text
-from sgstore.roads.summary import Part, summary
+from sgstore.roads import lane_text, summary
+from sgstore.roads._map import MapCount
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -158,4 +158,4 @@ def test_types_that_begin_beyond_the_road_hold_from_its_start() -> None:
 
     assert sum(part.length or 0 for part in roads) == pytest.approx(50.0)
     assert {part.kind for part in roads} == {"town", "rural"}
-    assert Part("lane", "driving", 1, pytest.approx(50.0)) in summary(road_map)
+    assert MapCount("lane", "driving", 1, pytest.approx(50.0)) in summary(road_map)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from conftest import REPOSITORY
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from opendrive_maps import a_map, a_road, element, line
 
@@ -21,11 +21,11 @@ from sgstore.config import (
     PRESETS,
     Config,
     Direction,
-    Lanes,
-    Pairs,
+    LaneSettings,
+    PairSettings,
     Payloads,
     Proximity,
-    Range,
+    RangeSettings,
     as_markdown,
     as_toml,
     configured,
@@ -66,7 +66,7 @@ def test_what_a_file_does_not_name_keeps_its_default(tmp_path: Path) -> None:
     config = load(written(tmp_path, text))
 
     assert config == Config(
-        ego="hero", range=Range(30.0), proximity=Proximity(("near", "visible"), (5.0, 20.5))
+        ego="hero", range=RangeSettings(30.0), proximity=Proximity(("near", "visible"), (5.0, 20.5))
     )
 
 
@@ -74,10 +74,14 @@ def test_what_a_file_does_not_name_keeps_its_default(tmp_path: Path) -> None:
     "config",
     [
         Config(),
-        Config(direction=Direction((), ()), proximity=Proximity((), ()), pairs=Pairs(0, ego=False)),
+        Config(
+            direction=Direction((), ()),
+            proximity=Proximity((), ()),
+            pairs=PairSettings(0, ego=False),
+        ),
         Config(direction=Direction(("inDFrontOf",), ()), payloads=Payloads("latest", 0.5)),
         Config(
-            range=Range(shape="polygon", polygon=((9.0, 0.0), (-1.0, 4.0), (-1.0, -4.0))),
+            range=RangeSettings(shape="polygon", polygon=((9.0, 0.0), (-1.0, 4.0), (-1.0, -4.0))),
             types={"A.b": TypeMeaning("car", "taxi"), 'with "quotes"\t': TypeMeaning("prop")},
             egos=("hero", "7"),
         ),
@@ -191,9 +195,9 @@ def test_a_wrong_setting_is_named_with_what_would_be_right(
 @pytest.mark.parametrize("value", [math.inf, math.nan])
 def test_lengths_are_finite(value: float) -> None:
     with pytest.raises(ConfigError):
-        Range(value)
+        RangeSettings(value)
     with pytest.raises(ConfigError):
-        Pairs(within=value)
+        PairSettings(within=value)
     with pytest.raises(ConfigError):
         Proximity(("near",), (value,))
     with pytest.raises(ConfigError):
@@ -214,11 +218,13 @@ def test_files_that_are_no_config_are_refused(tmp_path: Path) -> None:
 
 
 def test_keywords_are_tables_of_either_form_on_top_of_a_preset() -> None:
-    config = configured(preset="carlasgg", range={"front": 80}, pairs=Pairs(within=9), rate=2)
+    config = configured(
+        preset="carlasgg", range={"front": 80}, pairs=PairSettings(within=9), rate=2
+    )
 
     base = preset("carlasgg")
-    assert config.range == Range(**{**vars_of(base.range), "front": 80.0})
-    assert config.pairs == Pairs(within=9)
+    assert config.range == RangeSettings(**{**vars_of(base.range), "front": 80.0})
+    assert config.pairs == PairSettings(within=9)
     assert (config.rate, config.kinds, config.sees) == (2.0, base.kinds, False)
 
 
@@ -231,7 +237,7 @@ def test_a_file_may_begin_with_a_preset(tmp_path: Path) -> None:
 
     base = preset("carlasgg")
     assert config == configured(
-        preset="carlasgg", lanes=Lanes(**{**vars_of(base.lanes), "ahead": 70})
+        preset="carlasgg", lanes=LaneSettings(**{**vars_of(base.lanes), "ahead": 70})
     )
 
 
@@ -274,6 +280,7 @@ def test_the_page_of_parameters_is_what_the_code_says() -> None:
     assert page == as_markdown(PRESETS), "run: sgstore config --page > docs/parameters.md"
 
 
+@settings(deadline=None)
 @given(
     st.dictionaries(st.text(min_size=1), st.sampled_from(["car", "sign", "unknown"]), max_size=5)
 )

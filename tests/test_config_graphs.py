@@ -13,10 +13,10 @@ from conftest import REPOSITORY
 from test_online import columns, shown
 
 from sgstore.config import Config, configured
-from sgstore.online import Replay
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.traces import open_trace
+from sgstore.step import Replay
 from sgstore.vocabulary import RELATION_CODE, RELATIONS, TypeMeaning
 
 if TYPE_CHECKING:

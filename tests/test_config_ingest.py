@@ -10,10 +10,11 @@ from conftest import REPOSITORY
 from sgstore.cli import run
 from sgstore.config import Config, configured, from_dict, preset
 from sgstore.ingest import ingest
-from sgstore.ingest.maps import Maps
+from sgstore.map_files import Maps
+from sgstore.opendrive import SIGNS
 from sgstore.query import Store
+from sgstore.readers import open_trace
 from sgstore.store import StoreFile
-from sgstore.traces import open_trace
 from sgstore.vocabulary import KIND_CODE, TypeMeaning
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def test_graphs_in_a_store_have_the_range_that_was_asked_for(tmp_path: Path, of:
 def test_signs_of_a_recordings_own_map_are_what_the_client_says() -> None:
     config = Config(types={"306": TypeMeaning("yield_sign"), "TYPE_CAR": TypeMeaning("bus")})
     with open_trace(SAMPLE) as trace:
-        plain, told = (Maps(None, signs).of(trace.info)[0] for signs in ((), config.signs))
+        plain, told = (Maps(None, signs).of(trace.info)[0] for signs in (SIGNS, config.signs))
     assert plain is not None
     assert told is not None
 

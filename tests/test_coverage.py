@@ -19,15 +19,17 @@ from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 import sgstore
 from sgstore.abstractions import ABSTRACTIONS
 from sgstore.coverage import (
+    Classed,
+    CountedUnit,
     Missing,
     Outcomes,
-    Unit,
     classed,
     classes,
     combos,
     covered,
     explain,
     failures,
+    features,
     growth,
     novel,
     novel_clips,
@@ -38,11 +40,9 @@ from sgstore.coverage import (
     specification,
     venn,
 )
-from sgstore.coverage.asking import block_of, query_of_features
-from sgstore.coverage.classed import Classed
-from sgstore.coverage.estimates import estimate, expected_classes
-from sgstore.coverage.explain import tree
-from sgstore.coverage.features import features
+from sgstore.coverage._compare import estimate, expected_classes
+from sgstore.coverage._explain import tree
+from sgstore.coverage._frames import block_of, query_of_features
 from sgstore.errors import ConfigError, QueryError, StoreError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
@@ -132,10 +132,10 @@ def test_runs_and_traces_are_counted_as_loops_count_them(worlds) -> None:
         runs.update(k for i, k in enumerate(kinds) if i == 0 or kinds[i - 1] != k)
         traces.update(set(kinds))
 
-    assert sorted(frames.sizes(Unit.run).tolist()) == sorted(runs.values())
-    assert sorted(frames.sizes(Unit.trace).tolist()) == sorted(traces.values())
-    assert classes(frames, Unit.run).column("runs") == sorted(runs.values(), reverse=True)
-    assert classes(frames, Unit.trace).column("share")[0] == max(traces.values()) / 2
+    assert sorted(frames.sizes(CountedUnit.run).tolist()) == sorted(runs.values())
+    assert sorted(frames.sizes(CountedUnit.trace).tolist()) == sorted(traces.values())
+    assert classes(frames, CountedUnit.run).column("runs") == sorted(runs.values(), reverse=True)
+    assert classes(frames, CountedUnit.trace).column("share")[0] == max(traces.values()) / 2
 
 
 def test_coverage_novelty_and_venn_are_those_of_sets(worlds) -> None:
@@ -181,7 +181,7 @@ def test_growth_counts_first_sights_in_the_order_in_which_traces_came(worlds) ->
     assert table.column("frames") == list(range(1, 111))
     assert table.column("classes") == [len(set(kinds[:n])) for n in range(1, 111)]
     assert table.column("at_random")[-1] == pytest.approx(len(set(kinds)))
-    assert growth(frames, Unit.trace).column("classes") == [
+    assert growth(frames, CountedUnit.trace).column("classes") == [
         len({class_of(s) for s in of_a[0]}),
         len(set(kinds)),
     ]
@@ -383,7 +383,7 @@ def test_each_feature_has_a_query_that_finds_the_frames_that_have_it(
 
 
 def test_too_many_combinations_are_an_error_and_not_a_part_of_them(worlds, monkeypatch) -> None:
-    from sgstore.coverage import features as room
+    import sgstore.coverage._features as room
 
     monkeypatch.setattr(room, "MOST", 3)
 

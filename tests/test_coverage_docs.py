@@ -54,7 +54,7 @@ def test_a_command_of_the_page_runs(
 
 
 def test_every_verb_of_coverage_and_every_format_is_on_the_page() -> None:
-    from sgstore.cli.coverage import coverage
+    from sgstore.cli._coverage import coverage
 
     verbs = {command.name for command in coverage.registered_commands}
 

@@ -8,8 +8,8 @@ import pytest
 
 import sgstore
 from sgstore.config import configured
+from sgstore.derive import derive
 from sgstore.errors import AbstractionError, ConfigError
-from sgstore.graphs import derive
 from sgstore.ingest import ingest
 
 SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"

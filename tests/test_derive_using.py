@@ -5,14 +5,16 @@ from __future__ import annotations
 from importlib import resources
 
 import pytest
+from recordings import Recorder, car
 
 import sgstore
-from sgstore.abstractions.literature import SUBSETS
+from sgstore.abstractions import SUBSETS
 from sgstore.cli import run
 from sgstore.config import configured
+from sgstore.derive import derive, keep_abstraction
 from sgstore.errors import AbstractionError, QueryError, QueryNameError
-from sgstore.graphs import derive, keep_abstraction
 from sgstore.ingest import ingest
+from sgstore.vocabulary import RELATIONS
 
 SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"
 OTHER = configured(
@@ -64,14 +66,33 @@ def test_a_derived_set_answers_as_a_store_made_with_its_settings(stores, query) 
     assert list(ours.clips(1, 1)) == list(theirs.clips(1, 1))
 
 
-def test_a_relation_that_a_set_does_not_answer_leaves_its_traces_out(stores) -> None:
+@pytest.mark.parametrize("relation", RELATIONS)
+def test_a_relation_that_a_set_lacks_is_an_error(stores, relation: str) -> None:
     derived, ingested = stores
+    answers = derived.file.deriving.sets()[0].answers
+    query = f"MATCH (a) WHERE NOT EXISTS {{(a)-[:{relation}]->(b)}}"
 
-    for found in (
-        derived.find("USING ABSTRACTION 'other' MATCH (a)-[:overlaps]->(b)"),
-        ingested.find("MATCH (a)-[:overlaps]->(b)"),
-    ):
-        assert found.left_out == ("town",)
+    assert (ingested.find(query).left_out == ()) == (relation in answers)
+    if relation in answers:
+        assert derived.find(f"USING ABSTRACTION other {query}").left_out == ()
+        return
+    for ask in (derived.find, derived.check):
+        text = query if ask == derived.find else f"CHECK ALWAYS EXISTS {{(a)-[:{relation}]->(b)}}"
+        with pytest.raises(QueryError, match=f"'other' has no relation '{relation}'") as raised:
+            list(ask(f"USING ABSTRACTION other {text}"))
+        assert "it has: " in (raised.value.hint or "")
+
+
+def test_a_set_of_traces_without_a_map_knows_nothing_of_lanes(tmp_path) -> None:
+    with Recorder(tmp_path / "field.mcap") as recorder:
+        recorder.ground_truth(0.0, [car(1, 0, 0), car(2, 9, 0)], host=1)
+    assert ingest(tmp_path / "s.sgstore", [tmp_path / "field.mcap"])[0].error is None
+    derive(tmp_path / "s.sgstore", OTHER, "other")
+    store = sgstore.open(tmp_path / "s.sgstore")
+
+    assert store.find("USING ABSTRACTION other MATCH (a)-[:isIn]->(b)").left_out == ("field",)
+    with pytest.raises(QueryError, match="'other' has no relation 'overlaps'"):
+        store.find("USING ABSTRACTION other MATCH (a)-[:overlaps]->(b)")
 
 
 def test_the_name_may_be_a_parameter_and_case_does_not_matter(stores) -> None:

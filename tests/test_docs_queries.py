@@ -14,8 +14,8 @@ import pytest
 
 import sgstore
 from sgstore.config import Config
-from sgstore.graphs import derive
-from sgstore.monitor import Monitor
+from sgstore.derive import derive
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,8 +16,10 @@ import shapely
 from drawing import Crossing, crowd, entity, graph_of, related
 from PIL import Image
 
-from sgstore.draw import SheetFrame, draw_frame, draw_map, draw_sheet, palette, title_of
-from sgstore.draw.indexed import FURTHEST
+import sgstore.draw._palette as palette
+from sgstore.draw import SheetFrame, draw_frame, draw_map, draw_sheet
+from sgstore.draw._page import FURTHEST
+from sgstore.draw._picture import title_of
 from sgstore.errors import ExportError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -86,7 +88,7 @@ def test_another_ending_is_refused_with_what_would_be_right(tmp_path: Path, name
 
 
 def test_a_folder_that_is_missing_is_an_error_of_ours(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="cannot write the picture"):
+    with pytest.raises(ExportError, match="No such file or directory"):
         draw_frame(two(), None, tmp_path / "missing" / "a.png")
 
 
@@ -387,3 +389,108 @@ def test_a_line_of_the_map_is_a_line_and_no_area(tmp_path: Path) -> None:
     drawn = (np.abs(pixels(tmp_path / "m.png") - barrier) < 20).all(axis=2)
 
     assert 500 < drawn.sum() < 5000
+
+
+# Names beside what they name ---------------------------------------------------------------------------
+
+
+def boxes_of(root: ET.Element, word: str) -> dict[int, tuple[float, float, float, float]]:
+    """Left, bottom, right and top of the groups ``word-17``, by node; metres of the picture."""
+    found: dict[int, tuple[float, float, float, float]] = {}
+    for one in root.iter():
+        ident = one.get("id", "")
+        if ident.startswith(f"{word}-"):
+            corners = points(one)
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            found[int(ident.removeprefix(f"{word}-"))] = (*low.tolist(), *high.tolist())
+    return found
+
+
+def gap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    aside = max(one[0] - other[2], other[0] - one[2], 0.0)
+    return math.hypot(aside, max(one[1] - other[3], other[1] - one[3], 0.0))
+
+
+@pytest.mark.parametrize("north_up", [True, False])
+@pytest.mark.parametrize("heading", [0.0, 45.0, 90.0])
+@pytest.mark.parametrize("apart", [6.5, 9.0, 9.5, 10.0])
+def test_a_name_in_a_queue_is_nearest_to_what_it_names(
+    tmp_path: Path, apart: float, heading: float, *, north_up: bool
+) -> None:
+    ahead = math.cos(math.radians(heading)), math.sin(math.radians(heading))
+    queue = {
+        n: entity("car", apart * n * ahead[0], apart * n * ahead[1], heading, is_ego=n == 0)
+        for n in range(-2, 4)
+    }
+    nodes = {n if n >= 0 else 10 - n: a for n, a in queue.items()}
+    draw_frame(graph_of(nodes), None, tmp_path / "a.svg", radius=45.0, north_up=north_up)
+    root = svg(tmp_path / "a.svg")
+
+    labels, things = boxes_of(root, "label"), boxes_of(root, "node")
+    assert len(labels) >= 5
+    for node, label in labels.items():
+        away = {other: gap(label, thing) for other, thing in things.items()}
+        nearest_other = min(value for other, value in away.items() if other != node)
+        own = things[node]
+        over = own[0] < (label[0] + label[2]) / 2 < own[2]
+        assert away[node] + (0.0 if over else 3.0) < nearest_other, (node, away)
+
+
+# Storeys ---------------------------------------------------------------------------------------------
+
+
+def dashed(root: ET.Element, node: int) -> bool:
+    element = group(root, f"node-{node}")
+    assert element is not None
+    return "stroke-dasharray" in next(element.iter(f"{SVG}path")).attrib["style"]
+
+
+def under_and_over() -> tuple[dict[int, dict[str, Any]], set[int]]:
+    """An ego on a bridge, 10 m above a street; and who of the others is below the bridge."""
+    high, low = 10.8, 0.8
+    nodes = {
+        0: entity("car", 0, -15, 90.0, is_ego=True, z=high),
+        1: entity("car", 0, 3, 90.0, z=high),
+        2: entity("car", 1.0, 0, 0.0, z=low, height=1.6),
+        3: entity("person", -1.0, 1.0, 0.0, z=low, height=1.6),
+        4: entity("car", 25, 0, 0.0, z=low),
+        5: entity("car", -25, 0, 0.0, z=low),
+        6: entity("car", 0.5, 12, 90.0, z=float("nan")),
+    }
+    return nodes, {2, 3}
+
+
+@pytest.mark.parametrize("north_up", [True, False])
+def test_what_is_below_the_egos_road_is_not_drawn_as_if_on_it(
+    tmp_path: Path, *, north_up: bool
+) -> None:
+    from opendrive_maps import a_map, a_road, cubic, lane, line, section
+
+    from sgstore.opendrive import read_map
+
+    lanes = section(lane(1), lane(0), lane(-1))
+    bridge = a_road(
+        "bridge",
+        line(80.0, x=0, y=-40, hdg=math.pi / 2),
+        sections=lanes,
+        elevation=cubic("elevation", 10.0, s=0),
+    )
+    road_map = read_map(a_map(bridge, a_road("street", line(80.0, x=-40), sections=lanes)), "two")
+    nodes, below = under_and_over()
+    draw_frame(graph_of(nodes), road_map, tmp_path / "a.svg", radius=40.0, north_up=north_up)
+    root = svg(tmp_path / "a.svg")
+
+    assert {node for node in nodes if dashed(root, node)} == below
+    assert {"car 2, 10 m below", "person 3, 10 m below", "a storey below"} <= set(texts(root))
+    assert "car 4" in texts(root)
+
+
+def test_without_a_map_the_ego_tells_what_is_a_storey_deeper(tmp_path: Path) -> None:
+    nodes, _ = under_and_over()
+    nodes[7] = entity("car", 0, 80, 90.0, z=4.0)  # down a slope, on the ego's own road
+    draw_frame(graph_of(nodes), None, tmp_path / "a.svg", radius=90.0)
+    root = svg(tmp_path / "a.svg")
+
+    assert {node for node in nodes if dashed(root, node)} == {2, 3, 4, 5}
+    assert any("m below" in text for text in texts(root))
+    assert "a storey below" in texts(root)

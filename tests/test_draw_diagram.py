@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sgstore.draw import draw_frame
-from sgstore.draw.excerpt import NEIGHBOURS, excerpt_of
-from sgstore.draw.layout import rows, scattered
+from sgstore.draw._diagram import NEIGHBOURS, excerpt_of, rows, scattered
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sgstore.draw import layers, palette
-from sgstore.draw.ground import Ground, rings_of
-from sgstore.draw.indexed import FURTHEST, indexed
-from sgstore.draw.labels import Placer
-from sgstore.draw.links import ego_lane, links_of, seen_from_ego, sentences
-from sgstore.draw.view import View, bodies_of, clean, number, outline, view_of
+import sgstore.draw._page as layers
+import sgstore.draw._palette as palette
+from sgstore.draw._ground import GroundView, rings_of
+from sgstore.draw._labels import Placer
+from sgstore.draw._links import ego_lane, links_of, seen_from_ego, sentences
+from sgstore.draw._page import FURTHEST, indexed
+from sgstore.draw._view import MapWindow, bodies_of, clean, number, outline, view_of
 from sgstore.opendrive import read_map
 from sgstore.vocabulary import ENTITY_KINDS, LIGHT_STATES, PROXIMITY, SIGNALS
 
@@ -36,7 +37,7 @@ def test_a_place_in_a_view_is_a_turn_of_the_complex_plane(
     x: float, y: float, eye: float, up: float
 ) -> None:
     turned = (complex(x, y) - complex(eye, -eye)) * cmath.exp(1j * (math.pi / 2 - up))
-    ((right, ahead),) = View(eye, -eye, up, 50.0).place(np.array([(x, y)])).tolist()
+    ((right, ahead),) = MapWindow(eye, -eye, up, 50.0).place(np.array([(x, y)])).tolist()
 
     assert complex(right, ahead) == pytest.approx(turned, abs=1e-9)
 
@@ -68,7 +69,7 @@ def test_what_is_no_number_is_missing(value: object) -> None:
 
 def test_a_box_is_as_shapely_makes_it() -> None:
     car = entity("car", 3.0, -2.0, 30.0)
-    (body,), _ = bodies_of(graph_of({1: car}), View(0.0, 0.0, math.pi / 2, 50.0))
+    (body,), _ = bodies_of(graph_of({1: car}), MapWindow(0.0, 0.0, math.pi / 2, 50.0))
     box = shapely.box(-2.3, -0.95, 2.3, 0.95)
     expected = shapely.affinity.translate(shapely.affinity.rotate(box, 30, (0, 0)), 3, -2)
 
@@ -183,7 +184,7 @@ def test_every_kind_of_geometry_has_its_rings(shape: shapely.Geometry | None, ri
 
 def test_the_sides_of_a_lane_are_left_and_right_of_its_travel() -> None:
     road_map = Crossing()
-    ground = Ground.of(road_map, View(0.0, 0.0, math.pi / 2, 60.0))
+    ground = GroundView.of(road_map, MapWindow(0.0, 0.0, math.pi / 2, 60.0))
 
     _left_is_left(ground, 36)
 
@@ -193,13 +194,13 @@ def test_the_sides_of_a_lane_are_left_and_right_of_its_travel() -> None:
 def test_the_sides_of_real_lanes_are_left_and_right_of_their_travel(data: Path, name: str) -> None:
     text = (data / "maps" / f"{name}.xodr").read_text(encoding="utf-8")
     road_map = read_map(text, name)
-    ground = Ground.of(road_map, View(0.0, 0.0, math.pi / 2, 2000.0))
+    ground = GroundView.of(road_map, MapWindow(0.0, 0.0, math.pi / 2, 2000.0))
     lanes = len(ground.of_kind("lane"))
 
     _left_is_left(ground, lanes)
 
 
-def _left_is_left(ground: Ground, at_least: int) -> None:
+def _left_is_left(ground: GroundView, at_least: int) -> None:
     """Of all lanes with sides the left one lies to the left where the map says it is and how it runs."""
     nodes, known = ground.nodes, 0
     for row in ground.of_kind("lane"):
@@ -224,7 +225,7 @@ def test_what_lies_above_is_drawn_above() -> None:
     z = np.linspace(-300.0, 300.0, len(road_map.nodes))
     z[5] = math.nan
     road_map.nodes = replace(road_map.nodes, z=z)
-    storeys = Ground.of(road_map, View(0.0, 0.0, 0.0, 60.0)).storeys()
+    storeys = GroundView.of(road_map, MapWindow(0.0, 0.0, 0.0, 60.0)).storeys()
 
     assert len(storeys) == 36
     assert storeys.pop(5) == 0

@@ -14,9 +14,8 @@ from recordings import Recorder, car
 import sgstore
 from sgstore.config import Config
 from sgstore.ingest import ingest
-from sgstore.store import StoreFile
-from sgstore.store.happenings import Happenings
-from sgstore.store.packing import frame_ids
+from sgstore.store import StoreFile, frame_ids
+from sgstore.store._payloads import Happenings
 from sgstore.world import Event
 
 if TYPE_CHECKING:

@@ -19,12 +19,10 @@ from PIL import Image
 from recordings import Recorder, car
 
 import sgstore
+import sgstore.exporters._foxglove as foxglove
 from sgstore.errors import ExportError, TraceError
-from sgstore.exporters import foxglove
-from sgstore.exporters.export import Export
-from sgstore.exporters.pictures import png
-from sgstore.exporters.sensors import Cloud, Picture, Video, cloud_file, sensor_of
-from sgstore.exporters.stored import labelled, write_export
+from sgstore.exporters import Export, labelled, write_export
+from sgstore.exporters._sensors import ImageFile, PointCloud, Video, cloud_file, png, sensor_of
 from sgstore.ingest import ingest
 from sgstore.world import Clip
 
@@ -190,7 +188,7 @@ def test_pixels_become_a_picture(
 ) -> None:
     found = image_of(sent, encoding, **how)
 
-    assert isinstance(found, Picture)
+    assert isinstance(found, ImageFile)
     assert found.form == "png"
     assert (opened(found.data) == expected).all()
 
@@ -246,7 +244,7 @@ def test_pixels_in_json_and_files_of_pictures_are_found_too() -> None:
     video = {"format": "h264", "data": data}
 
     assert (opened(as_json()(json.dumps(raw).encode()).data) == COLOUR).all()
-    assert as_json()(json.dumps(file).encode()) == Picture("png", png(COLOUR))
+    assert as_json()(json.dumps(file).encode()) == ImageFile("png", png(COLOUR))
     assert isinstance(as_json()(json.dumps(video).encode()), Video)
     for other in (
         b"[1]",
@@ -270,7 +268,7 @@ def test_a_message_of_foxgloves_is_read_by_the_schema_in_the_file() -> None:
         [(1, 2, 3, 4), (5, 6, 7, 8)], [(n, "<f4") for n in ("x", "y", "z", "intensity")]
     )
     cloud = of("PointCloud")(foxglove.cloud(points, 0, "lidar"))
-    assert isinstance(cloud, Cloud)
+    assert isinstance(cloud, PointCloud)
     assert cloud.points.tolist() == points.tolist()
     assert (opened(of("CompressedImage")(foxglove.image(COLOUR, 0, "c")).data) == COLOUR).all()
     assert of("CameraCalibration")(foxglove.calibration(4, 3, 90, 0, "c")) is None
@@ -555,7 +553,7 @@ def test_windows_of_few_frames_make_the_same_files(
 ) -> None:
     whole = Export(store, (Clip("drive", 3 * S // 10, 2 * S),))
     write_export(whole, tmp_path / "one", "frames")
-    monkeypatch.setattr("sgstore.exporters.frames.WINDOW", 3)
+    monkeypatch.setattr("sgstore.exporters._frames.WINDOW", 3)
     write_export(whole, tmp_path / "many", "frames")
 
     def content(folder: Path) -> dict[str, bytes]:
@@ -599,8 +597,8 @@ def test_messages_that_are_hurt_at_random_are_read_or_refused() -> None:
                 outcomes.add("refused")
                 continue
             outcomes.add(type(found).__name__)
-            if isinstance(found, Cloud):
+            if isinstance(found, PointCloud):
                 assert all(
                     cloud_file(found.points, form) is not None for form in ("pcd", "npy", "bin")
                 )
-    assert outcomes >= {"refused", "Picture", "Cloud"}
+    assert outcomes >= {"refused", "ImageFile", "PointCloud"}

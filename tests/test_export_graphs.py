@@ -30,14 +30,13 @@ from mcap.records import (
 from recordings import drive
 
 import sgstore
+import sgstore.exporters._foxglove as foxglove_scene
 from sgstore.demo import RECORDING
 from sgstore.errors import ExportError
-from sgstore.exporters import foxglove_scene
-from sgstore.exporters.export import Export
-from sgstore.exporters.mcap_rules import examine
-from sgstore.exporters.stored import labelled, write_export
+from sgstore.exporters import Export, labelled, write_export
+from sgstore.exporters._mcap_writer import examine
 from sgstore.ingest import ingest
-from sgstore.traces import open_trace
+from sgstore.readers import open_trace
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
@@ -172,7 +171,7 @@ def test_foxgloves_own_classes_read_the_scene(store: Store, clip: Path) -> None:
 def test_the_descriptors_of_the_scene_are_foxgloves() -> None:
     from google.protobuf import descriptor_pb2
 
-    ours = descriptor_pb2.FileDescriptorSet.FromString(foxglove_scene.schema())
+    ours = descriptor_pb2.FileDescriptorSet.FromString(foxglove_scene.scene_schema())
     for message in next(f for f in ours.file if f.package == "foxglove").message_type:
         official = SceneUpdate.DESCRIPTOR.file.pool.FindMessageTypeByName(
             f"foxglove.{message.name}"
@@ -280,7 +279,7 @@ def test_a_clip_of_a_clip_has_its_own_graphs_once(clip: Path, tmp_path: Path) ->
 
 
 def test_graphs_in_clips_keep_to_their_own_numbers(tmp_path: Path) -> None:
-    from sgstore.exporters.mcap_graphs import Added
+    from sgstore.exporters._mcap_graphs import Added
 
     path = drive(tmp_path / "drive.mcap")
     ingest(tmp_path / "s.sgstore", [path])
@@ -328,13 +327,13 @@ def test_clips_keep_to_the_rules_of_the_doctor(store: Store, clip: Path, tmp_pat
 def test_clips_of_recordings_of_all_producers_keep_to_the_rules(
     data: Path, tmp_path: Path, name: str
 ) -> None:
-    from sgstore.exporters import Source
-    from sgstore.exporters.mcap import write_clips
+    from sgstore.exporters import ClipSource
+    from sgstore.exporters._mcap import write_clips
 
     path = data / "traces" / name
     with open_trace(path) as trace:
         first = next(iter(trace.blocks())).log_time_ns
-        source = Source(path, trace.info.digest, trace.info.context)
+        source = ClipSource(path, trace.info.digest, trace.info.context)
     span = Clip("t", int(first[0]), int(first[-1]))
     (written,) = write_clips([span], {"t": source}, tmp_path)
 
@@ -481,7 +480,7 @@ def test_a_file_without_fault_has_none(tmp_path: Path) -> None:
 def test_a_clip_that_breaks_a_rule_is_not_handed_out(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sgstore.exporters import mcap
+    import sgstore.exporters._mcap as mcap
 
     def broken(path: Path) -> Any:
         found = examine(path)
@@ -491,4 +490,4 @@ def test_a_clip_that_breaks_a_rule_is_not_handed_out(
     monkeypatch.setattr(mcap, "examine", broken)
     with pytest.raises(ExportError, match="breaks a rule of MCAP: it is broken"):
         write_export(Export(store, (Clip("town", 0, S),)), tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()

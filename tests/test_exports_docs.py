@@ -15,9 +15,7 @@ import pytest
 import sgstore
 from sgstore.cli import run
 from sgstore.demo import RECORDING
-from sgstore.exporters import EXPORTERS, GROUP
-from sgstore.exporters.export import Export
-from sgstore.exporters.stored import write_export
+from sgstore.exporters import EXPORTERS, GROUP, Export, write_export
 from sgstore.ingest import ingest
 from sgstore.world import Clip
 
@@ -118,7 +116,7 @@ def test_the_format_of_the_page_can_be_exported(
         def load(self) -> Any:
             return own
 
-    monkeypatch.setattr("sgstore.exporters.entry_points", lambda group: [Point()])
+    monkeypatch.setattr("sgstore.exporters._registry.entry_points", lambda group: [Point()])
     store = sgstore.open(folder / "drives.sgstore")
 
     (written,) = write_export(

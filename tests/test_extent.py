@@ -14,9 +14,10 @@ from builders import Thing, edges, frames, graph_of, present, thing
 from conftest import REPOSITORY
 from opendrive_maps import a_map, a_road, cubic, lane, line, link, section
 
-from sgstore.config import Config, Lanes, Pairs, Range, configured
+from sgstore.config import Config, LaneSettings, PairSettings, RangeSettings, configured
 from sgstore.opendrive import read_map
-from sgstore.relations.extent import STEP, Extent, Places
+from sgstore.relations import EgoPoses, Extent
+from sgstore.relations._extent import STEP
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
 
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 
 ARROW = ((40.0, 0.0), (-10.0, 18.0), (0.0, 0.0), (-10.0, -18.0))
 SHAPES = {
-    "radius": Range(35.0),
-    "rectangle": Range(shape="rectangle", front=50, rear=2, side=25),
-    "polygon": Range(shape="polygon", polygon=ARROW),
-    "corridor": Range(shape="corridor", width=9, length=70),
+    "radius": RangeSettings(35.0),
+    "rectangle": RangeSettings(shape="rectangle", front=50, rear=2, side=25),
+    "polygon": RangeSettings(shape="polygon", polygon=ARROW),
+    "corridor": RangeSettings(shape="corridor", width=9, length=70),
 }
 shapes = pytest.mark.parametrize("of", SHAPES.values(), ids=SHAPES)
 
@@ -45,7 +46,7 @@ def outlines() -> Any:
     return town().outlines()
 
 
-def places(seed: int, count: int = 40) -> Places:
+def places(seed: int, count: int = 40) -> EgoPoses:
     """Egos on lanes, roughly in their direction or against it, some off the roads, some without a number."""
     rng = np.random.default_rng(seed)
     points = town().waypoints(1.0)
@@ -54,10 +55,10 @@ def places(seed: int, count: int = 40) -> Places:
     heading = points.heading[at] + rng.normal(0, 0.3, count) + np.pi * (rng.random(count) < 0.2)
     x[::9] += 30
     x[3], y[4], heading[5] = np.nan, np.nan, np.nan
-    return Places(x, y, heading, points.z[at])
+    return EgoPoses(x, y, heading, points.z[at])
 
 
-def boxes_around(egos: Places, seed: int, each: int = 30) -> tuple[Any, Any]:
+def boxes_around(egos: EgoPoses, seed: int, each: int = 30) -> tuple[Any, Any]:
     """Frames and footprints of things around egos; some of them points, some without a position."""
     rng = np.random.default_rng(seed)
     frame = np.repeat(np.arange(len(egos)), each)
@@ -89,7 +90,7 @@ def footprint(box: Any, by: str = "footprint") -> Any:
     return turned(shapely.box(-length / 2, -width / 2, length / 2, width / 2), x, y, heading)
 
 
-def area(of: Range, egos: Places, i: int) -> Any:
+def area(of: RangeSettings, egos: EgoPoses, i: int) -> Any:
     """The area of a frame as a shapely shape; None where there is no range."""
     x, y, heading = (float(column[i]) for column in (egos.x, egos.y, egos.heading))
     if math.isnan(x + y) or (math.isnan(heading) and of.shape != "radius"):
@@ -103,7 +104,7 @@ def area(of: Range, egos: Places, i: int) -> Any:
     return shapely.MultiLineString(corridor(of.length, x, y, heading))
 
 
-def reach(of: Range) -> float:
+def reach(of: RangeSettings) -> float:
     return {"radius": of.radius, "corridor": of.width / 2}.get(of.shape, 0.0)
 
 
@@ -165,7 +166,9 @@ def cut(number: int, begin: float, end: float) -> Any:
 @shapes
 @pytest.mark.parametrize("by", ["footprint", "centre"])
 @pytest.mark.parametrize("seed", range(3))
-def test_entities_in_range_are_those_that_shapely_finds(of: Range, by: str, seed: int) -> None:
+def test_entities_in_range_are_those_that_shapely_finds(
+    of: RangeSettings, by: str, seed: int
+) -> None:
     egos = places(seed)
     frame, boxes = boxes_around(egos, seed)
     areas = Extent(replace(of, by=by), town()).areas(egos)
@@ -184,7 +187,7 @@ def test_entities_in_range_are_those_that_shapely_finds(of: Range, by: str, seed
 
 @shapes
 @pytest.mark.parametrize("seed", range(2))
-def test_parts_of_a_map_in_range_are_those_that_shapely_finds(of: Range, seed: int) -> None:
+def test_parts_of_a_map_in_range_are_those_that_shapely_finds(of: RangeSettings, seed: int) -> None:
     egos, nodes = places(seed), town().nodes
     inside = town().edges.relation == RELATION_CODE["isIn"]
     within = list(zip(town().edges.src[inside], town().edges.dst[inside], strict=True))
@@ -206,7 +209,7 @@ def test_parts_of_a_map_in_range_are_those_that_shapely_finds(of: Range, seed: i
 
 
 @shapes
-def test_the_circle_around_an_area_holds_whatever_is_in_it(of: Range) -> None:
+def test_the_circle_around_an_area_holds_whatever_is_in_it(of: RangeSettings) -> None:
     egos = places(7)
     frame, boxes = boxes_around(egos, 7)
     areas = Extent(of, town()).areas(egos)
@@ -219,13 +222,15 @@ def test_the_circle_around_an_area_holds_whatever_is_in_it(of: Range) -> None:
 
 
 @shapes
-def test_a_block_of_one_frame_has_the_same_range(of: Range) -> None:
+def test_a_block_of_one_frame_has_the_same_range(of: RangeSettings) -> None:
     egos = places(1, 12)
     frame, boxes = boxes_around(egos, 1)
     whole = Extent(of, town()).areas(egos)
     held = whole.hold(frame, boxes, np.zeros(len(frame)))
     for i in range(len(egos)):
-        one = Places(*(column[i : i + 1] for column in (egos.x, egos.y, egos.heading, egos.ground)))
+        one = EgoPoses(
+            *(column[i : i + 1] for column in (egos.x, egos.y, egos.heading, egos.ground))
+        )
         areas = Extent(of, town()).areas(one)
         mine = frame == i
         alone = areas.hold(np.zeros(mine.sum(), int), boxes[mine], np.zeros(mine.sum()))
@@ -236,7 +241,7 @@ def test_a_block_of_one_frame_has_the_same_range(of: Range) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("of", [of for of in SHAPES.values() if of.shape != "corridor"])
-def test_a_range_stays_when_the_world_is_moved_and_turned(of: Range, seed: int) -> None:
+def test_a_range_stays_when_the_world_is_moved_and_turned(of: RangeSettings, seed: int) -> None:
     rng = np.random.default_rng(seed)
     egos = places(seed)
     frame, boxes = boxes_around(egos, seed)
@@ -247,7 +252,7 @@ def test_a_range_stays_when_the_world_is_moved_and_turned(of: Range, seed: int) 
         cos, sin = math.cos(turn), math.sin(turn)
         return dx + x * cos - y * sin, dy + x * sin + y * cos
 
-    there = Places(*moved(egos.x, egos.y), egos.heading + turn, egos.ground)
+    there = EgoPoses(*moved(egos.x, egos.y), egos.heading + turn, egos.ground)
     boxes[:, 0], boxes[:, 1] = moved(boxes[:, 0], boxes[:, 1])
     boxes[:, 2] += turn
 
@@ -258,8 +263,8 @@ def test_a_range_stays_when_the_world_is_moved_and_turned(of: Range, seed: int) 
 
 @shapes
 @pytest.mark.parametrize("far", [1e12, 1e200, 1e308, -1.7e308])
-def test_absurd_positions_are_far_from_everything_else(of: Range, far: float) -> None:
-    egos = Places(*(np.array([value]) for value in (far, 0.0, 1.0, 0.0)))
+def test_absurd_positions_are_far_from_everything_else(of: RangeSettings, far: float) -> None:
+    egos = EgoPoses(*(np.array([value]) for value in (far, 0.0, 1.0, 0.0)))
     with np.errstate(over="ignore", invalid="ignore"):  # as the generator has it
         areas = Extent(of, town()).areas(egos)
         held = areas.hold(np.array([0]), np.array([[0.0, 0, 0, 4, 2]]), np.zeros(1))
@@ -322,7 +327,9 @@ def test_what_moves_and_what_stands_are_told_in_range_as_the_settings_say() -> N
 
 
 def test_the_ego_is_in_its_graph_wherever_its_range_lies() -> None:
-    of = Range(shape="polygon", polygon=((20.0, -5.0), (40.0, -5.0), (40.0, 5.0), (20.0, 5.0)))
+    of = RangeSettings(
+        shape="polygon", polygon=((20.0, -5.0), (40.0, -5.0), (40.0, 5.0), (20.0, 5.0))
+    )
     things = [thing("ego"), thing("near", 6), thing("there", 30)]
 
     assert entities(graph_of(frames(things), None, Config(range=of))) == ["ego", "there"]
@@ -345,23 +352,25 @@ def roads(graph: GraphBlock, road_map: RoadMap) -> set[str]:
 @pytest.mark.parametrize(
     ("of", "names", "passed"),
     [
-        (Range(), ["ego", "above", "below", "unknown"], {"low", "high", "ramp"}),
-        (Range(height=(-2.0, 2.0)), ["ego", "unknown"], {"low", "ramp"}),
-        (Range(height=(-2.0, 9.0)), ["ego", "above", "unknown"], {"low", "high", "ramp"}),
+        (RangeSettings(), ["ego", "above", "below", "unknown"], {"low", "high", "ramp"}),
+        (RangeSettings(height=(-2.0, 2.0)), ["ego", "unknown"], {"low", "ramp"}),
+        (RangeSettings(height=(-2.0, 9.0)), ["ego", "above", "unknown"], {"low", "high", "ramp"}),
         (
-            Range(height=(-2.0, 2.0), grade=0.5),
+            RangeSettings(height=(-2.0, 2.0), grade=0.5),
             ["ego", "below", "unknown"],
             {"low", "high", "ramp"},
         ),
         (
-            Range(height=(-2.0, 2.0), height_of_entities=False),
+            RangeSettings(height=(-2.0, 2.0), height_of_entities=False),
             ["ego", "above", "below", "unknown"],
             {"low", "ramp"},
         ),
     ],
     ids=["any height", "one storey", "upwards", "by grade", "the map alone"],
 )
-def test_other_storeys_are_out_of_range(of: Range, names: list[str], passed: set[str]) -> None:
+def test_other_storeys_are_out_of_range(
+    of: RangeSettings, names: list[str], passed: set[str]
+) -> None:
     road_map = read_map(BRIDGE, "bridge")
     things = [
         thing("ego", -90, -1.75),
@@ -378,7 +387,7 @@ def test_other_storeys_are_out_of_range(of: Range, names: list[str], passed: set
 
 
 def test_a_light_hangs_over_the_road_of_its_storey() -> None:
-    config = Config(range=Range(50, height=(-2.0, 2.0)))
+    config = Config(range=RangeSettings(50, height=(-2.0, 2.0)))
     lights = [
         thing(f"{z}", 9, 3, z=z, kind="traffic_light", static=static, length=0.4, width=0.4)
         for static in (False, True)
@@ -396,8 +405,8 @@ def test_a_light_hangs_over_the_road_of_its_storey() -> None:
 )
 def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is(ground: float, ramp: bool) -> None:
     road_map = read_map(BRIDGE, "bridge")
-    egos = Places(*np.array([[0.0], [9.0], [0.0], [ground]]))
-    points, of = road_map.waypoints(STEP), Range(30.0, height=(-1.0, 1.0))
+    egos = EgoPoses(*np.array([[0.0], [9.0], [0.0], [ground]]))
+    points, of = road_map.waypoints(STEP), RangeSettings(30.0, height=(-1.0, 1.0))
     expected: list[bool] = []
     for i in range(3):
         mine = points.lane == i
@@ -457,13 +466,13 @@ def test_only_the_kinds_that_are_wanted_are_nodes_but_the_ego_always_is() -> Non
 
 
 def test_lanes_of_other_types_go_with_their_roads() -> None:
-    nodes, _ = kinds_of(Config(lanes=Lanes(types=("Driving",))))
+    nodes, _ = kinds_of(Config(lanes=LaneSettings(types=("Driving",))))
 
     assert nodes == {"ego", "car", "walker", "house", "off_road", "street", "street/0/-1"}
 
 
 def test_without_road_granularity_nothing_of_the_roads_is_known() -> None:
-    config = Config(lanes=Lanes(granularity="none"))
+    config = Config(lanes=LaneSettings(granularity="none"))
 
     nodes, names = kinds_of(config)
     answers = SceneGraphGenerator(read_map(STREET, "street"), config).answers
@@ -530,12 +539,12 @@ CROWD = [
     ("settings", "expected"),
     [
         ({}, {("a", "ego"), ("b", "ego"), ("c", "ego"), ("a", "b")}),
-        ({"pairs": Pairs(0)}, {("a", "ego"), ("b", "ego"), ("c", "ego")}),
-        ({"pairs": Pairs(0, ego_within=15)}, {("a", "ego")}),
+        ({"pairs": PairSettings(0)}, {("a", "ego"), ("b", "ego"), ("c", "ego")}),
+        ({"pairs": PairSettings(0, ego_within=15)}, {("a", "ego")}),
         ({"pairs": {"kinds": [["Ego", "Person"]]}}, {("b", "ego")}),
         ({"pairs": {"kinds": [["person", "CAR"]]}}, {("a", "b"), ("b", "ego")}),
         ({"pairs": {"kinds": [["Vehicle", "Vehicle"]]}}, {("a", "ego"), ("c", "ego")}),
-        ({"pairs": Pairs(ego=False, within=12)}, {("a", "b"), ("a", "ego")}),
+        ({"pairs": PairSettings(ego=False, within=12)}, {("a", "b"), ("a", "ego")}),
     ],
     ids=["all", "ego", "ego within", "ego and people", "either order", "super-kinds", "no ego"],
 )
@@ -635,7 +644,7 @@ SECTIONS = a_map(
 
 
 def test_lanes_of_a_number_are_one_node_where_sections_do_not_count() -> None:
-    road_map, config = read_map(SECTIONS, "m"), Config(lanes=Lanes(sections=False))
+    road_map, config = read_map(SECTIONS, "m"), Config(lanes=LaneSettings(sections=False))
     shown = map_of_graphs(road_map, config)
     assert shown is not None
     things = [thing("ego", 19, -1.75), thing("wide", 42, -3.5, width=5.0), thing("c", 70, -1.75)]
@@ -660,7 +669,7 @@ def test_lanes_of_a_number_are_one_node_where_sections_do_not_count() -> None:
 
 
 def test_of_sections_that_are_one_lane_the_shares_add_up_and_one_is_primary() -> None:
-    road_map, config = read_map(SECTIONS, "m"), Config(lanes=Lanes(sections=False))
+    road_map, config = read_map(SECTIONS, "m"), Config(lanes=LaneSettings(sections=False))
     things = [thing("ego", 20.5, -1.75), thing("c", 40, -3.5)]
 
     lanes = graph_of(frames(things), road_map, config).lanes

@@ -21,8 +21,8 @@ from mcap.reader import make_reader
 import sgstore
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
-from sgstore.traces import READERS, open_trace, read_message
-from sgstore.traces.foxglove_mapping import Ego, Entity, Scene, shipped
+from sgstore.readers import READERS, open_trace, read_message
+from sgstore.readers.foxglove._mapping import Ego, EntityMapping, SceneMapping, shipped
 from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
 
 
@@ -250,5 +250,5 @@ def test_the_page_of_flavours_names_them_all() -> None:
         assert f"`{mapping}`" in page
     (example,) = re.findall(r"```toml\n(\[scene\].*?)```", page, re.DOTALL)
     told = tomllib.loads(example)
-    for section, cls in (("scene", Scene), ("entity", Entity), ("ego", Ego)):
+    for section, cls in (("scene", SceneMapping), ("entity", EntityMapping), ("ego", Ego)):
         assert set(told[section]) == set(cls.__dataclass_fields__)

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from recordings import ns
 
 from sgstore.errors import TraceError
-from sgstore.traces import open_trace
-from sgstore.traces.foxglove_axes import Axes, angles, normed, product, rotated
-from sgstore.traces.foxglove_mapping import mapping_for, shipped
+from sgstore.readers import open_trace
+from sgstore.readers.foxglove._mapping import mapping_for, shipped
+from sgstore.readers.foxglove._messages import Axes, angles, normed, product, rotated
 from sgstore.vocabulary import KINDS, LIGHT_STATES
 from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
 
@@ -95,7 +95,7 @@ def test_nuscenes_is_understood_by_the_mapping_that_is_shipped(file: Path, encod
         "ab12": "car",
         "09fe": "person",
         "77aa": "prop",
-        "5e5e": "unknown",
+        "5e5e": "vehicle",
         "base_link": "car",
     }
     assert report.unknown_types == {"vehicle.hovercraft": 1}

@@ -1,12 +1,15 @@
-"""A part of what ``make fuzz`` does, and files cut at every byte."""
+"""A part of what ``make fuzz`` and ``make fuzz-queries`` do, and files cut at every byte."""
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import TYPE_CHECKING, Any
 
 import carla_recordings
 import fuzz
+import fuzz_queries
+import fuzz_texts
 import pytest
 import recordings
 from foxglove_scenes import SceneRecorder, cube
@@ -14,7 +17,7 @@ from mcap.reader import make_reader
 from recordings import car
 
 from sgstore.errors import TraceError
-from sgstore.traces import READERS, open_trace
+from sgstore.readers import READERS, open_trace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,6 +46,26 @@ def test_a_case_is_made_of_its_seed_alone(tmp_path: Path) -> None:
         fuzz.case(flavour, 7, tmp_path / "a")
         fuzz.case(flavour, 7, tmp_path / "b")
         assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("kind", fuzz_texts.LAWS)
+def test_looking_at_what_was_hurt_ends_in_a_result_or_an_error(kind: str, tmp_path: Path) -> None:
+    cases = math.ceil(CASES * fuzz.share_of(kind))
+
+    (counts,) = fuzz.run([kind], cases, 0, tmp_path).values()
+
+    assert counts.get("FAILED", 0) == 0, sorted(tmp_path.iterdir())
+    assert {"whole", "error"} <= set(counts)
+
+
+@pytest.mark.data
+def test_random_queries_on_many_traces_end_in_rows_or_a_reason(data: Path, tmp_path: Path) -> None:
+    store = fuzz_queries.many(tmp_path / "many.sgstore", traces=6, frames=20, egos=1)
+
+    ended, failures = fuzz_queries.run(store, first=1, count=60)
+
+    assert failures == []
+    assert ended["rows"] > 5
 
 
 # Cut at every byte ----------------------------------------------------------------------------------------

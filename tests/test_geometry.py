@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 from typing import TYPE_CHECKING
 
 import duckdb
 import numpy as np
 import pytest
 import shapely
+from contacts import disagreements, random_movers
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -171,6 +173,7 @@ def test_pair_numbers_of_a_car_closing_in_on_another() -> None:
     assert numbers.distance[0] == 25
     assert numbers.gap[0] == pytest.approx(20)
     assert numbers.closing_speed[0] == pytest.approx(5)
+    assert numbers.closing_time[0] == pytest.approx(4)
     assert numbers.ttc[0] == pytest.approx(4)
     assert numbers.headway[0] == pytest.approx(2)
     assert numbers.rel_speed[0] == pytest.approx(5)
@@ -183,14 +186,69 @@ def test_pair_numbers_that_do_not_exist_are_missing() -> None:
     behind = pair_numbers(moving(0, 0, vx=10), moving(-20, 0, vx=20))
     same_place = pair_numbers(moving(0, 0, vx=10), moving(0, 0, vx=20))
 
+    assert np.isnan(apart.closing_time[0])
     assert np.isnan(apart.ttc[0])
     assert apart.closing_speed[0] == pytest.approx(-5)
     assert np.isnan(standing.headway[0])
     assert np.isnan(behind.headway[0])
+    assert behind.closing_time[0] == pytest.approx(1.6)
     assert behind.ttc[0] == pytest.approx(1.6)
     assert np.isnan(same_place.closing_speed[0])
-    assert np.isnan(same_place.ttc[0])
+    assert np.isnan(same_place.closing_time[0])
+    assert same_place.ttc[0] == 0
     assert same_place.gap[0] == 0
+
+
+@pytest.mark.parametrize("seed", range(100 if os.environ.get("SGSTORE_LONG") else 1))
+def test_the_time_to_collision_is_when_sampled_boxes_first_touch(seed: int) -> None:
+    a, b = random_movers(10_000, seed)
+
+    numbers = pair_numbers(a, b)
+
+    assert disagreements(a, b, numbers.ttc, horizon=20) == []
+    assert np.array_equal(numbers.ttc == 0, numbers.gap == 0)
+    assert min((numbers.ttc == 0).mean(), (numbers.ttc > 0).mean()) > 0.09
+    assert np.array_equal(numbers.ttc, pair_numbers(b, a).ttc, equal_nan=True) or (
+        np.nanmax(np.abs(numbers.ttc - pair_numbers(b, a).ttc)) < 1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("other", "closing_time", "ttc"),
+    [
+        pytest.param(moving(24, 0), 2, 2, id="stands ahead"),
+        pytest.param(moving(24, 3), 2.02, None, id="stands beside the path"),
+        pytest.param(moving(20, 16, -PI / 2, vy=-10), 1.522, 1.7, id="comes from the side"),
+        pytest.param(moving(20, 30, -PI / 2, vy=-10), 2.30, None, id="comes from the side, late"),
+        pytest.param(moving(3, 1.5, vx=-5), 0, 0, id="overlaps"),
+        pytest.param(moving(1, 1, vx=12), None, 0, id="overlaps and leaves"),
+        pytest.param(moving(4, 0, vx=10), None, 0, id="touches, and keeps its place"),
+        pytest.param(moving(9, 0, vx=10), None, None, id="keeps its place"),
+        pytest.param(moving(9, 0, vx=10 - 9e-7), 5.56e6, None, id="comes nearer in months"),
+        pytest.param(moving(-2, 2.1, vx=10, vy=-1), 0.138, 0.1, id="drives into the flank"),
+        pytest.param(moving(-1, 3.1, PI / 2, vx=60, vy=-1), 0.00613, None, id="is past in time"),
+        pytest.param(moving(3, 2.2, vx=11, vy=-1), None, 0.2, id="meets though the centres part"),
+        pytest.param(moving(0, 0, math.nan), None, None, id="turned who knows how"),
+        pytest.param(moving(24, 0, vx=math.nan), None, None, id="of a speed that is not known"),
+    ],
+)
+def test_times_until_two_meet(other: Floats, closing_time: float | None, ttc: float | None) -> None:
+    numbers = pair_numbers(moving(0, 0, vx=10), other)
+
+    expected = [math.nan if time is None else time for time in (closing_time, ttc)]
+    found = [numbers.closing_time[0], numbers.ttc[0]]
+    assert found == pytest.approx(expected, nan_ok=True, rel=0.01)
+
+
+@pytest.mark.parametrize("column", [0, 1, 3, 4, 5, 6, 7])
+def test_a_missing_number_makes_the_time_to_collision_missing(column: int) -> None:
+    a = np.concatenate([moving(0, 0, vx=10), moving(0, 0, vx=10)])
+    b = np.concatenate([moving(9, 0, 0.2), moving(1, 0, 0.2)])
+    assert not np.isnan(pair_numbers(a, b).ttc).any()
+    b[:, column] = np.nan
+
+    assert np.isnan(pair_numbers(a, b).ttc).all()
+    assert np.isnan(pair_numbers(b, a).ttc).all()
 
 
 def test_gaps_along_and_across_are_those_of_the_shadows_on_the_axes() -> None:
@@ -266,6 +324,7 @@ def test_pair_numbers_equal_the_measured_view_in_sql(data: Path) -> None:
     numbers = pair_numbers(state[rows["src"]], state[rows["dst"]])
 
     assert len(rows["src"]) == 120 * 11
+    rows["closing_time"] = rows.pop("ttc")  # as it was called then
     measured = [name for name in numbers.__slots__ if name in rows]
     assert len(measured) == 10
     for name in measured:

@@ -9,7 +9,10 @@ import lzma
 import os
 import random
 import re
+import subprocess
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import networkx as nx
 import pytest
@@ -18,10 +21,13 @@ import sgstore
 from sgstore.cli import run
 from sgstore.errors import ConfigError, TraceError
 from sgstore.importing import FORMATS, Words, import_graphs
-from sgstore.importing.blocks import Blocks, parts_map
-from sgstore.importing.meant import Understanding, survey
+from sgstore.importing._blocks import Blocks, parts_map
+from sgstore.importing._resolve import Understanding, survey
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 HEADER = "ds,sg,n_img,t_id,node1,edge,node2\n"
 TWO = HEADER + (
@@ -227,7 +233,7 @@ WRONG = [
         "graph,src,relation,dst,src_kind\na,x,near,ego,car\na,x,near,ego,truck\n",
         "row 3, column src: 'x' is 'truck' here and 'car' in row 2",
     ),
-    ("csv", CSV + "a,vehicle,near,ego\n", "it can be any of car, truck"),
+    ("csv", CSV + "a,vru,near,ego\n", "it can be any of person, bicycle, motorcycle"),
     ("nodelink", "", "empty; expected a graph"),
     ("nodelink", "[]", "an empty list"),
     ("nodelink", "{", "no JSON"),
@@ -371,7 +377,7 @@ def test_text_that_is_no_utf_8_and_a_broken_archive_are_errors_with_their_line(
 def test_an_archive_of_nothing_but_air_is_refused_before_it_fills_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sgstore.importing import lines
+    import sgstore.importing._formats as lines
 
     monkeypatch.setattr(lines, "_FREE", 1 << 16)
     monkeypatch.setattr(lines, "MAX_RATIO", 10)
@@ -380,6 +386,81 @@ def test_an_archive_of_nothing_but_air_is_refused_before_it_fills_the_memory(
     (done,) = import_graphs(tmp_path / "x.sgstore", [file], "s3c")
 
     assert "unpacked, from a file of" in str(done.error)
+
+
+M = 1 << 20
+S3C = HEADER.encode()
+BOMBS: dict[str, tuple[str, Iterable[bytes], str]] = {
+    "rows of one graph": ("csv", [S3C, *[b"d,a,1,0,ego,near,car_1\n" * 1000] * 1001], "edges"),
+    "nodes of one graph": (
+        "csv",
+        [S3C, *(b"d,a,1,0,car_%d,,\n" % number for number in range(200_001))],
+        "nodes",
+    ),
+    "columns of one row": ("csv", [S3C, b"," * (2 * M), b"\n"], "characters"),
+    "a row over many lines": ("csv", [S3C, *[b'"\n",' * 1000] * 12_000], "characters"),
+    "long names": (
+        "csv",
+        [S3C, *(b"d,a,1,0,%s_%d,,\n" % (b"x" * 980, number) for number in range(40_000))],
+        "characters of names",
+    ),
+    "one line": ("csv", [S3C, *[b"x" * M] * 40], "longer than"),
+    "objects": ("json", [b'{"nodes":[{}', *[b",{}" * (M // 3)] * 20, b"]}\n"], "values"),
+    "objects on lines": ("json", [b'{"nodes":[\n', *[b"{},\n" * M] * 8, b"{}]}\n"], "values"),
+    "lists": ("json", [*[b"[]," * M] * 10, b"[]\n"], "values"),
+    "wide letters": ("json", ['{"nodes":["😀'.encode(), *[b"x" * M] * 31, b'"]}\n'], "an 'id'"),
+}
+"""What small files unpack to: the format, the content, and a word of the refusal."""
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_what_a_small_file_unpacks_to_is_refused_before_it_fills_the_memory(
+    tmp_path: Path, bomb: str
+) -> None:
+    ending, parts, word = BOMBS[bomb]
+    file = tmp_path / f"bomb.{ending}.xz"
+    with lzma.open(file, "wb", preset=1) as packed:
+        for part in parts:
+            packed.write(part)
+    program = (
+        "import resource, sys\n"
+        "from sgstore.importing import import_graphs\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "(done,) = import_graphs(*sys.argv[1:2], sys.argv[2:3], sys.argv[3])\n"
+        "print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024, done.error)\n"
+    )
+    form = "s3c" if ending == "csv" else "nodelink"
+    arguments = [str(tmp_path / "x.sgstore"), str(file), form]
+    run = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True
+    )
+    used, _, error = run.stdout.partition(" ")
+
+    assert file.stat().st_size < 200_000
+    assert word in error
+    assert int(used) < 400, "MB"
+    assert not (tmp_path / "x.sgstore").exists()
+
+
+def test_graphs_of_many_edges_come_in_as_well_as_small_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sgstore.importing._run as running
+
+    rows = "".join(
+        f"d,g{graph},1,0,ego,near,car_{car}\n"
+        for graph in range(130)
+        for car in range(graph % 7 + 1)
+    )
+    whole, _ = imported(tmp_path, HEADER + rows, "s3c")
+    monkeypatch.setattr(running, "_BLOCK_SIZE", 9)
+    (tmp_path / "pieces").mkdir()
+    pieces, _ = imported(tmp_path / "pieces", HEADER + rows, "s3c")
+
+    for view in ("edges", "nodes", "imports"):
+        query = f"SELECT * EXCLUDE (frame_id), frame_id & 16777215 FROM {view} ORDER BY ALL"
+        assert pieces.sql(query).values == whole.sql(query).values
+        assert whole.sql(query).values
 
 
 def test_a_client_says_what_words_mean_and_what_nobody_knows_is_counted(tmp_path: Path) -> None:
@@ -405,7 +486,7 @@ def test_a_client_says_what_words_mean_and_what_nobody_knows_is_counted(tmp_path
     "given",
     [
         {"kinds": {"x": "dragon"}},
-        {"kinds": {"x": "vehicle"}},
+        {"kinds": {"x": "vru"}},
         {"relations": {"x": "nearr"}},
         {"unknown_as": "lane"},
         {"unknown_as": "dragon"},

@@ -8,20 +8,26 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive
 
-from sgstore.config import Config, Range
+from sgstore import ingest as running
+from sgstore import map_files as maps
+from sgstore.config import Config, RangeSettings
 from sgstore.errors import MapError, StoreError, TraceError
-from sgstore.ingest import Progress, ingest, maps, read_map_file, running
+from sgstore.ingest import ingest
+from sgstore.map_files import read_map_file
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.traces import open_trace
 from sgstore.vocabulary import RELATIONS
+
+if TYPE_CHECKING:
+    from sgstore.segments import Progress
 
 STREET = a_map(a_road("1", line(200.0, x=-20.0, y=2.0)))
 """A lane 200 m long under the drive."""
@@ -99,7 +105,7 @@ def test_the_same_recording_with_other_settings_is_refused(tmp_path) -> None:
     ingest(tmp_path / "s.db", [path])
     before = (tmp_path / "s.db").read_bytes()
 
-    (outcome,) = ingest(tmp_path / "s.db", [path], config=Config(range=Range(20.0)))
+    (outcome,) = ingest(tmp_path / "s.db", [path], config=Config(range=RangeSettings(20.0)))
 
     assert outcome.status == "failed"
     assert "already in the store as 'drive', read with other settings" in str(outcome.error)
@@ -288,7 +294,7 @@ def test_an_interrupted_run_leaves_a_whole_store_and_nothing_beside_it(
 def test_ctrl_c_in_the_middle_is_an_interruption_too(tmp_path) -> None:
     path = drive(tmp_path / "long.mcap", frames=1500)
     code = (
-        "import sys; from sgstore.ingest import running as m; m.BLOCK_FRAMES = 60\n"
+        "import sys; from sgstore import ingest as m; m.BLOCK_FRAMES = 60\n"
         f"m.ingest({str(tmp_path / 's.db')!r}, [{str(path)!r}],"
         " on_progress=lambda p: print(p.frames, flush=True))"
     )

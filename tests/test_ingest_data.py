@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING
 import pytest
 from mcap.reader import make_reader
 
-from sgstore.ingest import TraceOutcome, ingest
+from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from sgstore.segments import TraceOutcome
 
 pytestmark = pytest.mark.data
 

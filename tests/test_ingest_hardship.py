@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,18 +11,156 @@ from pathlib import Path
 
 import pytest
 from killing import begun, content, killed_and_resumed, made
+from opendrive_maps import a_map, a_road
+from opendrive_maps import line as straight
 from recordings import drive
 from soaking import soak
 
+from sgstore.cli import run as sgstore
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
 
-def test_a_killed_run_goes_on_and_ends_with_the_same_store(tmp_path) -> None:
-    done = killed_and_resumed(tmp_path, kills=5, seed=5, frames=70)
+def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path) -> None:
+    # All of them take minutes: ``make kill``.
+    verbs = ["derive", "export clips", "lock union"]
 
-    assert done["kills"] >= 5
+    done = killed_and_resumed(tmp_path, kills=4, seed=5, frames=20, verbs=verbs)
+
+    assert all(one.kills.total() >= 1 for one in done.values())
+
+
+DYING = """
+import os, signal, sys
+from pathlib import Path
+import sgstore.rebuild
+from sgstore.cli import run
+moment, *line = sys.argv[1:]
+def dying(of, name):
+    old = getattr(of, name)
+    def new(*args, **named):
+        if name != "ingest":
+            old(*args, **named)
+        if name != "ingest" or named["road_map"]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return old(*args, **named)
+    setattr(of, name, new)
+of, name = moment.split(".")
+dying({"Path": Path, "rebuilding": sgstore.rebuild}[of], name)
+run(line)
+"""
+"""A command line in a process that dies right after a call, or before it reads on a map."""
+
+
+def dies(folder: Path, moment: str, *line: object) -> Path:
+    """Run a command line until it dies; gives the folder that it has for what is temporary."""
+    temporary = folder / "tmp"
+    temporary.mkdir()
+    run = subprocess.run(
+        [sys.executable, "-c", DYING, moment, *map(str, line)],
+        env=os.environ | {"TMPDIR": str(temporary)},
+        check=False,
+    )
+    assert run.returncode == -signal.SIGKILL
+    return temporary
+
+
+def again(temporary: Path, *line: object) -> None:
+    """Run a command line as others do."""
+    command = [sys.executable, "-m", "sgstore", *map(str, line)]
+    env = os.environ | {"TMPDIR": str(temporary)}
+    subprocess.run(command, env=env, check=True, capture_output=True)
+
+
+def test_an_export_that_was_killed_while_its_files_were_moved_is_made_again(tmp_path) -> None:
+    store, to = tmp_path / "s.db", tmp_path / "clips"
+    ingest(store, [drive(tmp_path / "d.mcap", frames=30)])
+    line = ("export", store, "MATCH (e:Ego) WHERE e.x < 1 OR e.x > 20 RETURN CLIPS(0s, 0s)")
+    to.mkdir()
+    (to / "notes.txt").write_text("mine")
+    temporary = dies(tmp_path, "Path.hardlink_to", *line, "--to", to)
+    assert len(list(to.glob("*.mcap"))) == 1
+    assert not (to / "manifest.json").exists()
+
+    again(temporary, *line, "--to", to)
+    again(temporary, *line, "--to", tmp_path / "other")
+
+    found = {path.name: path.read_bytes() for path in to.iterdir()}
+    assert found.pop("notes.txt") == b"mine"
+    assert found == {path.name: path.read_bytes() for path in (tmp_path / "other").iterdir()}
+    assert len(found) == 3
+
+
+def test_folders_that_a_killed_export_had_moved_are_taken_back_too(tmp_path) -> None:
+    store, to = tmp_path / "s.db", tmp_path / "frames"
+    ingest(store, [drive(tmp_path / "d.mcap", frames=12)])
+    line = ("export", store, "MATCH (e:Ego) WHERE e.x < 5", "--format", "frames", "--to", to)
+    temporary = dies(tmp_path, "Path.replace", *line)
+    assert [path for path in to.iterdir() if path.is_dir() and not path.name.startswith(".")]
+
+    again(temporary, *line)
+
+    assert (to / "manifest.json").exists()
+    assert not list(to.glob(".export-*"))
+
+
+def test_the_map_of_a_rebuild_that_was_killed_is_not_left(tmp_path) -> None:
+    store, road = tmp_path / "s.db", tmp_path / "street.xodr"
+    road.write_text(a_map(a_road("1", straight(200.0, x=-20.0, y=2.0))))
+    bare = drive(tmp_path / "d.mcap", frames=9)
+    ingest(store, [bare], road_map=road)
+    temporary = dies(tmp_path, "rebuilding.ingest", "rebuild", store)
+    assert list(temporary.iterdir())
+
+    again(temporary, "rebuild", store)
+
+    assert not list(temporary.iterdir())
+    names = {"s.db", "street.xodr", "d.mcap", "tmp"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+LOGGED = (
+    "import duckdb, os, sys\n"
+    "c = duckdb.connect(sys.argv[1], config={'wal_autocheckpoint': '1TB'})\n"
+    "c.execute('PRAGMA disable_checkpoint_on_shutdown')\n"
+    "c.execute(\"INSERT INTO store_info VALUES ('test', 'kept')\")\n"
+    "os.kill(os.getpid(), 9)\n"
+)
+"""A writer that is killed before its log is worked into the store."""
+
+
+def test_a_log_is_never_left_beside_a_store_that_was_written_anew(tmp_path) -> None:
+    store = tmp_path / "s.db"
+    ingest(store, [drive(tmp_path / "d.mcap", frames=20)])
+    subprocess.run([sys.executable, "-c", LOGGED, str(store)], check=False)
+    assert (tmp_path / "s.db.wal").exists()
+
+    dies(tmp_path, "Path.replace", "remove", store, "--compact")
+
+    assert not (tmp_path / "s.db.wal").exists()
+    assert StoreFile(store).verify().faults == []
+    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values
+
+
+@pytest.mark.parametrize("verb", ["derive", "import"])
+def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(tmp_path, verb) -> None:
+    store = tmp_path / "s.db"
+    ingest(store, [drive(tmp_path / "d.mcap", frames=20)])
+    (tmp_path / "g.csv").write_text("graph,src,relation,dst\ng,ego,near,car_1\n")
+    (tmp_path / "c.toml").write_text("[range]\nradius = 20.0\n")
+    line = {
+        "derive": ["derive", store, "--as", "x", "--config", tmp_path / "c.toml", "--trace", "d"],
+        "import": ["import", store, tmp_path / "g.csv", "--format", "csv"],
+    }[verb]
+    assert sgstore(list(map(str, line))) == 0
+    subprocess.run([sys.executable, "-c", LOGGED, str(store)], check=False)
+    (tmp_path / "s.db.gate").touch()
+
+    assert sgstore(list(map(str, line))) == 0
+
+    assert sorted(path.name for path in tmp_path.glob("s.db*")) == ["s.db"]
+    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values
 
 
 def test_readers_and_a_writer_meet_no_lock_and_no_half_trace(tmp_path) -> None:
@@ -131,14 +270,7 @@ def test_what_a_killed_writer_left_is_worked_in_by_the_next_run(tmp_path: Path) 
     recording = drive(tmp_path / "a.mcap", frames=20)
     store = tmp_path / "s.db"
     assert ingest(store, [recording])[0].status == "added"
-    code = (
-        "import duckdb, os, sys\n"
-        "c = duckdb.connect(sys.argv[1], config={'wal_autocheckpoint': '1TB'})\n"
-        "c.execute('PRAGMA disable_checkpoint_on_shutdown')\n"
-        "c.execute(\"INSERT INTO store_info VALUES ('test', 'kept')\")\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    subprocess.run([sys.executable, "-c", code, str(store)], check=False)
+    subprocess.run([sys.executable, "-c", LOGGED, str(store)], check=False)
     (tmp_path / "s.db.gate").touch()
     assert (tmp_path / "s.db.wal").exists()
 

@@ -12,17 +12,18 @@ from foxglove_scenes import SceneRecorder, cube
 from killing import content, made
 from recordings import Recorder, car, drive, person
 
-from sgstore.config import Config, Range
+import sgstore.mcap._fetch as fetch
+from sgstore import ingest as workers
+from sgstore.config import Config, RangeSettings
 from sgstore.errors import MapError, StoreError, TraceError
-from sgstore.ingest import Progress, ingest, recordings, workers
+from sgstore.ingest import ingest, recordings
 from sgstore.store import StoreFile
-from sgstore.traces import fetch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.ingest import TraceOutcome
+    from sgstore.segments import Progress, TraceOutcome
 
 
 def rows(store: Path, sql: str) -> list[tuple[Any, ...]]:
@@ -153,7 +154,7 @@ def test_what_is_there_is_read_anew_and_replaced_by_force(tmp_path) -> None:
     paths = made(tmp_path, frames=30)
     ingest(tmp_path / "s.db", paths)
     before = content(tmp_path / "s.db")
-    small = Config(range=Range(15.0))
+    small = Config(range=RangeSettings(15.0))
 
     outcomes = ingest(tmp_path / "s.db", [paths[1]], config=small, force=True)
 
@@ -286,7 +287,7 @@ def of_trace(store: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
 
 
 def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(crowd, tmp_path) -> None:
-    small = Config(range=Range(25.0))
+    small = Config(range=RangeSettings(25.0))
 
     outcomes = ingest(tmp_path / "s.db", [crowd], config=small, egos=["5", "1", "6"])
 
@@ -297,7 +298,7 @@ def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(crowd, tmp_
     ]
     for outcome in outcomes:
         alone = tmp_path / f"{outcome.ego}.db"
-        ingest(alone, [crowd], config=Config(range=Range(25.0), ego=outcome.ego))
+        ingest(alone, [crowd], config=Config(range=RangeSettings(25.0), ego=outcome.ego))
         assert of_trace(tmp_path / "s.db", outcome.name) == of_trace(alone, "crowd")
     again = ingest(tmp_path / "s.db", [crowd], config=small, egos=["1", "2"])
     assert [(o.ego, o.status) for o in again] == [("1", "present"), ("2", "added")]

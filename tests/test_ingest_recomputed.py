@@ -26,9 +26,9 @@ from sgstore.world import (
     MessageRefs,
     Origin,
     States,
-    as_kept,
     number,
     origin_of,
+    quantize,
 )
 
 if TYPE_CHECKING:
@@ -196,14 +196,14 @@ def test_what_is_kept_is_what_comes_back(offsets, zero) -> None:
         messages=block.messages,
     )
 
-    kept = as_kept(whole, origin)
+    kept = quantize(whole, origin)
 
     for axis in ("x", "y", "z"):
         value, start = getattr(kept.states, axis), getattr(origin, axis)
         came_back = start + number(value - start).astype(np.float64)
         np.testing.assert_array_equal(came_back, value)
         np.testing.assert_allclose(value, getattr(states, axis), rtol=0, atol=1e-4)
-    twice = as_kept(kept, origin)
+    twice = quantize(kept, origin)
     for column in fields(States):
         np.testing.assert_array_equal(
             getattr(twice.states, column.name), getattr(kept.states, column.name)

@@ -11,12 +11,12 @@ import pytest
 from builders import PaperMap, Patch, Recording, graph_of, thing
 from graph_blocks import RandomTrace, map_stub, publish
 
-from sgstore.config import Config, Range
-from sgstore.graph import Reach
-from sgstore.lang.evaluation import FrameView
+from sgstore.config import Config, RangeSettings
+from sgstore.graph import LaneDistances
+from sgstore.lang import FrameView
 from sgstore.opendrive import read_map
 from sgstore.query import Store
-from sgstore.roads.lanegraph import FARTHEST
+from sgstore.roads._lane_graph import FARTHEST
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 from sgstore.vocabulary import RELATION_CODE
@@ -72,7 +72,7 @@ def test_between_any_two_places_it_is_the_shorter_way_that_dijkstra_finds(
 ) -> None:
     path = data / f"maps/{town}.xodr"
     road_map = read_map(path.read_text(), town)
-    ways, reach = lane_ways(road_map), Reach(*road_map.reach)
+    ways, reach = lane_ways(road_map), LaneDistances(*road_map.reach)
     rng = np.random.default_rng(1)
     lengths = road_map.ribbons.lengths
     near = road_map.graph.downstream(120.0)
@@ -145,13 +145,13 @@ def test_whoever_is_ahead_and_whatever_it_is_has_a_distance_and_opposite_lanes_h
         thing("oncoming", -20, 2, heading=math.pi),
     ]
     recording = Recording()
-    generator = SceneGraphGenerator(TOWN, Config(range=Range(400)))
+    generator = SceneGraphGenerator(TOWN, Config(range=RangeSettings(400)))
     lanes = generator.block(recording.block(things)).lanes
     places: dict[str, list[tuple[int, float]]] = {}
     for node, lane, along, own in zip(lanes.node, lanes.lane, lanes.along, lanes.own, strict=True):
         if own:
             places.setdefault(recording.names[node], []).append((int(lane), float(along)))
-    reach = Reach(*TOWN.reach)
+    reach = LaneDistances(*TOWN.reach)
 
     def far(one: str, other: str) -> float | None:
         return reach.distance(places[one], places[other])
@@ -174,8 +174,8 @@ def test_the_gap_between_who_follows_and_who_leads_is_the_lane_distance_less_hal
     # One whose centre is beyond the end of its lane is taken to be at the end by who follows it.
     x = [x for x in rng.uniform(-99, 150, 40).tolist() if not 15 <= x <= 21]
     things = [thing(f"c{i}", at, -2, length=float(rng.uniform(3, 6))) for i, at in enumerate(x)]
-    graph = graph_of(recording.block(things), TOWN, Config(range=Range(400)))
-    lanes, gaps, reach = graph.lanes, graph.gaps, Reach(*TOWN.reach)
+    graph = graph_of(recording.block(things), TOWN, Config(range=RangeSettings(400)))
+    lanes, gaps, reach = graph.lanes, graph.gaps, LaneDistances(*TOWN.reach)
     places: dict[int, list[tuple[int, float]]] = {}
     for node, lane, along, own in zip(lanes.node, lanes.lane, lanes.along, lanes.own, strict=True):
         if own:

@@ -9,11 +9,11 @@ import pytest
 
 from sgstore.config import Config
 from sgstore.lang import compile_query
-from sgstore.lang.match import Matcher
-from sgstore.online import Replay
+from sgstore.lang._search import Matcher
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.traces import open_trace
+from sgstore.step import Replay
 
 RECORDING = str(resources.files("sgstore") / "sample" / "town.mcap")
 INSIDE = "MATCH (x:Entity)-[:isIn]->(l:Lane) WHERE l.role IS NOT NULL"

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from scenes import Scene, actor, along, cone, ego, light, store_of, street
 
-from sgstore.config import Config, Pairs, Proximity
-from sgstore.lang.bound import Value
-from sgstore.lang.catalog import TraceFacts
-from sgstore.lang.reach import Reach, in_range
-from sgstore.monitor import Monitor
-from sgstore.online.frame import Replay
+from sgstore.config import Config, PairSettings, Proximity
+from sgstore.lang import RelationScope, TraceFacts
+from sgstore.lang._needs import in_range
+from sgstore.lang.ir import Value
+from sgstore.step import Replay
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from sgstore.query import Store
@@ -61,13 +61,13 @@ def test_a_map_without_such_edges_says_that_there_are_none(lanes: Store, relatio
 # Whether a pair was looked at --------------------------------------------------------------------------------
 
 PAIRS = {
-    "default": Pairs(),
-    "nobody but the ego": Pairs(within=0),
-    "nobody": Pairs(within=0, ego=False),
-    "without the ego": Pairs(ego=False, within=12),
-    "not far from the ego": Pairs(within=9, ego_within=15),
-    "what stands": Pairs(static=True, within=8),
-    "listed": Pairs(kinds=(("Ego", "Person"), ("Vehicle", "Truck"))),
+    "default": PairSettings(),
+    "nobody but the ego": PairSettings(within=0),
+    "nobody": PairSettings(within=0, ego=False),
+    "without the ego": PairSettings(ego=False, within=12),
+    "not far from the ego": PairSettings(within=9, ego_within=15),
+    "what stands": PairSettings(static=True, within=8),
+    "listed": PairSettings(kinds=(("Ego", "Person"), ("Vehicle", "Truck"))),
 }
 EVERYTHING = Proximity(("visible",), (100_000.0,))
 """A relation that holds for every pair that is related."""
@@ -123,7 +123,7 @@ def test_parts_of_the_map_are_no_pair(related: Store) -> None:
 
 
 def test_of_settings_that_are_not_known_nothing_is_said() -> None:
-    assert Reach.of({}) is None
+    assert RelationScope.of({}) is None
     traces = [TraceFacts(1, "imported", "", frozenset())]
     assert in_range("a", "b", traces) == Value(None, in_range("a", "b", traces).type)
 

@@ -6,21 +6,22 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.lang.bound import FrameAttribute, NodeAttribute, TraceAttribute
-from sgstore.lang.catalog import (
+from sgstore.lang import Attribute, Binding, Type
+from sgstore.lang._catalog import (
+    EDGE_ATTRIBUTES,
     ENV_ATTRIBUTES,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
     TRACE_ATTRIBUTES,
-    Attribute,
-    Unit,
+    DisplayUnit,
 )
-from sgstore.lang.evaluation import Binding, evaluator
-from sgstore.lang.functions import PAIR_FUNCTIONS
+from sgstore.lang._evaluate import evaluator
+from sgstore.lang._functions import PAIR_FUNCTIONS
+from sgstore.lang.ir import FrameAttribute, NodeAttribute, TraceAttribute
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
-    from sgstore.lang.evaluation import FrameView
+    from sgstore.lang import FrameView
     from sgstore.query import Store
 
 SEQ = 300
@@ -88,7 +89,7 @@ def test_without_labels_numbers_of_pairs_are_of_entities(store: Store) -> None:
 def test_an_attribute_of_frames(attribute: Attribute, store: Store, view: FrameView) -> None:
     name = (
         attribute.name
-        if attribute.unit in {Unit.weather, Unit.clock}
+        if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}
         else f"frame.{attribute.name}"
     )
     ((value,),) = store.find(f"MATCH (e:Ego) WHERE frame.seq = {SEQ} RETURN {name} AS value").rows()
@@ -102,3 +103,183 @@ def test_an_attribute_of_traces(attribute: Attribute, store: Store, view: FrameV
     ((value,),) = store.find(query).rows()
 
     assert same(value, in_memory(TraceAttribute(attribute, attribute.type), view))
+
+
+# Every attribute in every form that an expression can have. What each form says is worked out in Python from
+# the plain values, so that an operand which binds wrongly in the SQL is seen, not only one that is refused.
+
+WHOLE = "MATCH (n) WHERE frame.seq = 300"
+OF_EDGE = {
+    "gap": "MATCH (m)-[r:follows]->(n) WHERE frame.seq % 50 = 0",
+    None: "MATCH (n)-[r:isIn]->(m:Lane) WHERE frame.seq % 50 = 0",
+}
+
+
+def asked_of() -> list[Any]:
+    """Each attribute as it is written, with a pattern that binds what it belongs to."""
+    found = [(f"n.{one.name}", one, WHOLE) for one in NODE_ATTRIBUTES.values()]
+    found += [
+        (f"r.{one.name}", one, OF_EDGE.get(one.name, OF_EDGE[None]))
+        for one in EDGE_ATTRIBUTES.values()
+    ]
+    found += [(f"frame.{one.name}", one, WHOLE) for one in FRAME_ATTRIBUTES.values()]
+    found += [(one.name, one, WHOLE) for one in ENV_ATTRIBUTES.values()]
+    found += [(f"trace.{one.name}", one, WHOLE) for one in TRACE_ATTRIBUTES.values()]
+    return [pytest.param(*one, id=one[0]) for one in found]
+
+
+def written(value: Any) -> str:
+    """A value as a constant of the language."""
+    if isinstance(value, bool):
+        return str(value).upper()
+    return f"'{value}'" if isinstance(value, str) else repr(value)
+
+
+def forms(name: str, some: Any, kind: Type) -> dict[str, Any]:
+    """Conditions on an attribute, with what each says of a value (``None``: unknown)."""
+    one = written(some)
+
+    def known(test: Any) -> Any:
+        return lambda value: None if value is None else test(value)
+
+    same_as, differs = known(lambda v: v == some), known(lambda v: v != some)
+    found: dict[str, Any] = {
+        f"{name} = {one}": same_as,
+        f"{one} = {name}": same_as,
+        f"{name} <> {one}": differs,
+        f"NOT {name} = {one}": differs,
+        f"NOT ({name} <> {one})": same_as,
+        f"{name} IN [{one}]": same_as,
+        f"{name} NOT IN [{one}]": differs,
+        f"{name} = {name}": known(lambda _: True),
+        f"{name} <> {name}": known(lambda _: False),
+        f"{name} IS NULL": lambda v: v is None,
+        f"{name} IS NOT NULL": lambda v: v is not None,
+        f"NOT {name} IS NULL": lambda v: v is not None,
+        f"known({name}) = TRUE": lambda v: v is not None,
+        f"coalesce({name}, {one}) = {one}": lambda v: v is None or v == some,
+        f"({name} = {one}) = ({name} IS NULL)": known(lambda v: v != some),
+        f"({name} = {one}) <> TRUE": differs,
+        f"{name} = {one} XOR {name} IS NULL": known(lambda v: v == some),
+        f"{name} = {one} IMPLIES {name} IS NULL": lambda v: True if v is None else v != some,
+        f"({name} = {one}) IN [TRUE]": same_as,
+    }
+    if kind is Type.boolean:
+        found |= {
+            name: known(lambda v: v),
+            f"NOT {name}": known(lambda v: not v),
+            f"{name} = FALSE": known(lambda v: not v),
+            f"{name} <> FALSE": known(lambda v: v),
+            f"{name} = ({name} = {one})": known(lambda v: v == (v == some)),
+            f"{name} XOR NOT {name}": known(lambda _: True),
+            f"{name} OR NOT {name}": known(lambda _: True),
+        }
+    if kind is Type.number:
+        found |= {
+            f"{name} - {one} = 0": same_as,
+            f"-{name} = -({one})": same_as,
+            f"{name} < {one} OR {name} > {one}": differs,
+            f"abs({name}) = abs({one})": known(lambda v: abs(v) == abs(some)),
+        }
+    return found
+
+
+def some_of(values: list[Any], attribute: Attribute) -> Any:
+    """A value that occurs; if nothing of the sample has one, one that could."""
+    known = [value for value in values if value is not None]
+    could = {Type.number: 1.5, Type.text: "none", Type.boolean: True}[attribute.type]
+    return known[-1] if known else attribute.values[0] if attribute.values else could
+
+
+@pytest.mark.parametrize(("name", "attribute", "pattern"), asked_of())
+def test_an_attribute_in_every_form(
+    name: str, attribute: Attribute, pattern: str, store: Store
+) -> None:
+    keys = "frame.id AS frame, n.id AS n" + (", m.id AS m" if "(m" in pattern else "")
+    plain = store.find(f"{pattern} RETURN {keys}, {name} AS value").rows()
+    values = [row[-1] for row in plain]
+    some = some_of(values, attribute)
+    asked = forms(name, some, attribute.type)
+    wanted = [tuple(test(value) for test in asked.values()) for value in values]
+    columns = ", ".join(f"{one} AS c{number}" for number, one in enumerate(asked))
+
+    rows = store.find(f"{pattern} RETURN {keys}, {columns}").rows()
+
+    width = len(plain[0]) - 1
+    assert [row[:width] for row in rows] == [row[:-1] for row in plain]
+    assert [row[width:] for row in rows] == wanted
+    # As conditions, a row being kept where it is true: of each attribute some, of each form some attributes.
+    for number, condition in enumerate(asked):
+        if (number + len(name)) % 6:
+            continue
+        kept = [row[:-1] for row, told in zip(plain, wanted, strict=True) if told[number] is True]
+        found = store.find(f"{pattern} AND ({condition}) RETURN {keys}").rows()
+        assert found == kept, condition
+
+
+@pytest.mark.parametrize(("name", "attribute", "pattern"), asked_of())
+def test_an_attribute_in_what_is_returned(
+    name: str, attribute: Attribute, pattern: str, store: Store
+) -> None:
+    values = [row[0] for row in store.find(f"{pattern} RETURN {name} AS value, n.id AS n").rows()]
+    known = sorted(value for value in values if value is not None)
+    ordered = known + [None] * (len(values) - len(known))
+
+    def column(text: str) -> list[Any]:
+        return [row[0] for row in store.find(f"{pattern} RETURN {text}").rows()]
+
+    assert column(f"{name} AS value, n.id AS n ORDER BY {name}") == ordered
+    assert column(f"{name} AS value, n.id AS n ORDER BY value DESC")[: len(known)] == known[::-1]
+    assert set(column(f"DISTINCT {name} AS value")) == set(values)
+    assert len(column(f"n.id AS n, {name} AS value SAMPLE 1 PER {name}")) == len(set(values))
+    counts = [f"COUNT({name})", f"COUNT(DISTINCT {name})"]
+    wanted: list[Any] = [len(known), len(set(known))]
+    if attribute.type is not Type.boolean:
+        counts += [f"MIN({name})", f"MAX({name})"]
+        wanted += [min(known, default=None), max(known, default=None)]
+    if attribute.type is Type.number:
+        counts.append(f"SUM({name})")
+        wanted.append(sum(known) if known else None)
+    (row,) = store.find(f"{pattern} RETURN {', '.join(counts)}").rows()
+    assert all(map(same, row, wanted)), (row, wanted)
+    grouped = store.find(f"{pattern} RETURN {name} AS value, COUNT(*) AS many").rows()
+    assert dict(grouped) == {value: values.count(value) for value in set(values)}
+
+
+@pytest.mark.parametrize(
+    ("name", "attribute", "pattern"), [one for one in asked_of() if one.id[:2] in {"n.", "r."}]
+)
+def test_an_attribute_as_a_property(
+    name: str, attribute: Attribute, pattern: str, store: Store
+) -> None:
+    plain = store.find(f"{pattern} RETURN n.id AS n, frame.id AS frame, {name} AS value").rows()
+    tried = sorted({row[-1] for row in plain if row[-1] is not None})[:2]
+    for value in tried or [some_of([], attribute)]:
+        braces = f" {{{attribute.name}: {written(value)}}}"
+        head, tail = pattern.split("n)" if name[0] == "n" else "]", 1)
+        braced = f"{head}n{braces}){tail}" if name[0] == "n" else f"{head}{braces}]{tail}"
+
+        rows = store.find(f"{braced} RETURN n.id AS n, frame.id AS frame").rows()
+
+        assert rows == [row[:-1] for row in plain if row[-1] == value]
+
+
+OF_CARS = [one for one in NODE_ATTRIBUTES.values() if "car" in one.kinds]
+
+
+@pytest.mark.parametrize("attribute", OF_CARS, ids=lambda one: one.name)
+def test_an_attribute_in_checks(attribute: Attribute, store: Store) -> None:
+    name = f"ego.{attribute.name}"
+    rows = store.find(f"MATCH (e:Ego) RETURN frame.seq, e.{attribute.name} AS value").rows()
+    some = some_of([value for _, value in rows], attribute)
+    asked = dict(list(forms(name, some, attribute.type).items())[:10:3])
+    asked[f"EXISTS {{(n:Ego {{{attribute.name}: {written(some)}}})}}"] = lambda v: v == some
+    text = ";\n".join(f"CHECK c{n}: ALWAYS ({one})" for n, one in enumerate(asked))
+
+    verdicts = list(store.check(text))
+
+    for verdict, (condition, test) in zip(verdicts, asked.items(), strict=True):
+        # Under an operator of time what is unknown is false, part by part.
+        if all(value is not None for _, value in rows):
+            holds = all(test(value) for _, value in rows)
+            assert verdict.verdict == ("true" if holds else "false"), condition

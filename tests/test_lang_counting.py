@@ -11,14 +11,14 @@ import duckdb
 import pytest
 from oracle_worlds import World, random_world
 
-from sgstore.lang import compile_query, rewrite
-from sgstore.lang.compiler import Compiled
-from sgstore.lang.counting import MOST, Range, frames_with
+import sgstore.lang._rewrite as rewrite
+from sgstore.lang import Compiled, compile_query
+from sgstore.lang._sql_masks import MOST, CountRange, frames_with
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sgstore.lang.results import Statement
+    from sgstore.lang import SqlStatement
 
 SIGNS: dict[str, Callable[[float, float], bool]] = {
     "=": eq,
@@ -31,7 +31,7 @@ SIGNS: dict[str, Callable[[float, float], bool]] = {
 Rows = list[tuple[int, int, int]]
 
 
-def found(rows: Rows, wanted: Range) -> set[tuple[int, int, int]]:
+def found(rows: Rows, wanted: CountRange) -> set[tuple[int, int, int]]:
     """Bucket, key and bit of the frames that the SQL finds among rows of (bucket, key, mask)."""
     with duckdb.connect() as connection:
         connection.execute('CREATE TABLE "given" ("bucket" BIGINT, "key" INTEGER, "mask" BIGINT)')
@@ -63,7 +63,7 @@ def test_sums_of_masks_find_the_frames_that_counting_finds(sign: str, number: fl
     rows = [(rng.choice((5, 9)), rng.choice((1, 2, 3)), rng.getrandbits(60)) for _ in range(60)]
     rows += [(5, 4, (1 << 60) - 1), (5, 4, 1 << 59), (5, 4, 1)]
 
-    frames = found(rows, Range.of(sign, number))
+    frames = found(rows, CountRange.of(sign, number))
 
     assert frames == counted(rows, lambda count: SIGNS[sign](count, number))
 
@@ -77,8 +77,8 @@ def test_a_count_is_right_however_many_rows_there_are(bound: int, most: int) -> 
     rows += [(1, 2, rng.getrandbits(60)) for _ in range(5)]
 
     for wanted, holds in (
-        (Range.of(">=", bound), lambda count: count >= bound),
-        (Range.of("=", bound), lambda count: count == bound),
+        (CountRange.of(">=", bound), lambda count: count >= bound),
+        (CountRange.of("=", bound), lambda count: count == bound),
     ):
         assert found(rows, wanted) == counted(rows, holds)
 
@@ -95,7 +95,7 @@ def test_a_count_of_a_block_is_what_the_matches_of_the_block_say(sign: str, worl
 
     statement, counts = (compile_query(q, world.catalog).rows() for q in (text, each))
 
-    def rows(of: Statement) -> list[tuple[int, ...]]:
+    def rows(of: SqlStatement) -> list[tuple[int, ...]]:
         return world.connection.execute(of.sql, list(of.values)).fetchall()
 
     wanted = {row[:2] for row in rows(counts) if SIGNS[sign](row[2], 3)}
@@ -125,7 +125,7 @@ def test_counts_by_buckets_are_counts_by_frames(text: str, world: World) -> None
         query = query if rule is rewrite.count_by_buckets else rule(query, world.catalog)
     by_frames = Compiled(text, compiled.bound, query, world.catalog).rows()
 
-    def rows(of: Statement) -> list[tuple[object, ...]]:
+    def rows(of: SqlStatement) -> list[tuple[object, ...]]:
         return world.connection.execute(of.sql, list(of.values)).fetchall()
 
     assert rows(compiled.rows()) == rows(by_frames)

@@ -9,10 +9,8 @@ import pytest
 from oracle_worlds import random_world
 from test_lang_match import view_of
 
-from sgstore.lang import compile_query
-from sgstore.lang.crowds import crowd, crowd_test
-from sgstore.lang.evaluation import Binding
-from sgstore.lang.match import expression
+from sgstore.lang import Binding, compile_query, expression
+from sgstore.lang._evaluate import crowd, crowd_test
 
 NUMBERS = (
     "b.speed",

@@ -10,11 +10,11 @@ import pytest
 from oracle_worlds import SCHEMA
 from test_lang_golden import CATALOG
 
+import sgstore.lang._catalog as catalog
 from sgstore.errors import QueryError
-from sgstore.lang import catalog, compile_query
-from sgstore.lang.compiler import compile_checks
-from sgstore.lang.functions import FUNCTIONS, PAIR_FUNCTIONS
-from sgstore.lang.standard import patterns, predicates
+from sgstore.lang import compile_checks, compile_query, patterns
+from sgstore.lang._functions import FUNCTIONS, PAIR_FUNCTIONS
+from sgstore.lang.library import predicates
 from sgstore.vocabulary import KINDS, RELATIONS
 
 PAGE = (Path(__file__).parents[1] / "docs" / "language.md").read_text(encoding="utf-8")

@@ -7,9 +7,8 @@ import math
 import pytest
 from test_lang_golden import CATALOG
 
-from sgstore.errors import QueryError, Span
-from sgstore.lang import compile_query
-from sgstore.lang.reading import for_people
+from sgstore.errors import QueryError, TextSpan
+from sgstore.lang import compile_query, for_people
 
 
 def refused(text: str, **parameters: object) -> QueryError:
@@ -109,7 +108,7 @@ def test_a_whole_number_that_is_too_large_for_the_database_is_a_number_all_the_s
 def test_carets_stand_below_what_is_wrong(text: str, line: str, carets: str) -> None:
     start = text.index("bad")
 
-    message = str(QueryError("no", text=text, span=Span(start, start + 3)))
+    message = str(QueryError("no", text=text, span=TextSpan(start, start + 3)))
 
     assert message.split("\n") == ["no", line, carets]
 
@@ -119,7 +118,7 @@ def test_of_a_long_line_what_is_around_the_mistake_is_shown(at: int) -> None:
     text = "x " * 5_000
     text = f"{text[:at]}bad {text[at:]}"
 
-    _, line, carets = str(QueryError("no", text=text, span=Span(at, at + 3))).split("\n")
+    _, line, carets = str(QueryError("no", text=text, span=TextSpan(at, at + 3))).split("\n")
 
     assert len(line) < 170
     assert line[carets.index("^") : carets.index("^") + 3] == "bad"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from oracle import disagreement, try_many
+from oracle import disagreement, disagreement_of_results, tried, try_many
 from oracle_worlds import World, random_world
 
 
@@ -13,6 +13,14 @@ def test_random_patterns_find_what_exhaustive_search_finds(first: int) -> None:
 
     assert seen["tried"] > 80
     assert seen["matched"] > 20
+
+
+def test_several_processes_try_what_one_tries(capsys: pytest.CaptureFixture[str]) -> None:
+    seen = tried(0, 60, jobs=2)
+
+    assert seen["tried"] + seen["refused"] == 60
+    assert seen == tried(0, 60, jobs=1)
+    assert capsys.readouterr().out.count("60/60") == 2
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["moving only", "static too"])
@@ -105,6 +113,29 @@ def test_queries_find_what_exhaustive_search_finds(text: str, world: World) -> N
 
     assert problem == ""
     FOUND[text] = FOUND.get(text, 0) + frames
+
+
+@pytest.mark.parametrize("returned", ["ego.x", "COUNT(ego.speed), MAX(ego.x)", "ego.id, COUNT(*)"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (:Ego)-[:near|visible]->()",
+        "MATCH ()<-[:near]-(:Ego&Vehicle)",
+        "MATCH (:Lane), (:Ego)",
+        "MATCH (e:Ego)-[:near]-(), (e)-[:isIn]->()",
+        "MATCH (e:Ego)-[:near]->(), (e)",
+        "MATCH ()-[:near]->(:Entity)",
+        "MATCH (a:Car) WHERE EXISTS {(:Ego)-[:near]-(a)}",
+        "MATCH (a:Car) WHERE NOT EXISTS {(:Lane)<-[:isIn]-(a), (ego)}",
+    ],
+)
+def test_the_ego_after_return_is_the_node_that_has_its_label(
+    text: str, returned: str, world: World
+) -> None:
+    problem, rows = disagreement_of_results(f"{text} RETURN {returned}", world)
+
+    assert problem == ""
+    assert rows
 
 
 def test_most_of_these_queries_have_matches() -> None:

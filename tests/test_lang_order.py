@@ -11,8 +11,9 @@ import pytest
 from oracle import disagreement
 from oracle_worlds import World, random_world
 
-from sgstore.lang import Catalog, compile_query, sql
-from sgstore.store.cataloguing import catalog_of
+import sgstore.lang._sql_masks as sql
+from sgstore.lang import Catalog, compile_query
+from sgstore.store._catalog import catalog_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

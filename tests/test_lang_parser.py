@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 from lark import Lark, UnexpectedInput
 
+import sgstore.lang._parse as tables
 from sgstore.errors import QuerySyntaxError
+from sgstore.lang import parse
 from sgstore.lang import syntax as s
-from sgstore.lang import tables
-from sgstore.lang.builders import BUILDERS
-from sgstore.lang.parser import MAX_DEPTH, MAX_LENGTH, parse
-from sgstore.lang.printing import statements_text, tree_text
+from sgstore.lang._compile import statements_text, tree_text
+from sgstore.lang._parse import MAX_DEPTH, MAX_LENGTH
+from sgstore.lang._syntax_builder import BUILDERS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +60,7 @@ def test_the_tables_that_are_shipped_are_those_of_the_grammar() -> None:
 
     made = tables.text_of(tables.made_from(GRAMMAR))
 
-    assert kept == made, "run: python -m sgstore.lang.tables"
+    assert kept == made, "run: python -m sgstore.lang._parse"
 
 
 def test_every_rule_of_the_grammar_has_a_builder_and_every_builder_a_rule() -> None:
@@ -100,7 +101,7 @@ def test_every_example_of_the_proposed_language_is_a_sentence(data: Path) -> Non
 def test_keywords_are_words_where_a_keyword_cannot_stand() -> None:
     (match,) = parse("match (limit:Car) where limit.frames > 3 return limit.match as match")
 
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     assert match.block.paths[0].nodes[0].name == "limit"
     assert match.returns is not None
     assert match.returns.items[0].name == "match"
@@ -109,7 +110,7 @@ def test_keywords_are_words_where_a_keyword_cannot_stand() -> None:
 def test_comments_are_no_edges_and_edges_no_comments() -> None:
     (match,) = parse("MATCH (a)--(b)-->(c)<--(d) -- a comment (e)\n, (f) /* and\n(g) */ , (h) --")
 
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     assert [len(path.nodes) for path in match.block.paths] == [4, 1, 1]
     assert [e.direction for e in match.block.paths[0].edges] == ["any", "right", "left"]
 
@@ -117,7 +118,7 @@ def test_comments_are_no_edges_and_edges_no_comments() -> None:
 def test_arithmetic_binds_as_in_school() -> None:
     (match,) = parse("MATCH (a) WHERE 1 + 2 * 3 - -4 = 11 AND TRUE OR NOT FALSE AND TRUE")
 
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     where = match.block.where
     assert isinstance(where, s.Logic)
     assert where.word == "OR"
@@ -131,7 +132,7 @@ def test_arithmetic_binds_as_in_school() -> None:
 def test_texts_keep_what_is_escaped() -> None:
     (match,) = parse(r"""MATCH (a) WHERE a.name IN ['it\'s', "a\"b", 'c\\d', 'e\nf']""")
 
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     assert isinstance(match.block.where, s.Membership)
     assert isinstance(match.block.where.choices, s.ListOf)
     values = [
@@ -145,7 +146,7 @@ def test_spans_cover_the_parts_of_the_text() -> None:
 
     (match,) = parse(text)
 
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     where = match.block.where
     assert isinstance(where, s.Comparison)
     assert text[where.span.start : where.span.end] == "dist(e, p) < 15"
@@ -174,7 +175,7 @@ def test_many_terms_in_a_row_are_no_nesting() -> None:
 
     (match,) = parse(text)
 
-    assert isinstance(match, s.Match)
+    assert isinstance(match, s.MatchClause)
     assert isinstance(match.block.where, s.Logic)
     assert len(match.block.where.operands) == 2000
 

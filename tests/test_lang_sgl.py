@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import operator
+import random
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from sgstore.cli import run
+from sgstore.contrib.sgsm import translated
 from sgstore.errors import QueryError
-from sgstore.lang.parser import parse
-from sgstore.lang.sgl import translated
+from sgstore.lang import parse
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import networkx as nx
 
     from sgstore.query import Store
@@ -39,6 +43,8 @@ Property("mine", "G((only & ~is_red) -> X (rightmost U near)) | F fast",
           "rightmost": P.eq(P.size(P.relSetR(lanes, "toRightOf")), 0),
           "near": P.ge(P.size(close), 2),
           "fast": P.eq(P.size(P.filterByAttr("Ego", "carla_speed", lambda x: x > 4)), 1),
+          "below": P.lt(P.size(near), 0), "at_most": P.le(P.size(near), 0), "equal": P.eq(P.size(near), 0),
+          "not_equal": P.ne(P.size(near), 0), "at_least": P.ge(P.size(near), 0), "above": P.gt(P.size(near), 0),
           "some": P.gt(P.size(P.symmetric_difference(near, P.relSetR("Ego", "inDFrontOf"))), 1),
           "nobody": P.logic_not(P.gt(P.size(P.filterByAttr(near, "base_class", "person")), 0))})
 """
@@ -75,6 +81,12 @@ class Algebra:
             "rightmost": len(self.back(lanes, "toRightOf")) == 0,
             "near": len(close) >= 2,
             "fast": sum(nodes[n]["speed"] > 4 for n in self.ego) == 1,
+            "below": False,
+            "at_most": not near,
+            "equal": not near,
+            "not_equal": bool(near),
+            "at_least": True,
+            "above": bool(near),
             "some": len(operator.xor(near, self.back(self.ego, "inDFrontOf"))) > 1,
             "nobody": not any(nodes[n]["kind"] == "person" for n in near),
         }
@@ -106,7 +118,7 @@ def test_formulas_are_translated_word_by_word() -> None:
     assert "CHECK Phi1: ALWAYS ((NOT (in_opposing())));" in text
     assert "EVENTUALLY (ALWAYS[0frames, 9frames] ((multiple() AND NOT (junction())))" in text
     assert "NEXT (((rightmost() UNTIL near()))" in text
-    assert len(parse(text)) == 13
+    assert len(parse(text)) == 19
 
 
 def test_carla_steers_to_the_other_side() -> None:
@@ -170,3 +182,116 @@ def test_what_is_no_python_is_shown_where_it_is_not() -> None:
 
     assert error.value.as_dict()["line"] == 2
     assert "  y = (2 3)" in str(error.value)
+
+
+# What is hurt: a translation that the language can read, or a refusal that says where; nothing else
+
+FUNCTIONS = [
+    *("gt", "lt", "ge", "le", "eq", "ne", "logic_or", "logic_and", "logic_implies", "logic_xor"),
+    *("logic_not", "size", "relSet", "relSetR", "filterByAttr", "intersection", "union"),
+    *("difference", "symmetric_difference", "unheard_of", ""),
+]
+LEAVES = [
+    *('"Ego"', '"G"', "Ego", "lanes", '"isIn"', '"near"', '"no_relation"', '"incoming"', '"name"'),
+    *('"carla_speed"', '"light_state"', '"Red"', '"traffic_light*"', '"["', '""', "0", "1", "-1"),
+    *("2.5", "True", "None", "1e999", "10**400", "0x" + "f" * 5000, "1j", "...", 'b"x"', "*lanes"),
+    *(
+        "lambda x: x > 4",
+        "lambda: 1",
+        "lambda x, y: y < 2",
+        "lambda x: 1 < x < 2",
+        "lambda x: x in x",
+    ),
+    *("[]", "()", "{}", "{**lanes}", 'f"{lanes}"', "lanes.x", "lanes[0]", "itself", "not lanes"),
+]
+
+
+def random_value(rng: random.Random, depth: int) -> str:
+    """A value that SGL may have, or may not."""
+    if depth == 0 or rng.random() < 0.2:
+        return rng.choice(LEAVES)
+    inner = [random_value(rng, depth - 1) for _ in range(rng.choice((0, 1, 2, 2, 2, 3, 3, 4)))]
+    name = rng.choice(FUNCTIONS)
+    if rng.random() < 0.2:
+        return f"partial({', '.join([f'P.{name}' if name else 'P', *inner])})"
+    if rng.random() < 0.1 and inner:
+        inner[-1] = rng.choice(("edge=", "x=", "**")) + inner[-1]
+    return f"P.{name}({', '.join(inner)})" if name else f"P({', '.join(inner)})"
+
+
+def random_properties(rng: random.Random) -> str:
+    """Properties with whatever in them; half of them are right but for what is hurt."""
+    formulas = [
+        "G(~a)",
+        "a",
+        "$[3][a]",
+        "$[0][a]",
+        f"$[{'9' * 5000}][a]",
+        "G(",
+        "",
+        "a U b R a <-> a",
+    ]
+    formulas += [
+        "X",
+        "~" * 2000 + "a",
+        "(" * 500 + "a" + ")" * 500,
+        "ä & a",
+        "$[²][a]",
+        "a b",
+        "tru",
+    ]
+    names = ['"Phi"', '""', '"1"', '"ALWAYS"', '"a b"', "1", "None", '"ü"']
+    right = f"P.gt(P.size(P.relSet({rng.choice(LEAVES[:4])}, {rng.choice(LEAVES[4:7])})), 0)"
+    value = rng.choice((right, random_value(rng, 3), random_value(rng, 4)))
+    key = rng.choice(('"a"', '"a"', '"a"', '"MATCH"', '"é"', '"1a"', '""', "1"))
+    pairs = rng.choice((f"[({key}, {value})]", f"{{{key}: {value}}}", f"[{value}]", value, "[]"))
+    one = f"Property({rng.choice(names)}, '{rng.choice(formulas)}', {pairs})"
+    lanes = rng.choice(('P.relSet("Ego", "isIn")', random_value(rng, 2)))
+    text = (
+        f"lanes = {lanes}\nitself = itself\nagain = {right}\n{rng.choice((one, one, '', value))}\n"
+    )
+    if rng.random() < 0.3:
+        at = rng.randrange(len(text))
+        hurt = rng.choice(("", "(", ")", '"', "\x0c", "\u2028", "\r", "\0", "é", "\ud800", "#"))
+        text = text[:at] + hurt + text[at + rng.choice((0, 1, 3)) :]
+    return text
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_translated_can_be_read_or_is_refused(seed: int) -> None:
+    rng = random.Random(seed)
+    read = 0
+    for _ in range(400):
+        text = random_properties(rng)
+        try:
+            found = translated(text)
+        except QueryError:
+            continue
+        assert parse(found), text
+        read += 1
+    assert read > 20
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        ("P.gt(1)", "gt takes 2 arguments, found 1"),
+        ("P.gt(P.size(P.relSet('Ego')), 0)", "relSet takes 2 or 3 arguments, found 1"),
+        ("P.gt(P.size(), 0)", "size takes 1 argument, found 0"),
+        ("P.logic_not()", "logic_not takes 1 argument, found 0"),
+        ("P.gt(P.size('Ego'), True)", "expected a number"),
+        ("P.gt(P.size('Ego'), 1e999)", "too large a number"),
+        ("partial(P.union, 'Ego')", "union takes 2 arguments, found 1"),
+    ],
+)
+def test_a_wrong_number_of_arguments_is_told(value: str, says: str, tmp_path: Path) -> None:
+    file = tmp_path / "properties.py"
+    file.write_text(
+        f"# ein Kommentar: ä\nProperty('p', 'G(a)', [('a', {value})])\n", encoding="utf-8"
+    )
+
+    with pytest.raises(QueryError) as raised:
+        translated(file.read_text(encoding="utf-8"))
+
+    assert says in str(raised.value)
+    assert run(["translate", str(file)]) == 2

@@ -16,9 +16,8 @@ from typer.testing import CliRunner
 
 from sgstore.cli import application
 from sgstore.errors import QueryError
-from sgstore.lang import compile_query
-from sgstore.lang.match import Matcher
-from sgstore.lang.parser import parse
+from sgstore.lang import compile_query, parse
+from sgstore.lang._search import Matcher
 
 if TYPE_CHECKING:
     from sgstore.query import Store

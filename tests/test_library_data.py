@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from test_docs_queries import queries_of
 
 from sgstore.ingest import ingest
 from sgstore.lang import patterns
@@ -12,7 +14,6 @@ from sgstore.query import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from sgstore.matches import Interval
 
@@ -69,9 +70,19 @@ def test_cut_ins_are_found_by_name_where_somebody_cuts_in(store: Store) -> None:
     (first,) = (c for c in cut_ins if c.trace == "cut-in")
 
     assert (who(first, "e"), who(first, "v")) == ("car 0", "car 1")
-    assert first.start < 8 < first.end
+    assert 7 < first.start < 8 < first.end < 9  # it is half in the ego's lane at 7.9 s
     assert {c.trace for c in cut_ins} == {"cut-in", "highway_merge"}
     assert {(c.trace, who(c, "v")) for c in found(store, "CutIn")} >= {("cut-in", "car 1")}
+
+
+def test_the_cut_in_of_the_readme_is_found_where_lines_are_solid(store: Store) -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (text,) = (text for text in queries_of(readme) if "THEN" in text)
+
+    assert "AS cutter" in text
+    assert ("cut-in", "car 1") in {
+        (c.trace, c.values["cutter"]) for c in store.find(text).intervals()
+    }
 
 
 def test_who_cuts_in_and_brakes_is_found_by_name(store: Store) -> None:

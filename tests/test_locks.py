@@ -13,9 +13,9 @@ import pytest
 
 import sgstore
 from sgstore.cli import run
-from sgstore.config.reading import from_dict
+from sgstore.config import from_dict
 from sgstore.coverage import classed, selection_of
-from sgstore.differences import by_frame, matches, scenes, verdicts
+from sgstore.diff import by_frame, matches, scenes, verdicts
 from sgstore.errors import ExportError, StoreError
 from sgstore.ingest import ingest
 from sgstore.locks import (
@@ -29,8 +29,8 @@ from sgstore.locks import (
     verify,
 )
 from sgstore.query import Store
-from sgstore.selection import Piece, Way, Wish, locked_selection, select
-from sgstore.store.contents import graph_digests
+from sgstore.selection import SelectionSpec, SelectionUnit, Strategy, locked_selection, select
+from sgstore.store import graph_digests
 
 pytest_plugins = ["pytester"]
 
@@ -52,8 +52,10 @@ def made(folder: Path, name: str = "town", **how: object) -> Store:
     return Store(folder / "s.sgstore")
 
 
-def lock_of(store: Store, way: Way = Way.minimal, *, payloads: bool = True) -> Lock:
-    found = select(selection_of(str(store.file.path)), Wish(way, Piece.clip, 1.0, "E"))
+def lock_of(store: Store, way: Strategy = Strategy.minimal, *, payloads: bool = True) -> Lock:
+    found = select(
+        selection_of(str(store.file.path)), SelectionSpec(way, SelectionUnit.clip, 1.0, "E")
+    )
     return locked_selection(found, payloads=payloads)
 
 
@@ -64,7 +66,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 @pytest.fixture(scope="module")
 def lock(store: Store) -> Lock:
-    return lock_of(store, Way.every)
+    return lock_of(store, Strategy.every)
 
 
 def what_changed(lock: Lock, store: Store) -> dict[str, set[str]]:
@@ -79,7 +81,7 @@ def test_made_again_in_another_folder_it_is_the_same_to_the_byte(
 ) -> None:
     elsewhere = made(tmp_path / "far" / "away")
 
-    again = lock_of(elsewhere, Way.every)
+    again = lock_of(elsewhere, Strategy.every)
 
     assert again.text() == lock.text()
     assert str(tmp_path) not in again.text()
@@ -182,6 +184,26 @@ def test_a_graph_that_changed_is_named_and_others_are_not(lock: Lock, store: Sto
     assert what_changed(replace(lock, cases=cases), store) == {"graph": {other.id}}
 
 
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"first": -1}, "frames"),
+        ({"last": 1}, "frames"),
+        ({"frames": 1}, "frames"),
+        ({"start_ns": -1}, "time"),
+        ({"end_ns": 1}, "time"),
+    ],
+)
+def test_a_case_of_other_frames_or_times_is_named(
+    lock: Lock, store: Store, change: dict[str, int], what: str
+) -> None:
+    one = lock.cases[2]
+    other = replace(one, **{name: getattr(one, name) + by for name, by in change.items()})
+    cases = (*lock.cases[:2], other, *lock.cases[3:])
+
+    assert other.id in what_changed(replace(lock, cases=cases), store)[what]
+
+
 def test_versions_are_named_and_do_not_make_another_set(lock: Lock, store: Store) -> None:
     trace = replace(lock.traces[0], version="0.0.1")
     old = replace(lock, made_with={"sgstore": "0.0.1", "schema": "1"}, traces=(trace,))
@@ -207,7 +229,7 @@ def test_a_trace_that_is_missing_is_named_and_its_clips_are_not_handed_out(
 
 
 def test_a_digest_tells_every_number_and_every_edge_apart(store: Store) -> None:
-    ids = frames_of_lock(lock_of(store, Way.every, payloads=False), store)
+    ids = frames_of_lock(lock_of(store, Strategy.every, payloads=False), store)
 
     alone = list(graph_digests(store.file, [ids[i : i + 1] for i in range(len(ids))]))
     pairs = list(graph_digests(store.file, [ids[i : i + 2] for i in range(0, len(ids) - 1, 2)]))

@@ -21,9 +21,9 @@ from mcap.stream_reader import StreamReader
 from recordings import OSI, Recorder, bulb, car, drive, ground_truth, house, person, sign
 
 from sgstore.errors import TraceError
-from sgstore.traces import open_trace, read_message
-from sgstore.traces.chunks import MAX_RECORDS, decompress
-from sgstore.traces.mcap_file import McapFile
+from sgstore.mcap import McapFile
+from sgstore.mcap._chunks import MAX_RECORDS, decompress
+from sgstore.readers import open_trace, read_message
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
@@ -478,6 +478,16 @@ def test_a_chunk_that_lies_about_its_size_costs_neither_time_nor_memory(
     assert len(report.losses) == 1
     assert cost <= 0.05
     assert peak <= 64 << 20
+
+
+@pytest.mark.parametrize("more", [1, 1000])
+def test_a_zstd_frame_that_declares_more_than_its_chunk_is_told_with_both_sizes(more: int) -> None:
+    stored = zstd_bomb(1000 + more, declared=True)
+
+    with pytest.raises(
+        TraceError, match=f"declares 1000 bytes, the zstd frame in it {1000 + more}"
+    ):
+        decompress(stored, "zstd", 1000)
 
 
 def test_a_frame_that_asks_for_a_huge_window_is_refused() -> None:

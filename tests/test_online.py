@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from builders import PaperMap, Patch, Recording, Thing, thing
 
-from sgstore.config import Config, Range
+from sgstore import step as stepping
+from sgstore.config import Config, RangeSettings
 from sgstore.demo import RECORDING
-from sgstore.online import Frame, Replay, stepping
 from sgstore.opendrive import read_map
 from sgstore.query import Store
+from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.traces import open_trace
+from sgstore.step import Frame, Replay
 from sgstore.vocabulary import RELATIONS
-from sgstore.world import Origin, as_kept, number, origin_of
+from sgstore.world import Origin, number, origin_of, quantize
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -122,7 +123,7 @@ def test_a_graph_goes_to_networkx() -> None:
     ("wrong", "message"),
     [
         ({"kind": "cra"}, "unknown kind 'cra'; did you mean 'car'"),
-        ({"kind": "vehicle"}, "unknown kind 'vehicle'"),
+        ({"kind": "vru"}, "unknown kind 'vru'"),
         ({"kind": "lane"}, "unknown kind 'lane'"),
         ({"light_state": "rde"}, "unknown state of a traffic light 'rde'; did you mean 'red'"),
         ({"lights": ["light_brakes"]}, "did you mean 'light_brake'"),
@@ -289,7 +290,7 @@ def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
 ) -> None:
     monkeypatch.setattr(stepping, "REMEMBERED", 60)
     monkeypatch.setattr(stepping, "SPARE", 60)
-    online = generator(None, range=Range(30))
+    online = generator(None, range=RangeSettings(30))
 
     def run(first: int, count: int) -> int:
         for step in range(first, first + count):
@@ -429,7 +430,7 @@ def test_recordings_driven_step_by_step_give_what_blocks_of_them_give(
             idents += block.entities.ident
             origin = origin or origin_of(block)
             assert origin is not None
-            graph = offline.block(as_kept(block, origin))
+            graph = offline.block(quantize(block, origin))
             for row, frame in enumerate(replay.frames(block)):
                 if row % every == 0:
                     assert shown(online.step(frame)) == columns(graph, row, idents)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,6 @@ from opendrive_maps import (
     a_map,
     a_road,
     arc,
-    border,
     cubic,
     element,
     geometry,
@@ -24,8 +24,10 @@ from opendrive_maps import (
     width,
 )
 
+import sgstore.opendrive._document as document
+import sgstore.opendrive._lanes as lanes
 from sgstore.errors import MapError
-from sgstore.opendrive import document, lanes, read_map
+from sgstore.opendrive import read_map
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -112,11 +114,6 @@ BROKEN_ROADS = {
         "farther|points",
         "road",
     ),
-    "a number beyond all": (
-        a_road("bad", line(9.0), offset=cubic("laneOffset", 1e300, s=0)),
-        "'a'",
-        "laneOffset",
-    ),
     "a lane as wide as a sea": (
         a_road("bad", line(9.0), sections=section(lane(0), lane(-1, width(1e9)))),
         "farther",
@@ -126,18 +123,6 @@ BROKEN_ROADS = {
         a_road("bad", line(900.0), sections=section(lane(0), lane(-1, width(0, 0, 0, 1e11)))),
         "farther|points",
         "road",
-    ),
-    "a width that is no number": (
-        a_road(
-            "bad", line(9.0), sections=section(lane(0), lane(-1).replace('a="3.5"', 'a="wide"'))
-        ),
-        "'a'",
-        "width",
-    ),
-    "a border that is no number": (
-        a_road("bad", line(9.0), sections=section(lane(-1, border(-3.5).replace("-3.5", "x")))),
-        "'a'",
-        "border",
     ),
     "a lane without an id": (
         a_road("bad", line(9.0), sections=section(lane(-1).replace('id="-1"', ""))),
@@ -158,11 +143,6 @@ BROKEN_ROADS = {
         a_road("bad", line(9.0), sections=section(lane(-1)).replace('s="0"', "")),
         "'s' is missing",
         "laneSection",
-    ),
-    "a height of NaN": (
-        a_road("bad", line(9.0), elevation=cubic("elevation", float("nan"), s=0)),
-        "'a'",
-        "elevation",
     ),
 }
 
@@ -196,6 +176,78 @@ def test_several_defects_of_several_kinds_cost_only_their_roads() -> None:
 
     assert road_map.nodes.name[1:3] == ("good/0/-1", "good")
     assert len(road_map.warnings) == len(roads)
+
+
+HURT = {
+    "NaN": "nan",
+    "Windows' NaN": "-1.#IND",
+    "infinity": "inf",
+    "a word": "wide",
+    "nothing": "",
+    "beyond all": "1e300",
+}
+
+
+@pytest.mark.parametrize("number", HURT.values(), ids=HURT)
+@pytest.mark.parametrize("attribute", ["a", "b", "c", "d", "s"])
+@pytest.mark.parametrize("kind", ["width", "border", "elevation", "laneOffset"])
+def test_a_broken_record_costs_itself_and_the_one_before_it_holds_on(
+    kind: str, attribute: str, number: str
+) -> None:
+    def road(name: str, *records: str) -> str:
+        of_lanes = records if kind in {"width", "border"} else (width(3.5),)
+        around = {kind.replace("laneOffset", "offset"): "".join(records)}
+        return a_road(
+            name,
+            line(30.0),
+            sections=section(lane(0), lane(-1, "".join(of_lanes)), lane(-2, width(2.0))),
+            **(around if kind in {"elevation", "laneOffset"} else {}),
+        )
+
+    key = "s" if kind in {"elevation", "laneOffset"} else "sOffset"
+    whole = cubic(kind, 3.0 if kind == "width" else -3.0, 0.01, **{key: 0})
+    attribute = key if attribute == "s" else attribute
+    hurt = cubic(kind, -4.0, **{key: 12}).replace(f'{attribute}="', f'{attribute}="{number}" x="')
+
+    plain = read_map(a_map(GOOD, road("other", whole)), "whole")
+    found = read_map(
+        a_map(GOOD, road("other", whole, hurt), BROKEN_ROADS["no planView"][0]), "hurt"
+    )
+
+    assert found.nodes.name == plain.nodes.name
+    for column in ("x", "y", "z", "width", "length"):
+        expected = pytest.approx(getattr(plain.nodes, column), nan_ok=True)
+        assert getattr(found.nodes, column) == expected, column
+    told = [warning for warning in found.warnings if "'other'" in warning]
+    assert len(told) == 1, found.warnings
+    assert kind in told[0]
+    assert "left out" in told[0]
+    assert len(found.warnings) == 2
+
+
+def test_a_lane_whose_only_width_is_broken_costs_no_road_and_records_are_counted() -> None:
+    lanes = lane(0), lane(-1, width(float("nan")) + width(float("inf"), s=3)), lane(-2)
+
+    road_map = read_map(a_map(a_road("1", line(9.0), sections=section(*lanes))), "m")
+
+    assert {"1/0/-2", "1"} <= {*road_map.nodes.name}
+    assert len(road_map.warnings) == 1
+    assert "it and 1 more are left out" in road_map.warnings[0]
+
+
+@pytest.mark.data
+def test_one_width_that_is_not_finite_costs_a_town_nothing_else(data: Path) -> None:
+    text = (data / "maps/Town01.xodr").read_text("utf-8")
+    plain = read_map(text, "town")
+    widths = [m.start() for m in re.finditer(r'<width sOffset="[^0]', text)]
+    at = widths[len(widths) // 2]
+    hurt = text[:at] + text[at:].replace(' a="', ' a="-nan(ind)" was="', 1)
+
+    found = read_map(hurt, "town")
+
+    assert found.nodes.name == plain.nodes.name
+    assert len(found.warnings) == len(plain.warnings) + 1
+    assert "width>: attribute 'a' is no finite number" in " ".join(found.warnings)
 
 
 def test_links_that_lead_nowhere_cost_no_road_and_are_said() -> None:

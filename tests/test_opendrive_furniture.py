@@ -10,9 +10,9 @@ import pytest
 import shapely
 from opendrive_maps import a_map, a_road, arc, cubic, element, lane, line, section
 
-from sgstore.opendrive import read_map
-from sgstore.opendrive.objects import PAINT, PARKING, kind_of_object
-from sgstore.opendrive.signals import kind_of_signal
+from sgstore.opendrive import kind_of_object, read_map
+from sgstore.opendrive._objects import PAINT, PARKING
+from sgstore.opendrive._signals import kind_of_signal
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:

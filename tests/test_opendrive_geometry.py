@@ -24,7 +24,7 @@ from opendrive_maps import (
 )
 
 from sgstore.opendrive import read_map
-from sgstore.opendrive.grouped import last_before
+from sgstore.opendrive._document import last_before
 
 if TYPE_CHECKING:
     from sgstore.roads import LanePoints, RoadMap

@@ -19,12 +19,12 @@ from mcap.reader import make_reader
 from mcap.records import Schema
 from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
 
+import sgstore.readers._base as frames
 from sgstore.errors import TraceError
-from sgstore.traces import frames, open_trace
-from sgstore.traces.frames import derive
-from sgstore.traces.osi_lights import lit, shown
-from sgstore.traces.osi_objects import MovingObjects, light_bits
-from sgstore.traces.osi_schema import message_class
+from sgstore.readers import message_class, open_trace
+from sgstore.readers._base import derive
+from sgstore.readers.osi._lights import lit, shown
+from sgstore.readers.osi._objects import MovingObjects, light_bits
 from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.world import POSE, FrameBlock, States, TraceInfo, TraceReport
 
@@ -397,7 +397,7 @@ def test_kinds_roles_and_types_that_nobody_knows(tmp_path: Path) -> None:
 
     assert [kind(blocks, str(i)) for i in (1, 2, 3, 4, 5)] == [
         "van",
-        "unknown",
+        "vehicle",
         "unknown",
         "unknown",
         "person",

@@ -13,13 +13,10 @@ from recordings import Recorder, car, ground_truth
 from test_osi_file import messages, packed
 
 import sgstore
-from sgstore.exporters.stored import write_stored
+from sgstore.exporters import write_stored
 from sgstore.ingest import ingest
+from sgstore.readers import OsiFile, descriptors, message_class, open_trace
 from sgstore.store import StoreFile
-from sgstore.traces import open_trace
-from sgstore.traces.osi_file import OsiFile
-from sgstore.traces.osi_schema import message_class
-from sgstore.traces.osi_types import descriptors
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from mcap.reader import make_reader
 from recordings import OSI, Recorder, bulb, car, ground_truth, house, ns, person
 
 from sgstore.errors import TraceError
-from sgstore.traces import open_trace, read_message
-from sgstore.traces.osi_file import OsiFile, time_of
-from sgstore.traces.osi_types import descriptors
+from sgstore.readers import OsiFile, descriptors, open_trace, read_message
+from sgstore.readers.osi._file import time_of
 from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
 
 if TYPE_CHECKING:

@@ -18,9 +18,8 @@ import sgstore
 from sgstore.errors import MapError
 from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
-from sgstore.roads.lanes import PlainSignal
-from sgstore.roads.lanetext import lane_text
-from sgstore.traces import open_trace
+from sgstore.readers import open_trace
+from sgstore.roads import PlainSignal, lane_text
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,7 +12,10 @@ import pytest
 from oracle_over_time import (
     compare_check,
     compare_condition,
+    compare_edges,
     compare_sequence,
+    edge_questions,
+    random_check,
     random_sequence,
     worlds,
 )
@@ -20,17 +23,17 @@ from oracle_temporal import holds, random_formula, random_word
 
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
-from sgstore.lang.over_time import Hold, Length
-from sgstore.lang.standard import pattern_named
-from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
-from sgstore.temporal.columns import Table
-from sgstore.temporal.formulas import And
-from sgstore.temporal.knowing import known
-from sgstore.temporal.measures import Clock
-from sgstore.temporal.sequences import Leg, Line, matches_of
-from sgstore.temporal.verdicts import STATUS, Settled, within_bounds
+from sgstore.lang import pattern_named
+from sgstore.lang.ir import BoundHold, Length
+from sgstore.temporal import OnlineFormula, evaluate, formula_of, prefix_verdicts
+from sgstore.temporal._formula import And
+from sgstore.temporal._sequences import BindingLine, Leg, matches_of
+from sgstore.temporal._signals import Clock, PropositionTable
+from sgstore.temporal._verdicts import STATUS, Settled, known, within_bounds
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from oracle_worlds import World
 
     from sgstore.query import Store
@@ -68,12 +71,46 @@ def test_conditions_over_time_are_what_their_definition_says(asked: tuple[World,
     assert sum(found) > 10
 
 
+def test_edges_over_time_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
+    found = [compare_edges(*asked, *one) for one in edge_questions(random.Random(7))]
+
+    assert sum(found) > 50
+
+
+def test_an_edge_without_a_number_has_an_unknown_one(tmp_path: Path) -> None:
+    _, store = worlds(8, tmp_path)  # with gaps that are not known, and have no row
+    pattern = "USING UNKNOWN false MATCH (v:Entity)-[r:follows]->(w:Entity)"
+    every, known = (list(store.find(f"{pattern} {w}")) for w in ("", "WHERE known(r.gap)"))
+
+    unknown = list(store.find(f"{pattern} WHERE r.gap IS NULL"))
+
+    assert len(unknown) > 0
+    assert len(unknown) == len(every) - len(known)
+
+
 def test_checks_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
     rng = random.Random(3)
 
-    violated = [compare_check(*asked, rng) for _ in range(12)]
+    violated = [compare_check(*asked, random_check(rng)) for _ in range(12)]
 
     assert 0 < sum(violated) < 36
+
+
+def test_all_and_some_range_over_entities_of_the_trace_and_signs_of_the_map(
+    asked: tuple[World, Store],
+) -> None:
+    kinds = {one["kind"] for trace in asked[0].traces for one in trace.map_nodes.values()}
+    kinds |= {one["kind"] for trace in asked[0].traces for one in trace.entities.values()}
+    told = [f"v.kind {sign} '{kind}'" for sign in ("=", "<>") for kind in sorted(kinds)]
+
+    violated = [
+        compare_check(*asked, f"CHECK c: {word} (v:Entity) EVENTUALLY ({one})")
+        for word in ("FORALL", "FORSOME")
+        for one in told
+    ]
+
+    assert len(kinds & {"stop_sign", "traffic_light", "lane"}) >= 2
+    assert 0 < sum(violated) < 3 * len(violated)
 
 
 def test_the_matches_of_random_columns_are_the_earliest_of_all_tuples() -> None:
@@ -90,7 +127,7 @@ def compare_columns(rng: random.Random) -> int:
     frames = rng.randint(1, 9)
     times = np.cumsum([rng.choice((1, 1, 1, 5)) for _ in range(frames)])
     clock = Clock.of(times, np.arange(frames), 1, 2.5)
-    line = Line(clock)
+    line = BindingLine(clock)
     bindings = rng.randint(1, 3)
     steps = [random_places(rng, line, bindings) for _ in range(rng.randint(2, 4))]
     links = [random_leg(rng, line, bindings, places) for places in steps[1:]]
@@ -117,7 +154,7 @@ def compare_columns(rng: random.Random) -> int:
     return len(expected)
 
 
-def random_places(rng: random.Random, line: Line, bindings: int) -> Any:
+def random_places(rng: random.Random, line: BindingLine, bindings: int) -> Any:
     chosen = [
         b * line.stride + i
         for b in range(bindings)
@@ -127,7 +164,7 @@ def random_places(rng: random.Random, line: Line, bindings: int) -> Any:
     return np.array(chosen, np.int64)
 
 
-def random_leg(rng: random.Random, line: Line, bindings: int, places: Any) -> Leg:
+def random_leg(rng: random.Random, line: BindingLine, bindings: int, places: Any) -> Leg:
     kind = rng.choice(("then", "then", "then", "immediately", "until", "while"))
     if kind != "then":
         return Leg(kind, None, None, None, places)
@@ -173,10 +210,10 @@ def follows(leg: Leg, i: int, j: int, before: list[int], clock: Clock) -> bool:
 @pytest.mark.parametrize("comparison", [">=", ">", "<", "<=", "="])
 def test_a_run_lasts_from_its_first_frame_to_its_last(comparison: str) -> None:
     clock = Clock.of(np.array([0, 1, 2, 9, 10, 12]), np.arange(6), 1, 2.5)
-    line = Line(clock)
+    line = BindingLine(clock)
     places = np.array([0, 1, 2, 3, 4, 5])
 
-    held = line.held(places, Hold(comparison, Length(2, frames=False), inclusive=False))
+    held = line.held(places, BoundHold(comparison, Length(2, frames=False), inclusive=False))
 
     runs = {(0, 1, 2): 2, (3, 4, 5): 3}
     fits = {">=": [2, 3], ">": [3], "<": [], "<=": [2], "=": [2]}[comparison]
@@ -194,7 +231,7 @@ def test_statuses_and_traps_are_those_of_the_engine_that_reads_frame_by_frame() 
         frames = rng.randint(1, 12)
         times = np.cumsum([rng.choice((1, 2, 7)) for _ in range(frames)])
         columns = {name: np.array([rng.random() < 0.6 for _ in range(frames)]) for name in "abc"}
-        engine = Online(formula)
+        engine = OnlineFormula(formula)
         told: list[int] = []
         for i in range(frames):
             engine.step({name: bool(column[i]) for name, column in columns.items()}, int(times[i]))
@@ -221,7 +258,7 @@ def test_what_is_known_no_other_future_changes() -> None:
         rng = random.Random(seed)
         formula, (word, times) = random_formula(rng, rng.randint(1, 4)), random_word(rng)
         columns = {name: np.array([letter[name] for letter in word]) for name in "abc"}
-        told = known(formula, Table(columns, np.array(times, np.int64)))
+        told = known(formula, PropositionTable(columns, np.array(times, np.int64)))
         for i in range(len(word)):
             for at, value in ((int(told.true[i]), True), (int(told.false[i]), False)):
                 if at == len(word):
@@ -331,7 +368,9 @@ def test_limits_orders_and_samples_hold_for_sequences(store: Store) -> None:
 
     every = store.find(text).rows()
     assert rows == sorted(every, key=lambda row: (-row[1], row[0]))[:3]
-    assert len(store.find(f"{text} SAMPLE 1 PER v").rows()) == len({row[0] for row in every})
+    entities = store.find(f"{text}, trace.name").rows()
+    sampled = store.find(f"{text} SAMPLE 1 PER v").rows()
+    assert len(sampled) == len({(row[0], row[2]) for row in entities})
 
 
 def test_a_scenario_is_the_sequence_that_it_stands_for(store: Store) -> None:

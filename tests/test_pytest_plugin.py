@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from recordings import drive
 
 import sgstore
-from sgstore import pytest_plugin
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
+from sgstore.locks import CasePart, lock_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -136,17 +138,17 @@ def test_the_store_may_stand_beside_the_test_or_be_told_to_pytest(
     here.runpytest(*PLUGIN).stdout.fnmatch_lines(["*which store? Say store=PATH, --scenes-store*"])
 
 
-def test_a_lock_hands_its_cases_on(here: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Path] = []
-
-    def cases(lock: Path, store: object) -> list[pytest_plugin.Case]:
-        asked.append(lock)
-        return [
-            pytest_plugin.Case("town", 0, 10**9),
-            pytest_plugin.Case("town", 5 * 10**9, 6 * 10**9, "five"),
-        ]
-
-    monkeypatch.setattr(pytest_plugin, "cases_of", cases)
+@pytest.fixture
+def lock(here: pytest.Pytester, store: Path) -> dict[str, Any]:
+    """A lock of three clips, as its text says it, in ``tests.lock`` beside a test for each."""
+    opened = sgstore.open(store)
+    ids = opened.file.arrays("SELECT frame_id, log_time_ns FROM frames ORDER BY frame_id")
+    parts = [
+        CasePart(ids["frame_id"][low : low + 11], ids["log_time_ns"][low : low + 11])
+        for low in (0, 30, 60)
+    ]
+    made = lock_of(opened, parts, {})
+    made.write(here.path / "tests.lock")
     here.makepyfile(
         """
         import pytest
@@ -156,19 +158,190 @@ def test_a_lock_hands_its_cases_on(here: pytest.Pytester, monkeypatch: pytest.Mo
             assert len(scene.frames) == 11
         """
     )
+    return json.loads(made.text())
 
+
+def test_a_lock_hands_its_cases_on(here: pytest.Pytester, lock: dict[str, Any]) -> None:
     listed = here.runpytest(*PLUGIN, "--collect-only", "-q")
 
-    assert ids(listed) == ["test_scene[town#0-10]", "test_scene[five]"]
-    assert asked == [here.path / "tests.lock"]
-    here.runpytest(*PLUGIN).assert_outcomes(passed=2)
+    assert ids(listed) == [f"test_scene[{case['id']}]" for case in lock["cases"]]
+    assert ids(listed)[1] == "test_scene[town#30-40]"
+    here.runpytest(*PLUGIN).assert_outcomes(passed=3)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("last", 45, "*town#30-40: frames were 11, are 16*"),
+        ("first", 29, "*town#30-40: frames were 11, are 12*"),
+        ("frames", 12, "*town#30-40: frames were 12, are 11*"),
+        ("end_ns", 4_500_000_000, "*town#30-40: time was 3000000000 to 4500000000 ns, is *"),
+        ("start_ns", 2_000_000_000, "*town#30-40: time was 2000000000 to 4000000000 ns, is *"),
+        ("graph", "0" * 32, "*town#30-40: graph was 000000000000*"),
+    ],
+)
+def test_a_case_that_is_not_what_the_lock_says_is_an_error_of_its_test_and_of_no_other(
+    here: pytest.Pytester, lock: dict[str, Any], field: str, value: object, says: str
+) -> None:
+    lock["cases"][1][field] = value
+    (here.path / "tests.lock").write_text(json.dumps(lock))
+
+    result = here.runpytest(*PLUGIN)
+
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines([says])
+
+
+def test_messages_are_held_against_the_lock_by_a_test_that_reads_them(
+    here: pytest.Pytester, lock: dict[str, Any]
+) -> None:
+    lock["cases"][1]["payload"]["/ego/camera/front/image"] = "0" * 32
+    (here.path / "tests.lock").write_text(json.dumps(lock))
+    here.makepyfile(
+        test_graphs="""
+        import pytest
+
+        @pytest.mark.scenes(lock="tests.lock", store="town.sgstore")
+        def test_graphs(scene):
+            assert list(scene.graphs())
+        """,
+        test_pictures="""
+        import pytest
+
+        @pytest.mark.scenes(lock="tests.lock", store="town.sgstore")
+        def test_payload(scene):
+            assert scene.payload("/ego/camera/front/image", 1)
+
+        @pytest.mark.scenes(lock="tests.lock", store="town.sgstore")
+        def test_picture(scene):
+            assert scene.carried("/ego/camera/front/image", 1).form == "jpeg"
+        """,
+    )
+
+    here.runpytest(*PLUGIN, "test_graphs.py").assert_outcomes(passed=3)
+    result = here.runpytest(*PLUGIN, "test_pictures.py")
+    result.assert_outcomes(passed=4, failed=2)
+    result.stdout.fnmatch_lines(["*town#30-40: payload /ego/camera/front/image: other messages*"])
+
+
+RULES = """
+CHECK slow: ALWAYS ego.speed < $limit;
+CHECK moves: EVENTUALLY ego.speed > 1;
+CHECK alone: FORALL (p:Person) ALWAYS dist(ego, p) > 5
+"""
+
+
+@pytest.fixture
+def rules(here: pytest.Pytester, tmp_path: Path) -> pytest.Pytester:
+    """A folder with rules, a test of them, and a store of two traces."""
+    (here.path / "town.sgstore").unlink()
+    ingest(here.path / "town.sgstore", [RECORDING], until=11)
+    ingest(here.path / "town.sgstore", [drive(tmp_path / "short.mcap", frames=11)])
+    (here.path / "rules.sgql").write_text(RULES)
+    here.makepyfile(
+        """
+        import pytest
+
+        @pytest.mark.scenes(check="rules.sgql", store="town.sgstore", parameters={"limit": 50})
+        def test_rule(scene):
+            assert scene.verdict.verdict == "true"
+            assert scene.trace == scene.verdict.trace
+            assert len(scene.frames) == {"town": 111, "short": 11}[scene.trace]
+        """
+    )
+    return here
+
+
+def test_each_trace_and_rule_is_a_test_that_fails_where_the_rule_is_violated(
+    rules: pytest.Pytester,
+) -> None:
+    said = {
+        (one.check, one.trace): one
+        for one in sgstore.open(rules.path / "town.sgstore").check(RULES, limit=50)
+    }
+    listed = rules.runpytest(*PLUGIN, "--collect-only", "-q")
+    result = rules.runpytest(*PLUGIN)
+
+    assert sorted(ids(listed)) == sorted(f"test_rule[{t}-{c}]" for c, t in said)
+    assert len(said) == 6
+    broken = [one for one in said.values() if one.verdict == "false"]
+    assert 0 < len(broken) < 6
+    result.assert_outcomes(passed=6 - len(broken), failed=len(broken))
+    for one in broken:
+        first = one.first_violation
+        assert first is not None
+        result.stdout.fnmatch_lines(
+            [f"{one.trace} violates {one.check}", f"  #{first.start_seq}-{first.end_seq}, *"]
+        )
+
+
+def test_a_rule_is_a_test_though_its_body_asserts_nothing(rules: pytest.Pytester) -> None:
+    rules.makepyfile(
+        """
+        import pytest
+
+        @pytest.mark.scenes(check="rules.sgql", store="town.sgstore", parameters={"limit": 0.5})
+        def test_rule(scene):
+            pass
+        """
+    )
+
+    result = rules.runpytest(*PLUGIN, "-k", "town-slow or town-moves")
+
+    result.assert_outcomes(passed=1, failed=1)
+
+
+def test_a_rule_that_a_trace_cannot_answer_is_skipped_and_not_passed(
+    rules: pytest.Pytester,
+) -> None:
+    (rules.path / "rules.sgql").write_text(
+        "CHECK laned: EVENTUALLY EXISTS {(:Ego)-[:isIn]->(:Lane)}"
+    )
+    rules.makepyfile(
+        """
+        import pytest
+
+        @pytest.mark.scenes(check="rules.sgql", store="town.sgstore")
+        def test_rule(scene):
+            pass
+        """
+    )
+
+    rules.runpytest(*PLUGIN).assert_outcomes(passed=1, skipped=1)
+
+
+def test_several_processes_share_the_rules(rules: pytest.Pytester) -> None:
+    alone = rules.runpytest(*PLUGIN).parseoutcomes()
+
+    there = rules.runpytest(*PLUGIN, "-n2").parseoutcomes()
+
+    assert [there[k] for k in ("passed", "failed")] == [alone[k] for k in ("passed", "failed")]
+
+
+def test_a_wrong_mark_hides_no_other_test(here: pytest.Pytester) -> None:
+    here.makepyfile(
+        test_a='import pytest\n\n@pytest.mark.scenes(lock="no.lock", store="town.sgstore")\n'
+        "def test_lock(scene): pass\n\ndef test_beside(): pass\n",
+        test_b='import pytest\n\n@pytest.mark.scenes(check="no.sgql", store="town.sgstore")\n'
+        "def test_check(scene): pass\n",
+        test_c='import pytest\n\n@pytest.mark.scenes(query="MATCH (e:Ego)")\ndef test_c(): pass\n',
+        test_d='import pytest\n\n@pytest.mark.scenes("x", store="town.sgstore")\n'
+        "def test_d(scene): pass\n",
+        test_e='import pytest\n\n@pytest.mark.scenes(query="MATCH (e:Ego)", store="town.sgstore",'
+        ' before="much")\ndef test_e(scene): pass\n',
+        test_right=TEST,
+    )
+    right = here.runpytest(*PLUGIN, "test_right.py").parseoutcomes()["passed"]
+
+    here.runpytest(*PLUGIN).assert_outcomes(passed=1 + right, errors=5)
 
 
 @pytest.mark.parametrize(
     ("mark", "says"),
     [
-        ('store="town.sgstore"', "*give a query or a lock*"),
-        ('store="town.sgstore", query="MATCH (e)", lock="x"', "*give a query or a lock*"),
+        ('store="town.sgstore"', "*give a query, a lock or a check*"),
+        ('store="town.sgstore", query="MATCH (e)", lock="x"', "*give a query, a lock or a check*"),
+        ('store="town.sgstore", query="MATCH (e)", check="x"', "*give a query, a lock or a check*"),
         ('store="town.sgstore", query="MATCH (e)", bfore=1', "*unknown: bfore*"),
         ('store="town.sgstore", query="MATCH (e:Egg)"', "*did you mean 'Ego'*"),
         ('store="nowhere.sgstore", query="MATCH (e)"', "*nowhere.sgstore*no such store*"),
@@ -203,12 +376,12 @@ def test_the_mark_and_the_fixture_need_one_another(pytester: pytest.Pytester) ->
         test_fixture="def test_b(scene): pass\n",
     )
 
-    result = pytester.runpytest(*PLUGIN, "--continue-on-collection-errors", "--strict-markers")
+    result = pytester.runpytest(*PLUGIN, "--strict-markers")
 
     result.stdout.fnmatch_lines(
         [
-            "*test_a: scenes needs the fixture `scene`*",
             "*the fixture `scene` needs @pytest.mark.scenes*",
+            "*test_a: scenes needs the fixture `scene`*",
         ]
     )
     result.assert_outcomes(errors=2)

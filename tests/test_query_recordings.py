@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
 
-VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train"}
+VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"}
 Graph = nx.MultiDiGraph
 
 pytestmark = pytest.mark.data

@@ -16,19 +16,19 @@ from google.protobuf import descriptor_pb2  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from standin_carla import StandInActor, StandInWorld, at_red, box, transform  # noqa: E402
 
+import sgstore.exporters._foxglove as foxglove  # noqa: E402
 from sgstore.cli import run  # noqa: E402
 from sgstore.config import Config  # noqa: E402
 from sgstore.demo import RECORDING  # noqa: E402
 from sgstore.errors import ConfigError, ExportError, TraceError  # noqa: E402
-from sgstore.exporters import foxglove  # noqa: E402
-from sgstore.exporters.recorder import Recorder  # noqa: E402
+from sgstore.exporters import Recorder  # noqa: E402
 from sgstore.ingest import ingest  # noqa: E402
-from sgstore.online import Frame  # noqa: E402
 from sgstore.query import Store  # noqa: E402
-from sgstore.recording import record  # noqa: E402
+from sgstore.readers import LiveWorld, Sensor, load_sensors  # noqa: E402
+from sgstore.readers.carla._sensors import LIDAR  # noqa: E402
+from sgstore.record import record  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
-from sgstore.traces.carla_live import LiveWorld  # noqa: E402
-from sgstore.traces.carla_sensors import LIDAR, Sensor, load_sensors  # noqa: E402
+from sgstore.step import Frame  # noqa: E402
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -400,7 +400,7 @@ def test_the_verb_records_what_a_server_has(
         asked.append((host, port))
         return Client()
 
-    monkeypatch.setattr("sgstore.traces.carla_live.connect", connect)
+    monkeypatch.setattr("sgstore.readers.connect", connect)
     path = tmp_path / "run.mcap"
 
     code = run(["record", str(path), "--host", "far", "--duration", "500ms"])

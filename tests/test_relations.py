@@ -12,14 +12,14 @@ from builders import PaperMap, Patch, Place, Recording, Thing, edges, frames, gr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sgstore.config import Config, Direction, Pairs, Proximity, Range
-from sgstore.relations import RELATIONS
-from sgstore.relations.bearing import SIDES
+from sgstore.config import Config, Direction, PairSettings, Proximity, RangeSettings
+from sgstore.relations import RELATIONS, BlockScene
+from sgstore.relations._bearing import SIDES
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
-    from sgstore.relations.scene import Family
+    from sgstore.relations._scene import RelationFamily
 
 PI = math.pi
 TOWN = PaperMap(
@@ -73,7 +73,7 @@ def blurred(what: Thing, rng: np.random.Generator) -> Thing:
 
 
 def found(
-    things: list[Thing], family: Family, config: Config | None = None, town: PaperMap = TOWN
+    things: list[Thing], family: RelationFamily, config: Config | None = None, town: PaperMap = TOWN
 ) -> list[tuple[str, str, str]]:
     config = config or Config()
     graph = graph_of(frames(things), town, config)
@@ -85,8 +85,19 @@ def found(
 
 
 @family
+def test_a_family_that_needs_a_map_says_so_where_there_is_none(family: RelationFamily) -> None:
+    nothing: Any = None
+    scene = BlockScene(Config(), nothing, nothing, nothing, nothing, ground=None)
+    if family.needs_map:
+        with pytest.raises(ValueError, match=r"needs? a map"):
+            family.edges(scene)
+
+
+@family
 @pytest.mark.parametrize("seed", range(10))
-def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(family: Family, seed: int) -> None:
+def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(
+    family: RelationFamily, seed: int
+) -> None:
     of = found(busy(seed), family)
 
     assert of
@@ -96,7 +107,7 @@ def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(family: Family,
 
 @family
 @pytest.mark.parametrize("seed", range(10))
-def test_symmetric_relations_are_symmetric(family: Family, seed: int) -> None:
+def test_symmetric_relations_are_symmetric(family: RelationFamily, seed: int) -> None:
     of = {edge for edge in found(busy(seed), family) if edge[1] in SYMMETRIC}
 
     assert of == {(dst, relation, src) for src, relation, dst in of}
@@ -104,7 +115,9 @@ def test_symmetric_relations_are_symmetric(family: Family, seed: int) -> None:
 
 @family
 @pytest.mark.parametrize("seed", range(10))
-def test_relations_stay_when_the_world_is_moved_and_turned(family: Family, seed: int) -> None:
+def test_relations_stay_when_the_world_is_moved_and_turned(
+    family: RelationFamily, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     # A footprint without a heading lies along the x axis, however the world is turned.
     things = [t for t in busy(seed) if not math.isnan(t.heading)]
@@ -117,7 +130,9 @@ def test_relations_stay_when_the_world_is_moved_and_turned(family: Family, seed:
 
 @family
 @pytest.mark.parametrize("blocks", [1, 2, 7])
-def test_a_block_of_one_frame_gives_what_a_block_of_many_gives(family: Family, blocks: int) -> None:
+def test_a_block_of_one_frame_gives_what_a_block_of_many_gives(
+    family: RelationFamily, blocks: int
+) -> None:
     scenery = [t for t in crowd(0) if t.static]
     scenes = [
         [t for t in crowd(seed) if not t.static and t.kind == "car"][seed % 2 :] + scenery
@@ -140,7 +155,7 @@ def test_a_block_of_one_frame_gives_what_a_block_of_many_gives(family: Family, b
 
 
 @family
-def test_a_family_gives_only_the_relations_it_names(family: Family) -> None:
+def test_a_family_gives_only_the_relations_it_names(family: RelationFamily) -> None:
     config = Config(
         proximity=Proximity(("near", "visible"), (9.0, 30.0)),
         direction=Direction(("inDFrontOf", "atDRearOf"), (90.0,)),
@@ -242,9 +257,11 @@ def test_moving_entities_are_related_up_to_the_distance_set() -> None:
 
     assert relations_between(a, thing("b", 25)) >= {"visible", "inDFrontOf", "atDRearOf"}
     assert relations_between(a, thing("b", 25.001)) == set()
-    assert relations_between(a, thing("b", 9), Config(pairs=Pairs(within=8))) == set()
-    assert relations_between(a, thing("b", 1), Config(pairs=Pairs(within=0))) == set()
-    assert "inDFrontOf" in relations_between(a, thing("b", 29), Config(pairs=Pairs(within=30)))
+    assert relations_between(a, thing("b", 9), Config(pairs=PairSettings(within=8))) == set()
+    assert relations_between(a, thing("b", 1), Config(pairs=PairSettings(within=0))) == set()
+    assert "inDFrontOf" in relations_between(
+        a, thing("b", 29), Config(pairs=PairSettings(within=30))
+    )
 
 
 @pytest.mark.parametrize("kind", ["car", "person", "animal", "bicycle", "unknown"])
@@ -273,7 +290,10 @@ def test_what_never_moves_is_related_to_its_like_when_that_is_asked() -> None:
         thing("s", 12, kind="sign", static=True),
     )
     far, mover = thing("far", 45, static=True), thing("mover", -9)
-    recording, generator = Recording(), SceneGraphGenerator(None, Config(pairs=Pairs(static=True)))
+    recording, generator = (
+        Recording(),
+        SceneGraphGenerator(None, Config(pairs=PairSettings(static=True))),
+    )
 
     blocks = [[thing("ego", -2, 9), post, mover], [thing("ego", 20), sign, far, mover]]
     graphs = [generator.block(recording.block(frame, frame)) for frame in blocks]
@@ -297,7 +317,7 @@ def test_static_pairs_are_those_that_would_be_related_if_they_moved(seed: int) -
 
     found, expected = (
         {e for e in edges(graph_of(frames(scene), None, config)) if e[1] in pairs}
-        for scene, config in ((still, Config(pairs=Pairs(static=True))), (moving, Config()))
+        for scene, config in ((still, Config(pairs=PairSettings(static=True))), (moving, Config()))
     )
 
     assert found == expected
@@ -314,7 +334,7 @@ def test_the_ego_is_related_to_everything_in_range_whatever_the_distance() -> No
 
 
 def test_without_ego_pairs_the_ego_is_one_of_many() -> None:
-    config = Config(pairs=Pairs(ego=False), sees=False)
+    config = Config(pairs=PairSettings(ego=False), sees=False)
     things = [thing("ego"), thing("near", 20), thing("far", 30), thing("post", 5, static=True)]
 
     of = edges(graph_of(frames(things), None, config))
@@ -548,7 +568,7 @@ def test_a_crowd_that_is_looked_at_in_parts_is_related_like_any_other(
     scenes = [[t for t in things if t.name != name] for name in ("e1", "e2", "e3")]
     whole = graph_of(frames(*scenes), TOWN)
 
-    monkeypatch.setattr("sgstore.relations.sweep.CHUNK", 100)
+    monkeypatch.setattr("sgstore.relations._scene.CHUNK", 100)
     parts = graph_of(frames(*scenes), TOWN)
 
     for frame in range(3):
@@ -559,7 +579,7 @@ def test_absurd_positions_are_related_to_nothing_and_disturb_nobody() -> None:
     sane = [thing("a"), thing("b", 3)]
     absurd = [thing("far", 1e300, -1e300), thing("inf", math.inf, 2), thing("minus", -1e18)]
 
-    alone = edges(graph_of(frames(sane), None, Config(range=Range(40.0))))
+    alone = edges(graph_of(frames(sane), None, Config(range=RangeSettings(40.0))))
     together = edges(graph_of(frames([*absurd, *sane])))
 
     assert [edge for edge in together if edge[1] in PROXIMITY] == [

@@ -12,9 +12,8 @@ import shapely
 from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of, thing
 from test_sgg_traces import graphs, opened, recording, recordings
 
-from sgstore.config import Config, Lanes, Range
-from sgstore.relations.along import Centrelines
-from sgstore.relations.lanenet import LaneNet
+from sgstore.config import Config, LaneSettings, RangeSettings
+from sgstore.relations._lane_net import Centrelines, LaneNet
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ FORK = PaperMap(
     Patch("kerb", -100, -6, 100, -4, lane_type="parking"),
     objects=(("s1", "traffic_light"),),
 )
-WIDE = Config(range=Range(400))
+WIDE = Config(range=RangeSettings(400))
 
 Pair = tuple[str, str]
 
@@ -166,12 +165,12 @@ def test_round_a_ring_two_may_lead_one_another_and_nobody_leads_itself() -> None
 def test_how_far_ahead_is_looked_is_set() -> None:
     things = [thing("ego", -80, -2), thing("b", -50, -2)]
 
-    assert followed(things, Config(lanes=Lanes(ahead=30)))
-    assert not followed(things, Config(lanes=Lanes(ahead=29.9)))
+    assert followed(things, Config(lanes=LaneSettings(ahead=30)))
+    assert not followed(things, Config(lanes=LaneSettings(ahead=29.9)))
 
 
 def test_where_nothing_is_looked_for_nothing_is_known() -> None:
-    blind = Config(lanes=Lanes(ahead=0))
+    blind = Config(lanes=LaneSettings(ahead=0))
     of = edges(graph_of(frames([thing("ego", -80, -2), thing("b", -50, -2)]), FORK, blind), 0, FORK)
 
     assert not {relation for _, relation, _ in of} & {"leads", "follows", "mayAffect"}
@@ -388,7 +387,7 @@ def test_a_light_that_the_map_lacks_may_affect_what_leads_to_its_lanes() -> None
     )  # its lanes are told, as by a trigger box, and no signal is there
     ego, light = thing("ego", -30, -2), thing("light", 0, -5, kind="traffic_light", map_ref="s1")
     other = thing("light", 0, -5, kind="traffic_light", map_ref="s2")
-    none = Config(range=Range(400), lanes=Lanes(ahead=0))
+    none = Config(range=RangeSettings(400), lanes=LaneSettings(ahead=0))
 
     assert affected([ego, light], WIDE, town) == {("light", "straight"), ("light", "in")}
     assert affected([ego, light], none, town) == set()
@@ -398,7 +397,9 @@ def test_a_light_that_the_map_lacks_may_affect_what_leads_to_its_lanes() -> None
 def test_how_far_a_signal_is_ahead_counts_from_the_end_of_the_lane() -> None:
     FORK.nodes.x[-1 - FORK.ids["s1"]] = 12
     try:
-        near, far = (Config(range=Range(400), lanes=Lanes(ahead=d)) for d in (12, 11.9))
+        near, far = (
+            Config(range=RangeSettings(400), lanes=LaneSettings(ahead=d)) for d in (12, 11.9)
+        )
         assert affected([thing("ego", -30, -2)], near) == {("s1", "straight"), ("s1", "in")}
         assert affected([thing("ego", -30, -2)], far) == {("s1", "straight")}
     finally:
@@ -406,7 +407,7 @@ def test_how_far_a_signal_is_ahead_counts_from_the_end_of_the_lane() -> None:
 
 
 def test_only_lanes_in_range_are_affected() -> None:
-    narrow = Config(range=Range(10))
+    narrow = Config(range=RangeSettings(10))
 
     assert affected([thing("ego", -30, -2)], narrow) == {("s1", "in")}
 

@@ -12,12 +12,12 @@ from builders import Place, Recording, Thing, edges, frames, graph_of, thing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sgstore.config import Config, Range
+from sgstore.config import Config, RangeSettings
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.vocabulary import SIGNALS
 
 PI = math.pi
-WIDE = Config(range=Range(200))
+WIDE = Config(range=RangeSettings(200))
 
 
 def seen(*things: Thing, config: Config = WIDE) -> set[str]:
@@ -234,7 +234,7 @@ def test_a_crowd_that_is_looked_at_in_parts_is_seen_like_any_other(
     scenes = [crowd(seed, 40, 15) for seed in range(3)]
     whole = graph_of(Recording().block(*scenes), None, WIDE)
 
-    monkeypatch.setattr("sgstore.relations.sweep.CHUNK", 50)
+    monkeypatch.setattr("sgstore.relations._scene.CHUNK", 50)
     parts = graph_of(Recording().block(*scenes), None, WIDE)
 
     assert all(edges(parts, i) == edges(whole, i) for i in range(3))

@@ -11,10 +11,10 @@ import shapely
 from builders import Place, thing
 from test_sgg_traces import opened, recording
 
-from sgstore.config import Config, Lanes, Range
+from sgstore.config import Config, LaneSettings, RangeSettings
 from sgstore.errors import ConfigError
 from sgstore.opendrive import read_map
-from sgstore.relations.waypoints import waypoints_of
+from sgstore.relations import waypoints_of
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE
 
@@ -48,7 +48,7 @@ def road(length: float = 10.5) -> RoadMap:
 
 
 def with_points(spacing: float, **lanes: object) -> Config:
-    return Config(lanes=Lanes(granularity="waypoint", spacing=spacing, **lanes))
+    return Config(lanes=LaneSettings(granularity="waypoint", spacing=spacing, **lanes))
 
 
 def names(road_map: RoadMap, relation: str) -> set[tuple[str, str]]:
@@ -168,8 +168,8 @@ def test_on_a_recording_it_is_about_what_boxes_around_waypoints_tell(data: Path)
     """The textbook's way: each waypoint has a box of the lane's width, as long as the spacing."""
     blocks, plain = opened(recording(data, "esmini/swarm_Town04"))
     assert plain is not None
-    lanes = Lanes(granularity="waypoint", spacing=2.0)
-    config = Config(range=Range(radius=300), lanes=lanes)
+    lanes = LaneSettings(granularity="waypoint", spacing=2.0)
+    config = Config(range=RangeSettings(radius=300), lanes=lanes)
     town = map_of_graphs(plain, config)
     assert town is not None
     nodes = town.nodes
@@ -206,7 +206,9 @@ def test_on_a_recording_it_is_about_what_boxes_around_waypoints_tell(data: Path)
 @pytest.mark.data
 def test_waypoints_in_range_are_present_and_lead_on(data: Path) -> None:
     blocks, plain = opened(recording(data, "esmini/swarm_Town04"))
-    config = Config(range=Range(radius=30), lanes=Lanes(granularity="waypoint", spacing=1.0))
+    config = Config(
+        range=RangeSettings(radius=30), lanes=LaneSettings(granularity="waypoint", spacing=1.0)
+    )
     town = map_of_graphs(plain, config)
     assert town is not None
     assert plain is not None

@@ -29,9 +29,8 @@ from opendrive_maps import (
 )
 
 from sgstore.opendrive import read_map
-from sgstore.roads import OFF_ROAD, LaneHits, RoadMap
-from sgstore.roads.footprints import TOUCH
-from sgstore.roads.lanegraph import LaneGraph
+from sgstore.roads import OFF_ROAD, LaneGraph, LaneHits, RoadMap
+from sgstore.roads._footprints import TOUCH
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:

@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import sgstore.roads._lane_lines as lanelines
 from sgstore.errors import MapError
 from sgstore.opendrive import parse_map
-from sgstore.roads import RoadMap, lanelines
-from sgstore.roads.lanelines import END, START, Area, Border, Joint, LaneLine, plain_lanes
-from sgstore.roads.lanetext import lane_text
+from sgstore.roads import END, START, Area, Border, Joint, LaneLine, RoadMap, lane_text, plain_lanes
 from sgstore.vocabulary import RELATION_CODE
 
 

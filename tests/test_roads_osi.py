@@ -13,16 +13,18 @@ from mcap.reader import make_reader
 from recordings import Recorder, car
 
 import sgstore
-from sgstore.draw.stored import map_of
+import sgstore.roads._lane_lines as lanelines
+from sgstore.draw._stored import map_of
 from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
-from sgstore.roads import RoadMap, lanelines
-from sgstore.traces import open_trace
-from sgstore.traces.osi_lanes import OsiLanes
+from sgstore.readers import open_trace
+from sgstore.readers.osi._lanes import OsiLanes
 from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from sgstore.roads import RoadMap
 
 TYPES = {
     "Pair": "antecessor_lane_id=1:Identifier successor_lane_id=2:Identifier",
@@ -422,8 +424,8 @@ def test_lanes_of_a_schema_that_lacks_what_they_need_are_said() -> None:
 
 
 def test_too_many_points_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sgstore.readers.osi._lanes as osi_lanes
     from sgstore.errors import MapError
-    from sgstore.traces import osi_lanes
 
     monkeypatch.setattr(osi_lanes, "MAX_POINTS", 5)
     with pytest.raises(MapError, match="more than 5 points"):

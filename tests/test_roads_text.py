@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from opendrive_maps import a_map, a_road, line
 
+import sgstore.roads._lanes as lanetext
 from sgstore.errors import MapError
 from sgstore.opendrive import parse_map, read_map
-from sgstore.roads import RoadMap, lanetext
-from sgstore.roads.lanes import PlainLane
-from sgstore.roads.lanetext import lane_text
+from sgstore.roads import PlainLane, RoadMap, lane_text
 from sgstore.vocabulary import KINDS, RELATION_CODE
 
 

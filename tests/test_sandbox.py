@@ -130,7 +130,7 @@ def test_nothing_but_the_store_is_reached(box: Sandbox, path: Path, tmp_path, sq
 
     assert box.sql("SELECT 1").rows == [(1,)]  # one that died is started again
     assert box.folder is not None
-    (folder,) = box.folder.glob("sgstore-tables-*")
+    (folder,) = box.folder.glob("sgstore-held-*/tables")
     for name, value in (("secret", secret), ("out", out), ("folder", folder)):
         sql = sql.replace(f"{{{name}}}", str(value))
 
@@ -145,11 +145,11 @@ def test_nothing_but_the_store_is_reached(box: Sandbox, path: Path, tmp_path, sq
 @pytest.mark.parametrize(
     ("sql", "reason"),
     [
-        ("SELECT len(list(range)) FROM range(100000000)", "Out of Memory"),
-        ("SELECT string_agg(repeat('x', 1000000), '') FROM range(100000)", "Out of Memory"),
+        ("SELECT len(list(range)) FROM range(100000000)", "needs more memory"),
+        ("SELECT string_agg(repeat('x', 1000000), '') FROM range(100000)", "needs more memory"),
         (
             "SELECT * FROM range(50000000) ORDER BY hash(range) OFFSET 49999999",
-            "more memory than is allowed|Out of Memory",  # which one, many threads decide
+            "more memory",  # which one, many threads decide
         ),
     ],
 )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import duckdb
 import pytest
 
-from sgstore.store.schema import schema_sql, tables_sql
+import sgstore.store._schema as shape
+from sgstore.store import StoreFile
+from sgstore.store._schema import schema_sql, schema_version, tables_sql
 from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATIONS, VEHICLE_LIGHTS
 from sgstore.world import BUCKET_FRAMES
 
@@ -17,7 +21,7 @@ VIEWS = {
     "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary along is_own",
     "lane_gaps": "frame_id src dst gap",
     "pairs": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
-    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading",
+    " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading closing_time",
     "lane_dists": "frame_id src dst lane_dist src_kind dst_kind src_is_ego dst_is_ego",
     "roles": "frame_id node_id role",
     "classes": "frame_id abstraction class",
@@ -70,12 +74,14 @@ def test_every_view_is_public_and_commented(empty) -> None:
 
 def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty) -> None:
     columns = [c[0] for c in empty.execute("SELECT * FROM nodes").description]
-    empty.execute("INSERT INTO trace BY NAME SELECT 0 AS trace_id")
+    loose = duckdb.connect()  # where nothing has to be known
+    loose.execute(tables_sql())
+    loose.execute("--" + schema_sql().partition("-- The public views")[2])
+    loose.execute("INSERT INTO trace BY NAME SELECT 0 AS trace_id")
     for bit in range(len(VEHICLE_LIGHTS)):
-        empty.execute(f"INSERT INTO state BY NAME SELECT {bit} AS frame_id, {1 << bit} AS lights")
+        loose.execute(f"INSERT INTO state BY NAME SELECT {bit} AS frame_id, {1 << bit} AS lights")
     lights = ", ".join(c for c in columns if c.startswith("light_") and c != "light_state")
-    rows = empty.execute(f"SELECT {lights} FROM nodes ORDER BY frame_id").fetchall()
-    empty.execute("DELETE FROM state")
+    rows = loose.execute(f"SELECT {lights} FROM nodes ORDER BY frame_id").fetchall()
 
     assert lights == ", ".join(VEHICLE_LIGHTS)
     assert [row.index(True) for row in rows] == list(range(len(VEHICLE_LIGHTS)))
@@ -89,7 +95,20 @@ def test_bits_are_those_of_the_frames_of_a_bucket(empty) -> None:
 
 
 def test_no_table_has_keys_that_loading_would_pay_for(empty) -> None:
-    assert empty.execute("SELECT count(*) FROM duckdb_constraints()").fetchone() == (0,)
+    found = empty.execute("SELECT DISTINCT constraint_type FROM duckdb_constraints()").fetchall()
+
+    assert found == [("NOT NULL",)]
+
+
+def test_the_head_says_the_version_that_a_store_is_made_with(tmp_path) -> None:
+    store = StoreFile.create(tmp_path / "s.db")
+    (version,) = re.findall(
+        r"^-- sgstore: what is in a store, version (\d+)\.$", schema_sql(), re.MULTILINE
+    )
+
+    sql = "SELECT value FROM store_info WHERE key = 'schema_version'"
+    assert store.rows(sql).values == [(version,)]
+    assert f"--   * Version {version}: " in schema_sql()
 
 
 def test_tables_come_before_the_views() -> None:
@@ -98,3 +117,11 @@ def test_tables_come_before_the_views() -> None:
 
     assert "CREATE TABLE edge" in tables_sql()
     assert "VIEW" not in tables_sql().split("VIEWS at the end")[1]
+
+
+def test_a_schema_that_says_no_version_is_no_schema(monkeypatch: pytest.MonkeyPatch) -> None:
+    headless = schema_sql().partition("\n")[2]
+    monkeypatch.setattr(shape, "schema_sql", lambda: headless)
+
+    with pytest.raises(ValueError, match="says no version"):
+        schema_version()

@@ -10,20 +10,21 @@ import numpy as np
 import pytest
 
 import sgstore
-from sgstore.coverage import Chosen, classed, selection_of
+from sgstore.coverage import ChosenFrames, classed, selection_of
 from sgstore.errors import ConfigError, QueryError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
 from sgstore.query import Store
 from sgstore.selection import (
     Budget,
-    Family,
     Measure,
-    Piece,
     Selection,
-    Way,
-    Wish,
+    SelectionSpec,
+    SelectionUnit,
+    SetFamily,
+    Strategy,
     curve,
+    listed,
     minimal,
     parse_split,
     select,
@@ -32,17 +33,16 @@ from sgstore.selection import (
     units_of,
     within,
 )
-from sgstore.selection.bounds import bounded
-from sgstore.selection.choose import listed
-from sgstore.selection.curve import expected
-from sgstore.selection.greedy import greedy
-from sgstore.store.covering import seq_of, trace_of
+from sgstore.selection._cover import bounded
+from sgstore.selection._curve import expected
+from sgstore.selection._sets import greedy
+from sgstore.store import seq_of, trace_of
 
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 SEEDS = range(36)
 
 
-def family(seed: int) -> tuple[Family, np.ndarray]:
+def family(seed: int) -> tuple[SetFamily, np.ndarray]:
     """A few random sets, of costs that are one, whole, or any; and which elements each holds."""
     rng = np.random.default_rng(seed)
     sets, elements = int(rng.integers(1, 10)), int(rng.integers(1, 12))
@@ -50,7 +50,7 @@ def family(seed: int) -> tuple[Family, np.ndarray]:
     cost = (np.ones(sets), rng.integers(1, 6, sets), rng.uniform(0.3, 3, sets))[seed % 3]
     cost = cost.astype(np.float64)
     pairs = np.array(np.nonzero(holds))
-    return Family.of(pairs, sets, elements, cost, 1 + (seed % 4 == 0)), holds
+    return SetFamily.of(pairs, sets, elements, cost, 1 + (seed % 4 == 0)), holds
 
 
 def every_choice(sets: int) -> list[list[int]]:
@@ -96,7 +96,7 @@ def test_under_a_budget_the_choice_is_within_its_factor_and_below_its_bound(seed
 
 def test_the_bound_is_that_of_the_linear_programme_where_that_is_known() -> None:
     # Each two of three sets share an element: two are needed, the relaxation takes a half of each.
-    triangle = Family.of(np.array([[0, 0, 1, 1, 2, 2], [0, 1, 1, 2, 2, 0]]), 3, 3)
+    triangle = SetFamily.of(np.array([[0, 0, 1, 1, 2, 2], [0, 1, 1, 2, 2, 0]]), 3, 3)
 
     low, *_ = bounded(triangle, np.array([0, 1, 2]))
 
@@ -107,7 +107,7 @@ def test_the_bound_is_that_of_the_linear_programme_where_that_is_known() -> None
 def test_a_search_that_may_not_end_still_gives_a_cover_and_a_bound_below_it() -> None:
     rng = np.random.default_rng(5)
     holds = rng.random((60, 120)) < 0.06
-    of = Family.of(np.array(np.nonzero(holds)), 60, 120)
+    of = SetFamily.of(np.array(np.nonzero(holds)), 60, 120)
 
     short, long = minimal(of, steps=40), minimal(of)
 
@@ -120,7 +120,7 @@ def test_ties_are_broken_by_rank_alone() -> None:
     pairs = np.array([[0, 1, 2, 3], [0, 0, 1, 1]])
 
     chosen = [
-        sorted(minimal(Family.of(pairs, 4, 2, rank=np.array(rank))).chosen.tolist())
+        sorted(minimal(SetFamily.of(pairs, 4, 2, rank=np.array(rank))).chosen.tolist())
         for rank in ([0, 1, 2, 3], [3, 2, 1, 0])
     ]
 
@@ -150,8 +150,8 @@ def import_two(folder: Path) -> None:
     import_graphs(folder / "s.sgstore", [folder / "two.csv"], "csv")
 
 
-def whole(store: Store) -> Chosen:
-    return Chosen("s", store)
+def whole(store: Store) -> ChosenFrames:
+    return ChosenFrames("s", store)
 
 
 def classes_in(found: Selection) -> set[int]:
@@ -183,10 +183,12 @@ def test_features_of_frames_on_several_maps_are_those_of_each_frame_alone(store:
     assert of(ids) == {frame: what for one in alone for frame, what in one.items()}
 
 
-@pytest.mark.parametrize("piece", list(Piece))
+@pytest.mark.parametrize("piece", list(SelectionUnit))
 @pytest.mark.parametrize("least", [Measure.units, Measure.seconds])
-def test_the_minimal_set_keeps_every_class(store: Store, piece: Piece, least: Measure) -> None:
-    wish = Wish(Way.minimal, piece, abstraction="EL", least=least)
+def test_the_minimal_set_keeps_every_class(
+    store: Store, piece: SelectionUnit, least: Measure
+) -> None:
+    wish = SelectionSpec(Strategy.minimal, piece, abstraction="EL", least=least)
 
     found = select(whole(store), wish)
     everything = set(classed(whole(store), "EL").code.tolist())
@@ -198,13 +200,13 @@ def test_the_minimal_set_keeps_every_class(store: Store, piece: Piece, least: Me
 
 
 def test_of_frames_one_of_each_class_is_enough(store: Store) -> None:
-    found = select(whole(store), Wish(Way.minimal, abstraction="EL"))
+    found = select(whole(store), SelectionSpec(Strategy.minimal, abstraction="EL"))
 
     assert len(found.picked) == len(set(classed(whole(store), "EL").code.tolist()))
 
 
 def test_each_class_comes_k_times_or_as_often_as_it_is_there(store: Store) -> None:
-    found = select(whole(store), Wish(Way.per_class, abstraction="EL", each=3))
+    found = select(whole(store), SelectionSpec(Strategy.per_class, abstraction="EL", each=3))
     of = classed(whole(store), "EL")
     picked = np.isin(of.frame_id, found.units.frame_id[found.picked])
 
@@ -216,10 +218,12 @@ def test_each_class_comes_k_times_or_as_often_as_it_is_there(store: Store) -> No
 def test_pairs_of_features_are_those_that_coverage_counts(store: Store) -> None:
     from sgstore.coverage import combos
 
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, abstraction="E", combos=2))
+    found = select(
+        whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, abstraction="E", combos=2)
+    )
     known = combos(classed(whole(store), "E"), "E", 2)
     ids = found.units.frame_id[found.units.rows_of(found.picked)]
-    kept = combos(classed(Chosen("kept", store, ids), "E"), "E", 2)
+    kept = combos(classed(ChosenFrames("kept", store, ids), "E"), "E", 2)
 
     assert found.holdings is not None
     assert found.holdings.total == len(known.covered().rows) == len(kept.covered().rows)
@@ -227,11 +231,13 @@ def test_pairs_of_features_are_those_that_coverage_counts(store: Store) -> None:
 
 
 @pytest.mark.parametrize("budget", ["12frames", "3s", "2units", "700kB"])
-@pytest.mark.parametrize("way", [Way.minimal, Way.per_class, Way.rarest, Way.every])
-def test_no_budget_is_exceeded(store: Store, budget: str, way: Way) -> None:
+@pytest.mark.parametrize(
+    "way", [Strategy.minimal, Strategy.per_class, Strategy.rarest, Strategy.every]
+)
+def test_no_budget_is_exceeded(store: Store, budget: str, way: Strategy) -> None:
     most = Budget.parse(budget)
 
-    found = select(whole(store), Wish(way, Piece.clip, 0.5, "EL", budget=most))
+    found = select(whole(store), SelectionSpec(way, SelectionUnit.clip, 0.5, "EL", budget=most))
     cost = found.units.costs(most.measure)[found.picked].sum()
 
     assert 0 < cost <= most.most + 1e-6
@@ -266,7 +272,7 @@ def test_clips_are_runs_of_what_was_asked_for_cut_by_time(store: Store) -> None:
         f"{store.file.path}:MATCH (e:Ego) WHERE frame.seq >= 13 AND trace.name = 'one'"
     )
 
-    units = units_of(chosen, Piece.clip, 2.0)
+    units = units_of(chosen, SelectionUnit.clip, 2.0)
     many = units.sizes.tolist()
 
     assert seq_of(units.first).tolist()[:3] == [13, 33, 53]
@@ -277,7 +283,7 @@ def test_clips_are_runs_of_what_was_asked_for_cut_by_time(store: Store) -> None:
 
 def test_the_same_seed_chooses_the_same_and_another_chooses_otherwise(store: Store) -> None:
     def some(seed: int) -> list[int]:
-        wish = Wish(Way.every, budget=Budget.parse("20frames"), seed=seed)
+        wish = SelectionSpec(Strategy.every, budget=Budget.parse("20frames"), seed=seed)
         return sorted(select(whole(store), wish).picked.tolist())
 
     assert some(1) == some(1) != some(2)
@@ -287,7 +293,9 @@ def test_the_same_seed_chooses_the_same_and_another_chooses_otherwise(store: Sto
 def test_strata_share_a_budget_as_they_are_or_evenly(store: Store) -> None:
     def strata(temper: float) -> dict[str, tuple[int, int]]:
         budget = Budget.parse("40frames")
-        wish = Wish(Way.stratify, each=0, by="trace.name", temper=temper, budget=budget)
+        wish = SelectionSpec(
+            Strategy.stratify, each=0, by="trace.name", temper=temper, budget=budget
+        )
         return select(whole(store), wish).strata
 
     own, even = strata(1.0), strata(0.0)
@@ -298,11 +306,11 @@ def test_strata_share_a_budget_as_they_are_or_evenly(store: Store) -> None:
         assert abs(taken - 40 * size / total) <= 1
 
 
-@pytest.mark.parametrize("way", list(Way))
-def test_of_nothing_nothing_is_selected_and_it_is_said(store: Store, way: Way) -> None:
+@pytest.mark.parametrize("way", list(Strategy))
+def test_of_nothing_nothing_is_selected_and_it_is_said(store: Store, way: Strategy) -> None:
     none = selection_of(f"{store.file.path}:MATCH (e:Ego) WHERE frame.seq > 9999")
 
-    found = select(none, Wish(way, Piece.clip, by="trace.name"))
+    found = select(none, SelectionSpec(way, SelectionUnit.clip, by="trace.name"))
 
     assert len(found.picked) == 0
     assert found.said[0].endswith("no frame to select from")
@@ -317,7 +325,7 @@ def test_an_expression_that_is_wrong_is_shown_as_it_was_written(
     store: Store, text: str, at: str
 ) -> None:
     with pytest.raises(QueryError) as caught:
-        select(whole(store), Wish(Way.stratify, each=1, by=text))
+        select(whole(store), SelectionSpec(Strategy.stratify, each=1, by=text))
 
     assert caught.value.text == text
     assert caught.value.span is not None
@@ -326,13 +334,13 @@ def test_an_expression_that_is_wrong_is_shown_as_it_was_written(
 
 
 def test_of_each_stratum_k(store: Store) -> None:
-    found = select(whole(store), Wish(Way.stratify, each=7, by="trace.name"))
+    found = select(whole(store), SelectionSpec(Strategy.stratify, each=7, by="trace.name"))
 
     assert {name: taken for name, (_, taken) in found.strata.items()} == {"one": 7, "two": 7}
 
 
 def test_parts_share_no_recording_and_what_leaks_is_told(store: Store) -> None:
-    found = select(whole(store), Wish(Way.every))
+    found = select(whole(store), SelectionSpec(Strategy.every))
     shares = parse_split("train=0.8,test=0.2")
 
     parts = split(found, shares)
@@ -356,7 +364,7 @@ def test_what_is_no_split_is_refused(text: str) -> None:
 
 
 def test_the_curve_rises_to_all_and_random_order_is_hypergeometric(store: Store) -> None:
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL"))
+    found = select(whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "EL"))
     drawn = curve(found)
     held = found.holdings
     assert held is not None
@@ -379,7 +387,7 @@ def test_the_curve_rises_to_all_and_random_order_is_hypergeometric(store: Store)
 
 
 def test_what_was_chosen_is_listed_with_what_it_brings(store: Store) -> None:
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL"))
+    found = select(whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "EL"))
     rows = listed(found).dicts()
 
     assert sum(row["new"] for row in rows) == found.result["elements"]
@@ -404,7 +412,10 @@ def test_on_a_drive_of_sumo_the_set_of_clips_meets_its_bound_and_is_smaller_than
     if not place.exists():
         ingest(place, [data / "traces" / "sumo" / "Town10HD_sumo_osi.mcap"])
 
-    found = select(Chosen("sumo", Store(place)), Wish(Way.minimal, Piece.clip, 2.0, **wish))
+    found = select(
+        ChosenFrames("sumo", Store(place)),
+        SelectionSpec(Strategy.minimal, SelectionUnit.clip, 2.0, **wish),
+    )
     drawn = curve(found)
 
     assert len(found.units) == 30

@@ -48,7 +48,7 @@ def test_the_program_of_the_page_prints_a_bound_below_its_cost(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    program = next(p for p in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "Wish" in p)
+    program = next(p for p in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "SelectionSpec" in p)
 
     exec(compile(program, "selection.md", "exec"), {})
     cost, bound, at_random = map(float, capsys.readouterr().out.splitlines()[0].split())
@@ -57,7 +57,7 @@ def test_the_program_of_the_page_prints_a_bound_below_its_cost(
 
 
 def test_every_verb_of_locks_is_on_the_page() -> None:
-    from sgstore.cli.selection import lock
+    from sgstore.cli._selection import lock
 
     verbs = {command.name for command in lock.registered_commands}
 

@@ -13,19 +13,19 @@ import pytest
 
 import sgstore
 from sgstore.cli import run
-from sgstore.coverage import Chosen, classed
+from sgstore.coverage import ChosenFrames, classed
 from sgstore.errors import ConfigError
 from sgstore.ingest import ingest
 from sgstore.locks import frames_of_lock, intersect, read_lock, union, verify
 from sgstore.query import Store
 from sgstore.selection import (
     Budget,
-    Family,
     Measure,
-    Piece,
     Selection,
-    Way,
-    Wish,
+    SelectionSpec,
+    SelectionUnit,
+    SetFamily,
+    Strategy,
     curve,
     locked_selection,
     minimal,
@@ -35,8 +35,8 @@ from sgstore.selection import (
     split_table,
     units_of,
 )
-from sgstore.selection.reduce import reduced
-from sgstore.store.covering import seq_of
+from sgstore.selection._cover import reduced
+from sgstore.store import seq_of
 
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 
@@ -49,15 +49,15 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return Store(folder / "s.sgstore")
 
 
-def whole(store: Store) -> Chosen:
-    return Chosen("s", store)
+def whole(store: Store) -> ChosenFrames:
+    return ChosenFrames("s", store)
 
 
-def some(store: Store, *ranges: tuple[int, int]) -> Chosen:
+def some(store: Store, *ranges: tuple[int, int]) -> ChosenFrames:
     """Frames by number, the last one of each range not included."""
     frame_id = store.file.abstracted.times()[0]
     numbers = np.concatenate([np.arange(*one) for one in ranges])
-    return Chosen("some", store, frame_id[np.isin(seq_of(frame_id), numbers)])
+    return ChosenFrames("some", store, frame_id[np.isin(seq_of(frame_id), numbers)])
 
 
 def frames_of(found: Selection) -> set[int]:
@@ -74,7 +74,7 @@ def frames_of(found: Selection) -> set[int]:
 
 
 def test_clips_begin_a_stride_after_one_another_until_one_reaches_the_end(store: Store) -> None:
-    units = units_of(some(store, (0, 33)), Piece.clip, 1.0, 0.5)
+    units = units_of(some(store, (0, 33)), SelectionUnit.clip, 1.0, 0.5)
 
     spans = list(zip(seq_of(units.first).tolist(), seq_of(units.last).tolist(), strict=True))
 
@@ -83,7 +83,7 @@ def test_clips_begin_a_stride_after_one_another_until_one_reaches_the_end(store:
 
 
 def test_clips_that_begin_with_every_frame_are_as_many_as_fit(store: Store) -> None:
-    units = units_of(whole(store), Piece.clip, 2.0, 0.1)
+    units = units_of(whole(store), SelectionUnit.clip, 2.0, 0.1)
 
     assert len(units) == 201 - 20 + 1
     assert (units.sizes == 20).all()
@@ -92,7 +92,7 @@ def test_clips_that_begin_with_every_frame_are_as_many_as_fit(store: Store) -> N
 
 def test_a_stride_as_long_as_a_clip_is_no_stride(store: Store) -> None:
     plain, told = (
-        units_of(some(store, (0, 95)), Piece.clip, 2.0, stride) for stride in (None, 2.0)
+        units_of(some(store, (0, 95)), SelectionUnit.clip, 2.0, stride) for stride in (None, 2.0)
     )
 
     assert not plain.overlap
@@ -103,7 +103,7 @@ def test_a_stride_as_long_as_a_clip_is_no_stride(store: Store) -> None:
 def test_no_clip_reaches_over_a_gap(store: Store) -> None:
     chosen = some(store, (0, 12), (20, 47))
 
-    units = units_of(chosen, Piece.clip, 1.0, 0.3)
+    units = units_of(chosen, SelectionUnit.clip, 1.0, 0.3)
     first, last = seq_of(units.first), seq_of(units.last)
 
     assert first.tolist() == [0, 3, 20, 23, 26, 29, 32, 35, 38]
@@ -111,7 +111,7 @@ def test_no_clip_reaches_over_a_gap(store: Store) -> None:
 
 
 def test_a_stride_below_the_period_begins_a_clip_with_every_frame_once(store: Store) -> None:
-    fine, each = (units_of(whole(store), Piece.clip, 1.0, stride) for stride in (1e-6, 0.1))
+    fine, each = (units_of(whole(store), SelectionUnit.clip, 1.0, stride) for stride in (1e-6, 0.1))
 
     assert fine.begin.tolist() == each.begin.tolist()
 
@@ -119,7 +119,7 @@ def test_a_stride_below_the_period_begins_a_clip_with_every_frame_once(store: St
 @pytest.mark.parametrize("stride", [0.0, -1.0, 2.5, float("nan"), float("inf")])
 def test_a_stride_that_would_leave_frames_out_is_refused(store: Store, stride: float) -> None:
     with pytest.raises(ConfigError, match="every frame is in one"):
-        units_of(whole(store), Piece.clip, 2.0, stride)
+        units_of(whole(store), SelectionUnit.clip, 2.0, stride)
 
 
 # Few of them ------------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ def test_where_every_element_is_in_consecutive_sets_reductions_alone_decide(seed
         if not points or points[-1] < begin:
             points.append(end)
 
-    forced, parts = reduced(Family.of(pairs, 60, 40))
+    forced, parts = reduced(SetFamily.of(pairs, 60, 40))
 
     assert parts == []
     assert len(forced) == len(points)
@@ -151,7 +151,7 @@ def test_what_is_superfluous_changes_no_optimum_whatever_sets_cost(seed: int) ->
     sets, elements = 10, 14
     holds = rng.random((sets, elements)) < 0.3
     cost = rng.integers(1, 5, sets).astype(np.float64)
-    of = Family.of(np.array(np.nonzero(holds)), sets, elements, cost, 1 + seed % 2)
+    of = SetFamily.of(np.array(np.nonzero(holds)), sets, elements, cost, 1 + seed % 2)
     reachable = of.need.sum()
     every = [list(c) for n in range(sets + 1) for c in combinations(range(sets), n)]
     best = min(
@@ -170,8 +170,11 @@ def test_what_is_superfluous_changes_no_optimum_whatever_sets_cost(seed: int) ->
 def test_clips_that_may_begin_anywhere_keep_every_class_with_no_more_than_a_grid(
     store: Store, stride: float
 ) -> None:
-    grid = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL"))
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL", stride_s=stride))
+    grid = select(whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "EL"))
+    found = select(
+        whole(store),
+        SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "EL", stride_s=stride),
+    )
     of = classed(whole(store), "EL")
     kept = {
         c
@@ -209,7 +212,9 @@ def test_the_cheapest_union_lies_between_bound_and_cost(
     store: Store, low: int, stride: float
 ) -> None:
     chosen = some(store, (low, low + (13 if stride < 0.2 else 23)))
-    wish = Wish(Way.minimal, Piece.clip, 0.4, "RSV", least=Measure.frames, stride_s=stride)
+    wish = SelectionSpec(
+        Strategy.minimal, SelectionUnit.clip, 0.4, "RSV", least=Measure.frames, stride_s=stride
+    )
     found = select(chosen, wish)
     assert found.holdings is not None
     everything = set(range(len(found.holdings.weight)))
@@ -227,7 +232,10 @@ def test_within_a_budget_of_frames_what_is_kept_lies_below_the_best_and_its_boun
 ) -> None:
     chosen = some(store, (low, low + 13))
     most = Budget.parse(f"{budget}frames")
-    found = select(chosen, Wish(Way.minimal, Piece.clip, 0.4, "RSV", budget=most, stride_s=0.1))
+    found = select(
+        chosen,
+        SelectionSpec(Strategy.minimal, SelectionUnit.clip, 0.4, "RSV", budget=most, stride_s=0.1),
+    )
     best = max(len(has) for frames, has in unions(found) if frames <= budget)
 
     assert len(frames_of(found)) <= budget
@@ -237,10 +245,14 @@ def test_within_a_budget_of_frames_what_is_kept_lies_below_the_best_and_its_boun
 
 
 @pytest.mark.parametrize("budget", ["12frames", "3s", "700kB"])
-@pytest.mark.parametrize("way", [Way.minimal, Way.rarest, Way.every, Way.stratify])
-def test_no_budget_is_exceeded_by_the_union(store: Store, budget: str, way: Way) -> None:
+@pytest.mark.parametrize(
+    "way", [Strategy.minimal, Strategy.rarest, Strategy.every, Strategy.stratify]
+)
+def test_no_budget_is_exceeded_by_the_union(store: Store, budget: str, way: Strategy) -> None:
     most = Budget.parse(budget)
-    wish = Wish(way, Piece.clip, 0.5, "EL", budget=most, stride_s=0.1, by="ego.speed > 3")
+    wish = SelectionSpec(
+        way, SelectionUnit.clip, 0.5, "EL", budget=most, stride_s=0.1, by="ego.speed > 3"
+    )
 
     found = select(whole(store), wish)
 
@@ -252,7 +264,9 @@ def test_no_budget_is_exceeded_by_the_union(store: Store, budget: str, way: Way)
 
 
 def test_at_random_no_clip_is_taken_that_others_hold_already(store: Store) -> None:
-    wish = Wish(Way.every, Piece.clip, 1.0, budget=Budget.parse("6s"), stride_s=0.1)
+    wish = SelectionSpec(
+        Strategy.every, SelectionUnit.clip, 1.0, budget=Budget.parse("6s"), stride_s=0.1
+    )
 
     found = select(whole(store), wish)
     before: set[int] = set()
@@ -268,7 +282,7 @@ def test_at_random_no_clip_is_taken_that_others_hold_already(store: Store) -> No
 
 def test_each_class_several_times_is_not_for_clips_that_overlap() -> None:
     with pytest.raises(ConfigError, match="leave out --stride"):
-        Wish(Way.per_class, Piece.clip, 2.0, each=2, stride_s=0.5)
+        SelectionSpec(Strategy.per_class, SelectionUnit.clip, 2.0, each=2, stride_s=0.5)
 
 
 # Locks, parts, curves -----------------------------------------------------------------------------------------
@@ -277,7 +291,7 @@ def test_each_class_several_times_is_not_for_clips_that_overlap() -> None:
 def test_a_lock_has_each_clip_as_a_case_and_what_they_share_once(
     store: Store, tmp_path: Path
 ) -> None:
-    wish = Wish(Way.minimal, Piece.clip, 1.0, "RSV", stride_s=0.3)
+    wish = SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "RSV", stride_s=0.3)
     found = select(whole(store), wish)
     lock = locked_selection(found, payloads=False)
     lock.write(tmp_path / "some.lock")
@@ -294,7 +308,9 @@ def test_a_lock_has_each_clip_as_a_case_and_what_they_share_once(
 def test_each_case_of_a_lock_is_exported_as_a_clip_of_its_own(
     store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL", stride_s=0.3))
+    found = select(
+        whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "EL", stride_s=0.3)
+    )
     lock = locked_selection(found, payloads=False)
     lock.write(tmp_path / "some.lock")
     asked = ["export", str(store.file.path), "--lock", str(tmp_path / "some.lock")]
@@ -311,7 +327,9 @@ def test_each_case_of_a_lock_is_exported_as_a_clip_of_its_own(
 
 
 def test_parts_count_frames_once_and_share_no_recording(store: Store) -> None:
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "RSV", stride_s=0.3))
+    found = select(
+        whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "RSV", stride_s=0.3)
+    )
     shares = parse_split("train=0.7,test=0.3")
 
     rows = split_table(found, split(found, shares), shares).dicts()
@@ -321,7 +339,9 @@ def test_parts_count_frames_once_and_share_no_recording(store: Store) -> None:
 
 
 def test_the_curve_is_beside_the_same_clips_in_random_order(store: Store) -> None:
-    found = select(whole(store), Wish(Way.minimal, Piece.clip, 1.0, "EL", stride_s=0.1))
+    found = select(
+        whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, 1.0, "EL", stride_s=0.1)
+    )
     drawn = curve(found)
     held, units = found.holdings, found.units
     assert held is not None
@@ -353,9 +373,11 @@ def test_of_a_drive_of_sumo_less_than_half_of_what_random_order_needs_and_none_t
     place = tmp_path_factory.getbasetemp() / "sumo.sgstore"
     if not place.exists():
         ingest(place, [data / "traces" / "sumo" / "Town10HD_sumo_osi.mcap"])
-    chosen = Chosen("sumo", Store(place))
+    chosen = ChosenFrames("sumo", Store(place))
 
-    found = select(chosen, Wish(Way.minimal, Piece.clip, 2.0, **wish, stride_s=stride))
+    found = select(
+        chosen, SelectionSpec(Strategy.minimal, SelectionUnit.clip, 2.0, **wish, stride_s=stride)
+    )
     drawn = curve(found)
 
     assert found.result["cost"] <= 1.05 * found.result["bound"]

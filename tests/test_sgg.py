@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of, present, thing
 
-from sgstore.config import Config, Direction, Pairs, Proximity, Range
+from sgstore.config import Config, Direction, PairSettings, Proximity, RangeSettings
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
@@ -66,8 +66,8 @@ def test_what_is_in_range_is_told_by_its_footprint(what: Thing, inside: bool, st
 def test_the_range_follows_the_ego_and_the_config() -> None:
     frame = [thing("ego", 100), thing("c", 120)]
 
-    assert nodes(graph_of(frames(frame), None, Config(range=Range(10)))) == ["ego"]
-    assert nodes(graph_of(frames(frame), None, Config(range=Range(18)))) == ["ego", "c"]
+    assert nodes(graph_of(frames(frame), None, Config(range=RangeSettings(10)))) == ["ego"]
+    assert nodes(graph_of(frames(frame), None, Config(range=RangeSettings(18)))) == ["ego", "c"]
 
 
 def test_what_is_out_of_range_has_no_state_and_no_relation() -> None:
@@ -140,7 +140,7 @@ def test_the_map_is_present_as_far_as_the_range_reaches() -> None:
 
 def test_what_an_entity_is_in_is_present_even_out_of_range() -> None:
     truck = thing("truck", 51, 0, length=10, width=3)
-    graph = graph_of(frames([thing("ego", y=-2), truck]), STREET, Config(range=Range(46.5)))
+    graph = graph_of(frames([thing("ego", y=-2), truck]), STREET, Config(range=RangeSettings(46.5)))
 
     assert ("truck", "isIn", "zebra") in edges(graph, 0, STREET)
     assert "zebra" in names_present(graph)
@@ -171,7 +171,7 @@ def test_every_end_of_every_edge_is_in_its_graph(seed: int) -> None:
 
 
 def test_a_lane_brings_its_road_and_its_junction() -> None:
-    narrow = Config(range=Range(38))
+    narrow = Config(range=RangeSettings(38))
     truck = thing("truck", 37, -2, length=10)
 
     alone = graph_of(frames([thing("ego", y=-2)]), STREET, narrow)
@@ -439,7 +439,7 @@ def test_relations_that_the_config_leaves_out_are_not_answered() -> None:
 
 
 def test_where_no_pairs_are_related_their_relations_are_unknown() -> None:
-    config = Config(pairs=Pairs(within=0, ego=False), sees=False)
+    config = Config(pairs=PairSettings(within=0, ego=False), sees=False)
 
     assert SceneGraphGenerator(None, config).answers == ()
     assert edges(graph_of(frames([thing("ego"), thing("c", 3)]), None, config)) == []

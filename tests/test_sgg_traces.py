@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from sgstore.config import Config, Range
+from sgstore.config import Config, RangeSettings
 from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
 from sgstore.roads import OFF_ROAD
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.traces import open_trace
 from sgstore.vocabulary import KIND_CODE, PROXIMITY, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def test_the_ego_sees_what_is_there_and_never_itself(data: Path, name: str) -> N
 
 def test_vehicles_of_the_swarm_drive_in_driving_lanes(data: Path) -> None:
     path = recording(data, "esmini/swarm_Town04")
-    generator = SceneGraphGenerator(opened(path)[1], Config(range=Range(1000)))
+    generator = SceneGraphGenerator(opened(path)[1], Config(range=RangeSettings(1000)))
     vehicles, kinds = [KIND_CODE[kind] for kind in VEHICLES], np.zeros(0, np.int8)
     samples = off = 0
     with open_trace(path) as trace:

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from recordings import drive
 
-from sgstore.traces import ahead, chunks, open_trace, spool
-from sgstore.traces.mcap_file import McapFile
+import sgstore.mcap._chunks as chunks
+import sgstore.mcap._read_ahead as ahead
+import sgstore.mcap._read_ahead as spool
+from sgstore.mcap import McapFile
+from sgstore.readers import open_trace
 from sgstore.world import FrameBlock, TraceReport
 
 if TYPE_CHECKING:
@@ -86,7 +89,7 @@ def test_what_is_kept_is_decompressed_once(path: Path, counted: list[int]) -> No
 def test_where_there_is_no_room_chunks_are_decompressed_again(
     path: Path, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(spool, "MOST", most)
+    monkeypatch.setattr(spool, "MOST_SPOOLED", most)
     with McapFile(path) as recording:
         first = told(recording, lambda _: True)
 
@@ -123,7 +126,7 @@ def test_frames_do_not_depend_on_what_is_kept(
 ) -> None:
     write(tmp_path / "a.mcap", 30)
     kept = blocks(tmp_path / "a.mcap")
-    monkeypatch.setattr(spool, "MOST", 0)
+    monkeypatch.setattr(spool, "MOST_SPOOLED", 0)
 
     for one, other in zip(kept, blocks(tmp_path / "a.mcap"), strict=True):
         for name in ("seq", "time_ns", "log_time_ns", "ego"):

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from recordings import Recorder, car, drive
 
+import sgstore.store._payloads as payloads
 from sgstore.config import Config, Payloads
 from sgstore.errors import StoreError, TraceError
 from sgstore.ingest import ingest
-from sgstore.store import StoreFile, payloads
-from sgstore.store.schema import tables_sql
-from sgstore.store.staging import MESSAGES
+from sgstore.store import StoreFile
+from sgstore.store._schema import tables_sql
+from sgstore.store._staging import MESSAGES
 from sgstore.world import Channel
 
 if TYPE_CHECKING:

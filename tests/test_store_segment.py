@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from graph_blocks import RandomTrace, map_stub, publish, trace_info
 
-from sgstore.config import Config, Range
+import sgstore.store._staging as staging
+from sgstore.config import Config, RangeSettings
 from sgstore.errors import StoreError
-from sgstore.store import StoreFile, staging
-from sgstore.store.traces import trace_id_of
+from sgstore.store import StoreFile, trace_id_of
 from sgstore.world import TraceReport
 
 TABLES = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
@@ -172,7 +172,7 @@ def test_a_trace_that_comes_twice_at_once_comes_once(store) -> None:
 @pytest.mark.parametrize(
     ("config", "roads", "what"),
     [
-        (Config(range=Range(9.0)), None, "with other settings"),
+        (Config(range=RangeSettings(9.0)), None, "with other settings"),
         (Config(), map_stub(seed=9), "with another road map"),
     ],
 )
@@ -296,7 +296,8 @@ KILLED = """
 import os, sys, signal
 sys.path[:0] = {path!r}
 from graph_blocks import RandomTrace, publish
-from sgstore.store import StoreFile, staging
+import sgstore.store._staging as staging
+from sgstore.store import StoreFile
 store = StoreFile({store!r})
 publish(store, RandomTrace(1, frames=130, path="first"))
 lines = 0
@@ -369,7 +370,8 @@ sys.path[:0] = {path!r}
 from pathlib import Path
 from graph_blocks import RandomTrace, publish
 from sgstore.errors import StoreError
-from sgstore.store import StoreFile, staging
+import sgstore.store._staging as staging
+from sgstore.store import StoreFile
 store = StoreFile({store!r})
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 most = {most}

@@ -17,7 +17,7 @@ from graph_blocks import RandomTrace, publish
 
 from sgstore.errors import StoreError
 from sgstore.store import StoreFile
-from sgstore.store.access import Access
+from sgstore.store._locking import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -151,6 +151,34 @@ def test_a_stream_of_readers_does_not_keep_a_writer_out(store) -> None:
             publish(store, RandomTrace(seed, frames=5, path=f"t{seed}"))
 
     assert len(store.traces()) == 4
+
+
+ASKS = """
+import sys
+sys.path[:0] = {path!r}
+from sgstore.store import StoreFile
+print("asking", flush=True)
+traces = StoreFile({store!r}).traces()
+sys.stdin.read()
+assert len(traces) == 2, "it came before the writer who waited longer"
+"""
+
+
+def test_who_comes_while_a_writer_waits_comes_after_it(store) -> None:
+    about = {"store": str(store.path)}
+    writer = threading.Thread(target=publish, args=(store, RandomTrace(2, frames=5, path="b")))
+    with process(READS, **about) as reader:
+        writer.start()
+        gate = store.path.with_name(f"{store.path.name}.gate")
+        while not gate.exists():
+            time.sleep(0.01)
+        time.sleep(0.2)
+        with process(ASKS, **about):
+            time.sleep(0.7)  # it would have read by now, beside the reader
+            assert reader.stdin is not None
+            reader.stdin.close()
+            reader.stdin = None
+            writer.join()
 
 
 def test_threads_read_while_one_writes_and_see_whole_traces(store) -> None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
+import duckdb
 import pytest
 from graph_blocks import RandomTrace, publish
 
+import sgstore.store._rows as rows
 from sgstore.errors import SqlError, StoreError
-from sgstore.store import StoreFile
+from sgstore.store import GivenTable, StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -206,3 +209,59 @@ def test_a_statement_that_is_too_long_is_refused(store) -> None:
 
 def test_an_error_of_sql_is_an_error_of_the_store() -> None:
     assert issubclass(SqlError, StoreError)
+
+
+# Faults of the database itself
+
+
+@pytest.fixture
+def alone(tmp_path) -> StoreFile:
+    store = StoreFile.create(tmp_path / "alone.db")
+    publish(store, RandomTrace(frames=5))
+    return store
+
+
+class _Faulty:
+    """Stands for what runs a statement: the database fails the first times, and then answers."""
+
+    def __init__(self, monkeypatch, times: int) -> None:
+        self.left, self._run = times, rows.run
+        monkeypatch.setattr(rows, "run", self)
+
+    def __call__(self, connection, sql, parameters=None):
+        if self.left:
+            self.left -= 1
+            raise duckdb.InternalException(
+                "INTERNAL Error: global dictionary\n\nStack Trace:\n0x4b"
+            )
+        return self._run(connection, sql, parameters)
+
+
+@pytest.mark.skipif(duckdb.__version__.startswith("1."), reason="DuckDB 1 has no such setting")
+def test_small_chunks_are_not_gathered_because_their_dictionaries_are_mixed_up(store) -> None:
+    setting = "SELECT current_setting('enable_caching_operators')"
+    assert store.user_sql(setting).values == [(False,)]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_question_that_meets_a_fault_of_the_database_is_asked_again(
+    alone, monkeypatch, nested
+) -> None:
+    _Faulty(monkeypatch, times=1)
+    with alone.snapshot() if nested else nullcontext():
+        assert alone.rows("SELECT count(*) FROM frames").values == [(5,)]
+        assert alone.rows("SELECT 1").values == [(1,)]
+
+
+def test_a_fault_that_stays_is_one_line_and_the_store_goes_on(alone, monkeypatch) -> None:
+    _Faulty(monkeypatch, times=9)
+    with pytest.raises(StoreError, match=r"fault of DuckDB \S+ itself.*global dictionary$"):
+        alone.rows("SELECT 1")
+    monkeypatch.undo()
+    assert alone.rows("SELECT 1").values == [(1,)]
+
+
+def test_what_a_question_was_given_is_given_again(alone, monkeypatch) -> None:
+    _Faulty(monkeypatch, times=1)
+    given = GivenTable("mine", {"n": "INTEGER"}, lambda: iter([[[1, 2]], [[3]]]))
+    assert alone.rows("SELECT sum(n) FROM mine", given=[given]).values == [(6,)]

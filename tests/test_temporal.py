@@ -14,9 +14,9 @@ import pytest
 from oracle_temporal import try_formulas
 
 from sgstore.errors import QueryError
-from sgstore.temporal import Online, evaluate, formula_of, prefix_verdicts
-from sgstore.temporal.formulas import And, Next, Not, eventually
-from sgstore.temporal.verdicts import PRESUMABLY_TRUE, Settled
+from sgstore.temporal import OnlineFormula, evaluate, formula_of, prefix_verdicts
+from sgstore.temporal._formula import And, Next, Not, eventually
+from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -95,7 +95,7 @@ def test_columns_that_do_not_fit_are_refused() -> None:
         evaluate(formula, {"a": good, "b": good[:2]}, times)
     with pytest.raises(ValueError, match="must ascend"):
         evaluate(formula, {"a": good, "b": good}, times[::-1])
-    engine = Online(formula)
+    engine = OnlineFormula(formula)
     engine.step({"a": True, "b": False}, 5)
     with pytest.raises(ValueError, match="must ascend"):
         engine.step({"a": True, "b": False}, 5)
@@ -109,7 +109,7 @@ def test_an_empty_trace_has_no_values() -> None:
 
 
 def test_online_a_value_is_known_when_its_look_ahead_is_over() -> None:
-    engine = Online(formula_of("EVENTUALLY[0s, 2s] a"))
+    engine = OnlineFormula(formula_of("EVENTUALLY[0s, 2s] a"))
     told = [engine.step({"a": t == 9}, t * SECOND) for t in range(12)]
 
     assert told[:3] == [[], [], []]
@@ -119,7 +119,7 @@ def test_online_a_value_is_known_when_its_look_ahead_is_over() -> None:
 
 
 def test_online_memory_does_not_grow_with_the_trace() -> None:
-    engine = Online(
+    engine = OnlineFormula(
         formula_of("ALWAYS (a IMPLIES EVENTUALLY[0s, 5s] b) AND ONCE[0s, 5s] (a SINCE b)")
     )
     sizes = []
@@ -194,7 +194,7 @@ def published(data: Path) -> Iterator[tuple[str, str, dict[str, np.ndarray], np.
 def test_every_verdict_that_sgsm_published_is_met_online(data: Path) -> None:
     violated, verdicts, files = {"LAV": 0, "TCP": 0}, 0, 0
     for system, name, columns, published_verdicts in published(data):
-        engine, told = Online(property_named(name)), []
+        engine, told = OnlineFormula(property_named(name)), []
         letters = zip(*(flags.tolist() for flags in columns.values()), strict=True)
         for t, letter in enumerate(letters):
             engine.step(dict(zip(columns, letter, strict=True)), t)

@@ -9,7 +9,8 @@ import pytest
 
 from sgstore.cli import run
 from sgstore.demo import RECORDING
-from sgstore.draw.swimlanes import Lane, Span, Timeline, lines_of, timelines
+from sgstore.draw import lines_of, timelines
+from sgstore.draw._swimlanes import Lane, LaneSpan, Timeline
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -25,7 +26,10 @@ def town(town_store: Path) -> Path:
 
 def test_a_letter_is_full_where_most_of_it_is_covered_and_half_where_some_of_it_is() -> None:
     lane = Lane(
-        "brakes", "car 3", "", [Span(0, 2, False), Span(1, 3, False), Span(7.1, 7.2, False)]
+        "brakes",
+        "car 3",
+        "",
+        [LaneSpan(0, 2, False), LaneSpan(1, 3, False), LaneSpan(7.1, 7.2, False)],
     )
     head, line = lines_of(Timeline("drive", 10.0, [lane]), letters=10)
 

@@ -12,10 +12,10 @@ import pytest
 from typer.testing import CliRunner
 
 import sgstore
+import sgstore.store._joins as own
 from sgstore.cli import application
 from sgstore.errors import MissingExtraError, QueryError, StoreError
 from sgstore.sandbox import Sandbox
-from sgstore.store import joining as own
 
 if TYPE_CHECKING:
     from pathlib import Path

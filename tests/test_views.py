@@ -228,6 +228,7 @@ def test_two_edges_joined_in_plain_sql_are_two_edges_of_one_frame(store) -> None
 NUMBERS = ("distance", "gap", "bearing", "rel_heading", "lon", "lat")
 NUMBERS += (
     "closing_speed",
+    "closing_time",
     "ttc",
     "headway",
     "rel_speed",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import duckdb
 
-from sgstore.store.schema import schema_sql
+from sgstore.store._schema import schema_sql
 
 PAGE = Path(__file__).parents[1] / "docs" / "views.md"
 

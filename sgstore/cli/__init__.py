@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
-from sgstore.cli.arguments import ERROR, INTERRUPTED, USAGE, app
-from sgstore.cli.output import say, write_error
+import sgstore.cli._process as ending
+from sgstore.cli._options import ERROR, USAGE, app
+from sgstore.cli._output import say, write_error
+from sgstore.cli._process import take_streams
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
+from sgstore.files import ReaderGoneError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,24 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["application", "main"]
 
 VERBS: Final = {
-    "traces": ("ingest", "info", "doctor"),
-    "imports": ("import",),
-    "stores": ("verify", "remove"),
-    "graphs": ("derive",),
-    "maps": ("map",),
-    "live": ("record",),
-    "settings": ("config",),
-    "queries": ("find", "why-not", "like", "translate", "sql"),
-    "checks": ("check",),
-    "monitoring": ("monitor",),
-    "timelines": ("timeline",),
-    "library": ("patterns",),
+    "recordings": ("ingest", "info", "doctor", "import", "record"),
+    "stores": ("verify", "remove", "rebuild", "derive", "map", "payload", "config", "demo"),
+    "queries": ("find", "why-not", "like", "translate", "sql", "patterns"),
+    "checks": ("check", "monitor", "timeline"),
     "coverage": ("coverage",),
     "selection": ("select", "diff", "lock"),
-    "payloads": ("payload",),
-    "pictures": ("show",),
-    "exports": ("export",),
-    "tour": ("demo",),
+    "exports": ("show", "export"),
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.
 
@@ -61,15 +53,23 @@ def application(arguments: Sequence[str] = ()) -> typer.Typer:
     """
     asked = [module for module, verbs in VERBS.items() if {*arguments[:1]} & {*verbs}]
     for module in asked or VERBS:
-        import_module(f"{__name__}.{module}")
-    order = [f"{__name__}.{module}" for module in VERBS]
+        import_module(f"{__name__}._{module}")
+    order = [f"{__name__}._{module}" for module in VERBS]
     app.registered_commands.sort(key=lambda verb: order.index(verb.callback.__module__))
     return app
 
 
+_PUBLISHING: Final = ("ingest", "import", "derive")
+"""Verbs that do their work in parts, each of which is in the store when it is done."""
+
+
 def main() -> None:
     """Run the command line of this process and end it with the right exit code."""
-    sys.exit(run(sys.argv[1:]))
+    take_streams()
+    ending.heed_signals()
+    code = run(sys.argv[1:])
+    ending.ignore_signals()
+    sys.exit(code)
 
 
 def _wants_json(arguments: list[str]) -> bool:
@@ -88,16 +88,9 @@ def run(arguments: list[str]) -> int:
         The exit code, as the module says.
     """
     try:
-        asked = application(arguments)
-        code = int(asked(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
-    except (KeyboardInterrupt, typer.Abort):
-        code = INTERRUPTED
+        code = _ran(arguments)
     except SgstoreError as error:
-        if _wants_json(arguments):
-            write_error(error.as_dict())
-        else:
-            say(str(error))
-        return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR
+        return 0 if isinstance(error, ReaderGoneError) else _refused(error, arguments)
     except BrokenPipeError:
         # The reader of our output went away (`| head`): nothing to say, and nothing more to flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -109,6 +102,38 @@ def run(arguments: list[str]) -> int:
             raise
         show()
         return USAGE
-    if code == INTERRUPTED:  # typer, too, makes this code of Ctrl-C
-        say("interrupted; what was finished is in the store")
+    finally:
+        ending.clear_deadline()
+    if code == ending.INTERRUPTED:  # which typer, too, makes of Ctrl-C
+        more = "; what was finished is in the store" if {*arguments[:1]} & {*_PUBLISHING} else ""
+        say(f"{ending.word()}{more}")
+        return ending.exit_code()
     return code
+
+
+def _ran(arguments: list[str]) -> int:
+    """Run one command line; the exit code of an interruption, whatever became of that on its way."""
+    try:
+        asked = application(arguments)
+        code = int(asked(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+        if code != ending.INTERRUPTED:
+            sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        ended = isinstance(error, typer.Abort) or ending.was_ended()
+        if not (ended or ending.is_interruption(error)):
+            raise
+        code = ending.INTERRUPTED
+    if ending.was_ended():  # an interruption may end as the error of one recording
+        code = ending.INTERRUPTED
+    if code == ending.INTERRUPTED:
+        ending.refuse_late()
+    return code
+
+
+def _refused(error: SgstoreError, arguments: list[str]) -> int:
+    """Say what was refused; the exit code."""
+    if _wants_json(arguments):
+        write_error(error.as_dict())
+    else:
+        say(str(error))
+    return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR

@@ -9,46 +9,6 @@ looks at where a system failed.
 Every answer is a table that says what its shares are of.
 """
 
-from sgstore.coverage.cells import specification
-from sgstore.coverage.classed import Classed, Missing, Unit, classed
-from sgstore.coverage.compare import (
-    classes,
-    covered,
-    growth,
-    novel,
-    novel_clips,
-    novel_frames,
-    venn,
-)
-from sgstore.coverage.explain import explain
-from sgstore.coverage.failures import S3C_THRESHOLD, Outcomes, failures
-from sgstore.coverage.features import Combos, combos
-from sgstore.coverage.frames import Chosen, selection_of
-from sgstore.coverage.slots import read_specifications, slot_coverage
-from sgstore.coverage.tables import Table
+import lazy_loader
 
-__all__ = [
-    "S3C_THRESHOLD",
-    "Chosen",
-    "Classed",
-    "Combos",
-    "Missing",
-    "Outcomes",
-    "Table",
-    "Unit",
-    "classed",
-    "classes",
-    "combos",
-    "covered",
-    "explain",
-    "failures",
-    "growth",
-    "novel",
-    "novel_clips",
-    "novel_frames",
-    "read_specifications",
-    "selection_of",
-    "slot_coverage",
-    "specification",
-    "venn",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 ABOUT: Final = "graphs.json"
 FOLDER: Final = "graphs"
-FORMAT: Final = "sgstore.graphs"
+FORMAT: Final = "sgstore.derive"
 VERSION: Final = 1
 
 _COLUMNS: Final = (
@@ -54,7 +54,7 @@ class GraphData:
     about : dict
         ``abstraction``, ``node_types``, ``relations``, ``node_features``, ``labels``, ``clips``.
     columns : dict
-        Name → array; see :mod:`sgstore.exporters.pyg`. ``label_NAME``: float64, NaN where it is not known.
+        Name → array; see :mod:`sgstore.exporters._pyg`. ``label_NAME``: float64, NaN where it is not known.
 
     Raises
     ------

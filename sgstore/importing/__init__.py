@@ -10,7 +10,6 @@ graphs if it has the same name and kind. Lanes, roads and other parts keep the n
 geometry: what needs poses is unknown of such frames. The view ``imports`` says what the file calls each frame.
 """
 
-from sgstore.importing.running import FORMATS, Imported, import_graphs
-from sgstore.importing.words import Words
+import lazy_loader
 
-__all__ = ["FORMATS", "Imported", "Words", "import_graphs"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,16 +5,6 @@ The stages are parse (:mod:`~sgstore.lang.parser`), bind (:mod:`~sgstore.lang.bi
 printed.
 """
 
-from sgstore.lang.catalog import Catalog, TraceFacts
-from sgstore.lang.compiler import Compiled, compile_query
-from sgstore.lang.standard import NamedPattern, pattern_named, patterns
+import lazy_loader
 
-__all__ = [
-    "Catalog",
-    "Compiled",
-    "NamedPattern",
-    "TraceFacts",
-    "compile_query",
-    "pattern_named",
-    "patterns",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

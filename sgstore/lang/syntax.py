@@ -1,6 +1,6 @@
 """Syntax trees: a query as it was written, every part with its place in the text.
 
-Nothing here is checked against a vocabulary; that is the binder's work. :mod:`sgstore.lang.parser` makes these
+Nothing here is checked against a vocabulary; that is the binder's work. :mod:`sgstore.lang._parse` makes these
 trees from text.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from sgstore.errors import Span
+    from sgstore.errors import TextSpan
 
 
 # Expressions --------------------------------------------------------------------------------------
@@ -21,7 +21,7 @@ class Constant:
     """A number, a text, a truth value or NULL as it stands in the query."""
 
     value: int | float | str | bool | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Duration:
 
     amount: float
     unit: str
-    span: Span
+    span: TextSpan
 
     @property
     def ns(self) -> int:
@@ -43,7 +43,7 @@ class Parameter:
     """``$name``: a value that comes with the query."""
 
     name: str
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Variable:
     """A name that a pattern binds, or ``ego``, ``frame``, ``trace``."""
 
     name: str
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class AttributeOf:
 
     owner: Variable
     name: str
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +70,15 @@ class Call:
     name: str
     arguments: tuple[Expression, ...]
     distinct: bool
-    name_span: Span
-    span: Span
+    name_span: TextSpan
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
 class CountAll:
     """``COUNT(*)``."""
 
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class ListOf:
     """``[a, b, …]``."""
 
     items: tuple[Expression, ...]
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Logic:
 
     word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"]
     operands: tuple[Expression, ...]
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class Comparison:
     word: str
     left: Expression
     right: Expression
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ class NullTest:
 
     operand: Expression
     negated: bool
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ class Membership:
     operand: Expression
     choices: Expression
     negated: bool
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class Arithmetic:
 
     first: Expression
     rest: tuple[tuple[str, Expression], ...]
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +141,7 @@ class Negative:
     """``-a``."""
 
     operand: Expression
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,7 @@ class BlockExpression:
     word: str
     block: Block
     value: Expression | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ class Temporal:
 
     word: str
     operands: tuple[Expression, ...]
-    span: Span
+    span: TextSpan
     bound: tuple[Duration | Parameter, Duration | Parameter | None] | None = None
 
 
@@ -195,7 +195,7 @@ class Label:
     """A label as written; the name ``%`` stands for any."""
 
     name: str
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +204,7 @@ class LabelLogic:
 
     word: Literal["!", "&", "|"]
     operands: tuple[LabelExpression, ...]
-    span: Span
+    span: TextSpan
 
 
 LabelExpression = Label | LabelLogic
@@ -216,7 +216,7 @@ class Property:
 
     name: str
     value: Expression
-    name_span: Span
+    name_span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,8 +227,8 @@ class NodePattern:
     label: LabelExpression | None
     properties: tuple[Property, ...]
     where: Expression | None
-    name_span: Span
-    span: Span
+    name_span: TextSpan
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +242,7 @@ class EdgePattern:
     properties: tuple[Property, ...]
     where: Expression | None
     direction: Literal["right", "left", "any"]
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +259,7 @@ class Block:
 
     paths: tuple[Path, ...]
     where: Expression | None
-    span: Span
+    span: TextSpan
 
 
 # Statements ---------------------------------------------------------------------------------------
@@ -271,7 +271,7 @@ class Setting:
 
     name: str
     value: str | Parameter
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,7 +286,7 @@ class Item:
     name: str | None
     before: int
     after: int
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +303,7 @@ class Sample:
 
     number: int
     per: Expression | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,21 +315,21 @@ class Returns:
     order: tuple[Sort, ...]
     sample: Sample | None
     limit: int | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Hold:
+class HoldClause:
     """``FOR >= duration INCLUSIVE``: how long a step must last."""
 
     comparison: str
     duration: Duration | Parameter
     inclusive: bool
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StepClause:
     """One step of a sequence.
 
     Attributes
@@ -338,17 +338,17 @@ class Step:
         What stands after ``MATCH``; of ``HOLDS (condition)`` a block without paths.
     absent : bool
         Whether it is ``NOT MATCH``.
-    hold : Hold or None
+    hold : HoldClause or None
     name : str or None
         What ``AS`` calls it.
-    span : Span
+    span : TextSpan
     """
 
     block: Block
     absent: bool
-    hold: Hold | None
+    hold: HoldClause | None
     name: str | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,22 +356,22 @@ class ScenarioStep:
     """``MATCH name(parameter = value, …)``: the steps of a scenario that has a name."""
 
     name: str
-    given: tuple[Given, ...]
-    name_span: Span
-    span: Span
+    given: tuple[Argument, ...]
+    name_span: TextSpan
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class Argument:
     """``name = value``: the value of a parameter of a scenario."""
 
     name: str
     value: Constant | Duration | Parameter
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class LinkClause:
     """What stands between two steps: when the second one comes after the first.
 
     Attributes
@@ -380,38 +380,38 @@ class Link:
         ``then``, ``immediately``, ``until`` or ``while``.
     after, within : Duration, Parameter or None
         Least and greatest time of ``then``.
-    span : Span
+    span : TextSpan
     """
 
     kind: Literal["then", "immediately", "until", "while"]
     after: Duration | Parameter | None
     within: Duration | Parameter | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Sequence:
+class SequenceClause:
     """Steps with links between them; there is one step more than links."""
 
-    steps: tuple[Step | ScenarioStep, ...]
-    links: tuple[Link, ...]
-    span: Span
+    steps: tuple[StepClause | ScenarioStep, ...]
+    links: tuple[LinkClause, ...]
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
+class MatchClause:
     """``USING … MATCH … WHERE … THEN … RETURN …``."""
 
     settings: tuple[Setting, ...]
-    sequence: Sequence
+    sequence: SequenceClause
     returns: Returns | None
-    span: Span
+    span: TextSpan
 
     @property
     def block(self) -> Block:
         """The pattern of its first step; of a scenario, an empty one."""
         first = self.sequence.steps[0]
-        return first.block if isinstance(first, Step) else Block((), None, first.span)
+        return first.block if isinstance(first, StepClause) else Block((), None, first.span)
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,7 +420,7 @@ class Formal:
 
     name: str
     default: Constant | Duration | None
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -429,9 +429,9 @@ class Define:
 
     name: str
     parameters: tuple[Formal, ...]
-    body: Expression | Sequence
-    name_span: Span
-    span: Span
+    body: Expression | SequenceClause
+    name_span: TextSpan
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -440,30 +440,30 @@ class QuantifiedNode:
 
     name: str
     label: LabelExpression
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Quantifier:
+class QuantifierClause:
     """``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
 
     word: str
     nodes: tuple[QuantifiedNode, ...]
     where: Expression | None
     absent: bool
-    span: Span
+    span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class CheckClause:
     """``USING … CHECK name: quantifiers formula RESET WHEN condition``."""
 
     settings: tuple[Setting, ...]
     name: str | None
-    quantifiers: tuple[Quantifier, ...]
+    quantifiers: tuple[QuantifierClause, ...]
     formula: Expression
     reset: Expression | None
-    span: Span
+    span: TextSpan
 
 
-Statement = Match | Define | Check
+Statement = MatchClause | Define | CheckClause

@@ -5,35 +5,6 @@ few sets that hold everything, and how few there must be · ``curve`` shows what
 random order · ``splits`` makes parts that share no recording · ``locking`` makes a lock of it.
 """
 
-from sgstore.locks import cases_of
-from sgstore.selection.choose import Selection, Way, Wish, select
-from sgstore.selection.cover import Cover, Fitted, minimal, within
-from sgstore.selection.curve import Curve, curve
-from sgstore.selection.family import Family
-from sgstore.selection.locking import locked_selection
-from sgstore.selection.splits import parse_split, split, split_table
-from sgstore.selection.units import Budget, Measure, Piece, Units, units_of
+import lazy_loader
 
-__all__ = [
-    "Budget",
-    "Cover",
-    "Curve",
-    "Family",
-    "Fitted",
-    "Measure",
-    "Piece",
-    "Selection",
-    "Units",
-    "Way",
-    "Wish",
-    "cases_of",
-    "curve",
-    "locked_selection",
-    "minimal",
-    "parse_split",
-    "select",
-    "split",
-    "split_table",
-    "units_of",
-    "within",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -4,8 +4,6 @@ Both engines give the same answers: :func:`evaluate` at all frames of a trace at
 frames come, each as soon as it is known.
 """
 
-from sgstore.temporal.columns import evaluate, prefix_verdicts
-from sgstore.temporal.formulas import Formula, formula_of
-from sgstore.temporal.online import Online
+import lazy_loader
 
-__all__ = ["Formula", "Online", "evaluate", "formula_of", "prefix_verdicts"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,576 @@
+"""Canonical forms and class identifiers of labelled graphs.
+
+An order of the nodes of one graph that depends on the graph only, where colours do not tell all nodes apart.
+
+Colour refinement leaves cells of nodes that look alike. Edges between two cells that hold for all pairs of
+their nodes, and nodes that are alone in their cells, tell nothing about which is which; without them a graph
+falls into components. Each is put in order by itself: at once if each of its cells has one node there; else by
+individualising each node of one cell in turn, refining, and keeping the order with the least form (McKay and
+Piperno: Practical graph isomorphism II, 2014). Two orders with the same form are an automorphism, and nodes
+that automorphisms map to one another need not be tried again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict, defaultdict
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.abstractions._columns import found
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from sgstore.abstractions._columns import Labelled
+    from sgstore.world import Bools, Ints
+
+
+Arcs = dict[int, dict[int, int]]
+"""Node → node → number of the label of the edge between them."""
+
+Form = tuple[object, ...]
+
+
+_DEEPEST: Final = 150
+"""Nodes that may be individualised one within the other."""
+
+
+class TooSymmetricError(Exception):
+    """The work that was allowed does not suffice. Never leaves the room."""
+
+
+@dataclass(slots=True)
+class SymmetrySearch:
+    """The search for the canonical order of one graph.
+
+    Parameters
+    ----------
+    work : int
+        How many edges may be looked at; the same graph takes the same work on every machine.
+    """
+
+    work: int
+    spent: int = field(default=0)
+    depth: int = field(default=0)
+
+    def order(
+        self, colours: Sequence[int], edges: Iterable[tuple[int, int, int]]
+    ) -> list[int] | None:
+        """Nodes 0, 1, … in an order that is the same up to automorphisms, however they were numbered.
+
+        Parameters
+        ----------
+        colours : sequence of int
+            Of the nodes; numbers that mean the same in every graph.
+        edges : iterable of (int, int, int)
+            Source, label, destination; one for a pair of nodes in one direction, no loops. The numbers of
+            labels mean the same in every graph.
+
+        Returns
+        -------
+        list of int or None
+            ``None`` if it takes more work than is allowed.
+        """
+        arcs: Arcs = {node: {} for node in range(len(colours))}
+        for src, label, dst in edges:
+            arcs[src][dst] = label
+        try:
+            return self._canonical(arcs, dict(enumerate(colours)))
+        except TooSymmetricError:
+            return None
+
+    def _canonical(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
+        """The order of a graph: refined, cut into components, each in order."""
+        colour = self._refined(arcs, colour)
+        sizes = Counter(colour.values())
+        alone = sorted((n for n in colour if sizes[colour[n]] == 1), key=colour.__getitem__)
+        parts = [
+            (_form(part, {n: colour[n] for n in order}, order), order)
+            for part in _parts_of_graph(_telling(arcs, colour, sizes))
+            for order in [self._connected(part, {n: colour[n] for n in part})]
+        ]
+        parts.sort(key=lambda part: part[0])
+        return alone + [node for _, order in parts for node in order]
+
+    def _connected(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
+        """The order of a connected graph with stable colours."""
+        cells: dict[int, list[int]] = defaultdict(list)
+        for node, of in colour.items():
+            cells[of].append(node)
+        if len(cells) == len(colour):
+            return sorted(colour, key=colour.__getitem__)
+        _, chosen = min((len(nodes), of) for of, nodes in cells.items() if len(nodes) > 1)
+        tried: dict[Form, list[int]] = {}
+        orbit = {node: node for node in colour}
+        explored: set[int] = set()
+        for node in cells[chosen]:
+            if _root(orbit, node) in {_root(orbit, other) for other in explored}:
+                continue
+            explored.add(node)
+            # Beyond all colours there are: the node gets one of its own.
+            self.depth += 1
+            order = self._canonical(arcs, colour | {node: max(cells) + 1})
+            self.depth -= 1
+            form = _form(arcs, colour, order)
+            if form in tried:
+                for a, b in zip(tried[form], order, strict=True):
+                    orbit[_root(orbit, a)] = _root(orbit, b)
+            else:
+                tried[form] = order
+        return tried[min(tried)]
+
+    def _refined(self, arcs: Arcs, colour: dict[int, int]) -> dict[int, int]:
+        """Stable colours: ranks, which mean the same in every graph."""
+        back: Arcs = {node: {} for node in arcs}
+        for src, to in arcs.items():
+            for dst, label in to.items():
+                back[dst][src] = label
+        count = len(set(colour.values()))
+        cost = len(arcs) + 2 * sum(map(len, arcs.values()))
+        while True:
+            self.spent += cost
+            if self.spent > self.work or self.depth > _DEEPEST:
+                raise TooSymmetricError
+            keys = {
+                node: (
+                    colour[node],
+                    sorted((label, colour[dst]) for dst, label in arcs[node].items()),
+                    sorted((label, colour[src]) for src, label in back[node].items()),
+                )
+                for node in arcs
+            }
+            ranked = sorted(keys, key=keys.__getitem__)
+            ranks: dict[int, int] = {}
+            rank = -1
+            last: object = None
+            for node in ranked:
+                if keys[node] != last:
+                    rank, last = rank + 1, keys[node]
+                ranks[node] = rank
+            colour = ranks
+            if rank + 1 == count:
+                return colour
+            count = rank + 1
+
+
+def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
+    """The part of a graph that tells nodes of one cell apart."""
+    many = Counter(
+        (colour[src], label, colour[dst]) for src, to in arcs.items() for dst, label in to.items()
+    )
+    full = {
+        key
+        for key, edges in many.items()
+        if edges == sizes[key[0]] * (sizes[key[2]] - (key[0] == key[2]))
+    }
+    return {
+        src: {
+            dst: label
+            for dst, label in to.items()
+            if sizes[colour[dst]] > 1 and (colour[src], label, colour[dst]) not in full
+        }
+        for src, to in arcs.items()
+        if sizes[colour[src]] > 1
+    }
+
+
+def _parts_of_graph(arcs: Arcs) -> list[Arcs]:
+    near: dict[int, set[int]] = {node: set(to) for node, to in arcs.items()}
+    for src, to in arcs.items():
+        for dst in to:
+            near[dst].add(src)
+    seen: set[int] = set()
+    parts: list[Arcs] = []
+    for start in arcs:
+        if start in seen:
+            continue
+        seen.add(start)
+        waiting, part = [start], [start]
+        while waiting:
+            fresh = near[waiting.pop()] - seen
+            seen |= fresh
+            waiting += fresh
+            part += fresh
+        parts.append({node: arcs[node] for node in part})
+    return parts
+
+
+def _form(arcs: Arcs, colour: dict[int, int], order: Sequence[int]) -> Form:
+    """A coloured graph as its nodes in an order, and its edges by their places in it."""
+    place = {node: i for i, node in enumerate(order)}
+    edges = sorted(
+        (place[src], place[dst], label) for src, to in arcs.items() for dst, label in to.items()
+    )
+    return (tuple(colour[node] for node in order), tuple(edges))
+
+
+def _root(orbit: dict[int, int], node: int) -> int:
+    while orbit[node] != node:
+        orbit[node] = orbit[orbit[node]]
+        node = orbit[node]
+    return node
+
+
+# Classes of graphs: 128 bits of a canonical form, equal exactly if the graphs are isomorphic ----
+# Two labelled multigraphs have the same class if and only if there is a bijection of their nodes that keeps the
+# labels of nodes and, for each ordered pair of nodes, how often each label of an edge occurs (but for a
+# collision of 128-bit hashes). A class depends on its graph and on nothing else: not on the machine, not on the
+# graphs beside it.
+#
+# How. Colour refinement runs over all graphs of a block at once. Colours are 64-bit hashes and only *order* the
+# nodes; the class is the hash of the whole graph written down in that order. So a collision of colours costs
+# work and never an answer. Where colours leave several nodes alike, edges that hold between all nodes of two
+# cells are set aside, and what is left falls into components. If no component has two nodes of one colour,
+# those that look alike are interchangeable (twins are the simplest case): with stable colours, components
+# that share a colour are then isomorphic. Only what remains goes through
+# :mod:`sgstore.abstractions._classes`, with a bound on its work; beyond it the class is unknown, and says so,
+# rather than wrong.
+
+Words = NDArray[np.uint64]
+
+WORK: Final = 5_000_000
+"""Edges that may be looked at to put one graph in order: some seconds."""
+
+REMEMBERED: Final = 4096
+"""Graphs of an abstraction whose classes are remembered, so that one that comes again costs nothing."""
+
+_A: Final = np.uint64(0x9E3779B97F4A7C15)
+_B: Final = np.uint64(0xBF58476D1CE4E5B9)
+_C: Final = np.uint64(0x94D049BB133111EB)
+_D: Final = np.uint64(0xD6E8FEB86659FD93)
+_SHIFT: Final = np.uint64(32)
+"""Constants of SplitMix64 and of Mulvey's rrmxmx: odd, and of mixed bits."""
+
+_EDGE: Final = np.dtype([("src", "<u4"), ("dst", "<u4"), ("low", "<u8"), ("high", "<u8")])
+
+
+def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
+    """The class of each frame's graph: 32 hexadecimal digits, or empty if it takes more than ``work``.
+
+    Raises
+    ------
+    ValueError
+        An edge ends at what is no node of its frame: a defect of the abstraction.
+    """
+    return Classes(work).of(graphs)
+
+
+class Classes:
+    """Classes of the graphs of one abstraction, which remembers the last ones.
+
+    Parameters
+    ----------
+    work : int
+        Most work for one graph.
+    """
+
+    def __init__(self, work: int = WORK) -> None:
+        self._work = work
+        self._known: OrderedDict[bytes, str] = OrderedDict()
+
+    def of(self, graphs: Labelled) -> list[str]:
+        """As :func:`classes_of`."""
+        block = _Block.of(graphs)
+        contents = block.contents()
+        fresh = {content: i for i, content in enumerate(contents) if content not in self._known}
+        rows = sorted(fresh.values())
+        for row, name in zip(rows, block.taken(rows).classes(self._work), strict=True):
+            self._known[contents[row]] = name
+        answer = [self._known[content] for content in contents]
+        while len(self._known) > REMEMBERED:
+            self._known.popitem(last=False)
+        return answer
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Graphs side by side: nodes in order of their graph, edges too.
+
+    ``low`` and ``high`` are the two words of the digests of labels.
+    """
+
+    graphs: int
+    graph: Ints
+    node: Ints
+    node_low: Words
+    node_high: Words
+    edge_graph: Ints
+    src: Ints
+    dst: Ints
+    low: Words
+    high: Words
+
+    @classmethod
+    def of(cls, graphs: Labelled) -> _Block:
+        words = _digests(graphs.labels)
+        on_edges = _on_edges(words, graphs.bundles)
+        src = found(graphs.node_frame, graphs.node, graphs.frame, graphs.src)
+        dst = found(graphs.node_frame, graphs.node, graphs.frame, graphs.dst)
+        if len(src) and min(int(src.min()), int(dst.min())) < 0:
+            raise ValueError("an edge of an abstraction ends at what is no node of its frame")
+        order = np.argsort(_narrow(graphs.frame, graphs.frames), kind="stable")
+        label = on_edges[graphs.label[order]]
+        of_node = words[graphs.node_label]
+        return cls(
+            graphs.frames,
+            graphs.node_frame,
+            graphs.node,
+            of_node[:, 0].copy(),
+            of_node[:, 1].copy(),
+            graphs.frame[order],
+            src[order],
+            dst[order],
+            label[:, 0].copy(),
+            label[:, 1].copy(),
+        )
+
+    def contents(self) -> list[bytes]:
+        """128 bits for each graph that are equal if nodes, edges and labels are the same."""
+        of_node = _mixed(self.node.view(np.uint64) * _A + self.node_low)
+        src, dst = self.node[self.src].view(np.uint64), self.node[self.dst].view(np.uint64)
+        of_edge = _mixed(_mixed(src * _B + self.low) + dst * _C)
+        sums = np.zeros((self.graphs, 4), np.uint64)
+        for column, (owner, values) in enumerate(
+            (
+                (self.graph, of_node),
+                (self.graph, _mixed(of_node * _D + self.node_high)),
+                (self.edge_graph, of_edge),
+                (self.edge_graph, _mixed(of_edge * _D + self.high)),
+            )
+        ):
+            sums[:, column] = _sums(owner, values, self.graphs)
+        return [blake2b(row.astype("<u8").tobytes(), digest_size=16).digest() for row in sums]
+
+    def taken(self, rows: list[int]) -> _Block:
+        """Some of the graphs, in ascending order."""
+        if len(rows) == self.graphs:
+            return self
+        number = np.full(self.graphs, -1)
+        number[rows] = np.arange(len(rows))
+        nodes = np.flatnonzero(number[self.graph] >= 0)
+        place = np.zeros(len(self.graph), np.int64)
+        place[nodes] = np.arange(len(nodes))
+        edges = np.flatnonzero(number[self.edge_graph] >= 0)
+        return _Block(
+            len(rows),
+            number[self.graph[nodes]],
+            self.node[nodes],
+            self.node_low[nodes],
+            self.node_high[nodes],
+            number[self.edge_graph[edges]],
+            place[self.src[edges]],
+            place[self.dst[edges]],
+            self.low[edges],
+            self.high[edges],
+        )
+
+    def simple(self) -> _Block:
+        """Parallel edges as one: the words of its label are the sums of theirs, which tell any two apart."""
+        if not len(self.src):
+            return self
+        order = _by(self.src, self.dst, len(self.graph))
+        src, dst = self.src[order], self.dst[order]
+        starts = np.flatnonzero(np.append(True, (src[1:] != src[:-1]) | (dst[1:] != dst[:-1])))
+        first = order[starts]
+        low = np.add.reduceat(self.low[order], starts)
+        high = np.add.reduceat(self.high[order], starts)
+        return _Block(
+            self.graphs,
+            self.graph,
+            self.node,
+            self.node_low,
+            self.node_high,
+            self.edge_graph[first],
+            self.src[first],
+            self.dst[first],
+            low,
+            high,
+        )
+
+    def classes(self, work: int) -> list[str]:
+        """The class of each graph."""
+        block = self.simple()
+        colour = _refined(block)
+        order, known = _ordered(block, colour, work)
+        return _hashed(block, order, known)
+
+
+def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
+    """(L, 2): 128 bits of each label."""
+    raw = b"".join(
+        blake2b(label.encode("utf-8", "surrogatepass"), digest_size=16).digest() for label in labels
+    )
+    return np.frombuffer(raw, "<u8").astype(np.uint64).reshape(-1, 2)
+
+
+def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
+    """The words of labels as edges add them up: for each label, and from the end for each bundle."""
+    words = _mixed(words)
+    sums = [words[list(bundle)].sum(axis=0, dtype=np.uint64) for bundle in reversed(bundles)]
+    return np.concatenate([words, np.array(sums, np.uint64).reshape(-1, 2)])
+
+
+def _mixed(words: Words) -> Words:
+    words = (words ^ (words >> _SHIFT)) * _B
+    words = (words ^ (words >> _SHIFT)) * _C
+    return words ^ (words >> _SHIFT)
+
+
+def _narrow(values: Ints, bound: int) -> NDArray[Any]:
+    """Small numbers in a type that sorts by radix."""
+    return values.astype(np.uint16) if bound <= 1 << 16 else values
+
+
+def _by(first: Ints, second: Ints, bound: int) -> NDArray[np.intp]:
+    """The order of pairs of numbers below a bound."""
+    order = np.argsort(_narrow(second, bound), kind="stable")
+    return order[np.argsort(_narrow(first, bound)[order], kind="stable")]
+
+
+def _sums(owner: Ints, values: Words, count: int) -> Words:
+    """Sums of values by owner, modulo 2⁶⁴; owners ascend."""
+    total = np.zeros(count, np.uint64)
+    if len(owner):
+        starts = np.flatnonzero(np.append(True, owner[1:] != owner[:-1]))
+        total[owner[starts]] = np.add.reduceat(values, starts)
+    return total
+
+
+def _refined(block: _Block) -> Words:
+    """Stable colours of the nodes.
+
+    Each graph stops by itself, when a round has told no more nodes apart: how many rounds it takes, and so
+    its colours, depend on it alone. A loop is part of the first colour.
+    """
+    nodes = len(block.graph)
+    colour = block.node_low.copy()
+    loops = block.src == block.dst
+    np.add.at(colour, block.src[loops], _mixed(block.low[loops] + _D))
+    rows = np.flatnonzero(~loops)
+    src, dst = block.src[rows], block.dst[rows]
+    out_label, back = block.low[rows], np.argsort(_narrow(dst, nodes), kind="stable")
+    src_back, dst_back, in_label = src[back], dst[back], out_label[back] * _D
+    size = np.bincount(block.graph, minlength=block.graphs)
+    cells = _cells(block, colour)
+    active = (size > cells) & (size > 0)
+    while active.any():
+        out = _sums(src, _mixed(colour[dst] * _A + out_label), nodes)
+        into = _sums(dst_back, _mixed(colour[src_back] * _B + in_label), nodes)
+        fresh = _mixed(colour + _mixed(out) * _C + _mixed(into) * _A)
+        now = _cells(block, fresh)
+        grown = active & (now > cells)
+        colour = np.where(grown[block.graph], fresh, colour)
+        cells = np.where(grown, now, cells)
+        active = grown & (cells < size)
+    return colour
+
+
+def _cells(block: _Block, colour: Words) -> Ints:
+    """How many colours each graph has."""
+    order = np.lexsort((colour, block.graph))
+    graph, of = block.graph[order], colour[order]
+    fresh = np.ones(len(of), np.bool_)
+    fresh[1:] = (graph[1:] != graph[:-1]) | (of[1:] != of[:-1])
+    return np.bincount(graph[fresh], minlength=block.graphs)
+
+
+def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
+    """Nodes in canonical order, graph after graph; and of which graphs it is known."""
+    nodes = len(block.graph)
+    order = np.lexsort((colour, block.graph))
+    cell = np.zeros(nodes, np.int64)
+    graph, of = block.graph[order], colour[order]
+    fresh = np.ones(nodes, np.bool_)
+    fresh[1:] = (graph[1:] != graph[:-1]) | (of[1:] != of[:-1])
+    cell[order] = np.cumsum(fresh) - 1
+    size = np.bincount(cell, minlength=1)
+    known = np.ones(block.graphs, np.bool_)
+    if not nodes or size.max() == 1:
+        return order, known
+    part = _components(block, cell, size)
+    order = np.lexsort((part, cell))  # cells are numbered graph after graph
+    alike = np.flatnonzero(
+        (cell[order][1:] == cell[order][:-1]) & (part[order][1:] == part[order][:-1])
+    )
+    for number in np.unique(block.graph[order[alike]]).tolist():
+        rows = np.flatnonzero(block.graph == number)
+        found_order = _searched(block, cell, rows, number, work)
+        known[number] = found_order is not None
+        if found_order is not None:
+            order[rows] = found_order  # rows of a graph are consecutive, and so are their places
+    return order, known
+
+
+def _components(block: _Block, cell: Ints, size: Ints) -> Ints:
+    """Components of what tells nodes of one colour apart: for each node the least row in its component."""
+    part = np.arange(len(cell))
+    src, dst = block.src, block.dst
+    rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
+    if not len(rows):
+        return part
+    src, dst = src[rows], dst[rows]
+    a, b = cell[src], cell[dst]
+    keys = (block.high[rows], block.low[rows], b, a)
+    order = np.lexsort(keys)
+    fresh = np.zeros(len(order), np.bool_)
+    fresh[0] = True
+    for key in keys:
+        fresh[1:] |= key[order][1:] != key[order][:-1]
+    group = np.empty(len(order), np.int64)
+    group[order] = np.cumsum(fresh) - 1
+    partial = np.bincount(group)[group] < size[a] * (size[b] - (a == b))
+    src, dst = src[partial], dst[partial]
+    while True:
+        least = np.minimum(part[src], part[dst])
+        before = part.copy()
+        np.minimum.at(part, part[src], least)
+        np.minimum.at(part, part[dst], least)
+        part = part[part]
+        if np.array_equal(before, part):
+            return part
+
+
+def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> Ints | None:
+    """Rows of the nodes of one graph in canonical order, by individualisation."""
+    first, last = np.searchsorted(block.edge_graph, [number, number + 1])
+    src, dst = block.src[first:last], block.dst[first:last]
+    low, high = block.low[first:last].tolist(), block.high[first:last].tolist()
+    rank = {label: i for i, label in enumerate(sorted(set(zip(low, high, strict=True))))}
+    edges = [
+        (a, rank[label], b)
+        for a, b, *label_words in zip(
+            (src - rows[0]).tolist(), (dst - rows[0]).tolist(), low, high, strict=True
+        )
+        for label in [tuple(label_words)]
+        if a != b
+    ]
+    colours = (cell[rows] - cell[rows].min()).tolist()
+    order = SymmetrySearch(work).order(colours, edges)
+    return None if order is None else rows[order]
+
+
+def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
+    """Graphs written down in an order of their nodes, and hashed."""
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")
+    sorted_edges = _by(place[block.src], place[block.dst], len(order))
+    node_ends = np.searchsorted(block.graph, np.arange(block.graphs + 1))
+    edge_ends = np.searchsorted(block.edge_graph[sorted_edges], np.arange(block.graphs + 1))
+    start = node_ends[block.edge_graph[sorted_edges]]
+    edges = np.empty(len(sorted_edges), _EDGE)
+    edges["src"] = place[block.src[sorted_edges]] - start
+    edges["dst"] = place[block.dst[sorted_edges]] - start
+    edges["low"], edges["high"] = block.low[sorted_edges], block.high[sorted_edges]
+    names: list[str] = []
+    for number in range(block.graphs):
+        form = blake2b(digest_size=16, person=b"sgstore class 1")
+        form.update(int(node_ends[number + 1] - node_ends[number]).to_bytes(8, "little"))
+        form.update(nodes[node_ends[number] : node_ends[number + 1]].tobytes())
+        form.update(edges[edge_ends[number] : edge_ends[number + 1]].tobytes())
+        names.append(form.hexdigest() if known[number] else "")
+    return names

@@ -1,0 +1,570 @@
+"""The input and output of abstractions: graphs of many frames as columns, with lane roles.
+
+What abstractions are made of, and what they make: the graphs of many frames as columns.
+
+An abstraction is a function from :class:`GraphColumns`, what a scene graph holds of nodes and edges, to
+:class:`Labelled`, a directed multigraph for each frame whose nodes and edges have nothing but labels.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, OrderedDict, defaultdict
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.vocabulary import (
+    DIRECTIONS,
+    DRIVING,
+    ENTITY_KINDS,
+    KIND_CODE,
+    KINDS,
+    PROXIMITY,
+    RELATION_CODE,
+    RELATIONS,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.world import Bools, Codes, Floats, Ints
+
+
+Labels = NDArray[np.int32]
+
+Part = tuple[NDArray[Any], ...]
+"""Columns of nodes or of edges."""
+
+EGO: Final = "ego"
+"""Label of the ego in every abstraction, as the literature has it."""
+
+EGOS: Final = (EGO, "ego_car")
+"""Labels that one node of a frame has, which is called by it."""
+
+SCENERY: Final = ("building", "pole", "barrier", "vegetation")
+"""Kinds of entities that only ``SG`` has."""
+
+BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
+"""Relations among entities that the literature has."""
+
+_SMALL: Final = np.array([kind in SCENERY for kind in KINDS])
+_BETWEEN: Final = np.array([name in BETWEEN_ENTITIES for name in RELATIONS])
+_ENTITY_KINDS: Final = len(ENTITY_KINDS)
+_LANE: Final = KIND_CODE["lane"]
+
+
+@dataclass(frozen=True, eq=False)
+class MapColumns:
+    """Parts of a road map, and the edges among them: row i has node id -1 - i.
+
+    Attributes
+    ----------
+    kind : (K,) int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    name, lane_type, road, junction : (K,) str
+        As in :class:`sgstore.roads.MapNodes`; empty where there is none.
+    lane : (K,) int64
+        Number of the lane in its road; 0 for what is no lane.
+    relation : (M,) int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : (M,) int64
+        Node ids, below zero.
+    """
+
+    kind: Codes
+    name: NDArray[Any]
+    lane_type: NDArray[Any]
+    road: NDArray[Any]
+    junction: NDArray[Any]
+    lane: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+
+    @classmethod
+    def of(cls, road_map: RoadMap) -> MapColumns:
+        """What a road map has of it."""
+        nodes, edges = road_map.nodes, road_map.edges
+        name, lane_type, road, junction = (
+            np.array(column, object)
+            for column in (nodes.name, nodes.lane_type, nodes.road, nodes.junction)
+        )
+        return cls(
+            nodes.kind,
+            name,
+            lane_type,
+            road,
+            junction,
+            nodes.lane,
+            edges.relation,
+            edges.src,
+            edges.dst,
+        )
+
+    @cached_property
+    def strands(self) -> Strands:
+        """The strands of its lanes."""
+        return Strands(self)
+
+    @cached_property
+    def driving(self) -> Bools:
+        """(K,): whether it is a lane that is driven on."""
+        return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class GraphColumns:
+    """Nodes and edges of the scene graphs of many frames.
+
+    Attributes
+    ----------
+    frames : int
+        How many there are.
+    node_frame, node : (N,) int64
+        Frame, counted from 0, and node id; ascending.
+    kind : (N,) int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    is_ego : (N,) bool
+    x, y, z, heading : (N,) float64
+        Of what moves or changes; m, rad. NaN of what stands, and where it is missing.
+    frame : (E,) int64
+    relation : (E,) int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : (E,) int64
+        Node ids. Edges among parts of the map are not here: see :meth:`lasting`.
+    ego_lane : (frames,) int64
+        Node id of the lane that the ego is in above all; 0 where there is none.
+    grounds : MapColumns or None
+        The road map; ``None`` without one.
+    """
+
+    frames: int
+    node_frame: Ints
+    node: Ints
+    kind: Codes
+    is_ego: Bools
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    frame: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+    ego_lane: Ints
+    grounds: MapColumns | None
+
+    @classmethod
+    def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> GraphColumns:
+        """From nodes in any order: ``node_frame, node, kind, is_ego, x, y, z, heading``."""
+        order = np.lexsort((nodes["node"], nodes["node_frame"]))
+        return cls(frames, **{name: of[order] for name, of in nodes.items()}, **columns)
+
+    @classmethod
+    def of(cls, graph: GraphBlock, kinds: Codes, grounds: MapColumns | None) -> GraphColumns:
+        """What a block of scene graphs holds.
+
+        Parameters
+        ----------
+        graph : GraphBlock
+        kinds : int8
+            Kinds of all entities of the trace so far, by node id.
+        grounds : MapColumns or None
+        """
+        frames, states, presence = graph.frames, graph.frames.states, graph.presence
+        of_map = np.zeros(0, np.int8) if grounds is None else grounds.kind
+        row, still = frames.frame_of, len(presence.node)
+        entity = presence.node >= 0
+        kind = np.empty(still, np.int8)
+        kind[entity] = kinds[presence.node[entity]]
+        kind[~entity] = of_map[-1 - presence.node[~entity]]
+        nodes = {
+            "node_frame": np.concatenate([row, presence.frame]),
+            "node": np.concatenate([states.node, presence.node]),
+            "kind": np.concatenate([kinds[states.node], kind]),
+            "is_ego": np.append(states.node == frames.ego[row], np.zeros(still, np.bool_)),
+        } | {
+            name: np.append(getattr(states, name), np.full(still, np.nan))
+            for name in ("x", "y", "z", "heading")
+        }
+        edges, lanes = graph.edges, graph.lanes
+        own = lanes.primary & (lanes.node == frames.ego[lanes.frame])
+        ego_lane = np.zeros(len(frames), np.int64)
+        ego_lane[lanes.frame[own]] = lanes.lane[own]
+        return cls.sorted(
+            len(frames),
+            nodes,
+            frame=edges.frame,
+            relation=edges.relation,
+            src=edges.src,
+            dst=edges.dst,
+            ego_lane=ego_lane,
+            grounds=grounds,
+        )
+
+    @cached_property
+    def is_entity(self) -> Bools:
+        """(N,): whether a node is an entity; else it is a part of the map."""
+        return self.kind < _ENTITY_KINDS
+
+    def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
+        """Edges among parts of the map, in each frame in which both their ends are present.
+
+        Returns
+        -------
+        frame, relation, src, dst : (K,)
+        """
+        none = np.zeros(0, np.int64)
+        grounds = self.grounds
+        rows = np.flatnonzero(self.node < 0)
+        if grounds is None or not len(rows):
+            return none, none.astype(np.int8), none, none
+        here, column = np.unique(-1 - self.node[rows], return_inverse=True)
+        place = np.full(len(grounds.kind), -1)
+        place[here] = np.arange(len(here))
+        src, dst = place[-1 - grounds.src], place[-1 - grounds.dst]
+        wanted = np.flatnonzero((src >= 0) & (dst >= 0) & np.isin(grounds.relation, relations))
+        present = np.zeros((self.frames, len(here)), np.bool_)
+        present[self.node_frame[rows], column] = True
+        frame, edge = np.nonzero(present[:, src[wanted]] & present[:, dst[wanted]])
+        edge = wanted[edge]
+        return frame, grounds.relation[edge], grounds.src[edge], grounds.dst[edge]
+
+    @cached_property
+    def is_traffic(self) -> Bools:
+        """(N,): whether a node is an entity that the literature has, which scenery is not."""
+        return self.is_entity & ~_SMALL[self.kind]
+
+    @cached_property
+    def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Ordered pairs of such entities, each once in a frame, with all that the literature has between them.
+
+        Returns
+        -------
+        frame, src, dst : (K,)
+        relations : (K,)
+            Bit i stands for the relation with code i.
+        """
+        kept = np.flatnonzero(self.is_traffic)
+        node_frame, node = self.node_frame[kept], self.node[kept]
+        rows = np.flatnonzero(_BETWEEN[self.relation])
+        frame, bit = self.frame[rows], self.relation[rows].astype(np.int64)
+        a, b = (found(node_frame, node, frame, end[rows]) for end in (self.src, self.dst))
+        both = np.flatnonzero((a >= 0) & (b >= 0))
+        frame, bit, a, b = frame[both], bit[both], a[both], b[both]
+        starts = np.searchsorted(node_frame, np.arange(self.frames + 1))
+        most = int(np.diff(starts).max(initial=0))
+        cell = (frame * most + (a - starts[frame])) * most + (b - starts[frame])
+        cells, bits = _united(cell, bit, self.frames * most * most)
+        frame, pair = np.divmod(cells, max(most * most, 1))
+        a, b = np.divmod(pair, max(most, 1))
+        return frame, node[starts[frame] + a], node[starts[frame] + b], bits
+
+    def row_of(self, frame: Ints, node: Ints) -> Ints:
+        """Rows of nodes in frames; -1 where they are not in the graph."""
+        return found(self.node_frame, self.node, frame, node)
+
+
+def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
+    """Cells below a bound that have bits, ascending, and all bits of each."""
+    if bound <= _CELLS:
+        sums = np.bincount(cell, weights=np.exp2(bit))
+        cells = np.flatnonzero(sums)
+        bits = sums[cells].astype(np.int64)
+    else:
+        cells, number = np.unique(cell, return_inverse=True)
+        bits = np.bincount(number, weights=np.exp2(bit)).astype(np.int64)
+    if int(np.bitwise_count(bits).sum()) == len(cell):
+        return cells, bits
+    once = np.unique(np.stack([cell, bit]), axis=1)  # sums are unions of what is there once
+    return _united(once[0], once[1], bound)
+
+
+def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
+    """Rows of (frame, node) in columns that name each once; -1 where there is none."""
+    if not len(nodes):
+        return np.full(len(node), -1)
+    ids, column = np.unique(nodes, return_inverse=True)
+    place = np.full((int(frames.max()) + 1, len(ids)), -1)
+    place[frames, column] = np.arange(len(nodes))
+    low, span = int(ids[0]), int(ids[-1]) - int(ids[0]) + 1
+    if span <= _TABLE:
+        table = np.zeros(span, np.int64)
+        table[ids - low] = np.arange(len(ids))
+        at = table[np.clip(node - low, 0, span - 1)]
+    else:
+        at = np.minimum(np.searchsorted(ids, node), len(ids) - 1)
+    row = place[np.minimum(frame, len(place) - 1), at]
+    return np.where((ids[at] == node) & (frame < len(place)), row, -1)
+
+
+_TABLE: Final = 1 << 18
+"""Up to so many numbers are looked up in a table, which is faster than searching."""
+
+_CELLS: Final = 1 << 23
+"""Up to so many ordered pairs are counted in a table."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A directed multigraph for each of many frames, with labels on nodes and edges.
+
+    Attributes
+    ----------
+    frames : int
+        How many frames there are; a frame without nodes has the empty graph.
+    labels : tuple of str
+        All labels, of nodes and of edges; no two are equal.
+    node_frame, node : (N,) int64
+        Frame, counted from 0, and a number that tells the nodes of a frame apart: a node id, or one that the
+        abstraction makes up. Ascending.
+    node_label : (N,) int32
+        Index into ``labels``.
+    frame, src, dst : (E,) int64
+        Edges; both ends are nodes of the same frame. An edge may be there more than once.
+    label : (E,) int32
+        Index into ``labels``; -1 less an index into ``bundles`` for several edges with the same ends.
+    bundles : tuple of tuple of int
+        Indices into ``labels``.
+    names : mapping of int to str
+        What nodes are called that are not called by their label: parts of the map.
+    """
+
+    frames: int
+    labels: tuple[str, ...]
+    node_frame: Ints
+    node: Ints
+    node_label: Labels
+    frame: Ints
+    src: Ints
+    label: Labels
+    dst: Ints
+    names: Mapping[int, str] = field(default_factory=dict[int, str])
+    bundles: tuple[tuple[int, ...], ...] = ()
+
+    @classmethod
+    def assembled(
+        cls,
+        frames: int,
+        nodes: Sequence[Part],
+        edges: Sequence[Part],
+        labels: Sequence[str],
+        names: Mapping[int, str] | None = None,
+        bundles: Sequence[Sequence[int]] = (),
+    ) -> Labelled:
+        """From parts: nodes ``(frame, node, label)`` in any order, edges ``(frame, src, label, dst)``.
+
+        Labels are indices into ``labels``, which may repeat texts; one below zero stands for a bundle. A node
+        that comes twice in a frame is one.
+        """
+        table = tuple(dict.fromkeys(labels))
+        index = {text: i for i, text in enumerate(table)}
+        renumbered = np.array([index[text] for text in labels] or [0], np.int32)
+        frame, node, label = _columns(nodes, 3)
+        order = np.lexsort((node, frame))
+        frame, node, label = frame[order], node[order], label[order]
+        fresh = np.ones(len(node), np.bool_)
+        fresh[1:] = (frame[1:] != frame[:-1]) | (node[1:] != node[:-1])
+        edge_frame, src, edge_label, dst = _columns(edges, 4)
+        return cls(
+            frames,
+            table,
+            frame[fresh],
+            node[fresh],
+            renumbered[label[fresh]],
+            edge_frame,
+            src,
+            np.where(edge_label < 0, edge_label, renumbered[np.maximum(edge_label, 0)]).astype(
+                np.int32
+            ),
+            dst,
+            names or {},
+            tuple(tuple(int(renumbered[label]) for label in bundle) for bundle in bundles),
+        )
+
+    def related(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Edges whose label is a relation, one row each: frame, source, code of the relation, destination."""
+        code = {name: i for i, name in enumerate(RELATIONS)}
+        parts = [(code.get(text, -1),) for text in self.labels]
+        bundles = [tuple(parts[label][0] for label in bundle) for bundle in self.bundles]
+        several = parts + bundles[::-1]  # a label below zero counts from the end
+        many = np.array([len(of) for of in several] or [0])
+        starts = np.cumsum(many) - many
+        flat = np.array([one for of in several for one in of] or [-1], np.int64)
+        index = np.where(self.label < 0, len(several) + self.label, self.label)
+        count = many[index]
+        edge = np.repeat(np.arange(len(index)), count)
+        within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+        relation = flat[starts[index[edge]] + within] if len(edge) else edge
+        known = relation >= 0
+        edge = edge[known]
+        return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
+
+    def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
+        """One of the frames by names: nodes ``name → label``, and edges ``(name, label, name)``.
+
+        The ego and what a graph has once are called by their label, parts of a map by their name, and all
+        else ``label_node``, such as ``car_12``.
+        """
+        rows = np.flatnonzero(self.node_frame == number)
+        labels = [self.labels[code] for code in self.node_label[rows].tolist()]
+        often = Counter(labels)
+        called = {
+            node: self.names.get(node)
+            or (label if node < 0 and often[label] == 1 else f"{label}_{abs(node)}")
+            for node, label in zip(self.node[rows].tolist(), labels, strict=True)
+        }
+        egos = {n: t for n, t in zip(called, labels, strict=True) if t in EGOS and often[t] == 1}
+        called |= egos
+        edges = np.flatnonzero(self.frame == number)
+        columns = (self.src[edges].tolist(), self.label[edges].tolist(), self.dst[edges].tolist())
+        return (
+            dict(zip(called.values(), labels, strict=True)),
+            [
+                (called[a], self.labels[label], called[b])
+                for a, r, b in zip(*columns, strict=True)
+                for label in ((r,) if r >= 0 else self.bundles[-1 - r])
+            ],
+        )
+
+
+def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
+    none = np.zeros(0, np.int64)
+    columns = zip(*parts, (none,) * count, strict=True)
+    return [np.concatenate(column).astype(np.int64) for column in columns]
+
+
+def repeated(columns: Part) -> Bools:
+    """Which rows have come before."""
+    again = np.zeros(len(columns[0]), np.bool_)
+    if len(again):
+        order = np.lexsort(columns)
+        same = np.ones(len(order) - 1, np.bool_)
+        for column in columns:
+            same &= column[order][1:] == column[order][:-1]
+        again[order[1:]] = same
+    return again
+
+
+# Lanes as an ego has them: ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on ----
+# A *strand* is lanes one behind the other: a lane and the only one that follows it, if that follows no other.
+# Outside of junctions and inside of them strands are apart. It is a matter of the map alone, and is found once.
+
+OPPOSING: Final = 1 << 16
+"""Roles from here on: ``Opposing Lane 0``, ``1``, …"""
+
+_MOST: Final = 1000
+"""Lanes to one side of the ego's that have a name."""
+
+UNNAMED: Final = -(1 << 21)
+"""What stands for no role among those that names say."""
+
+
+class Strands:
+    """The strands of a map, and how they lie beside one another.
+
+    Attributes
+    ----------
+    of : (K,) int64
+        For each part of the map a node id: of the lane that stands for its strand, the one with the greatest
+        node id; 0 for what is no lane that is driven on.
+    named : (K,) int64
+        For each part of the map the role that its name says, as in graphs that came from elsewhere;
+        :data:`UNNAMED` where it says none.
+    """
+
+    def __init__(self, grounds: MapColumns) -> None:
+        self.of = _strands(grounds)
+        self.named = np.array([_role_named(name) for name in grounds.name], np.int64)
+        self._left = self._beside(grounds, "toLeftOf")
+        self._right = self._beside(grounds, "toRightOf")
+        self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
+
+    def roles(self, ego: int) -> dict[int, int]:
+        """Strand → its role beside the ego's: 0 the ego's own, n the n-th to its left, -n to its right."""
+        if ego not in self._roles:
+            roles = {ego: 0}
+            for beside, sign in ((self._left, 1), (self._right, -1)):
+                edge = {ego}
+                for step in range(1, _MOST):
+                    edge = {s for one in edge for s in beside[one]} - roles.keys()
+                    if not edge:
+                        break
+                    roles |= dict.fromkeys(edge, sign * step)
+            self._roles[ego] = roles
+        return self._roles[ego]
+
+    def _beside(self, grounds: MapColumns, relation: str) -> defaultdict[int, set[int]]:
+        """Strand → strands next to it on one side, that run the same way."""
+        against = grounds.relation == RELATION_CODE["opposes"]
+        pairs = set(zip(grounds.src[against].tolist(), grounds.dst[against].tolist(), strict=True))
+        rows = np.flatnonzero(grounds.relation == RELATION_CODE[relation])
+        found: defaultdict[int, set[int]] = defaultdict(set)
+        for src, dst in zip(grounds.src[rows].tolist(), grounds.dst[rows].tolist(), strict=True):
+            one, other = int(self.of[-1 - dst]), int(self.of[-1 - src])
+            if one and other and (src, dst) not in pairs:
+                found[one].add(other)
+        return found
+
+
+def _strands(grounds: MapColumns) -> Ints:
+    """See :attr:`Strands.of`."""
+    on = grounds.relation == RELATION_CODE["travelsTo"]
+    src, dst = -1 - grounds.src[on], -1 - grounds.dst[on]
+    driven = grounds.driving
+    both = driven[src] & driven[dst]
+    src, dst = src[both], dst[both]
+    only = (np.bincount(src, minlength=len(driven))[src] == 1) & (
+        np.bincount(dst, minlength=len(driven))[dst] == 1
+    )
+    only &= (grounds.junction[src] == grounds.junction[dst]).astype(np.bool_)
+    src, dst = src[only], dst[only]
+    least = np.arange(len(driven))
+    while True:
+        before = least.copy()
+        low = np.minimum(least[src], least[dst])
+        np.minimum.at(least, src, low)
+        np.minimum.at(least, dst, low)
+        least = least[least]
+        if np.array_equal(before, least):
+            break
+    return np.where(driven, -1 - least, 0)
+
+
+def role_name(role: int) -> str:
+    """What the literature calls a role."""
+    if role == 0:
+        return "Ego Lane"
+    if role >= OPPOSING:
+        return f"Opposing Lane {role - OPPOSING}"
+    return f"{'Left' if role > 0 else 'Right'} {abs(role)} of Ego Lane"
+
+
+_BESIDE: Final = re.compile(r"(left|right) (\d{1,4}) of ego lane")
+_OPPOSING: Final = re.compile(r"opposing lane (\d{1,4})")
+_ROLES: Final = {
+    "ego lane": 0,
+    "middle lane": 0,
+    "left lane": 1,
+    "right lane": -1,
+    "lane_middle": 0,
+    "lane_left": 1,
+    "lane_right": -1,
+}
+"""Names of lanes with S3C and CARLASGG, and with RoadScene2Vec, whose ego is always in the middle one."""
+
+
+def _role_named(name: str) -> int:
+    """The role that a name says; the inverse of :func:`role_name`."""
+    text = name.lower()
+    if beside := _BESIDE.fullmatch(text):
+        return int(beside[2]) * (1 if beside[1] == "left" else -1)
+    if opposing := _OPPOSING.fullmatch(text):
+        return OPPOSING + int(opposing[1])
+    return _ROLES.get(text, UNNAMED)

@@ -1,0 +1,456 @@
+"""The verbs check, monitor and timeline.
+
+Verdicts as JUnit's XML, which build servers read: a test for each check and trace.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+from xml.etree import ElementTree as Xml
+
+import typer
+
+from sgstore.cli._options import (
+    LOSS,
+    NO_MATCH,
+    AsJson,
+    Config,
+    Expressions,
+    MaxSpill,
+    Output,
+    Parameters,
+    PatternNames,
+    Preset,
+    RoadMap,
+    RowFormat,
+    SgsmCompat,
+    StorePath,
+    Timeout,
+    all_asked_of,
+    app,
+    form_of,
+    open_store,
+    parameters_of,
+    say_notes,
+    say_unknown,
+    seconds_of,
+    settings_of,
+    text_of,
+)
+from sgstore.cli._output import Format, json_text, say, write_rows
+from sgstore.files import without_controls, write_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from sgstore.matches import Interval
+    from sgstore.temporal import FrameTime, MonitorEvent, Verdict
+
+
+_NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that no XML can hold, not even as references."""
+
+
+def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
+    """Write a suite for each check, with a case for each trace.
+
+    A violated check is a failure whose text names each violation; what a trace cannot answer is skipped.
+
+    Parameters
+    ----------
+    path : Path
+    verdicts : iterable of Verdict
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written; what was there before is still there.
+    """
+    root = Xml.Element("testsuites", name="sgstore check")
+    suites: dict[str, Xml.Element] = {}
+    for one in verdicts:
+        name = _plain(one.check)
+        if name not in suites:
+            suites[name] = Xml.SubElement(root, "testsuite", name=name)
+        case = Xml.SubElement(suites[name], "testcase", classname=name, name=_plain(one.trace))
+        if one.violated:
+            lines = _violations(one)
+            count = f"{len(lines)} violation{'s' * (len(lines) != 1)}"
+            Xml.SubElement(case, "failure", message=count).text = "\n".join(lines)
+        elif one.verdict != "true":
+            Xml.SubElement(case, "skipped", message=_plain(one.reason or one.verdict))
+    for element, cases in [(root, root.findall("*/*")), *((s, list(s)) for s in suites.values())]:
+        element.set("tests", str(len(cases)))
+        element.set("failures", str(sum(case.find("failure") is not None for case in cases)))
+        element.set("errors", "0")
+        element.set("skipped", str(sum(case.find("skipped") is not None for case in cases)))
+    Xml.indent(root)
+    write_bytes(path, Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _violations(verdict: Verdict) -> list[str]:
+    """A line for each violation: from which frame to which, when, and by whom."""
+    return [
+        _plain(
+            f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
+            f" {one.frames} frames"
+            + "".join(f", {name} {value}" for name, value in one.values.items())
+        )
+        for one in verdict.violations
+    ]
+
+
+def _plain(text: str) -> str:
+    """A text without characters that no XML can hold: they are written as escapes."""
+    return _NO_XML.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+
+
+# The verb that checks: verdicts of traces -------------------------------------------------------
+
+COLUMNS = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
+
+
+@app.command()
+def check(
+    store: StorePath,
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FILE…]", help="Files of CHECK statements; - is stdin."),
+    ] = None,
+    names: PatternNames = None,
+    texts: Expressions = None,
+    parameters: Parameters = None,
+    sgsm_compat: SgsmCompat = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Print how the checks are understood, and their SQL.")
+    ] = False,
+    require: Annotated[
+        bool, typer.Option("--require", help="End with exit code 4 if a trace violates a check.")
+    ] = False,
+    junit: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."
+        ),
+    ] = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+) -> int:
+    """Check what must be true of every trace.
+
+    One row a check and trace: true, false, or unknown where it cannot be told; and one a violation: by whom,
+    and from when to when.
+    """
+    from sgstore.lang import joined
+
+    given = parameters_of(parameters)
+    asked, values = all_asked_of(files or (), names or (), texts or (), given)
+    text = joined([*chain.from_iterable(asked.values())])
+    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    run = opened.check(text, sgsm_compat=sgsm_compat, **values)
+    if explain:
+        typer.echo(run.explain())
+        return 0
+    say_notes(run.notes)
+    tally = {"true": 0, "false": 0}
+    kept: list[Verdict] = []
+
+    def counted() -> Iterator[Verdict]:
+        for verdict in run:
+            if junit is not None or verdict.reason:
+                kept.append(verdict)
+            tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
+            yield verdict
+
+    form = form_of(form, output, as_json=as_json)
+    _write(counted(), form, output)
+    if form is Format.table:
+        say(", ".join(f"{count} {word}" for word, count in tally.items()))
+    say_unknown((one.check, one.trace, one.reason) for one in kept)
+    _write_junit(junit, kept)
+    return NO_MATCH if require and tally["false"] else 0
+
+
+def _write(verdicts: Iterator[Verdict], form: Format, output: Path | None) -> None:
+    """Write verdicts: for people a row for each violation, else one for each verdict."""
+    if form is Format.table:
+        write_rows(COLUMNS, (row for one in verdicts for row in _rows(one)), form, output)
+    else:
+        values = (tuple(_document(one).values()) for one in verdicts)
+        write_rows(tuple(_document(None)), values, form, output)
+
+
+def _write_junit(file: Path | None, verdicts: list[Verdict]) -> None:
+    if file is not None:
+        write_junit(file, verdicts)
+
+
+def _rows(verdict: Verdict) -> Iterator[tuple[Any, ...]]:
+    """A verdict as a person reads it: a row, or one for each violation."""
+    head = verdict.check, verdict.trace, verdict.verdict
+    told = False
+    for witness in verdict.witnesses:
+        who = ", ".join(witness.names.values())
+        for row in _times(witness.violations) or [("", "", "", "")]:
+            told = True
+            yield (*head, who, *row)
+    if not told:
+        for row in _times(verdict.violations) or [("", "", "", "")]:
+            yield (*head, "", *row)
+
+
+def _times(violations: tuple[Interval, ...]) -> list[tuple[Any, ...]]:
+    return [
+        (f"{i.trace}#{i.start_seq}", round(i.start, 3), round(i.end, 3), i.frames)
+        for i in violations
+    ]
+
+
+def _document(verdict: Verdict | None) -> dict[str, Any]:
+    """A verdict as a program reads it."""
+    return {
+        "check": verdict and verdict.check,
+        "trace": verdict and verdict.trace,
+        "verdict": verdict and verdict.verdict,
+        "reason": (verdict and verdict.reason) or None,
+        "first_violation": verdict and verdict.first_violation and _span(verdict.first_violation),
+        "violations": [_span(one) for one in verdict.violations] if verdict else [],
+        "witnesses": [
+            {
+                "nodes": dict(one.nodes),
+                "names": dict(one.names),
+                "holds": one.holds,
+                "violations": [_span(span) for span in one.violations],
+            }
+            for one in (verdict.witnesses if verdict else ())
+        ],
+    }
+
+
+def _span(interval: Interval) -> dict[str, Any]:
+    return {
+        "start_seq": interval.start_seq,
+        "end_seq": interval.end_seq,
+        "start_ns": interval.start_ns,
+        "end_ns": interval.end_ns,
+        "start": interval.start,
+        "end": interval.end,
+        "frames": interval.frames,
+    }
+
+
+# The verb that watches: checks and patterns over a recording as if it were live, or a running simulator ----
+
+
+@app.command()
+def monitor(
+    trace: Annotated[
+        str,
+        typer.Argument(metavar="TRACE", help="A recording; or carla://HOST:PORT, until Ctrl-C."),
+    ],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - is stdin."),
+    ] = None,
+    names: PatternNames = None,
+    texts: Expressions = None,
+    parameters: Parameters = None,
+    road_map: RoadMap = None,
+    config: Config = None,
+    preset: Preset = None,
+    ego: Annotated[
+        str, typer.Option("--ego", help="Id, role or name of the ego; else as the recording says.")
+    ] = "",
+    duration: Annotated[
+        str | None, typer.Option("--duration", metavar="TIME", help="Simulation time: 60s.")
+    ] = None,
+    sgsm_compat: SgsmCompat = False,
+    require: Annotated[
+        bool, typer.Option("--require", help="End with exit code 4 if a check is violated.")
+    ] = False,
+    as_json: AsJson = False,
+) -> int:
+    """Watch a recording as if it were live, or a running CARLA.
+
+    One line for each violation and each match, as soon as it is known; then the verdicts. The answers are
+    those of check and find over a store.
+    """
+    from sgstore.config import Config as Settings
+    from sgstore.lang import joined
+    from sgstore.temporal import Monitor, opened
+
+    given = parameters_of(parameters)
+    asked, values = all_asked_of(files or (), names or (), texts or (), given)
+    settings = settings_of(config, preset) or Settings()
+    tell = _as_json if as_json else _for_people
+    with opened(trace, settings, road_map=road_map, ego=ego) as source:
+        watched = Monitor(
+            joined([*chain.from_iterable(asked.values())]),
+            source.road_map,
+            settings,
+            on_event=tell,
+            parameters=values,
+            trace=source.name,
+            called=_called(asked),
+            sgsm_compat=sgsm_compat,
+        )
+        longest = seconds_of(duration, "--duration") if duration else None
+        verdicts = watched.run(source.frames, duration_s=longest)
+    losses = [*source.losses, *(loss.reason for loss in watched.generator.losses)]
+    for warning in [*source.warnings, *losses]:
+        say(warning)
+    for verdict in verdicts:
+        _tell_verdict(verdict, as_json=as_json)
+    if require and any(verdict.violated for verdict in verdicts):
+        return NO_MATCH
+    return LOSS if losses else 0
+
+
+def _called(asked: Mapping[str, list[str]]) -> list[str]:
+    """What each pattern is called in events, in the order in which they are asked."""
+    from sgstore.lang import parse
+    from sgstore.lang.syntax import MatchClause
+
+    every: list[str] = []
+    for name, texts in asked.items():
+        count = sum(isinstance(one, MatchClause) for text in texts for one in parse(text))
+        every += [name] if count == 1 else [f"{name} {number + 1}" for number in range(count)]
+    return every
+
+
+def _for_people(event: MonitorEvent) -> None:
+    who = ", ".join(f"{variable} = {name}" for variable, name in event.names.items())
+    about = f"from {event.start.t:.3f} s" if event.start != event.told else ""
+    if event.kind == "kept again":
+        about = f"after {event.end.t - event.start.t:.3f} s"
+    if event.at_end:
+        about = "at the end"
+    parts = (f"{event.told.t:9.3f} s", event.kind.ljust(10), event.name, who, about)
+    _line("  ".join(part for part in parts if part))
+
+
+def _as_json(event: MonitorEvent) -> None:
+    about: dict[str, Any] = {
+        "event": event.kind,
+        "name": event.name,
+        "told": _moment(event.told),
+        "start": _moment(event.start),
+        "end": _moment(event.end),
+        "nodes": dict(event.nodes),
+        "names": dict(event.names),
+        "steps": [_moment(step) for step in event.steps],
+        "at_end": event.at_end,
+    }
+    _line(json_text(about))
+
+
+def _moment(moment: FrameTime) -> dict[str, Any]:
+    return {"seq": moment.seq, "time_ns": moment.time_ns, "t": moment.t}
+
+
+def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
+    if as_json:
+        about = {
+            "event": "verdict",
+            "name": verdict.check,
+            "trace": verdict.trace,
+            "verdict": verdict.verdict,
+            "violations": len(verdict.violations),
+            "reason": verdict.reason or None,
+        }
+        _line(json_text(about))
+    else:
+        count = len(verdict.violations)
+        more = f"  {count} violation{'s' * (count > 1)}" if count else ""
+        why = f"  ({verdict.reason})" if verdict.reason else ""
+        _line(f"{verdict.check}: {verdict.verdict}{more}{why}")
+
+
+def _line(text: str) -> None:
+    """A line that is there at once, whoever reads it."""
+    typer.echo(without_controls(text))
+
+
+# The verb that shows when: swim lanes of matches and violations ---------------------------------
+
+
+@app.command()
+def timeline(
+    store: StorePath,
+    queries: Annotated[
+        list[str] | None, typer.Argument(metavar="[QUERY…]", help="'MATCH …', or 'CHECK …'.")
+    ] = None,
+    files: Annotated[
+        list[Path] | None,
+        typer.Option("--file", "-f", help="Read a query, or checks, from a file; repeatable."),
+    ] = None,
+    names: Annotated[
+        list[str] | None,
+        typer.Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
+    ] = None,
+    parameters: Parameters = None,
+    traces: Annotated[
+        list[str] | None, typer.Option("--trace", help="Only this trace; repeatable.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
+    ] = None,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+) -> int:
+    """Show when what matches or is violated: swim lanes, a lane for each who, over every trace.
+
+    In the terminal, or with -o as a picture.
+    """
+    from sgstore.draw import LETTERS, NAME, lines_of, timelines
+
+    asked = _asked(queries or [], files or [], names or [], parameters_of(parameters))
+    found = timelines(open_store(store, timeout=timeout, max_spill=max_spill), asked, traces or ())
+    for name in {*(traces or ())} - {one.trace for one in found}:
+        raise typer.BadParameter(f"--trace: the store has no trace {name!r}")
+    say_unknown((lane.name, one.trace, lane.reason) for one in found for lane in one.lanes)
+    if output is None:
+        letters = max(LETTERS, min(shutil.get_terminal_size().columns - NAME - 26, 3 * LETTERS))
+        for one in found:
+            typer.echo(without_controls("\n".join(lines_of(one, letters))))
+        return 0
+    from sgstore.draw import draw_timelines
+
+    draw_timelines(found, output)
+    typer.echo(output)
+    return 0
+
+
+def _asked(
+    queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
+) -> dict[str, tuple[str, Mapping[str, Any]]]:
+    """What is asked, by the names of its lanes."""
+    from sgstore.lang.library import pattern_named
+
+    found: dict[str, tuple[str, Mapping[str, Any]]] = {}
+    for number, text in enumerate(queries, start=1):
+        found["match" if len(queries) == 1 else f"match {number}"] = text, values
+    for file in files:
+        found[_free(file.stem, str(file), found)] = text_of(file), values
+    for name in names:
+        one = pattern_named(name)
+        own = {key: value for key, value in values.items() if key in one.parameters}
+        found[_free(name, f"pattern {name}", found)] = one.written(**own), {}
+    if not found:
+        raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")
+    return found
+
+
+def _free(name: str, longer: str, taken: Mapping[str, object]) -> str:
+    """A name for a lane that no other has."""
+    if name not in taken:
+        return name
+    numbers = (f"{longer} ({number})" for number in count(2))
+    return next(one for one in chain([longer], numbers) if one not in taken)

@@ -1,0 +1,408 @@
+"""The application, and the arguments that verbs share.
+
+What holds for every verb: how its command line is read.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from typer.core import TyperCommand
+
+from sgstore.cli._output import Format, say
+from sgstore.cli._process import set_deadline
+from sgstore.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.config import Config as Settings
+    from sgstore.coverage import ChosenFrames
+    from sgstore.matches import Matches
+    from sgstore.query import Store
+    from sgstore.sandbox import Answer
+
+
+class Verb(TyperCommand):
+    """A verb that refuses an option which is given twice, unless it collects what it is given."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read a command line; what follows of it is none of the verb's."""
+        if not ctx.resilient_parsing:  # which completes a command line that is not whole yet
+            _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+            given: Counter[Any] = Counter(order)
+            for parameter, times in given.items():
+                if times > 1 and _says_one_thing(parameter):
+                    raise typer.BadParameter(
+                        f"given {times} times, but it takes one value", ctx=ctx, param=parameter
+                    )
+        return super().parse_args(ctx, args)
+
+
+def _says_one_thing(parameter: Any) -> bool:
+    """Whether an option that is repeated would drop what was said before."""
+    if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
+        return False
+    return not parameter.is_flag or bool(parameter.secondary_opts)  # a flag said twice is said
+
+
+class Verbs(typer.Typer):
+    """An application, or a part of one, whose commands are each a :class:`Verb`."""
+
+    def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
+        """A decorator that registers a function as a verb; see :meth:`typer.Typer.command`."""
+        every: dict[str, Any] = {"cls": Verb, **options}
+        return super().command(name, **every)
+
+
+# The application, the arguments that verbs share, and how their texts become values -------------
+
+app = Verbs(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
+"""Exit codes; 0 is done."""
+
+RoadMap = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        help="OpenDRIVE file, or folder of NAME.xodr, for recordings that carry no map of their own.",
+    ),
+]
+Config = Annotated[
+    Path | None, typer.Option("--config", help="TOML file with settings of the scene graphs.")
+]
+Preset = Annotated[
+    str | None,
+    typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
+]
+
+StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="The store: one DuckDB file.")]
+FrameName = Annotated[
+    str, typer.Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")
+]
+QueryText = Annotated[
+    str | None, typer.Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")
+]
+QueryFile = Annotated[
+    Path | None, typer.Option("--file", "-f", help="Read the query from a file; - is stdin.")
+]
+PatternName = Annotated[
+    str | None,
+    typer.Option(
+        "--pattern", "-p", metavar="NAME", help="A pattern of the library, in place of a query."
+    ),
+]
+PatternNames = Annotated[
+    list[str] | None,
+    typer.Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
+]
+Expressions = Annotated[
+    list[str] | None,
+    typer.Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
+]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--param",
+        metavar="NAME=VALUE",
+        help="Value of $NAME in the query, a list as [1, 2]; repeatable.",
+    ),
+]
+With = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--with",
+        metavar="[NAME=]FILE",
+        help="Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns"
+        " or t; repeatable.",
+    ),
+]
+RowFormat = Annotated[Format, typer.Option("--format", help="How rows are printed.")]
+SgsmCompat = Annotated[
+    bool,
+    typer.Option(
+        "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Short for --format json.")]
+Output = Annotated[
+    Path | None, typer.Option("--output", "-o", help="Write to this file instead of stdout.")
+]
+
+
+Timeout = Annotated[
+    str | None,
+    typer.Option("--timeout", metavar="TIME", help="Stop after this time, such as 30s."),
+]
+MaxSpill = Annotated[
+    str | None,
+    typer.Option(
+        "--max-spill",
+        metavar="SIZE",
+        help="Most that is put on disk where memory does not suffice: 500MB, 50GB.",
+        show_default="10GB",
+    ),
+]
+
+
+@app.callback(invoke_without_command=True)
+def sgstore(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Find the driving scenes that matter.
+
+    Recordings go in (ingest), frames are found by what happens in them (find,
+    sql), looked at (show), and exported as clips (export). First steps: demo.
+    """
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"sgstore {version_of('sgstore')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def open_store(
+    store: Path,
+    tables: Mapping[str, Path] | None = None,
+    *,
+    timeout: str | None = None,
+    max_spill: str | None = None,
+) -> Store:
+    """The store at a path, with tables of the user's own; rows of these that belong to no frame are told.
+
+    With a timeout whatever is done from here on ends when that is over.
+    """
+    from sgstore.query import Store
+
+    opened = Store(store, tables=tables, max_spill=bounded(timeout, max_spill))
+    for name, joined in opened.file.joined().items():
+        if joined.matched < joined.rows:
+            lost = joined.rows - joined.matched
+            say(f"{name}: {lost} of {joined.rows} rows belong to no frame of the store")
+    return opened
+
+
+def bounded(timeout: str | None, max_spill: str | None) -> int:
+    """Bound whatever is done from here on.
+
+    Returns
+    -------
+    int
+        Most that a question may put on disk, in bytes; 0: what a store allows by itself.
+    """
+    spill = 0 if max_spill is None else bytes_of(max_spill, "--max-spill")
+    if timeout is not None:
+        set_deadline(seconds_of(timeout, "--timeout"))
+    return spill
+
+
+_ENDINGS: Final = {
+    ".csv": Format.csv,
+    ".json": Format.json,
+    ".ndjson": Format.ndjson,
+    ".jsonl": Format.ndjson,
+    ".parquet": Format.parquet,
+    ".arrow": Format.arrow,
+    ".feather": Format.arrow,
+    ".txt": Format.table,
+    "": Format.table,
+}
+
+
+def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
+    """What ``--format`` and ``--json`` mean together; without them the name of the file says it."""
+    if as_json and form not in {Format.table, Format.json}:
+        raise typer.BadParameter(f"give one of --json and --format {form}")
+    if as_json or form is not Format.table or output is None:
+        return Format.json if as_json else form
+    found = _ENDINGS.get(output.suffix.lower())
+    if found is None:
+        known = ", ".join(filter(None, _ENDINGS))
+        raise typer.BadParameter(
+            f"--output {output}: nothing is written as '{output.suffix}'; expected one of {known}"
+        )
+    return found
+
+
+def tables_of(given: list[str] | None) -> dict[str, Path]:
+    """``--with`` as files by the names of their tables: ``NAME=FILE``, or the name of the file."""
+    tables: dict[str, Path] = {}
+    for text in given or []:
+        name, equals, path = text.partition("=")
+        file = Path(path if equals else text)
+        name = name if equals else re.sub(r"\W", "_", file.stem)
+        if not name.isidentifier():
+            raise typer.BadParameter(f"--with {text!r}: expected NAME=FILE, such as labels={file}")
+        if name in tables:
+            raise typer.BadParameter(f"--with: two tables are called {name!r}; write NAME=FILE")
+        tables[name] = file
+    return tables
+
+
+def query_of(text: str | None, file: Path | None) -> str:
+    """The query of an argument, or of a file."""
+    if (text is None) == (file is None):
+        raise typer.BadParameter("give a query as an argument, or a file with -f FILE")
+    return text if text is not None else text_of(file or Path("-"))
+
+
+def asked_of(
+    text: str | None, file: Path | None, name: str | None, values: Mapping[str, Any]
+) -> tuple[str, Mapping[str, Any]]:
+    """The query as a text, from a file, or of the library by its name; and values that it does not hold yet."""
+    if sum(source is not None for source in (text, file, name)) != 1:
+        raise typer.BadParameter("give one of: a query as a text, a file with it, -p NAME")
+    if name is None:
+        return query_of(text, file), values
+    from sgstore.lang.library import pattern_named
+
+    return pattern_named(name).written(**values), {}
+
+
+def all_asked_of(
+    files: Sequence[Path], names: Sequence[str], texts: Sequence[str], values: Mapping[str, Any]
+) -> tuple[dict[str, list[str]], Mapping[str, Any]]:
+    """Texts of files, of the library and of the command line; and values that these do not hold yet.
+
+    Returns
+    -------
+    asked : dict
+        What a pattern is called → texts: by its name in the library, else ``pattern``.
+    values : mapping
+        A pattern of the library takes the values of its own parameters; all the others belong to the texts.
+    """
+    from sgstore.lang.library import pattern_named
+
+    if not (files or names or texts):
+        raise typer.BadParameter("give a FILE, -p NAME or -e TEXT; several are asked together")
+    found = {one.name: one for one in map(pattern_named, names)}
+    taken = {name for one in found.values() for name in one.parameters}
+    rest = {name: value for name, value in values.items() if name not in taken}
+    if rest and not (files or texts):
+        found[next(iter(found))].written(**rest)  # which says what it would take
+    asked = {"pattern": [*map(text_of, files), *texts]} if files or texts else {}
+    for name, one in found.items():
+        own = {key: value for key, value in values.items() if key in one.parameters}
+        asked[name] = [one.written(**own)]
+    return asked, rest
+
+
+def text_of(file: Path) -> str:
+    """The text in a file; ``-`` is stdin."""
+    try:
+        return sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        written = re.match(r"\s*(MATCH|CHECK|DEFINE|USING)\b", str(file))
+        hint = "; this is a query, and no file of that name" if written else ""
+        raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}{hint}") from error
+
+
+def lines_of(file: Path) -> list[str]:
+    """The lines of a file that hold something."""
+    return [line.strip() for line in text_of(file).splitlines() if line.strip()]
+
+
+def parameters_of(pairs: list[str] | None) -> dict[str, Any]:
+    """``NAME=VALUE`` as values: numbers, ``true`` and ``false``, lists as in JSON, all else as texts."""
+    values: dict[str, Any] = {}
+    for pair in pairs or []:
+        name, equals, value = pair.partition("=")
+        if not equals or not name.isidentifier():
+            raise typer.BadParameter(f"--param {pair!r}: expected NAME=VALUE")
+        if name in values:
+            raise typer.BadParameter(f"--param {pair!r}: {name} has a value already")
+        values[name] = _listed(pair, value) if value.startswith("[") else _parameter(value)
+    return values
+
+
+def _listed(pair: str, value: str) -> Any:
+    import json  # few need it
+
+    try:
+        return json.loads(value)
+    except (ValueError, RecursionError):
+        hint = """expected a list as in JSON: '["car", "bus"]'"""
+        raise typer.BadParameter(f"--param {pair!r}: {hint}") from None
+
+
+def _parameter(value: str) -> Any:
+    if value.lower() in {"true", "false"}:
+        return value.lower() == "true"
+    for number in (int, float):
+        try:
+            return number(value)
+        except ValueError:
+            continue
+    return value
+
+
+_TIME: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min)?")
+_UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
+
+
+def seconds_of(text: str, option: str) -> float:
+    """A time such as ``2s`` in seconds."""
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
+        raise typer.BadParameter(f"{option} {text!r}: expected a time such as 2s, 500ms or 1min")
+    return float(match[1]) * _UNIT[match[2]]
+
+
+_SIZE: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B", re.IGNORECASE)
+
+
+def bytes_of(text: str, option: str) -> int:
+    """A size such as ``20GB`` in bytes."""
+    match = _SIZE.fullmatch(text.strip())
+    size = round(float(match[1]) * 1000 ** "_kmgt".find(match[2].lower() or "_")) if match else 0
+    if match is None or not 1000 <= size < 1 << 62:
+        raise typer.BadParameter(f"{option} {text!r}: expected a size such as 500MB or 20GB")
+    return size
+
+
+def say_left_out(matches: Matches | Answer | ChosenFrames) -> None:
+    """Say which traces cannot answer a query, and why, and what may be a mistake in it."""
+    of: dict[str, list[str]] = {}
+    for name, reason in matches.reasons.items():
+        of.setdefault(reason, []).append(name)
+    for reason, names in of.items():
+        say(f"left out, because they cannot answer this query ({reason}): {', '.join(names)}")
+    say_notes(getattr(matches, "notes", ()))
+
+
+def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
+    """Say what is unknown of which traces, and why: of names, traces and reasons; no reason, nothing to say."""
+    said: dict[tuple[str, str], list[str]] = {}
+    for name, trace, reason in told:
+        if reason:
+            said.setdefault((name, reason), []).append(trace)
+    for (name, reason), traces in said.items():
+        say(f"{name} is unknown of {', '.join(traces)}: {reason}")
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Say what may be a mistake in a query."""
+    for note in notes:
+        say(f"note: {note}")
+
+
+def settings_of(config: Path | None, preset: str | None) -> Settings | None:
+    """What ``--config`` and ``--preset`` say; ``None``: neither is given."""
+    from sgstore.config import load
+    from sgstore.config import preset as preset_named
+
+    if config and preset:
+        raise typer.BadParameter("give --config or --preset; a file may name a preset itself")
+    return preset_named(preset) if preset else load(config) if config else None

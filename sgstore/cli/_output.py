@@ -1,0 +1,501 @@
+"""Output of verbs: progress bars, tables, machine formats, and reports on recordings.
+
+The bar that long work shows, on a terminal and nowhere else.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+import sys
+from contextlib import contextmanager
+from enum import StrEnum
+from itertools import chain, islice
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import ExportError
+from sgstore.files import without_controls, working_folder, written_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+    from pathlib import Path
+    from typing import TextIO
+
+    from sgstore.segments import Progress
+
+
+@contextmanager
+def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
+    """A function that shows the progress of an ingest on stderr; ``None`` where that is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[files]}{task.fields[frames]} frames"),
+        TextColumn("{task.fields[speed]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+    task = bar.add_task("", total=None, files="", frames=0, speed="")
+
+    def show(progress: Progress) -> None:
+        elapsed = bar.tasks[task].elapsed or 0
+        speed = f"{progress.all_bytes / elapsed / 1e6:.1f} MB/s" if elapsed > 0.5 else ""
+        several = f"{progress.files_done}/{progress.files} files, " if progress.files > 1 else ""
+        bar.update(
+            task,
+            description=progress.path.name,
+            total=progress.all_size,
+            completed=progress.all_bytes,
+            files=several,
+            frames=progress.all_frames,
+            speed=speed,
+        )
+
+    with bar:
+        yield show
+
+
+@contextmanager
+def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | None]:
+    """A function that shows how many of how many things are done; ``None`` where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(things))
+    with Progress(
+        *columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True
+    ) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+# Rows for people and for machines: a table that fits the terminal, JSON, NDJSON, CSV, Parquet, Arrow ----
+# In JSON, 64-bit ids and times (``frame_id``, ``trace_id``, ``bucket`` and whatever ends in ``_ns``) are texts,
+# because many JSON readers round whole numbers beyond 2⁵³; so is any other whole number beyond that.
+
+
+class Format(StrEnum):
+    """How rows are printed."""
+
+    table = "table"
+    json = "json"
+    ndjson = "ndjson"
+    csv = "csv"
+    parquet = "parquet"
+    arrow = "arrow"
+
+
+_KEYS: Final = frozenset({"frame", "from", "trace"})
+"""Columns by which a row is found again."""
+_LEAST: Final = 8
+"""Letters that a column keeps."""
+_BINARY: Final = frozenset({Format.parquet, Format.arrow})
+_WITHOUT_NESTING: Final = frozenset({Format.csv, *_BINARY})
+
+LONG: Final = frozenset({"frame_id", "trace_id", "bucket"})
+SAFE_INTEGER: Final = 2**53
+ROWS_THAT_SET_WIDTHS: Final = 200
+GAP: Final = "  "
+
+
+def write_rows(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    form: Format,
+    output: Path | None = None,
+    types: Sequence[str] | None = None,
+) -> int:
+    """Print rows as they come, on stdout or into a file; memory does not grow with their number.
+
+    Parameters
+    ----------
+    columns : sequence of str
+    rows : iterable of sequences
+        Plain Python values; ``None`` is a missing one.
+    form : Format
+    output : Path, optional
+        A file to write instead of stdout; Parquet and Arrow need one, unless stdout is a pipe or a file.
+    types : sequence of str, optional
+        The database's types of the columns, for Parquet and Arrow.
+
+    Returns
+    -------
+    int
+        How many rows were written.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written, or Parquet or Arrow would go to a terminal.
+    """
+    if form in _WITHOUT_NESTING and not types:
+        rows = ([_flat(value) for value in row] for row in rows)
+    if form in _BINARY:
+        return _write_binary(columns, rows, form, output, types)
+    if output is None:
+        return _write_text(columns, rows, form, sys.stdout)
+    with written_text(output) as stream:
+        return _write_text(columns, rows, form, stream)
+
+
+def write_document(values: dict[str, Any], form: Format) -> None:
+    """Print one thing on stdout: its values one a line for people, else as one JSON document."""
+    if form is Format.table:
+        lines = [(name, _cell(_json_value(value, name))) for name, value in values.items()]
+        width = max(len(name) for name, _ in lines)
+        sys.stdout.writelines(f"{name.ljust(width)}{GAP}{value}\n" for name, value in lines)
+        return
+    sys.stdout.write(f"{json_text(_json_object(values), 2)}\n")
+
+
+def say(message: str) -> None:
+    """Tell something that is not a result, on stderr."""
+    sys.stderr.write(f"sgstore: {without_controls(message)}\n")
+
+
+def write_error(about: dict[str, Any]) -> None:
+    """Tell an error as data: one line of JSON on stderr."""
+    sys.stderr.write(f"{json_text(_json_object(about))}\n")
+
+
+def write_text(text: str, output: Path | None = None) -> None:
+    """Print a text as it is, on stdout or into a file.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    if output is None:
+        sys.stdout.write(text)
+        return
+    with written_text(output) as stream:
+        stream.write(text)
+
+
+def _write_text(
+    columns: Sequence[str], rows: Iterable[Sequence[Any]], form: Format, stream: TextIO
+) -> int:
+    match form:
+        case Format.json:
+            return _write_json(columns, rows, stream)
+        case Format.ndjson:
+            return _count(stream.write(f"{_dumps(columns, row)}\n") for row in rows)
+        case Format.csv:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(columns)
+            return _count(writer.writerow(map(_csv_cell, row)) for row in rows)
+        case _:
+            return _write_table(columns, rows, stream)
+
+
+def _count(written: Iterator[Any]) -> int:
+    return sum(1 for _ in written)
+
+
+def _write_json(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO) -> int:
+    number = 0
+    for row in rows:
+        stream.write("[\n  " if number == 0 else ",\n  ")
+        stream.write(_dumps(columns, row))
+        number += 1
+    stream.write("\n]\n" if number else "[]\n")
+    return number
+
+
+def _dumps(columns: Sequence[str], row: Sequence[Any]) -> str:
+    return json_text(_json_object(dict(zip(columns, row, strict=True))))
+
+
+_CONTROLS: Final = {code: f"\\u{code:04x}" for code in range(0x7F, 0xA0)}
+"""The characters that a terminal may take for orders and JSON leaves as they are."""
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """A value as JSON that can be shown in a terminal."""
+    text = json.dumps(value, ensure_ascii=False, indent=indent)
+    return text if text.isprintable() else text.translate(_CONTROLS)
+
+
+def _csv_cell(value: Any) -> Any:
+    return "" if value is None else without_controls(value) if isinstance(value, str) else value
+
+
+def _flat(value: Any) -> Any:
+    """Lists and objects as JSON, for forms that have none."""
+    return json.dumps(_json_value(value), ensure_ascii=False) if _is_nested(value) else value
+
+
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, list | tuple | dict)
+
+
+def _json_object(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: _json_value(value, name) for name, value in values.items()}
+
+
+def _json_value(value: Any, name: str = "") -> Any:
+    match value:
+        case None | bool() | str():
+            return value
+        case int():
+            long = name in LONG or name.endswith("_ns") or abs(value) > SAFE_INTEGER
+            return str(value) if long else value
+        case float():
+            return value if math.isfinite(value) else None
+        case dict():
+            return _json_object(value)
+        case list() | tuple():
+            return [_json_value(item, name) for item in value]
+        case _:
+            return value.isoformat() if hasattr(value, "isoformat") else str(value)
+
+
+def _write_binary(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    form: Format,
+    output: Path | None,
+    types: Sequence[str] | None,
+) -> int:
+    """Write Parquet, or by way of it, so that memory stays bounded and types are those of the whole, Arrow."""
+    from sgstore.store import write_parquet
+
+    if form is Format.parquet and output is not None:
+        return write_parquet(columns, rows, output, types)
+    if output is None and sys.stdout.isatty():
+        raise ExportError(
+            f"{form.capitalize()} is not for a terminal: name a file with -o FILE, or redirect stdout"
+        )
+    from sgstore.store import arrow_file
+
+    with working_folder("rows") as folder:
+        file = folder / "rows.parquet"
+        number = write_parquet(columns, rows, file, types)
+        if form is Format.arrow:
+            ready = output or folder / "rows.arrow"
+            arrow_file(file, ready)
+            file = ready
+        if output is None:
+            with file.open("rb") as source:
+                shutil.copyfileobj(source, sys.stdout.buffer)
+    return number
+
+
+# Tables for people ---------------------------------------------------------------------------------
+
+
+def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO) -> int:
+    """A table whose widths the first rows set, so that it can start before the last row is known."""
+    rows = iter(rows)
+    first = [[_cell(value) for value in row] for row in islice(rows, ROWS_THAT_SET_WIDTHS)]
+    if not first:
+        return 0
+    numeric = [all(_is_number(row[i]) for row in first) for i in range(len(columns))]
+    widths = [max(len(name), *(len(row[i]) for row in first)) for i, name in enumerate(columns)]
+    widths = _fitted(columns, widths, _room(stream))
+    stream.write(_line(columns, widths, numeric))
+    stream.write(_line(["─" * width for width in widths], widths, numeric))
+    rest = ([_cell(value) for value in row] for row in rows)
+    return _count(stream.write(_line(row, widths, numeric)) for row in chain(first, rest))
+
+
+def _room(stream: TextIO) -> int | None:
+    """Columns of the terminal, or ``None`` where the table does not go to one."""
+    return shutil.get_terminal_size().columns if stream.isatty() else None
+
+
+def _fitted(columns: Sequence[str], widths: list[int], room: int | None) -> list[int]:
+    """Widths that fit: the widest columns give way first, what a row is found by last; none below 8 letters."""
+    if room is None:
+        return widths
+    widths = list(widths)
+    others = [i for i, name in enumerate(columns) if name not in _KEYS]
+    for giving in (others, list(range(len(columns)))):
+        while giving and sum(widths) + len(GAP) * (len(widths) - 1) > room:
+            widest = max(giving, key=widths.__getitem__)
+            if widths[widest] <= _LEAST:
+                break
+            widths[widest] -= 1
+    return widths
+
+
+def _line(cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool]) -> str:
+    parts = []
+    for cell, width, right in zip(cells, widths, numeric, strict=True):
+        text = cell if len(cell) <= width else f"{cell[: width - 1]}…"
+        parts.append(text.rjust(width) if right else text.ljust(width))
+    return f"{GAP.join(parts).rstrip()}\n"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) and abs(value) < 1e4 else f"{value:.1f}"
+    text = str(value)
+    return "".join(c if c.isprintable() else "�" for c in text)
+
+
+def _is_number(cell: str) -> bool:
+    return not cell or (cell.lstrip("-")[:1].isdigit() and cell[-1:].isdigit() and " " not in cell)
+
+
+# What is known of a recording, for people: a line a fact, and below it what needs more than one ----
+
+_MANY: Final = 20
+"""Losses and warnings that are listed; the others are counted."""
+
+
+def write_report(values: dict[str, Any]) -> None:
+    """Print what is known of a recording on stdout.
+
+    Parameters
+    ----------
+    values : dict
+        What :meth:`sgstore.store.StoredTrace.as_dict` with its report, or
+        :meth:`sgstore.ingest.Examination.as_dict` tells; what is missing or empty is left out.
+    """
+    facts = [(name, text) for name, text in _facts(values) if text]
+    width = max((len(name) for name, _ in facts), default=0)
+    lines = [f"{name.ljust(width)}{GAP}{_shown(text)}" for name, text in facts]
+    for title, items in _lists(values):
+        lines += ["", f"{title}:", *(f"{GAP}{_shown(item)}" for item in items)]
+    sys.stdout.writelines(f"{line}\n" for line in lines)
+
+
+def _facts(values: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "trace", values.get("name", "")
+    yield "trace_id", str(values.get("trace_id", ""))
+    yield "file", f"{values['path']} ({_amount(values['size'])})"
+    yield "sha256", values.get("digest", "")
+    yield "flavour", values.get("flavour", "")
+    yield "ego", values.get("ego", "")
+    yield "road map", values.get("map", "") or values.get("road_map", "")
+    yield "frames", _frames(values)
+    yield "part", _part(values)
+    yield "entities", _counts(values.get("entities", {}))
+    yield "unknown types", _counts(values.get("unknown_types", {}))
+    for name in ("clock_jumps", "gaps"):
+        if values.get("frames"):
+            yield name.replace("_", " "), _steps(values, name)
+    yield "lost", _lost(values.get("losses", []))
+    ingested = values.get("ingested_at")
+    yield (
+        "ingested",
+        f"{ingested:%Y-%m-%d %H:%M:%S} UTC, sgstore {values['version']}" if ingested else "",
+    )
+    yield "cannot be read", values.get("error", "")
+
+
+def _lists(values: dict[str, Any]) -> Iterator[tuple[str, list[str]]]:
+    channels = values.get("channels", [])
+    if channels:
+        yield "channels", list(_channels(channels))
+    for title, items in (
+        ("losses", [_loss(loss) for loss in values.get("losses", [])]),
+        ("warnings", list(values.get("warnings", []))),
+    ):
+        more = [f"… and {len(items) - _MANY} more"] if len(items) > _MANY else []
+        if items:
+            yield title, items[:_MANY] + more
+
+
+def _frames(values: dict[str, Any]) -> str:
+    count = values.get("frames", 0)
+    if not count:
+        return ""
+    seconds = values.get("seconds", (values.get("end_ns", 0) - values.get("start_ns", 0)) / 1e9)
+    period = values.get("period_ns", 0) / 1e9
+    return f"{count}, {seconds:g} s" + (f", mostly every {period:g} s" if period else "")
+
+
+def _part(values: dict[str, Any]) -> str:
+    since, until = values.get("since"), values.get("until")
+    parts = [f"from {since:g} s"] if since is not None else []
+    parts += [f"to {until:g} s"] if until is not None else []
+    rate = values.get("settings", {}).get("rate", 0)
+    parts += [f"{rate:g} frames a second"] if rate else []
+    return ", ".join(parts)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{count} {name}" for name, count in ordered)
+
+
+def _steps(values: dict[str, Any], name: str) -> str:
+    count, first = values.get(name, 0), values.get(f"{name}_at", [])
+    places = ", ".join(f"{s['seconds']:+g} s before #{s['seq']} ({s['t']:g} s)" for s in first[:5])
+    more = f", … ({count} in all)" if count > 5 else ""
+    return f"{count}: {places}{more}" if count and first else str(count)
+
+
+def _lost(losses: list[dict[str, Any]]) -> str:
+    if not losses:
+        return ""
+    messages = sum(max(loss["messages"], 0) for loss in losses)
+    size = sum(max(loss["bytes"], 0) for loss in losses)
+    unknown = any(loss["messages"] < 0 for loss in losses)
+    return f"{'at least ' if unknown else ''}{messages} messages, {_amount(size)}"
+
+
+def _loss(loss: dict[str, Any]) -> str:
+    told = [loss["reason"]]
+    if loss["messages"] >= 0:
+        told.append(f"{loss['messages']} messages")
+    if loss["bytes"] >= 0:
+        told.append(_amount(loss["bytes"]))
+    if loss["start_ns"] >= 0:
+        told.append(f"log times {loss['start_ns'] / 1e9:.3f} … {loss['end_ns'] / 1e9:.3f} s")
+    if loss["offset"] >= 0:
+        told.append(f"byte {loss['offset']} of the file")
+    return "; ".join(told)
+
+
+def _channels(channels: Iterable[dict[str, Any]]) -> Iterator[str]:
+    rows = [
+        (
+            channel["topic"],
+            channel["schema"] or channel["message_encoding"] or "no schema",
+            channel.get("role") or "",
+            f"{channel['messages']} messages" if channel.get("messages", -1) >= 0 else "",
+        )
+        for channel in channels
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        yield GAP.join(cells).rstrip()
+
+
+def _amount(size: int) -> str:
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= scale:
+            return f"{size / scale:.1f} {unit}"
+    return f"{size} bytes"
+
+
+def _shown(text: str) -> str:
+    """Texts come from files: what would move a terminal's cursor is not printed."""
+    return "".join(c if c.isprintable() else "�" for c in text)

@@ -1,0 +1,499 @@
+"""The verbs find, why-not, like, translate, sql and patterns.
+
+Verbs that find: patterns and SQL.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sgstore.cli._options import (
+    NO_MATCH,
+    AsJson,
+    FrameName,
+    MaxSpill,
+    Output,
+    Parameters,
+    PatternName,
+    QueryFile,
+    QueryText,
+    RowFormat,
+    StorePath,
+    Timeout,
+    Verbs,
+    With,
+    app,
+    asked_of,
+    form_of,
+    open_store,
+    parameters_of,
+    query_of,
+    say_left_out,
+    seconds_of,
+    tables_of,
+    text_of,
+)
+from sgstore.cli._output import Format, say, write_document, write_rows, write_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from sgstore.lang.library import NamedPattern
+    from sgstore.matches import Interval, Matches
+    from sgstore.sandbox import Answer, Sandbox
+
+
+Safe = Annotated[
+    bool,
+    typer.Option(
+        "--safe", help="Ask in a process of its own that is bounded in time (5s), memory and rows."
+    ),
+]
+MaxRows = Annotated[int, typer.Option("--max-rows", min=0, help="With --safe: the most rows.")]
+
+
+@app.command()
+def find(
+    store: StorePath,
+    query: QueryText = None,
+    file: QueryFile = None,
+    name: PatternName = None,
+    parameters: Parameters = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+    count: Annotated[
+        bool, typer.Option("--count", help="Print the number of distinct frames and nothing else.")
+    ] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Print how the query is understood, and its SQL.")
+    ] = False,
+    require: Annotated[
+        bool, typer.Option("--require", help="End with exit code 4 if nothing matches.")
+    ] = False,
+    safe: Safe = False,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+    max_rows: MaxRows = 10_000,
+    tables: With = None,
+) -> int:
+    """Find frames by a pattern of their scene graphs.
+
+    One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
+    """
+    text, values = asked_of(query, file, name, parameters_of(parameters))
+    if safe:
+        if count or explain:
+            raise typer.BadParameter("--safe gives rows: not with --count or --explain")
+        _refuse_spill(max_spill)
+        form = form_of(form, output, as_json=as_json)
+        with _sandbox(store, timeout, max_rows, tables) as box:
+            answer = box.find(text, **values)
+        _say_all(answer)
+        number = write_rows(*_as_shown(answer, form), form, output)
+        if not number and form is Format.table:
+            say("nothing matches")
+        return NO_MATCH if require and not number else 0
+    opened = open_store(store, tables_of(tables), timeout=timeout, max_spill=max_spill)
+    with opened.file.snapshot():  # it is opened once
+        matches = opened.find(text, **values)
+        if explain:
+            typer.echo(matches.explain())
+            return 0
+        say_left_out(matches)
+        if count:
+            number = matches.count()
+            typer.echo(number)
+        else:
+            form = form_of(form, output, as_json=as_json)
+            columns, rows = _as_shown(matches, form)
+            number = write_rows(columns, rows, form, output)
+            if not number and form is Format.table:
+                say("nothing matches")
+    return NO_MATCH if require and not number else 0
+
+
+def _as_shown(
+    answer: Matches | Answer, form: Format
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
+    from sgstore.lang import for_people
+    from sgstore.sandbox import Answer
+
+    rows = answer.rows if isinstance(answer, Answer) else answer
+    if form is Format.table:
+        return for_people(answer.columns, rows, graphs=answer.graphs)
+    return _node_link(answer, rows, form) if answer.graphs else (answer.columns, rows)
+
+
+def _node_link(
+    answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Rows that end in a graph: in JSON as networkx reads them."""
+    if form not in {Format.json, Format.ndjson}:
+        return answer.columns, rows
+    columns = ("directed", "multigraph", *answer.columns)
+    return columns, (
+        (True, True, *row[:-1], [{**edge, "key": edge["relation"]} for edge in row[-1]])
+        for row in rows
+    )
+
+
+@app.command("why-not")
+def why_not(
+    store: StorePath,
+    frame: FrameName,
+    query: QueryText = None,
+    file: QueryFile = None,
+    name: PatternName = None,
+    parameters: Parameters = None,
+    as_json: AsJson = False,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+) -> int:
+    """Say how far a pattern holds in a frame: what fails first, and how near it came."""
+    text, values = asked_of(query, file, name, parameters_of(parameters))
+    answer = open_store(store, timeout=timeout, max_spill=max_spill).why_not(frame, text, **values)
+    if as_json:
+        write_document(answer.as_dict(), Format.json)
+    else:
+        typer.echo(str(answer))
+    return 0
+
+
+@app.command()
+def like(
+    store: StorePath,
+    frame: FrameName,
+    ignore: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ignore", metavar="NAME", help="A relation or a kind that does not count; repeatable."
+        ),
+    ] = None,
+    abstraction: Annotated[
+        str, typer.Option("--abstraction", metavar="NAME", help="Whose graphs are compared.")
+    ] = "RSV",
+    limit: Annotated[int, typer.Option("--limit", min=1, help="How many runs of frames.")] = 10,
+    pattern: Annotated[
+        bool, typer.Option("--pattern", help="Print a pattern that describes the frame instead.")
+    ] = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+) -> int:
+    """Find frames like another: of the same class, or the most like by what they have in common.
+
+    One row for consecutive frames that are as like as each other: the first one, how many, how like, whether
+    the graphs are the same, and what the example has that they have not, and they that it has not.
+    """
+    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    if pattern:
+        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", output)
+        return 0
+    form = form_of(form, output, as_json=as_json)
+    found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
+    if form is Format.table:
+        columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
+        rows = (
+            (
+                f"{one.frame.trace}#{one.frame.seq}",
+                round(one.frame.t, 3),
+                one.frames,
+                round(one.similarity, 3),
+                one.same,
+                _counted(one.missing),
+                _counted(one.extra),
+            )
+            for one in found
+        )
+        write_rows(columns, rows, form, output)
+        return 0
+    columns = ("frame_id", "trace", "seq", "time_ns", "t", "frames", "similarity", "same")
+    columns += ("shared", "missing", "extra")
+    rows = (
+        (
+            *(getattr(one.frame, name) for name in columns[:5]),
+            *(getattr(one, name) for name in columns[5:]),
+        )
+        for one in found
+    )
+    write_rows(columns, rows, form, output)
+    return 0
+
+
+def _counted(features: dict[str, int]) -> str:
+    """Features with how often, as one text."""
+    return ", ".join(f"{n} x {text}" if n > 1 else text for text, n in features.items())
+
+
+class Language(StrEnum):
+    """Languages that are translated."""
+
+    sgl = "sgl"
+
+
+@app.command()
+def translate(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What to translate; - is stdin.")],
+    language: Annotated[
+        Language, typer.Option("--from", help="sgl: properties of SGSM, as Python.")
+    ] = Language.sgl,
+    output: Output = None,
+) -> int:
+    """Translate properties of other tools into the query language; nothing of the file is run."""
+    from sgstore.contrib.sgsm import translated
+
+    write_text(translated(text_of(file)), output)
+    return 0
+
+
+@app.command()
+def sql(
+    store: StorePath,
+    statement: Annotated[
+        str | None, typer.Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
+    ] = None,
+    file: QueryFile = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+    safe: Safe = False,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+    max_rows: MaxRows = 10_000,
+    tables: With = None,
+) -> int:
+    """Ask a store in SQL, read only.
+
+    Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
+    """
+    form = form_of(form, output, as_json=as_json)
+    if safe:
+        _refuse_spill(max_spill)
+        with _sandbox(store, timeout, max_rows, tables) as box:
+            answer = box.sql(query_of(statement, file))
+        _say_all(answer)
+        write_rows(answer.columns, answer.rows, form, output)
+        return 0
+    opened = open_store(store, tables_of(tables), timeout=timeout, max_spill=max_spill).file
+    with opened.user_batches(query_of(statement, file)) as batches:
+        rows = chain.from_iterable(batch.values for batch in batches)
+        write_rows(batches.columns, rows, form, output, batches.types)
+    return 0
+
+
+def _refuse_spill(max_spill: str | None) -> None:
+    if max_spill is not None:
+        raise typer.BadParameter("--max-spill: with --safe nothing is put on disk")
+
+
+def _sandbox(store: Path, timeout: str | None, max_rows: int, tables: list[str] | None) -> Sandbox:
+    from sgstore.sandbox import Sandbox
+
+    return Sandbox(
+        store,
+        timeout_s=seconds_of(timeout or "5s", "--timeout"),
+        max_rows=max_rows,
+        tables=tables_of(tables),
+    )
+
+
+def _say_all(answer: Answer) -> None:
+    """Say what an answer lacks."""
+    say_left_out(answer)
+    if answer.truncated:
+        say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
+
+
+# Verbs about the library of named patterns: list, show, run -------------------------------------
+
+library = Verbs(no_args_is_help=True)
+app.add_typer(library, name="patterns", help="The library of named patterns: list, show, run them.")
+
+LibraryName = Annotated[
+    str, typer.Argument(metavar="NAME", help="Of a pattern, such as cut_in or ParkingExit.")
+]
+Chosen = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
+]
+
+
+class Kind(StrEnum):
+    """Kinds of patterns."""
+
+    predicate = "predicate"
+    concept = "concept"
+    scenario = "scenario"
+    property = "property"
+
+
+@library.command("list")
+def list_patterns(
+    kinds: Annotated[
+        list[Kind] | None, typer.Option("--kind", help="Only of this kind; repeatable.")
+    ] = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+) -> int:
+    """Name the patterns of the library, with what they find.
+
+    Predicates are conditions that every query may use; concepts and scenarios are found by their
+    names; properties are rules that a trace keeps or violates.
+    """
+    from sgstore.lang.library import patterns
+
+    form = form_of(form, output, as_json=as_json)
+    found = [p for p in patterns().values() if not kinds or p.kind in kinds]
+    if form is Format.table:
+        columns = ("name", "kind", "from", "sentence")
+        rows = [(p.name, p.kind, p.library, p.sentence) for p in found]
+    else:
+        columns = ("name", "kind", "library", "sentence", "parameters", "source", "query")
+        rows = [(*_told(p).values(),) for p in found]
+    write_rows(columns, rows, form, output)
+    return 0
+
+
+@library.command("show")
+def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = None) -> int:
+    """Print a pattern: its text, its parameters, where it comes from, and a scene that it holds in.
+
+    What is printed is a query, its remarks being comments: it can be changed and asked with find -f.
+    """
+    from sgstore.lang.library import pattern_named
+
+    found = pattern_named(name)
+    if as_json:
+        write_document({**_told(found), "example": found.example}, Format.json)
+    else:
+        write_text(_for_people(found), output)
+    return 0
+
+
+@library.command("run")
+def run_pattern(
+    store: StorePath,
+    name: LibraryName,
+    chosen: Chosen = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+    output: Output = None,
+    clips: Annotated[
+        bool, typer.Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
+    ] = False,
+    before: Annotated[
+        str, typer.Option("--before", metavar="TIME", help="With --clips: time before each match.")
+    ] = "0s",
+    after: Annotated[
+        str, typer.Option("--after", metavar="TIME", help="With --clips: time after each match.")
+    ] = "0s",
+    require: Annotated[
+        bool,
+        typer.Option(
+            "--require",
+            help="End with exit code 4 if nothing matches, or if the property is violated.",
+        ),
+    ] = False,
+    timeout: Timeout = None,
+    max_spill: MaxSpill = None,
+) -> int:
+    """Find a pattern of the library in a store: when it holds, and who takes part.
+
+    Of a property: whether each trace keeps it, and where it does not.
+    """
+    from sgstore.lang.library import pattern_named
+
+    found = pattern_named(name)
+    if found.kind == "predicate":
+        hint = f"a condition: ask 'sgstore find STORE \"MATCH … WHERE {found.name}(…)\"'"
+        raise typer.BadParameter(f"{found.name} is {hint}")
+    if found.is_check:
+        if clips:
+            raise typer.BadParameter(f"{found.name} is a property, which has verdicts and no clips")
+        bounds = {"timeout": timeout, "max_spill": max_spill}
+        shown = {"require": require, "form": form, "as_json": as_json, "output": output}
+        return _check(store, names=[found.name], parameters=chosen, **shown, **bounds)
+    text = found.written(**parameters_of(chosen))
+    form = form_of(form, output, as_json=as_json)
+    matches = open_store(store, timeout=timeout, max_spill=max_spill).find(text)
+    say_left_out(matches)
+    if clips:
+        offsets = seconds_of(before, "--before"), seconds_of(after, "--after")
+        rows = ((c.trace, c.start_ns, c.end_ns) for c in matches.clips(*offsets))
+        number = write_rows(("trace", "start_ns", "end_ns"), rows, form, output)
+    else:
+        number = _write_intervals(matches.intervals(), form, output)
+    if not number and form is Format.table:
+        say("nothing matches")
+    return NO_MATCH if require and not number else 0
+
+
+def _check(store: Path, **options: Any) -> int:
+    from sgstore.cli._checks import check  # only here: the verb is none of this module's
+
+    return check(store, **options)
+
+
+def _write_intervals(intervals: Iterator[Interval], form: Format, output: Any) -> int:
+    """Intervals as rows; for people, with a name for each that takes part instead of its node id."""
+    first = next(intervals, None)
+    if first is None:
+        return write_rows((), [], form, output)
+    every = chain([first], intervals)
+    if form is not Format.table:
+        columns = ("trace", "start_seq", "end_seq", "start", "end", "frames", *first.values)
+        rows = (
+            (i.trace, i.start_seq, i.end_seq, i.start, i.end, i.frames, *i.values.values())
+            for i in every
+        )
+        return write_rows(columns, rows, form, output)
+    named = {name.removesuffix(".name") for name in first.values if name.endswith(".name")}
+    keep = [name for name in first.values if name.removesuffix(".id") not in named]
+    columns = ("from", "start", "end", "frames", *(name.removesuffix(".name") for name in keep))
+    shown = (
+        (
+            f"{i.trace}#{i.start_seq}",
+            round(i.start, 3),
+            round(i.end, 3),
+            i.frames,
+            *(i.values[name] for name in keep),
+        )
+        for i in every
+    )
+    return write_rows(columns, shown, form, output)
+
+
+def _told(found: NamedPattern) -> dict[str, Any]:
+    """A pattern as data."""
+    parameters = [
+        {"name": p.name, "type": p.type, "default": p.default, "meaning": p.meaning}
+        for p in found.parameters.values()
+    ]
+    return {
+        "name": found.name,
+        "kind": found.kind,
+        "library": found.library,
+        "sentence": found.sentence,
+        "parameters": parameters,
+        "source": found.source,
+        "query": found.query,
+    }
+
+
+def _for_people(found: NamedPattern) -> str:
+    """A pattern as a query: with its parameters' defaults, everything about it as comments."""
+    head = [f"{found.name}: {found.sentence}", f"source: {found.source}"]
+    head += [f"param {p.name} = {p.default}: {p.meaning}" for p in found.parameters.values()]
+    head += ["", *found.example.splitlines()] if found.example else []
+    comments = [f"-- {line}".rstrip() for line in head]
+    return "\n".join([*comments, found.text, ""])

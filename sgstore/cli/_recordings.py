@@ -1,0 +1,448 @@
+"""The verbs ingest, info, doctor, import and record.
+
+Verbs about recordings: read them into a store, say what is in it, and what is wrong with them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from contextlib import contextmanager
+from dataclasses import asdict, fields
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from sgstore.cli._options import (
+    ERROR,
+    LOSS,
+    AsJson,
+    Config,
+    Preset,
+    RoadMap,
+    RowFormat,
+    StorePath,
+    app,
+    form_of,
+    lines_of,
+    seconds_of,
+    settings_of,
+)
+from sgstore.cli._output import Format, say, write_document, write_report, write_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator
+
+    from sgstore.importing import Imported
+    from sgstore.segments import TraceOutcome
+    from sgstore.store import StoreFile
+
+
+Traces = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="TRACE…",
+        help="Recordings, folders of them, patterns ('drives/**/day?.mcap'); - reads a list from stdin.",
+    ),
+]
+Ego = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--ego",
+        help="Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.",
+    ),
+]
+Jobs = Annotated[
+    int,
+    typer.Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."),
+]
+Since = Annotated[
+    str | None, typer.Option("--since", help="From this time of a recording on: 10s.")
+]
+Until = Annotated[str | None, typer.Option("--until", help="Up to this time: 1min.")]
+Rate = Annotated[
+    float | None, typer.Option("--rate", min=0, help="Frames to keep of a second; 0: all.")
+]
+Force = Annotated[
+    bool, typer.Option("--force", help="Read anew, and replace, what is in the store already.")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+
+
+@app.command()
+def ingest(
+    store: StorePath,
+    traces: Traces,
+    road_map: RoadMap = None,
+    config: Config = None,
+    preset: Preset = None,
+    ego: Ego = None,
+    jobs: Jobs = 1,
+    since: Since = None,
+    until: Until = None,
+    rate: Rate = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Read recordings into a store; what is in it already is left as it is."""
+    from sgstore.cli._output import ingest_bar
+    from sgstore.ingest import ingest as ingest_traces
+    from sgstore.ingest import recordings
+
+    with ingest_bar() as on_progress:
+        outcomes = ingest_traces(
+            store,
+            recordings(_names(traces)),
+            road_map=road_map,
+            config=settings_of(config, preset),
+            egos=ego or (),
+            jobs=jobs or os.cpu_count() or 1,
+            since=None if since is None else seconds_of(since, "--since"),
+            until=None if until is None else seconds_of(until, "--until"),
+            rate=rate,
+            force=force,
+            dry_run=dry_run,
+            on_progress=on_progress,
+        )
+    for outcome in outcomes:
+        _say_what_was_odd(outcome)
+    columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
+    write_rows(columns, map(_outcome_row, outcomes), form_of(form, as_json=as_json))
+    if any(outcome.error for outcome in outcomes):
+        return ERROR
+    return LOSS if any(outcome.losses for outcome in outcomes) else 0
+
+
+def _names(traces: list[str]) -> list[str]:
+    """The names given, those on stdin in place of ``-``."""
+    return [name for one in traces for name in (lines_of(Path("-")) if one == "-" else [one])]
+
+
+def _say_what_was_odd(outcome: TraceOutcome) -> None:
+    if outcome.error:
+        say(str(outcome.error))
+    for name, number in outcome.unknown_types.items():
+        say(f"{outcome.path}: {number} entities of type {name!r}, {_no_kind(name)}")
+    for warning in outcome.warnings:
+        say(f"{outcome.path}: {warning}")
+    for loss in outcome.losses:
+        say(f"{outcome.path}: lost: {loss.reason}")
+
+
+def _no_kind(type_name: str) -> str:
+    """What is to be done about a type name that means no kind of its own."""
+    name = json.dumps(type_name, ensure_ascii=False)
+    return (
+        "of which nothing says what kind it is; to say it, write into a file for --config:"
+        f' [types] {name} = {{ kind = "…" }}'
+    )
+
+
+def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
+    return (
+        outcome.name,
+        outcome.status,
+        outcome.ego,
+        outcome.frames,
+        sum(outcome.entities.values()),
+        round(outcome.seconds, 2),
+        len(outcome.losses),
+        str(outcome.path),
+    )
+
+
+@app.command()
+def info(
+    store: StorePath,
+    traces: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trace", help="A trace in full: a name, id, or beginning of one; repeatable."
+        ),
+    ] = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """List the traces of a store, or say all that is known of one."""
+    from sgstore.store import StoreFile
+
+    file = StoreFile(store)
+    form = form_of(form, as_json=as_json)
+    if traces:
+        _tell_all_of(file, traces, form)
+        return 0
+    columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
+    write_rows(
+        columns,
+        (
+            (
+                one.name,
+                one.frames,
+                round((one.end_ns - one.start_ns) / 1e9, 3),
+                one.ego,
+                one.map,
+                one.flavour,
+                len(one.report["losses"]),
+                one.trace_id,
+                str(one.path),
+            )
+            for one in file.traces()
+        ),
+        form,
+    )
+    return 0
+
+
+def _tell_all_of(file: StoreFile, names: list[str], form: Format) -> None:
+    """Print all that is known of traces: one as a document, several as rows."""
+    with file.snapshot():
+        found = [file.trace(name) for name in names]
+        channels = [[asdict(one) for one in file.channels(trace.trace_id)] for trace in found]
+    documents = [
+        one.as_dict() | {"channels": its} for one, its in zip(found, channels, strict=True)
+    ]
+    if form is Format.table:
+        for number, (one, about) in enumerate(zip(found, documents, strict=True)):
+            sys.stdout.write("\n" if number else "")
+            write_report(about | one.report | {"frames": one.frames})
+    elif len(documents) == 1:
+        write_document(documents[0], form)
+    else:
+        write_rows(tuple(documents[0]), [tuple(one.values()) for one in documents], form)
+
+
+@app.command()
+def doctor(
+    traces: Traces,
+    road_map: RoadMap = None,
+    config: Config = None,
+    preset: Preset = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Say what would be read of recordings, and what is wrong with them; no store is needed."""
+    from sgstore.doctor import Examination, examine
+    from sgstore.ingest import recordings
+
+    form = form_of(form, as_json=as_json)
+    settings = settings_of(config, preset)
+    found = (
+        examine(path, config=settings, road_map=road_map) for path in recordings(_names(traces))
+    )
+    codes: set[int] = set()
+
+    def seen() -> Iterator[dict[str, Any]]:
+        for one in found:
+            codes.add(ERROR if one.error else LOSS if one.losses else 0)
+            yield one.as_dict()
+
+    if form is Format.table:
+        for number, values in enumerate(seen()):
+            sys.stdout.write("\n" if number else "")
+            write_report(values)
+    else:
+        columns = [column.name for column in fields(Examination)]
+        write_rows(columns, (tuple(values.values()) for values in seen()), form)
+    return ERROR if ERROR in codes else max(codes, default=0)
+
+
+# Verbs that need a running simulator ------------------------------------------------------------
+
+PORT: Final = 2000
+"""Where a CARLA server listens by default."""
+
+
+@app.command()
+def record(
+    output: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten."),
+    ],
+    host: Annotated[str, typer.Option("--host", help="Where the CARLA server runs.")] = "localhost",
+    port: Annotated[int, typer.Option("--port", help="Its port.")] = PORT,
+    ego: Annotated[
+        str, typer.Option("--ego", help="Id or role name of the ego; by default hero, ego_vehicle.")
+    ] = "",
+    sensors: Annotated[
+        Path | None,
+        typer.Option("--sensors", help="A TOML file with a table [[sensor]] for each sensor."),
+    ] = None,
+    duration: Annotated[
+        str | None,
+        typer.Option("--duration", metavar="TIME", help="Simulation time: 60s; else until Ctrl-C."),
+    ] = None,
+    step: Annotated[
+        str | None,
+        typer.Option(
+            "--step", metavar="TIME", help="Drive the world in steps: 50ms; else follow it."
+        ),
+    ] = None,
+    scenery: Annotated[
+        bool, typer.Option("--scenery/--no-scenery", help="Buildings, poles, … of the level, too.")
+    ] = True,
+) -> int:
+    """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego."""
+    from sgstore.readers import connect, load_sensors
+    from sgstore.record import record as record_world
+
+    attached = load_sensors(sensors) if sensors else []
+    duration_s = seconds_of(duration, "--duration") if duration else None
+    step_s = seconds_of(step, "--step") if step else None
+    world = connect(host, port).get_world()
+    with _counter() as count:
+        done = record_world(
+            world,
+            output,
+            ego=ego,
+            sensors=attached,
+            duration_s=duration_s,
+            step_s=step_s,
+            scenery=scenery,
+            on_frame=count,
+        )
+    for warning in done.warnings:
+        say(warning)
+    written = done.written
+    seconds = (written.end_ns - written.start_ns) / 1e9
+    say(f"{written.frames} frames, {seconds:.2f} s; sgstore ingest STORE {written.path}")
+    typer.echo(written.path)
+    return LOSS if done.dropped else 0
+
+
+@contextmanager
+def _counter() -> Generator[Callable[[int, float], None] | None]:
+    """A line that counts frames on stderr; ``None`` where that is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status("waiting for the first frame") as line:
+        yield lambda frames, seconds: line.update(
+            f"{frames} frames, {seconds:.1f} s of simulation; Ctrl-C ends the recording"
+        )
+
+
+# Verbs about graphs that other tools made -------------------------------------------------------
+
+
+class GraphFormat(StrEnum):
+    """What files of graphs are written in."""
+
+    s3c = "s3c"
+    nodelink = "nodelink"
+    csv = "csv"
+
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
+]
+WrittenIn = Annotated[
+    GraphFormat,
+    typer.Option(
+        "--format", help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx."
+    ),
+]
+Kinds = Annotated[
+    list[str] | None,
+    typer.Option("--kind", metavar="LABEL=KIND", help="What a label means; repeatable."),
+]
+Relations = Annotated[
+    list[str] | None,
+    typer.Option("--relation", metavar="NAME=RELATION", help="What a relation means; repeatable."),
+]
+UnknownAs = Annotated[
+    str,
+    typer.Option(
+        "--unknown-as",
+        metavar="KIND",
+        help="Take labels that nobody knows for this kind ('other': unknown), leave out relations.",
+    ),
+]
+Answers = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--answers",
+        metavar="RELATION",
+        help="The graphs can hold it, though none of them may; repeatable.",
+    ),
+]
+Period = Annotated[
+    str,
+    typer.Option("--period", metavar="TIME", help="From frame to frame, where no time is told."),
+]
+Reimport = Annotated[
+    bool, typer.Option("--force", help="Read anew, and replace, what is in the store already.")
+]
+Rows = Annotated[Format, typer.Option("--rows", help="How rows are printed.")]
+
+
+@app.command("import")
+def import_(
+    store: StorePath,
+    files: Files,
+    form_of_graphs: WrittenIn,
+    kind: Kinds = None,
+    relation: Relations = None,
+    unknown_as: UnknownAs = "",
+    answers: Answers = None,
+    period: Period = "1s",
+    force: Reimport = False,
+    form: Rows = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Bring graphs that other tools made into a store: each becomes a frame."""
+    from sgstore.importing import Words, import_graphs
+    from sgstore.vocabulary import relation_named
+
+    words = Words(_pairs(kind, "--kind"), _pairs(relation, "--relation"), unknown_as)
+    known = [relation_named(name) for name in answers or ()]
+    if None in known:
+        raise typer.BadParameter(
+            f"--answers {(answers or [''])[known.index(None)]}: no such relation"
+        )
+    seconds = seconds_of(period, "--period")
+    if seconds <= 0:
+        raise typer.BadParameter("--period: expected more than 0s")
+    done = import_graphs(
+        store,
+        files,
+        str(form_of_graphs),
+        words=words,
+        relations=[name for name in known if name is not None],
+        period_s=seconds,
+        force=force,
+    )
+    for one in done:
+        if one.error is not None:
+            say(str(one.error))
+        for what, often in sorted(one.lost.items()):
+            say(f"{one.path.name}: {what}: {often} times, cannot be kept")
+    columns = ("file", "status", "trace", "frames", "entities", "edges")
+    rows = ((str(o.path), o.status, o.name, o.frames, o.entities, o.edges) for o in done)
+    write_rows(columns, rows, form_of(form, as_json=as_json))
+    return _code(done)
+
+
+def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
+    pairs: dict[str, str] = {}
+    for text in texts or []:
+        name, equals, value = text.rpartition("=")
+        if not (name and equals and value):
+            raise typer.BadParameter(f"{option} {text!r}: expected NAME=VALUE")
+        if name in pairs:
+            raise typer.BadParameter(f"{option} {text!r}: {name} means {pairs[name]} already")
+        pairs[name] = value
+    return pairs
+
+
+def _code(done: list[Imported]) -> int:
+    if any(one.error is not None for one in done):
+        return ERROR
+    return LOSS if any(one.lost for one in done) else 0

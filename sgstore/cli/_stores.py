@@ -1,0 +1,377 @@
+"""Verbs about stores (verify, remove, rebuild, derive, payload), maps and settings, and the demo.
+
+Verbs about a store as a whole: is it as it was published, take traces out of it, make it anew.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sgstore.cli._options import ERROR, LOSS, AsJson, Output, RowFormat, StorePath, app, form_of
+from sgstore.cli._output import Format, say, write_rows
+from sgstore.errors import ExportError
+from sgstore.files import write_bytes
+
+if TYPE_CHECKING:
+    from sgstore.derive import Derivation
+    from sgstore.roads import RoadMap
+    from sgstore.store import StoreFile
+
+
+@app.command()
+def verify(
+    store: StorePath,
+    payloads: Annotated[
+        bool, typer.Option("--payloads", help="Hash the recordings again, too.")
+    ] = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Look whether everything is as it was published; print what is not."""
+    from sgstore.store import verify_file
+
+    found = verify_file(store, recordings=payloads)
+    rows = [(fault.trace, fault.check, fault.detail) for fault in found.faults]
+    write_rows(("trace", "check", "detail"), rows, form_of(form, as_json=as_json))
+    hashed = f", {found.recordings} recordings" if payloads else ""
+    wrong = f"{len(rows)} faults" if rows else "no fault"
+    if found.others:
+        say(f"{store}: none of sgstore's, so not looked at: {', '.join(found.others)}")
+    say(f"{store}: {found.traces} traces, {found.rows} rows{hashed}: {wrong}")
+    return ERROR if rows else 0
+
+
+@app.command()
+def remove(
+    store: StorePath,
+    traces: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="TRACE…", help="Names, ids, or beginnings of names."),
+    ] = None,
+    compact: Annotated[
+        bool,
+        typer.Option(
+            "--compact", help="Write the store anew, to give the space back; also without a TRACE."
+        ),
+    ] = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Take traces out of a store, all of them or none; the recordings stay where they are."""
+    from sgstore.store import StoreFile
+
+    if not traces and not compact:
+        raise typer.BadParameter("say which traces, or --compact")
+    file = StoreFile(store)
+    if compact:
+        file.refuse_others()
+    gone = file.remove(*traces) if traces else ()
+    if compact:
+        file.compact()
+    rows = [(trace.name, trace.frames, str(trace.path)) for trace in gone]
+    write_rows(("trace", "frames", "file"), rows, form_of(form, as_json=as_json))
+    return 0
+
+
+@app.command()
+def rebuild(
+    store: StorePath,
+    look_in: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--look-in",
+            metavar="FOLDER",
+            help="Where recordings may be that are not where they were; repeatable.",
+        ),
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--leave-out",
+            metavar="TRACE",
+            help="A trace that cannot be made anew: the new store does not have it; repeatable.",
+        ),
+    ] = None,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."
+        ),
+    ] = 1,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> None:
+    """Make a store anew from its recordings, as it was; the old one stays until the new one is whole."""
+    from sgstore.cli._output import ingest_bar
+    from sgstore.rebuild import rebuild as make_anew
+
+    with ingest_bar() as on_progress:
+        made = make_anew(
+            store,
+            look_in=look_in or (),
+            leave_out=leave_out or (),
+            jobs=jobs or os.cpu_count() or 1,
+            on_progress=on_progress,
+        )
+    rows = [(one.trace, one.status, one.frames, str(one.path)) for one in made]
+    write_rows(("trace", "status", "frames", "file"), rows, form_of(form, as_json=as_json))
+
+
+# Verbs about graphs: other relations from the states of a store ---------------------------------
+
+
+@app.command()
+def derive(
+    store: StorePath,
+    name: Annotated[
+        str | None,
+        typer.Option("--as", metavar="NAME", help="Name of the set: USING ABSTRACTION NAME."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="TOML file with settings of the relations.")
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
+    ] = None,
+    abstraction: Annotated[
+        str | None,
+        typer.Option(
+            "--abstraction",
+            metavar="NAME",
+            help="Keep what this makes of the graphs: roadscene2vec.",
+        ),
+    ] = None,
+    trace: Annotated[
+        list[str] | None, typer.Option("--trace", help="Only of this trace; repeatable.")
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a set of this name with other settings.")
+    ] = False,
+    remove: Annotated[
+        str | None, typer.Option("--remove", metavar="NAME", help="Delete a set instead.")
+    ] = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Make another set of relations from the stored states, without the recordings; without --as: list them."""
+    from sgstore.config import Config, load
+    from sgstore.config import preset as preset_named
+    from sgstore.derive import derive as derive_set
+    from sgstore.derive import keep_abstraction
+    from sgstore.store import StoreFile
+
+    if abstraction is not None:
+        if name is not None or remove is not None or config or preset or force:
+            raise typer.BadParameter("--abstraction NAME stands alone, or with --trace")
+        kept = keep_abstraction(store, abstraction, trace or ())
+        return _write(kept, form_of(form, as_json=as_json))
+    if name is None or remove is not None:
+        if name is not None or config or preset or (remove is None and (trace or force)):
+            raise typer.BadParameter("give --as NAME with settings, --remove NAME, or nothing")
+        deriving = StoreFile(store).deriving
+        if remove is not None:
+            say(f"removed {remove} of {', '.join(deriving.remove(remove))}")
+            return 0
+        rows = ((one.name, one.trace, len(one.answers)) for one in deriving.sets())
+        write_rows(("name", "trace", "relations"), rows, form_of(form, as_json=as_json))
+        return 0
+    if config and preset:
+        raise typer.BadParameter("give one of --config and --preset")
+    settings = preset_named(preset) if preset else load(config) if config else Config()
+    done = derive_set(store, settings, name, trace or (), replace_old=force)
+    return _write(done, form_of(form, as_json=as_json))
+
+
+def _write(done: list[Derivation], form: Format) -> int:
+    rows = ((one.trace, one.status, one.frames, one.edges) for one in done)
+    write_rows(("trace", "status", "frames", "edges"), rows, form)
+    for one in done:
+        for loss in one.losses:
+            say(f"{one.trace}: {loss}")
+    return LOSS if any(one.losses for one in done) else 0
+
+
+# Verbs about road maps --------------------------------------------------------------------------
+
+
+@app.command(name="map")
+def map_(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="OpenDRIVE (.xodr), or a recording that carries roads."
+        ),
+    ],
+    picture: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Draw it there, north up: .png or .svg."),
+    ] = None,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Say what is in a road map: lanes by type, junctions, signals, what is wrong with it."""
+    from sgstore.roads import summary
+
+    road_map = _road_map(file)
+    if picture is not None:
+        from sgstore.draw import draw_map
+
+        draw_map(road_map, picture)
+        say(f"drawn: {picture}")
+    form = form_of(form, as_json=as_json)
+    rows = [
+        (one.part, one.kind, one.count, None if one.length is None else round(one.length, 1))
+        for one in summary(road_map)
+    ]
+    if form is Format.table:  # sentences have no room in a table
+        for _, text, _, _ in (row for row in rows if row[0] == "warning"):
+            say(text)
+        rows = [row for row in rows if row[0] != "warning"]
+    columns = ("part", "kind", "count", "length_m")
+    types = ("VARCHAR", "VARCHAR", "BIGINT", "DOUBLE")
+    write_rows(columns, rows, form, types=types)
+    return 0
+
+
+def _road_map(file: Path) -> RoadMap:
+    """The map in a file, or the one that a recording carries."""
+    from sgstore.errors import MapError
+    from sgstore.map_files import read_map_file
+    from sgstore.opendrive import read_map
+    from sgstore.readers import open_trace
+
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(64)
+    except OSError as error:
+        raise MapError(f"{file}: {error.strerror or error}") from error
+    # Texts begin with a bracket, or the mark of their encoding; no recording does.
+    if start.lstrip()[:1] in {b"<", b"{"} or start[:2] in {b"\xff\xfe", b"\xfe\xff", b"\xef\xbb"}:
+        return read_map_file(file)
+    with open_trace(file) as trace:
+        if not trace.info.map_text:
+            raise MapError(f"{file}: the recording carries neither a road map nor lanes")
+        return read_map(trace.info.map_text, trace.info.map_name)
+
+
+# The verb that fetches sensor messages ----------------------------------------------------------
+
+
+@app.command()
+def payload(
+    store: StorePath,
+    frame: Annotated[
+        str, typer.Argument(metavar="FRAME", help="frame_id, TRACE#SEQ or TRACE@12.3s.")
+    ],
+    channel: Annotated[
+        str | None,
+        typer.Argument(metavar="CHANNEL", help="Topic; without it, list those there are."),
+    ] = None,
+    output: Output = None,
+    message: Annotated[
+        bool, typer.Option("--message", help="The message as it was recorded, whatever is in it.")
+    ] = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> int:
+    """Fetch what a sensor said at a frame: a picture, a video up to it, or the message."""
+    from sgstore.store import StoreFile
+
+    file = StoreFile(store)
+    if channel is None:
+        _list_channels(file, frame, form_of(form, as_json=as_json))
+        return 0
+    if output is None and sys.stdout.isatty():
+        raise ExportError(
+            "a payload is not for a terminal: name a file with -o, or redirect stdout"
+        )
+    if message:
+        data, what = file.payload(frame, channel), "message"
+    else:
+        carried = file.carried(frame, channel)
+        data, what = carried.data, carried.form
+        if carried.messages > 1:
+            what += f", {carried.messages} messages from the key frame on"
+    _write_payload(data, output)
+    say(f"{output or 'stdout'}: {len(data)} bytes ({what})")
+    return 0
+
+
+def _list_channels(file: StoreFile, frame: str, form: Format) -> None:
+    with file.snapshot():
+        wanted = file.frame(frame)
+        found = file.rows(
+            "SELECT channel, schema, offset_s, log_time_ns, length FROM payloads"
+            " WHERE frame_id = ? ORDER BY channel",
+            [wanted.frame_id],
+        )
+    write_rows(found.columns, found, form)
+
+
+def _write_payload(data: bytes, output: Path | None) -> None:
+    if output is None:
+        sys.stdout.buffer.write(data)
+    else:
+        write_bytes(output, data)
+
+
+# The verb about settings: print them, with what each means --------------------------------------
+
+
+@app.command()
+def config(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="A TOML file: check it, and print it whole."),
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", metavar="NAME", help="Settings of this preset.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--list", help="List the presets.")] = False,
+    page: Annotated[
+        bool, typer.Option("--page", help="Print the page docs/parameters.md instead.")
+    ] = False,
+    form: RowFormat = Format.table,
+    as_json: AsJson = False,
+) -> None:
+    """Print all settings as commented TOML, to be changed and given to ingest."""
+    from sgstore.config import PRESETS, Config, as_markdown, as_toml, load
+    from sgstore.config import preset as preset_named
+
+    if sum((file is not None, preset is not None, every, page)) > 1:
+        raise typer.BadParameter("give one of FILE, --preset, --list and --page")
+    if every:
+        rows = ((name, one.summary) for name, one in PRESETS.items())
+        write_rows(("preset", "what it is"), rows, form_of(form, as_json=as_json))
+        return
+    if page:
+        typer.echo(as_markdown(PRESETS), nl=False)
+        return
+    settings = preset_named(preset) if preset else load(file) if file else Config()
+    typer.echo(as_toml(settings), nl=False)
+
+
+# The verb for newcomers -------------------------------------------------------------------------
+
+
+@app.command()
+def demo(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Where its store, pictures and clips are put.")
+    ] = Path("sgstore-demo"),
+    recording: Annotated[
+        Path | None,
+        typer.Option("--recording", help="The sample recording, where the package lacks it."),
+    ] = None,
+) -> int:
+    """Do the main job on a bundled recording: ingest, ask, look, export."""
+    from sgstore.demo import RECORDING, run_demo
+
+    run_demo(folder, typer.echo, recording or RECORDING)
+    return 0

@@ -1,0 +1,75 @@
+# The face of this package: what others may import from it.
+
+from ._classes import UNKNOWN as UNKNOWN
+from ._classes import Classed as Classed
+from ._classes import CountedUnit as CountedUnit
+from ._classes import Missing as Missing
+from ._classes import classed as classed
+from ._classes import shared as shared
+from ._compare import classes as classes
+from ._compare import covered as covered
+from ._compare import growth as growth
+from ._compare import novel as novel
+from ._compare import novel_clips as novel_clips
+from ._compare import novel_frames as novel_frames
+from ._compare import rank_sizes as rank_sizes
+from ._compare import venn as venn
+from ._explain import explain as explain
+from ._failures import S3C_THRESHOLD as S3C_THRESHOLD
+from ._failures import Outcomes as Outcomes
+from ._failures import failures as failures
+from ._features import Combinations as Combinations
+from ._features import Combos as Combos
+from ._features import combined as combined
+from ._features import combos as combos
+from ._features import features as features
+from ._frames import ChosenFrames as ChosenFrames
+from ._frames import ReportTable as ReportTable
+from ._frames import frames_of as frames_of
+from ._frames import is_of_ego as is_of_ego
+from ._frames import names_of as names_of
+from ._frames import of_unknown as of_unknown
+from ._frames import periods_of as periods_of
+from ._frames import run_begins as run_begins
+from ._frames import selection_of as selection_of
+from ._slots import read_specifications as read_specifications
+from ._slots import slot_coverage as slot_coverage
+from ._slots import specification as specification
+
+__all__ = [
+    "ChosenFrames",
+    "Classed",
+    "Combinations",
+    "Combos",
+    "CountedUnit",
+    "Missing",
+    "Outcomes",
+    "ReportTable",
+    "S3C_THRESHOLD",
+    "UNKNOWN",
+    "classed",
+    "classes",
+    "combined",
+    "combos",
+    "covered",
+    "explain",
+    "failures",
+    "features",
+    "frames_of",
+    "growth",
+    "is_of_ego",
+    "names_of",
+    "novel",
+    "novel_clips",
+    "novel_frames",
+    "of_unknown",
+    "periods_of",
+    "rank_sizes",
+    "read_specifications",
+    "run_begins",
+    "selection_of",
+    "shared",
+    "slot_coverage",
+    "specification",
+    "venn",
+]

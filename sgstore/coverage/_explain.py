@@ -1,0 +1,229 @@
+"""What tells frames of one selection from those of another: features that differ, and a tree of questions.
+
+S3C asked so what failing test inputs have that training inputs have not. (Woodlief et al., ICSE 2024, RQ2.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.coverage._classes import shared
+from sgstore.coverage._features import features, over, weighted
+from sgstore.coverage._frames import ReportTable, of_unknown, query_of_features
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.coverage._classes import Classed
+    from sgstore.coverage._features import Feature
+    from sgstore.world import Bools, Floats
+
+
+DEPTH: Final = 4
+"""Questions, one after another, in the tree."""
+
+SMALLEST: Final = 5
+"""Least weight of a side of a question: of classes, or of frames."""
+
+_THRESHOLDS: Final = (0, 1, 2, 3)
+"""How often a feature must occur at least, less one, for the answer yes."""
+
+
+@dataclass(frozen=True, slots=True)
+class TreeQuestion:
+    """A question of a tree, whether a feature occurs more often than so; and the answer."""
+
+    feature: Feature
+    more_than: int
+    answer: bool
+
+    def __str__(self) -> str:
+        text = " ".join(self.feature)
+        if self.more_than == 0:
+            return text if self.answer else f"no {text}"
+        return f"{text} {'>' if self.answer else '<='} {self.more_than}"
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """Where questions lead: how much of both selections comes here."""
+
+    questions: tuple[TreeQuestion, ...]
+    ours: float
+    theirs: float
+
+
+def tree(
+    counts: NDArray[np.integer[Any]],
+    names: tuple[Feature, ...],
+    ours: Bools,
+    weight: Floats,
+    depth: int = DEPTH,
+) -> list[Leaf]:
+    """A decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
+
+    Parameters
+    ----------
+    counts : (C, F) int
+        How often each feature occurs in each case.
+    names : tuple of Feature
+    ours : (C,) bool
+    weight : (C,) float64
+    depth : int
+
+    Returns
+    -------
+    list of Leaf
+        Those with the most of ours for what they have of theirs first.
+    """
+    leaves: list[Leaf] = []
+    _grow(counts, names, ours, weight, depth, (), leaves)
+    leaves.sort(key=lambda leaf: (-leaf.ours / max(leaf.ours + leaf.theirs, 1e-12), -leaf.ours))
+    return leaves
+
+
+def _grow(
+    counts: NDArray[np.integer[Any]],
+    names: tuple[Feature, ...],
+    ours: Bools,
+    weight: Floats,
+    depth: int,
+    asked: tuple[TreeQuestion, ...],
+    leaves: list[Leaf],
+) -> None:
+    best = _best(counts, ours, weight) if depth else None
+    if best is None:
+        leaves.append(Leaf(asked, float(weight[ours].sum()), float(weight[~ours].sum())))
+        return
+    feature, more_than = best
+    yes = counts[:, feature] > more_than
+    for answer in (True, False):
+        side = yes if answer else ~yes
+        question = TreeQuestion(names[feature], more_than, answer)
+        _grow(
+            counts[side],
+            names,
+            ours[side],
+            weight[side],
+            depth - 1,
+            (*asked, question),
+            leaves,
+        )
+
+
+def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
+    """The question that makes both sides purest; ``None`` if none makes them purer."""
+    good = np.where(ours, weight, 0.0)
+    total, positive = float(weight.sum()), float(good.sum())
+    if min(positive, total - positive) < 1e-9:
+        return None
+    before = _impurity(np.array([positive]), np.array([total]))[0]
+    best: tuple[float, int, int] = (1e-9 * total, -1, 0)
+    most = counts.max(axis=0, initial=0)
+    for more_than in _THRESHOLDS:
+        columns = np.flatnonzero(most > more_than)
+        if not len(columns):
+            break
+        all_yes, good_yes = np.zeros((2, counts.shape[1]))
+        own = counts if len(columns) == counts.shape[1] else counts[:, columns]
+        all_yes[columns], good_yes[columns] = weighted(own, np.stack([weight, good]), more_than)
+        gain = (
+            before - _impurity(good_yes, all_yes) - _impurity(positive - good_yes, total - all_yes)
+        )
+        gain[np.minimum(all_yes, total - all_yes) < SMALLEST] = -np.inf
+        feature = int(np.argmax(gain)) if len(gain) else -1
+        if feature >= 0 and gain[feature] > best[0]:
+            best = (float(gain[feature]), feature, more_than)
+    return None if best[1] < 0 else best[1:]
+
+
+def _impurity(positive: Floats, total: Floats) -> Floats:
+    """Gini's impurity times the weight."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(total > 0, positive / total, 0.0)
+    return 2 * share * (1 - share) * total
+
+
+def explain(
+    b: Classed,
+    a: Classed,
+    abstraction: str,
+    *,
+    by_frame: bool = False,
+    depth: int = DEPTH,
+) -> tuple[ReportTable, ReportTable]:
+    """What tells ``b`` from ``a``: classes count once each, or as often as they have frames.
+
+    Parameters
+    ----------
+    b, a : Classed
+        A frame of the same store that is in both counts for ``b`` only.
+    abstraction : str
+        That of their classes.
+    by_frame : bool
+    depth : int
+        Questions, one after another.
+
+    Returns
+    -------
+    differing : ReportTable
+        ``feature``, ``share_of_b``, ``share_of_a``, ``difference``, and the ``query`` that finds it; the
+        largest difference first.
+    leaves : ReportTable
+        ``questions``, ``of_b``, ``of_a``, ``share_of_b`` among what comes there.
+    """
+    a, twice = _without(a, b)
+    _, (b, a) = shared(b, a)
+    of_b, of_a = features(b, abstraction), features(a, abstraction)
+    names = tuple(sorted({*of_b.names, *of_a.names}))
+    of_b, of_a = over(of_b, names), over(of_a, names)
+    weights = [
+        of.frames.astype(np.float64) if by_frame else np.ones(len(of.codes)) for of in (of_b, of_a)
+    ]
+    shares = [
+        weighted(of.counts, weight[None])[0] / max(float(weight.sum()), 1e-12)
+        for weight, of in zip(weights, (of_b, of_a), strict=True)
+    ]
+    order = np.argsort(-np.abs(shares[0] - shares[1]), kind="stable")
+    rows: list[tuple[Any, ...]] = [
+        (
+            " ".join(names[i]),
+            float(shares[0][i]),
+            float(shares[1][i]),
+            float(shares[0][i] - shares[1][i]),
+            query_of_features([names[i]]),
+        )
+        for i in order.tolist()
+    ]
+    unit = "frames with a class" if by_frame else "distinct classes"
+    said = [f"B: {unit} of {b.chosen.text}", f"A: {unit} of {a.chosen.text}"]
+    said += [f"{twice} frames of both count for B only"] if twice else []
+    said += of_unknown(b.unknown, b.chosen.text) + of_unknown(a.unknown, a.chosen.text)
+    counts = np.concatenate([of_b.counts, of_a.counts])
+    ours: NDArray[np.bool_] = np.arange(len(counts)) < len(of_b.codes)
+    grown = tree(counts, names, ours, np.concatenate(weights), depth)
+    leaves = [
+        (
+            " and ".join(map(str, leaf.questions)) or "(all)",
+            leaf.ours,
+            leaf.theirs,
+            leaf.ours / (leaf.ours + leaf.theirs) if leaf.ours + leaf.theirs else None,
+        )
+        for leaf in grown
+    ]
+    return (
+        ReportTable(("feature", "share_of_b", "share_of_a", "difference", "query"), rows, said),
+        ReportTable(("questions", "of_b", "of_a", "share_of_b"), leaves),
+    )
+
+
+def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
+    """``a`` without the frames that ``b`` has, too; and how many these are."""
+    if a.chosen.store.file.path.resolve() != b.chosen.store.file.path.resolve():
+        return a, 0
+    rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))
+    kept = replace(a, frame_id=a.frame_id[rows], code=a.code[rows])
+    return kept, len(a.frame_id) - len(rows)

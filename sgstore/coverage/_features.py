@@ -1,0 +1,313 @@
+"""What frames are made of in an abstraction: features, such as (car, near, ego), and k of them together.
+
+Equal classes have equal features, so one frame of each class is looked at, however many there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain, combinations
+from math import comb
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.coverage._frames import (
+    SHARES,
+    ReportTable,
+    is_of_ego,
+    of_unknown,
+    query_of_features,
+    share,
+)
+from sgstore.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.coverage._classes import Classed
+    from sgstore.world import Bools, Floats, Ints
+
+
+Feature = tuple[str, ...]
+"""Labels of an edge's source, of itself and of its destination; or of a node, in abstractions without edges."""
+
+MOST: Final = 5_000_000
+"""Most combinations that are gone through: more are an error, not a part of the answer."""
+
+LARGEST: Final = 4_000_000_000
+"""Most bytes that features of classes may take."""
+
+_ROWS: Final = 8_192
+"""Classes that are multiplied at once."""
+
+
+@dataclass(frozen=True)
+class ClassFeatures:
+    """Features of classes.
+
+    Attributes
+    ----------
+    names : tuple of Feature
+        In alphabetical order.
+    codes : (C,) int64
+        The classes, ascending.
+    counts : (C, F) unsigned
+        How often each class has each feature.
+    frames : (C,) int64
+        How many frames each class has.
+    """
+
+    names: tuple[Feature, ...]
+    codes: Ints
+    counts: NDArray[np.unsignedinteger[Any]]
+    frames: Ints
+
+    @property
+    def there(self) -> Bools:
+        """(C, F): whether a class has a feature."""
+        return self.counts > 0
+
+
+def features(a: Classed, abstraction: str) -> ClassFeatures:
+    """The features of the classes of a selection; ``a`` has classes of this very abstraction.
+
+    Raises
+    ------
+    ConfigError
+        There are more than can be held.
+    """
+    codes, first = a.present(), a.first()
+    order = np.argsort(first[codes], kind="stable")
+    number: dict[Feature, int] = {}
+    parts: list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
+    read = a.chosen.store.file.abstracted.features(abstraction, first[codes[order]])
+    for row, some in read:
+        own = np.array([number.setdefault(name, len(number)) for name in some.names] or [0])
+        rows, columns = order[row[some.frame]].astype(np.int32), own[some.feature].astype(np.int32)
+        parts.append((rows, columns, some.often.astype(np.int32)))
+    edges = any(len(name) == 3 for name in number)
+    known = {name for name in number if len(name) == 3 or not edges}
+    names = tuple(sorted(known))
+    place = {name: i for i, name in enumerate(names)}
+    at = np.array([place.get(name, -1) for name in number] or [-1])
+    most = max((int(often.max(initial=0)) for *_, often in parts), default=0)
+    counts = zeros((len(codes), len(names)), np.min_scalar_type(most))
+    for rows, columns, often in parts:
+        column = at[columns]
+        kept = np.flatnonzero(column >= 0)
+        counts[rows[kept], column[kept]] = often[kept]
+    return ClassFeatures(names, codes, counts, a.sizes()[codes])
+
+
+def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedinteger[Any]]:
+    """Room for features of classes.
+
+    Raises
+    ------
+    ConfigError
+        There is too little.
+    """
+    if shape[0] * shape[1] * kind.itemsize > LARGEST:
+        raise ConfigError(
+            f"{shape[1]:,} features in {shape[0]:,} classes would take more than {LARGEST:,} bytes: ask of"
+            " fewer frames, or for an abstraction with fewer labels"
+        )
+    return np.zeros(shape, kind)
+
+
+def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
+    """(K, F): the weights, (K, C), of the classes that have each feature more often than so, together."""
+    total = np.zeros((len(weights), counts.shape[1]))
+    # Whole numbers are exact in 32 bits below 2²⁴.
+    small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
+    kind = np.float32 if small else np.float64
+    for first in range(0, len(counts), _ROWS):
+        there = (counts[first : first + _ROWS] > more_than).astype(kind)
+        total += weights[:, first : first + _ROWS].astype(kind) @ there
+    return total
+
+
+@dataclass(frozen=True)
+class Combinations:
+    """Which combinations of k features occur.
+
+    Attributes
+    ----------
+    features : ClassFeatures
+    k : int
+    members : (M, k) int64
+        All combinations: indices of features, ascending.
+    frames : (M,) int64
+        Frames in which each occurs.
+    """
+
+    features: ClassFeatures
+    k: int
+    members: Ints
+    frames: Ints
+
+    def texts(self, rows: Sequence[int] | Ints) -> list[str]:
+        """Combinations for people."""
+        names = [" ".join(name) for name in self.features.names]
+        return [" & ".join(names[i] for i in one) for one in self.members[rows].tolist()]
+
+
+def combined(found: ClassFeatures, k: int) -> Combinations:
+    """All combinations of k features, and in how many frames each occurs.
+
+    Raises
+    ------
+    ConfigError
+        k is not positive, or there are more combinations than can be gone through.
+    """
+    many = len(found.names)
+    if k < 1 or comb(many, k) > MOST:
+        raise ConfigError(
+            f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
+            " ask for a smaller k, or for an abstraction with fewer labels"
+        )
+    listed = chain.from_iterable(combinations(range(many), k))
+    members = np.fromiter(listed, np.int64, comb(many, k) * k).reshape(-1, k)
+    if k == 2:
+        frames = _together(found)[members[:, 0], members[:, 1]]
+    else:
+        frames = np.fromiter(_counted(found, members), np.int64, len(members))
+    return Combinations(found, k, members, frames)
+
+
+def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
+    """Frames of combinations, one after another; bits of eight classes a byte."""
+    packed = np.packbits(found.there, axis=0).T.copy()
+    for row in members.tolist():
+        both = np.bitwise_and.reduce(packed[row], axis=0)
+        classes = np.flatnonzero(np.unpackbits(both, count=len(found.codes)))
+        yield int(found.frames[classes].sum())
+
+
+@dataclass(frozen=True)
+class Combos:
+    """How many combinations a selection has, and which ones it lacks.
+
+    Attributes
+    ----------
+    shares : ReportTable
+    found : Combinations
+        Of the selection, over the features of both.
+    gaps : int64
+        Those of all combinations that are missing, the most frequent in the reference first.
+    reference : ClassFeatures or None
+        Of the reference, over the features of both.
+    there : int64 or None
+        In how many frames of the reference each combination occurs.
+    """
+
+    shares: ReportTable
+    found: Combinations
+    gaps: Ints
+    reference: ClassFeatures | None
+    there: Ints | None
+
+    @property
+    def missing(self) -> ReportTable:
+        """``combination``, ``frames_in_reference`` (``None`` without one), ``query``: what would find it."""
+        names, members = self.found.features.names, self.found.members[self.gaps]
+        often = [None] * len(members) if self.there is None else self.there[self.gaps].tolist()
+        queries = [query_of_features([names[i] for i in one]) for one in members.tolist()]
+        rows = zip(self.found.texts(self.gaps), often, queries, strict=True)
+        return ReportTable(("combination", "frames_in_reference", "query"), list(rows))
+
+    def covered(self) -> ReportTable:
+        """The combinations that occur, the most frequent first: ``combination``, ``frames``."""
+        found = self.found
+        rows = np.flatnonzero(found.frames)
+        rows = rows[np.argsort(-found.frames[rows], kind="stable")]
+        listed = zip(found.texts(rows), found.frames[rows].tolist(), strict=True)
+        return ReportTable(("combination", "frames"), list(listed))
+
+    def matrix(self) -> tuple[list[str], Ints, Bools]:
+        """Pairs of features, whatever k: names, frames with both (F, F), and which pairs should be (F, F)."""
+        own = self.found.features
+        frames = _together(own)
+        wanted = np.ones(frames.shape, np.bool_)
+        if self.reference is not None:
+            wanted = _together(self.reference) > 0
+        return [" ".join(name) for name in own.names], frames, wanted
+
+
+def combos(
+    a: Classed,
+    abstraction: str,
+    k: int,
+    reference: Classed | None = None,
+    *,
+    of_ego: bool = False,
+) -> Combos:
+    """How many combinations of k features a selection has, and which ones it lacks.
+
+    Parameters
+    ----------
+    a : Classed
+    abstraction : str
+    k : int
+    reference : Classed, optional
+        What it is measured by: combinations that occur there. By default all combinations of features of ``a``.
+    of_ego : bool
+        Whether only features count that speak of the ego, or of a lane by how it lies to the ego.
+
+    Raises
+    ------
+    ConfigError
+        There are more combinations than can be gone through.
+    """
+    own = features(a, abstraction)
+    other = None if reference is None else features(reference, abstraction)
+    names = tuple(sorted({*own.names, *(other.names if other else ())}))
+    if of_ego:
+        names = tuple(name for name in names if is_of_ego(name))
+    other = None if other is None else over(other, names)
+    found = combined(over(own, names), k)
+    name, kinds = (
+        a.chosen.text,
+        f"combinations of {k} of the {len(names)} features{' of the ego' if of_ego else ''}",
+    )
+    if other is None or reference is None:
+        wanted, there = np.ones(len(found.frames), np.bool_), None
+        denominator = f"all {kinds} of {name}, whether they can be or not (product)"
+    else:
+        theirs = combined(other, k)
+        there = theirs.frames
+        wanted = there > 0
+        denominator = f"{kinds} that occur in {reference.chosen.text} (observed)"
+    covered = (found.frames > 0) & wanted
+    shares = ReportTable(
+        SHARES,
+        [share(f"{k}-way combinations", int(covered.sum()), int(wanted.sum()), denominator)],
+        of_unknown(a.unknown, name),
+    )
+    gaps = np.flatnonzero(wanted & (found.frames == 0))
+    if there is not None:
+        gaps = gaps[np.argsort(-there[gaps], kind="stable")]
+    return Combos(shares, found, gaps, other, there)
+
+
+def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
+    """The same over other features."""
+    place = {name: i for i, name in enumerate(names)}
+    counts = zeros((len(own.codes), len(names)), own.counts.dtype)
+    for column, name in enumerate(own.names):
+        if name in place:
+            counts[:, place[name]] = own.counts[:, column]
+    return ClassFeatures(names, own.codes, counts, own.frames)
+
+
+def _together(found: ClassFeatures) -> Ints:
+    """(F, F): frames in which two features occur."""
+    total = np.zeros((len(found.names), len(found.names)))
+    kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # whole numbers, exact
+    for first in range(0, len(found.codes), _ROWS):
+        there = (found.counts[first : first + _ROWS] > 0).astype(kind)
+        total += (there * found.frames[first : first + _ROWS, None].astype(kind)).T @ there
+    return total.astype(np.int64)

@@ -1,0 +1,269 @@
+"""Selections of frames to measure, missing values as queries, and result tables.
+
+Features and values of slots as queries: what is missing is asked for by text that a person can run.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import StoreError
+from sgstore.lang import node_of_kind
+from sgstore.locks import ENDING as LOCK
+from sgstore.locks import frames_of_lock, read_lock, store_beside
+from sgstore.query import Store
+from sgstore.store import begins, seq_of, trace_of
+from sgstore.vocabulary import KINDS
+from sgstore.world import longest_step_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sgstore.world import Bools, Floats, Ints
+
+
+_EGOS: Final = ("ego", "ego_car")
+_ROLE: Final = re.compile(r"Ego Lane|(Left|Right) \d+ of Ego Lane|Opposing Lane \d+")
+_PARTS: Final = {
+    "Lane": ":Lane",
+    "Off Road": ":OffRoad",
+    "Road": ":Road",
+    "Root Road": ":Road",
+    "Junction": ":Junction",
+}
+
+
+def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
+    """A query that finds the frames with all of some features; ``None`` if one of them cannot be asked for.
+
+    Parameters
+    ----------
+    features : sequence
+        Labels of an edge's source, of itself and of its destination; or of a node.
+    """
+    patterns = [_pattern(feature) for feature in features]
+    known = [pattern for pattern in patterns if pattern is not None]
+    if len(known) < len(patterns):
+        return None
+    rest = " AND ".join(f"EXISTS {{{pattern}}}" for pattern in known[1:])
+    return f"MATCH {known[0]}{' WHERE ' if rest else ''}{rest} RETURN FRAMES"
+
+
+def is_of_ego(feature: Sequence[str]) -> bool:
+    """Whether a feature speaks of the ego, or of a lane by how it lies to the ego."""
+    return any(label in _EGOS or _ROLE.fullmatch(label) for label in feature[::2])
+
+
+def _pattern(feature: Sequence[str]) -> str | None:
+    nodes = [_node(label) for label in feature[::2]]
+    if any(node is None for node in nodes):
+        return None
+    return f"{nodes[0]}-[:{feature[1]}]->{nodes[1]}" if len(feature) > 1 else nodes[0]
+
+
+def _node(label: str) -> str | None:
+    """A node of a label of an abstraction, as a pattern."""
+    if label in _EGOS:
+        return "(:Ego)"
+    if label in _PARTS:
+        return f"({_PARTS[label]})"
+    if _ROLE.fullmatch(label):
+        return f"(:Lane {{role: '{label}'}})"
+    if label in KINDS:
+        return node_of_kind(label)
+    return None
+
+
+_PATTERN: Final = re.compile(r"\s*MATCH\b(?P<body>.*)", re.IGNORECASE | re.DOTALL)
+_BEYOND: Final = re.compile(
+    r"\b(RETURN|ORDER\s+BY|LIMIT|SAMPLE|THEN|UNTIL|FOR|CHECK|USING|DEFINE)\b|;|(?<!<)--(?!\(|>\s*\()|/\*",
+    re.IGNORECASE,
+)
+_TEXT: Final = re.compile(r"'(?:[^'\\]|\\.|'')*'")
+
+
+def block_of(pattern: str) -> str | None:
+    """A pattern, ``MATCH … WHERE …``, as the inside of ``EXISTS {…}``; ``None`` if it is more than that."""
+    found = _PATTERN.fullmatch(pattern)
+    if found is None or _BEYOND.search(_TEXT.sub("''", found["body"])):
+        return None
+    return found["body"].strip()
+
+
+def query_of_blocks(there: Sequence[str], absent: Sequence[str]) -> str:
+    """A query for the frames in which some blocks can be found and others cannot."""
+    parts = [f"EXISTS {{{block}}}" for block in there]
+    parts += [f"NOT EXISTS {{{block}}}" for block in absent]
+    where = f" WHERE {' AND '.join(parts)}" if parts else ""
+    return f"MATCH (){where} RETURN FRAMES"
+
+
+# What the verbs of coverage answer with: a table, and sentences that say what its numbers are of ----
+
+Row = tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """Rows with the names of their columns.
+
+    Attributes
+    ----------
+    columns : tuple of str
+    rows : list of tuple
+    said : list of str
+        What a person must know to read them.
+    """
+
+    columns: tuple[str, ...]
+    rows: list[Row]
+    said: list[str] = field(default_factory=list[str])
+
+    def without(self, *names: str) -> ReportTable:
+        """The same without some columns."""
+        kept = [place for place, name in enumerate(self.columns) if name not in names]
+        rows = [tuple(row[place] for place in kept) for row in self.rows]
+        return ReportTable(tuple(self.columns[place] for place in kept), rows, self.said)
+
+    def column(self, name: str) -> list[Any]:
+        """The values of a column."""
+        place = self.columns.index(name)
+        return [row[place] for row in self.rows]
+
+    def dicts(self) -> list[dict[str, Any]]:
+        """The rows, each as a dict from column to value."""
+        return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
+
+
+SHARES = ("measure", "part", "of", "share", "denominator")
+"""Columns of a table of shares: the share, and what it is a share of."""
+
+
+def share(measure: str, part: float, of: float, denominator: str) -> Row:
+    """A row of such a table; no share of nothing."""
+    return measure, part, of, part / of if of else None, denominator
+
+
+def of_unknown(unknown: int, text: str) -> list[str]:
+    """The sentence about frames that have no class, if there are any."""
+    if not unknown:
+        return []
+    return [
+        f"{unknown} frames of {text} are too symmetric for a class to be told; they count nowhere"
+    ]
+
+
+# Which frames coverage is of: a store, or what a query finds in it ------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenFrames:
+    """Frames of a store.
+
+    Attributes
+    ----------
+    text : str
+        What they were called.
+    store : Store
+    frame_id : int64 or None
+        Ascending; ``None``: all.
+    reasons : mapping of str to str
+        Why traces are left out that cannot answer the query, by name.
+    """
+
+    text: str
+    store: Store
+    frame_id: Ints | None = None
+    reasons: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Traces that cannot answer the query."""
+        return tuple(self.reasons)
+
+    def rows_of(self, frame_id: Ints) -> Ints:
+        """Which of frames, by ascending id, are chosen: their rows."""
+        if self.frame_id is None:
+            return np.arange(len(frame_id))
+        at = np.searchsorted(frame_id, self.frame_id)
+        known = at < len(frame_id)
+        known[known] = frame_id[at[known]] == self.frame_id[known]
+        return at[known].astype(np.int64)
+
+
+def selection_of(text: str, *, max_spill: int = 0) -> ChosenFrames:
+    """The frames that a text means: a store, those of it in which a query holds, or those of a lock.
+
+    Parameters
+    ----------
+    text : str
+        ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A
+        lock is a file that is called ``….lock``.
+    max_spill : int
+        As of :class:`sgstore.query.Store`; bytes.
+
+    Raises
+    ------
+    StoreError
+        There is no such store, the lock cannot be read, or the store lacks what it names.
+    QueryError
+        The query is none.
+    """
+    whole = Path(text)
+    if whole.suffix == LOCK and whole.is_file():
+        lock = read_lock(whole)
+        store = Store(store_beside(whole, lock), max_spill=max_spill)
+        return ChosenFrames(text, store, frames_of_lock(lock, store))
+    if whole.exists():
+        return ChosenFrames(text, Store(whole, max_spill=max_spill))
+    for colon in re.finditer(":", text):
+        path, query = Path(text[: colon.start()]), text[colon.end() :]
+        if path.is_file():
+            store = Store(path, max_spill=max_spill)
+            if Path(query).suffix == LOCK and Path(query).is_file():
+                return ChosenFrames(text, store, frames_of_lock(read_lock(Path(query)), store))
+            found = frames_of(store, query)
+            return ChosenFrames(text, store, found, store.find(query).reasons)
+    raise StoreError(
+        f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)', nor a"
+        " lock"
+    )
+
+
+def frames_of(store: Store, query: str, /, **parameters: object) -> Ints:
+    """Ids of the frames in which a query holds, ascending. ``**parameters``: values of ``$name`` in it."""
+    if block_of(query) is not None:  # in columns
+        found = store.find(f"{query} RETURN FRAMES", **parameters).numpy()["frame_id"]
+        return np.unique(found.astype(np.int64))
+    rows = (frame.frame_id for frame in store.find(query, **parameters).frames())
+    return np.unique(np.fromiter(rows, np.int64))
+
+
+def periods_of(store: Store, frame_id: Ints) -> Floats:
+    """(N,): the median period of the trace of each frame; ns."""
+    periods = {one.trace_id: one.period_ns for one in store.info()}
+    traces, number = np.unique(trace_of(frame_id), return_inverse=True)
+    return np.array([periods.get(one, 0) for one in traces.tolist()], np.float64)[number]
+
+
+def run_begins(store: Store, frame_id: Ints, time_ns: Ints) -> Bools:
+    """(N,): which frames begin a run: the first of a trace, and the first where some are missing before it."""
+    step = np.diff(time_ns, prepend=time_ns[:1])
+    periods, place = np.unique(periods_of(store, frame_id), return_inverse=True)
+    longest = np.array([longest_step_ns(int(period)) for period in periods.tolist()])
+    return begins(frame_id) | (step > longest[place]) | (step < 0)
+
+
+def names_of(store: Store, frame_id: Sequence[int] | Ints) -> list[str]:
+    """Frames as every command takes them: ``TRACE#SEQ``."""
+    traces = {trace.trace_id: trace.name for trace in store.info()}
+    ids = np.asarray(frame_id, np.int64)
+    return [
+        f"{traces.get(trace, trace)}#{seq}"
+        for trace, seq in zip(trace_of(ids).tolist(), seq_of(ids).tolist(), strict=True)
+    ]

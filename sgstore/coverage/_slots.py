@@ -1,0 +1,480 @@
+"""Coverage over declared slots: parameters of a scene, their values by patterns, and combinations of them.
+
+A file says it, in TOML::
+
+    name = "a truck ahead in the ego's lane"       # optional, as is where: only frames in which this holds
+    count where = "MATCH (:Ego)"
+
+    [[slot]]
+    name = "near"
+    values = { front = "MATCH (t:Truck)-[:near]->(:Ego), (t)-[:inDFrontOf]->(:Ego)", side = "MATCH …" }
+
+    [[impossible]]                                 # combinations that cannot be, and do not count
+    near = "none"
+
+A slot has a value in a frame where its pattern holds, several if several hold, and ``none`` if none does; a
+frame with several has each combination of them. Or a file has several such, each a ``[[specification]]``.
+
+Or a specification is a query: each combination of what it returns is a cell.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+from itertools import combinations, product
+from math import comb, prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.coverage._frames import (
+    SHARES,
+    ReportTable,
+    Row,
+    block_of,
+    frames_of,
+    query_of_blocks,
+    selection_of,
+    share,
+)
+from sgstore.errors import ConfigError, QueryError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from sgstore.coverage._frames import ChosenFrames
+    from sgstore.world import Bools, Ints
+
+
+_FRAME: Final = ("frame_id", "trace", "seq", "time_ns", "t")
+_RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
+
+
+def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
+    """What a query returns, each combination once: its columns, and in how many frames each is.
+
+    Raises
+    ------
+    QueryError
+        The query is none, or returns no values.
+    """
+    store = chosen.store
+    matches = store.find(query)
+    if matches.columns[: len(_FRAME)] != _FRAME:
+        matches = store.find(f"{query.rstrip().rstrip(';')}, FRAMES")
+    columns = matches.columns[len(_FRAME) :]
+    if not columns or not _RETURN.search(query):
+        raise QueryError(
+            "a specification returns values, each combination of which is a cell",
+            text=query,
+            hint="such as: MATCH (v:Vehicle)-[d:near|visible]->(:Ego) RETURN v.kind, type(d)",
+        )
+    wanted = None if chosen.frame_id is None else set(chosen.frame_id.tolist())
+    frames: dict[tuple[Any, ...], set[int]] = {}
+    for row in matches:
+        if wanted is None or row[0] in wanted:
+            frames.setdefault(row[len(_FRAME) :], set()).add(row[0])
+    return columns, {cell: len(of) for cell, of in sorted(frames.items(), key=lambda i: repr(i[0]))}
+
+
+def specification(
+    chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
+) -> tuple[ReportTable, ReportTable, ReportTable]:
+    """How many of the cells of a specification occur, which ones do, and which ones are missing.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    query : str
+        ``MATCH … RETURN a, b``.
+    declared : int
+        How many cells there are; 0: it is not said.
+    reference : str or ChosenFrames
+        A selection of frames whose cells are those that there are; empty: each value of a column with each of
+        the others.
+
+    Returns
+    -------
+    shares, covered, missing : Table
+        Nothing is listed as missing of cells whose number only is declared.
+
+    Raises
+    ------
+    QueryError
+        The query is none, or returns no values.
+    """
+    columns, found = cells(chosen, query)
+    if declared:
+        missing: list[tuple[Any, ...]] = []
+        of, denominator = declared, "cells, as declared"
+    elif reference:
+        other = selection_of(reference) if isinstance(reference, str) else reference
+        there = cells(other, query)[1]
+        missing = [cell for cell in there if cell not in found]
+        of, denominator = len(there), f"cells that occur in {other.text} (observed)"
+        found = {cell: often for cell, often in found.items() if cell in there}
+    else:
+        values = [list(dict.fromkeys(column)) for column in zip(*found, strict=True)]
+        of = int(np.prod([len(column) for column in values])) if values else 0
+        missing = _product(values, found) if of <= _LISTED else []
+        denominator = f"combinations of the values that occur in {chosen.text} (product)"
+    shares = ReportTable(
+        SHARES, [share("cells", len(found), of, denominator)], [f"frames of {chosen.text}"]
+    )
+    rows = [(*cell, often) for cell, often in found.items()]
+    return shares, ReportTable((*columns, "frames"), rows), ReportTable(columns, missing)
+
+
+_LISTED: Final = 1_000_000
+
+
+def _product(values: list[list[Any]], found: dict[tuple[Any, ...], int]) -> list[tuple[Any, ...]]:
+    from itertools import product
+
+    return [cell for cell in product(*values) if cell not in found]
+
+
+# Declared slots ----------------------------------------------------------------------------------
+
+Bits = NDArray[np.uint8]
+"""Truth values of frames, eight a byte."""
+
+NONE: Final = "none"
+"""Value of a slot in a frame in which none of its patterns holds."""
+
+MOST: Final = 2_000_000
+"""Most combinations that are gone through: more are an error, not a part of the answer."""
+
+_MAX_FILE: Final = 8 << 20
+_MAX_SLOTS: Final = 200
+_MAX_VALUES: Final = 1_000
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A parameter of a scene.
+
+    Attributes
+    ----------
+    name : str
+    values : mapping
+        Value → pattern; ``none`` is not among them.
+    """
+
+    name: str
+    values: Mapping[str, str]
+
+    @property
+    def domain(self) -> tuple[str, ...]:
+        """All its values, ``none`` first."""
+        return (NONE, *self.values)
+
+    def block(self, value: str) -> tuple[list[str], list[str]]:
+        """What must be found, and what must not, where it has a value."""
+        blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
+        return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
+
+
+@dataclass(frozen=True)
+class Specification:
+    """Slots, and which frames and combinations of them count.
+
+    Attributes
+    ----------
+    name : str
+    where : str
+        A pattern; empty: all frames.
+    slots : tuple of Slot
+    impossible : tuple of mapping
+        Slot → value: combinations that contain one of these do not count.
+    """
+
+    name: str
+    where: str
+    slots: tuple[Slot, ...]
+    impossible: tuple[Mapping[str, str], ...]
+
+
+def read_specifications(path: str | Path) -> list[Specification]:
+    """The specifications in a file.
+
+    Raises
+    ------
+    ConfigError
+        It is no TOML, or something in it is not what it must be.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_FILE:
+            raise ConfigError(f"{path}: larger than {_MAX_FILE >> 20} MiB")
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: no TOML: {error}") from error
+    several = document.pop("specification", None)
+    if several is None:
+        return [_specification(path, document, path.stem)]
+    if document or not isinstance(several, list) or not several:
+        raise ConfigError(f"{path}: expected tables [[specification]] and nothing beside them")
+    return [_specification(path, one, f"{path.stem} {i}") for i, one in enumerate(several, start=1)]
+
+
+def _specification(path: Path, given: Any, name: str) -> Specification:
+    known = {"name", "where", "slot", "impossible"}
+    if not isinstance(given, dict) or given.keys() - known:
+        odd = ", ".join(sorted(given.keys() - known)) if isinstance(given, dict) else str(given)
+        raise ConfigError(f"{path}: {odd}: expected {', '.join(sorted(known))}")
+    slots = given.get("slot")
+    if not isinstance(slots, list) or not 0 < len(slots) <= _MAX_SLOTS:
+        raise ConfigError(f"{path}: expected 1 to {_MAX_SLOTS} tables [[slot]]")
+    where = given.get("where", "")
+    if not isinstance(where, str) or (where and block_of(where) is None):
+        raise ConfigError(f"{path}: where: {_EXPECTED}, found {str(where)[:80]!r}")
+    made = tuple(_slot(path, slot) for slot in slots)
+    if len({slot.name for slot in made}) < len(made):
+        raise ConfigError(f"{path}: two slots have the same name")
+    impossible = given.get("impossible", [])
+    domains = {slot.name: slot.domain for slot in made}
+    for one in impossible if isinstance(impossible, list) else [impossible]:
+        for key, value in one.items() if isinstance(one, dict) else [(one, None)]:
+            if value not in domains.get(str(key), ()):
+                raise ConfigError(f"{path}: impossible: {key} = {value!r}: no such slot or value")
+    return Specification(str(given.get("name", name)), where, made, tuple(impossible))
+
+
+_EXPECTED: Final = "expected a pattern, MATCH … WHERE … and nothing else"
+
+
+def _slot(path: Path, given: Any) -> Slot:
+    if not isinstance(given, dict) or given.keys() != {"name", "values"}:
+        raise ConfigError(f"{path}: [[slot]]: expected 'name' and 'values'")
+    name, values = given["name"], given["values"]
+    if (
+        not isinstance(name, str)
+        or not isinstance(values, dict)
+        or not 0 < len(values) <= _MAX_VALUES
+    ):
+        raise ConfigError(
+            f"{path}: slot {str(name)[:80]!r}: expected a name, and 1 to {_MAX_VALUES} values"
+        )
+    for value, pattern in values.items():
+        if value == NONE or not isinstance(pattern, str) or block_of(pattern) is None:
+            reason = f"no value may be called {NONE!r}" if value == NONE else _EXPECTED
+            raise ConfigError(f"{path}: slot {name!r}: {value}: {reason}")
+    return Slot(name, values)
+
+
+@dataclass(frozen=True)
+class Tuples:
+    """Combinations of values of k slots, and in how many frames each occurs.
+
+    Attributes
+    ----------
+    slots : list of tuple of Slot
+        Of each combination.
+    values : list of tuple of str
+    frames : (M,) int64
+    """
+
+    slots: list[tuple[Slot, ...]]
+    values: list[tuple[str, ...]]
+    frames: Ints
+
+
+class _Held:
+    """The frames of a selection in which patterns hold; each is asked for once."""
+
+    def __init__(self, chosen: ChosenFrames) -> None:
+        self._chosen = chosen
+        ids = chosen.store.file.abstracted.times()[0]
+        self._ids = ids[chosen.rows_of(ids)]
+        self._known: dict[str, Bools] = {}
+
+    def of(self, pattern: str) -> Bools:
+        """(F,): whether a pattern holds; it does everywhere if it is empty."""
+        if pattern not in self._known:
+            there = np.ones(len(self._ids), np.bool_)
+            if pattern:
+                there = np.isin(self._ids, frames_of(self._chosen.store, pattern))
+            self._known[pattern] = there
+        return self._known[pattern]
+
+    def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
+        """(slot, value) → in which frames, of those that count, it has this value."""
+        counts = self.of(specification.where)
+        held: dict[tuple[str, str], Bits] = {}
+        for slot in specification.slots:
+            none = counts.copy()
+            for value, pattern in slot.values.items():
+                there = counts & self.of(pattern)
+                none &= ~there
+                held[slot.name, value] = np.packbits(there)
+            held[slot.name, NONE] = np.packbits(none)
+        return held
+
+    def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
+        """Frames that count, names of what they have of all slots, and the number of the name of each."""
+        rows = np.flatnonzero(self.of(specification.where))
+        names, code = [""], np.zeros(len(rows), np.int64)
+        for slot in specification.slots:
+            own = np.zeros(len(rows), np.int64)
+            bits: list[str] = []
+            for value, pattern in slot.values.items():
+                found, own = np.unique(own * 2 + self.of(pattern)[rows], return_inverse=True)
+                bits = [
+                    "+".join(filter(None, (bits[n >> 1] if bits else "", value if n & 1 else "")))
+                    for n in found.tolist()
+                ]
+            both, code = np.unique(code * len(bits) + own, return_inverse=True)
+            names = [
+                f"{names[n // len(bits)]}, {slot.name}={bits[n % len(bits)] or NONE}".removeprefix(
+                    ", "
+                )
+                for n in both.tolist()
+            ]
+        return self._ids[rows], names, code.astype(np.int64)
+
+
+def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
+    """What each frame has of declared slots, as a class of its own.
+
+    Returns
+    -------
+    frame_id : int64
+        The frames of the selection that count, ascending.
+    names : list of str
+        ``close=person+vehicle, light=none``: of a slot all values that hold.
+    code : int64
+        Of each frame, an index into ``names``.
+
+    Raises
+    ------
+    QueryError
+        A pattern is none.
+    """
+    with chosen.store.file.snapshot():
+        return _Held(chosen).sets(specification)
+
+
+def tuples(
+    chosen: ChosenFrames, specification: Specification, k: int = 0, held: _Held | None = None
+) -> Tuples:
+    """All combinations of values of k slots that can be, and how many frames have each.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    specification : Specification
+    k : int
+        How many slots are combined; 0: all of them.
+    held : optional
+        What has been asked of the selection before.
+
+    Raises
+    ------
+    ConfigError
+        There are fewer slots than k, or too many combinations.
+    QueryError
+        A pattern is none.
+    """
+    slots = specification.slots
+    k = k or len(slots)
+    if k > len(slots):
+        raise ConfigError(f"{specification.name}: combinations of {k}, but {len(slots)} slots")
+    values_held = (held or _Held(chosen)).values(specification)
+    subsets = comb(len(slots), k)
+    most = (
+        sum(prod(len(s.domain) for s in some) for some in combinations(slots, k))
+        if subsets <= MOST
+        else subsets
+    )
+    if most > MOST:
+        raise ConfigError(
+            f"{specification.name}: {most:,} combinations; {MOST:,} can be gone through"
+        )
+    found = Tuples([], [], np.zeros(0, np.int64))
+    frames: list[int] = []
+    for some in combinations(slots, k):
+        for values, often in _counted(some, values_held):
+            named = {slot.name: value for slot, value in zip(some, values, strict=True)}
+            if any(one.items() <= named.items() for one in specification.impossible):
+                continue
+            found.slots.append(some)
+            found.values.append(values)
+            frames.append(often)
+    return Tuples(found.slots, found.values, np.array(frames, np.int64))
+
+
+def _counted(
+    slots: Sequence[Slot], held: Mapping[tuple[str, str], Bits]
+) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Each combination of values of some slots, with its frames."""
+    for values in product(*(slot.domain for slot in slots)):
+        both = np.bitwise_and.reduce(
+            [held[slot.name, value] for slot, value in zip(slots, values, strict=True)]
+        )
+        yield values, int(np.bitwise_count(both).sum())
+
+
+def slot_coverage(
+    chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
+) -> tuple[ReportTable, ReportTable, ReportTable]:
+    """How many combinations of the values of slots occur, which ones do, and which ones are missing.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    specifications : sequence of Specification
+    k : int
+        How many slots are combined; 0: all of them.
+
+    Returns
+    -------
+    shares, covered, missing : Table
+        ``missing`` has a ``query`` for each that would find it.
+    """
+    shares: list[Row] = []
+    covered: list[Row] = []
+    missing: list[Row] = []
+    parts = [0, 0]
+    held = _Held(chosen)
+    for one in specifications:
+        with chosen.store.file.snapshot():
+            found = tuples(chosen, one, k, held)
+        many, of = int((found.frames > 0).sum()), len(found.frames)
+        parts = [parts[0] + many, parts[1] + of]
+        size = k or len(one.slots)
+        denominator = f"combinations of values of {size} of {len(one.slots)} declared slots"
+        denominator += f", less {len(one.impossible)} impossible" if one.impossible else ""
+        shares.append(share(one.name, many, of, denominator))
+        for slots, values, frames in zip(
+            found.slots, found.values, found.frames.tolist(), strict=True
+        ):
+            text = ", ".join(f"{s.name}={v}" for s, v in zip(slots, values, strict=True))
+            if frames:
+                covered.append((one.name, text, frames))
+            else:
+                missing.append((one.name, text, _query(one, slots, values)))
+    if len(specifications) > 1:
+        shares.append(share("all", parts[0], parts[1], "the sum of these"))
+    said = [f"frames of {chosen.text}"]
+    return (
+        ReportTable(SHARES, shares, said),
+        ReportTable(("specification", "combination", "frames"), covered),
+        ReportTable(("specification", "combination", "query"), missing),
+    )
+
+
+def _query(one: Specification, slots: Sequence[Slot], values: Sequence[str]) -> str:
+    there = [block_of(one.where) or ""] if one.where else []
+    absent: list[str] = []
+    for slot, value in zip(slots, values, strict=True):
+        blocks = slot.block(value)
+        there += blocks[0]
+        absent += blocks[1]
+    return query_of_blocks(there, absent)

@@ -1,0 +1,321 @@
+"""Other relations from the states of a store, without its recordings: ``derive``."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.abstractions import SUBSETS, abstraction_named, abstractions, check_name
+from sgstore.config import Config, from_dict
+from sgstore.errors import AbstractionError, ConfigError
+from sgstore.opendrive import read_map
+from sgstore.relations import Crowds
+from sgstore.roads import is_lane_text, read_lane_text
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.store import StoreFile
+from sgstore.vocabulary import KINDS, RELATION_CODE, RELATIONS, kinds_labelled, normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from sgstore.config import RangeSettings
+    from sgstore.roads import RoadMap
+    from sgstore.store import StoredTrace
+
+
+_ASIDE: Final = 10.0
+"""How far at most the line of a corridor begins from the ego; m."""
+
+_NOT_RELATIONS: Final = ("ego", "egos", "payloads", "mapping", "rate")
+"""Settings that say what is read, not what is related: those of the ingest hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class Derivation:
+    """What became of a trace.
+
+    Attributes
+    ----------
+    trace : str
+        Its name.
+    status : str
+        ``derived``; ``present``: the store had this set of it already, with the same settings.
+    frames, edges : int
+        How many were made; an edge counts in every frame. 0 if it was present.
+    losses : list of str
+        What could not be made.
+    """
+
+    trace: str
+    status: str
+    frames: int = 0
+    edges: int = 0
+    losses: list[str] = field(default_factory=list[str])
+
+
+def derive(
+    store: str | Path,
+    config: Config,
+    name: str,
+    traces: Sequence[int | str] = (),
+    *,
+    replace_old: bool = False,
+) -> list[Derivation]:
+    """Make another set of relations from the stored states, and keep it under a name.
+
+    It holds what ingesting with these settings would have made: edges, and what is in range. Each trace is one
+    transaction, so that a run that was killed goes on where it was; the recordings are not read.
+
+    Parameters
+    ----------
+    store : str or Path
+    config : Config
+        Its relations and range. What is read from a recording (egos, payloads, rate) stays as it was ingested.
+    name : str
+        Of the set; what ``USING ABSTRACTION`` takes.
+    traces : sequence, optional
+        Names or ids; all by default.
+    replace_old : bool
+        Whether a set of this name with other settings is replaced.
+
+    Returns
+    -------
+    list of Derivation
+        One for each trace.
+
+    Raises
+    ------
+    AbstractionError
+        The name is no name, is that of an abstraction, or is taken by a set with other settings.
+    ConfigError
+        The settings need what is not in the store: a larger range, other kinds, finer lanes.
+    StoreError
+        There is no such store or trace, or others keep the store for too long.
+    """
+    check_name(name)
+    if normalize_name(name) in abstractions():
+        raise AbstractionError(f"{name!r} is the name of an abstraction; choose another")
+    file = StoreFile(store)
+    file.settle()
+    chosen = [file.trace(ref) for ref in traces] if traces else list(file.traces())
+    known = {
+        one.trace_id: one
+        for one in file.deriving.sets()
+        if normalize_name(one.name) == normalize_name(name)
+    }
+    of_name = next(
+        (
+            one.name
+            for one in file.deriving.sets()
+            if normalize_name(one.name) == normalize_name(name)
+        ),
+        name,
+    )
+    plans = [(trace, _settings(trace, config)) for trace in chosen]
+    results: list[Derivation] = []
+    for trace, settings in plans:
+        digest = _digest(settings)
+        old = known.get(trace.trace_id)
+        if old is not None and old.digest == digest:
+            results.append(Derivation(trace.name, "present"))
+            continue
+        if old is not None and not replace_old:
+            raise AbstractionError(
+                f"{trace.name!r} has a set {old.name!r} already, with other settings;"
+                " say --force to replace it, or choose another name"
+            )
+        results.append(_derived(file, trace, settings, of_name))
+    return results
+
+
+def keep_abstraction(
+    store: str | Path, name: str, traces: Sequence[int | str] = ()
+) -> list[Derivation]:
+    """Keep what an abstraction makes of the stored graphs, so that queries can name it.
+
+    That of ``roadscene2vec``, or of a client's own function: nodes of the scene graph, and edges labelled
+    with relations. Nodes that it makes up, and other labels, are in ``graph(frame, abstraction=…)`` only.
+
+    Parameters
+    ----------
+    store, traces
+        As :func:`derive` takes them.
+    name : str
+        Of the abstraction, and of the set.
+
+    Returns
+    -------
+    list of Derivation
+        One for each trace.
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction, or queries can name it without this.
+    StoreError
+        There is no such store or trace, or others keep the store for too long.
+    """
+    abstraction = abstraction_named(name)
+    if abstraction.name in SUBSETS:
+        raise AbstractionError(f"queries can name {abstraction.name!r} as it is: USING ABSTRACTION")
+    file = StoreFile(store)
+    file.settle()
+    chosen = [file.trace(ref) for ref in traces] if traces else list(file.traces())
+    known = {(one.name, one.trace_id) for one in file.deriving.sets()}
+    results: list[Derivation] = []
+    for trace in chosen:
+        if (abstraction.name, trace.trace_id) in known:
+            results.append(Derivation(trace.name, "present"))
+            continue
+        frames = edges = 0
+        relations: set[int] = set()
+        with file.deriving.building(abstraction.name, trace.trace_id) as building:
+            for seq, seen in file.deriving.seen(trace.trace_id):
+                graphs = abstraction.function(seen)
+                building.append_labelled(seq, seen, graphs)
+                relations |= {
+                    RELATION_CODE[text] for text in graphs.labels if text in RELATION_CODE
+                }
+                frames, edges = frames + graphs.frames, edges + len(graphs.related()[0])
+            answers = tuple(RELATIONS[code] for code in sorted(relations))
+            settings = {"abstraction": abstraction.name}
+            building.publish(settings, hashlib.sha256(repr(settings).encode()).hexdigest(), answers)
+        results.append(Derivation(trace.name, "derived", frames, edges))
+    return results
+
+
+def _derived(file: StoreFile, trace: StoredTrace, config: Config, name: str) -> Derivation:
+    generator, crowds = SceneGraphGenerator(_road_map(file, trace, config), config), Crowds()
+    frames = edges = 0
+    with file.deriving.building(name, trace.trace_id) as building:
+        for block in file.deriving.blocks(trace.trace_id):
+            for piece in generator.pieces(block):
+                graph = generator.block(piece)
+                building.append(graph)
+                crowds.see(graph)
+                frames += len(graph)
+                edges += len(graph.edges)
+        building.publish(config.as_dict(), _digest(config), generator.answers)
+    losses = [loss.reason for loss in crowds.losses(config)]
+    return Derivation(trace.name, "derived", frames, edges, losses)
+
+
+def _road_map(file: StoreFile, trace: StoredTrace, config: Config) -> RoadMap | None:
+    found = file.road_map_text(trace.trace_id)
+    if found is None:
+        return None
+    name, text = found
+    return read_lane_text(text, name) if is_lane_text(text) else read_map(text, name, config.signs)
+
+
+def _digest(config: Config) -> str:
+    return hashlib.sha256(repr(config.as_dict()).encode()).hexdigest()
+
+
+def _settings(trace: StoredTrace, wanted: Config) -> Config:
+    """The settings to derive with, if the states of a trace suffice.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if "imported" in trace.report:
+        raise ConfigError(
+            f"{trace.name!r} was imported as graphs: there is no geometry to derive others from"
+        )
+    old = from_dict(trace.settings)
+    new = replace(wanted, **{name: getattr(old, name) for name in _NOT_RELATIONS})
+
+    def need(holds: bool, setting: str, was: object, asked: object) -> None:  # noqa: FBT001
+        if not holds:
+            raise ConfigError(
+                f"setting '{setting}' is {asked!r}, and {trace.name!r} was ingested with {was!r}:"
+                " what that leaves out is not in the store; ingest the recording anew"
+            )
+
+    need(_covers(old.range, new.range), "range", _shown(old.range), _shown(new.range))
+    need(_kinds(new) <= _kinds(old), "kinds", old.kinds, new.kinds)
+    need(dict(new.types) == dict(old.types), "types", dict(old.types), dict(new.types))
+    lanes = new.lanes.granularity in {"none", old.lanes.granularity}
+    need(lanes, "lanes.granularity", old.lanes.granularity, new.lanes.granularity)
+    need(
+        old.lanes.sections == new.lanes.sections,
+        "lanes.sections",
+        old.lanes.sections,
+        new.lanes.sections,
+    )
+    need(
+        old.lanes.spacing == new.lanes.spacing,
+        "lanes.spacing",
+        old.lanes.spacing,
+        new.lanes.spacing,
+    )
+    fewer = not old.lanes.types or (
+        bool(new.lanes.types)
+        and {*map(str.lower, new.lanes.types)} <= {*map(str.lower, old.lanes.types)}
+    )
+    need(fewer, "lanes.types", old.lanes.types, new.lanes.types)
+    return new
+
+
+def _kinds(config: Config) -> set[str]:
+    if not config.kinds:
+        return set(KINDS)
+    return {kind for label in config.kinds for kind in kinds_labelled(label) or ()}
+
+
+def _shown(settings: RangeSettings) -> dict[str, Any]:
+    """The settings of a range that say how far it reaches."""
+    of_shape = {
+        "radius": ("radius",),
+        "rectangle": ("front", "rear", "side"),
+        "polygon": ("polygon",),
+        "corridor": ("length", "width"),
+    }
+    names = ("shape", *of_shape[settings.shape], "by", "static_by")
+    names += ("height", "grade", "height_of_entities") if settings.height else ()
+    return {name: getattr(settings, name) for name in names}
+
+
+def _covers(old: RangeSettings, new: RangeSettings) -> bool:
+    """Whether what is in the new range is in the old one, for certain."""
+    if _shown(old) == _shown(new):
+        return True
+    for name in ("by", "static_by"):
+        if getattr(old, name) == "centre" and getattr(new, name) != "centre":
+            return False
+    band = ("height", "grade", "height_of_entities")
+    if old.height and any(getattr(old, name) != getattr(new, name) for name in band):
+        return False
+    return _reaches(old, new)
+
+
+def _reaches(old: RangeSettings, new: RangeSettings) -> bool:
+    """The same of the areas alone."""
+    if old.shape == new.shape == "corridor":
+        return new.length <= old.length and new.width <= old.width
+    if old.shape == "polygon":
+        return new.shape == "polygon" and old.polygon == new.polygon
+    if old.shape == "corridor":
+        return False
+    if new.shape == "corridor":
+        reach = new.length + new.width + _ASIDE
+        corners: Sequence[Sequence[float]] = (
+            (reach, 0.0),
+            (-reach, 0.0),
+            (0.0, reach),
+            (0.0, -reach),
+        )
+    elif new.shape == "radius":
+        reach = new.radius
+        corners = ((reach, 0.0), (-reach, 0.0), (0.0, reach), (0.0, -reach))
+    elif new.shape == "rectangle":
+        ends = (new.front, -new.rear)
+        corners = [(ahead, left) for ahead in ends for left in (new.side, -new.side)]
+    else:
+        corners = new.polygon
+    if old.shape == "radius":
+        return all(ahead * ahead + left * left <= old.radius**2 for ahead, left in corners)
+    return all(-old.rear <= a <= old.front and abs(left) <= old.side for a, left in corners)

@@ -1,0 +1,189 @@
+"""What would be read of a recording, and what is wrong with it, without a store."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sgstore.config import Config
+from sgstore.errors import SgstoreError
+from sgstore.map_files import Maps, lost_lanes
+from sgstore.readers import on_map, open_recording, open_trace
+from sgstore.segments import TraceTally
+from sgstore.world import BUCKET_FRAMES, Loss, TraceReport
+
+if TYPE_CHECKING:
+    from sgstore.world import TraceInfo
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelFound:
+    """A channel of a recording.
+
+    Attributes
+    ----------
+    topic, schema, message_encoding : str
+    messages : int
+        How many of them can be read.
+    role : str
+        ``ground_truth``, ``map``, ``payload``; empty where the recording is of no flavour that is known.
+    """
+
+    topic: str
+    schema: str
+    message_encoding: str
+    messages: int
+    role: str = ""
+
+
+@dataclass(slots=True)
+class Examination:
+    """What is in a recording, and what is wrong with it.
+
+    Attributes
+    ----------
+    path : Path
+    size : int
+        Bytes.
+    flavour : str
+        Name of the reader that recognises it; empty: none does.
+    digest : str
+        SHA-256 of the file; empty where it was not read so far.
+    channels : list of ChannelFound
+    ego : str
+        The simulator's id of the ego; empty if there is none.
+    road_map : str
+        Name of the road map that it would be read with; empty: none.
+    frames, states : int
+    seconds : float
+        From the first frame to the last; s.
+    entities : dict
+        Kind → how many there are of it.
+    unknown_types : dict
+        Type names that no mapping knows → how many entities bear them.
+    clock_jumps, gaps : int
+        How often its clock runs backwards, or further than 2.5 periods.
+    clock_jumps_at, gaps_at : list of dict
+        The first of them, as :meth:`sgstore.segments.TraceTally.as_dict` has them.
+    warnings : list of str
+        What is odd but loses nothing.
+    losses : list of Loss
+        What cannot be used.
+    error : str
+        Why nothing of it can be ingested; empty if something can.
+    """
+
+    path: Path
+    size: int = 0
+    flavour: str = ""
+    digest: str = ""
+    channels: list[ChannelFound] = field(default_factory=list[ChannelFound])
+    ego: str = ""
+    road_map: str = ""
+    frames: int = 0
+    states: int = 0
+    seconds: float = 0.0
+    entities: dict[str, int] = field(default_factory=dict[str, int])
+    unknown_types: dict[str, int] = field(default_factory=dict[str, int])
+    clock_jumps: int = 0
+    gaps: int = 0
+    clock_jumps_at: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    gaps_at: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    warnings: list[str] = field(default_factory=list[str])
+    losses: list[Loss] = field(default_factory=list[Loss])
+    error: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as plain values."""
+        return asdict(self)
+
+
+def examine(
+    path: str | Path, *, config: Config | None = None, road_map: str | Path | None = None
+) -> Examination:
+    """Read a recording as :func:`sgstore.ingest.ingest` would, and keep only what is told of it.
+
+    Parameters
+    ----------
+    path : str or Path
+    config : Config, optional
+        Its ego counts.
+    road_map : str or Path, optional
+        A file, or a folder of them.
+
+    Raises
+    ------
+    MapError
+        The file given for the road map cannot be read.
+    """
+    config = config or Config()
+    maps = Maps(None if road_map is None else Path(road_map), config.signs)
+    found = Examination(Path(path))
+    report = TraceReport()
+    try:
+        channels = _channels(found, report)
+        _read(found, config, maps, channels)
+    except SgstoreError as error:
+        found.error = str(error)
+        found.warnings = found.warnings or report.warnings
+        found.losses = found.losses or report.losses
+    return found
+
+
+def _channels(found: Examination, report: TraceReport) -> dict[int, ChannelFound]:
+    """The channels of a recording and how many messages of each can be read."""
+    counts: Counter[int] = Counter()
+    recording = open_recording(found.path)
+    try:
+        found.size = recording.size
+        try:
+            for run in recording.walk(report):
+                ids, numbers = np.unique(run.channel, return_counts=True)
+                counts.update(dict(zip(ids.tolist(), numbers.tolist(), strict=True)))
+        finally:
+            channels: dict[int, ChannelFound] = {}
+            for number, record in sorted(recording.channels.items()):
+                schema = recording.schemas.get(record.schema_id)
+                name = schema.name if schema else ""
+                channels[number] = ChannelFound(
+                    record.topic, name, record.message_encoding, counts[number]
+                )
+            found.channels = list(channels.values())
+    finally:
+        recording.close()
+    return channels
+
+
+def _read(
+    found: Examination, config: Config, maps: Maps, channels: dict[int, ChannelFound]
+) -> None:
+    tally = TraceTally()
+    with open_trace(found.path, ego=config.ego, mapping=config.mapping) as trace:
+        _tell(found, trace.info, channels)
+        used, odd = maps.of(trace.info)
+        found.road_map = used.name if used else ""
+        on_map(trace, used)
+        try:
+            for block in trace.blocks(2 * BUCKET_FRAMES):
+                tally.see(block)
+        finally:
+            report = trace.report
+            for name, value in tally.as_dict().items():
+                setattr(found, name, value)
+            found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
+            found.unknown_types = config.unknown_of(report.unknown_types)
+            found.warnings = [*odd, *report.warnings]
+            found.losses = [*lost_lanes(trace.info, used), *report.losses]
+
+
+def _tell(found: Examination, info: TraceInfo, channels: dict[int, ChannelFound]) -> None:
+    found.flavour, found.digest, found.ego = info.flavour, info.digest, info.ego
+    found.channels = []
+    for channel in info.channels:
+        messages = channels[channel.id].messages if channel.id in channels else 0
+        told = (channel.topic, channel.schema, channel.message_encoding, messages, channel.role)
+        found.channels.append(ChannelFound(*told))

@@ -1,0 +1,39 @@
+# The face of this package: what others may import from it.
+
+from ._charts import draw_curve as draw_curve
+from ._charts import draw_growth as draw_growth
+from ._charts import draw_matrix as draw_matrix
+from ._charts import draw_rank_sizes as draw_rank_sizes
+from ._links import Relations as Relations
+from ._picture import SheetFrame as SheetFrame
+from ._picture import draw_frame as draw_frame
+from ._picture import draw_map as draw_map
+from ._picture import draw_sheet as draw_sheet
+from ._stored import draw_clip as draw_clip
+from ._stored import draw_stored as draw_stored
+from ._stored import range_of as range_of
+from ._swimlanes import LETTERS as LETTERS
+from ._swimlanes import NAME as NAME
+from ._swimlanes import draw_timelines as draw_timelines
+from ._swimlanes import lines_of as lines_of
+from ._swimlanes import timelines as timelines
+
+__all__ = [
+    "LETTERS",
+    "NAME",
+    "Relations",
+    "SheetFrame",
+    "draw_clip",
+    "draw_curve",
+    "draw_frame",
+    "draw_growth",
+    "draw_map",
+    "draw_matrix",
+    "draw_rank_sizes",
+    "draw_sheet",
+    "draw_stored",
+    "draw_timelines",
+    "lines_of",
+    "range_of",
+    "timelines",
+]

@@ -1,0 +1,650 @@
+"""The node-link diagram of a scene graph: what is shown, where, and how.
+
+Which nodes and edges of a graph are shown as a diagram, and which go together in one line.
+
+A frame of forty entities has thousands of edges; a diagram of a few dozen is what a person can read. Shown is
+the ego with its neighbours, the lanes that they are in, the roads and junctions of these, and the signals that
+control them. Pure functions; no drawing package is met here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+from matplotlib.patches import FancyArrowPatch, Rectangle
+
+import sgstore.draw._palette as palette
+from sgstore.draw._labels import Placer
+from sgstore.draw._legend import Entry
+from sgstore.draw._links import ego_lane, linked
+from sgstore.draw._view import SCENERY, clean, counted, distance
+from sgstore.vocabulary import ENTITY_KINDS, PROXIMITY, SIGNALS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.draw._labels import Rect
+    from sgstore.draw._links import Relations
+    from sgstore.draw._page import Page
+    from sgstore.draw._scene import DrawnFrame, Point
+    from sgstore.graph import SceneGraph
+    from sgstore.world import Floats
+
+
+Tier = Literal["entity", "lane", "road", "junction"]
+Family = Literal["ego", "matched", "entity", "light", "isIn", "map", "part"]
+
+NEIGHBOURS: Final = 12
+"""Entities around the ego that are shown, the nearest first."""
+MOST: Final = 60
+"""Entities that are shown at most, if every edge is asked for."""
+
+MOST_WORDS: Final = 2
+"""Relations that are written on a line, each way; the most telling come first."""
+
+_TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction"}
+_ALONG: Final = ("leads", "follows", "overlaps")
+
+
+@dataclass(frozen=True, slots=True)
+class DiagramLine:
+    """Edges between two nodes, drawn as one line with an arrow from ``a`` to ``b``.
+
+    Attributes
+    ----------
+    a, b : int
+        Node ids.
+    relations, back : tuple of str
+        From a to b, and, where they are shown in the same line, from b to a.
+    family : str
+        ``ego``: an entity seen from the ego; ``matched``: among matched nodes; ``entity``: others among
+        entities; ``light``: a signal and a lane; ``isIn``: an entity in a lane; ``map``: lane to lane;
+        ``part``: a lane in its road, a road in its junction.
+    """
+
+    a: int
+    b: int
+    relations: tuple[str, ...]
+    family: Family
+    back: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """What is written on it; nothing where the look of the line says it."""
+        if self.family in {"isIn", "part", "light"}:
+            return ""
+        there, back = (", ".join(words[:MOST_WORDS]) for words in (self.relations, self.back))
+        return there if back in {"", there} else f"{there} ⇄ {back}"
+
+
+@dataclass(frozen=True, slots=True)
+class Excerpt:
+    """What of a graph is shown.
+
+    Attributes
+    ----------
+    nodes : dict
+        Node id → tier; the ego first, then those nearest to it.
+    lines : list of DiagramLine
+        Those that matter most at the end.
+    """
+
+    nodes: dict[int, Tier]
+    lines: list[DiagramLine]
+
+    def edges(self) -> int:
+        """How many edges are shown."""
+        return sum(len(line.relations) + len(line.back) for line in self.lines)
+
+
+def excerpt_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> Excerpt:
+    """Choose what of a graph is shown.
+
+    Parameters
+    ----------
+    graph : SceneGraph
+    matched : frozenset of int
+        They are shown whatever else is.
+    relations : {"ego", "all", "none"}
+        ``ego``: of entities those that the ego is related to by distance, and only their relations to it;
+        ``all``: all entities and all their relations; ``none``: no relations among entities.
+    """
+    entities = _entities(graph, matched, relations)
+    lanes, inside = _lanes(graph, entities, matched)
+    lights = _lights(graph, lanes, matched)
+    parts = _parts(graph, [*lanes, *(n for n in matched if n < 0)])
+    shown = [*entities, *lights, *lanes, *inside, *parts, *sorted(matched)]
+    tiers: dict[int, Tier] = {n: tier_of(graph, n) for n in shown if n in graph.nodes}
+    return Excerpt(tiers, _lines(graph, tiers, matched, relations))
+
+
+def tier_of(graph: SceneGraph, node: int) -> Tier:
+    """Where in a diagram a node belongs."""
+    kind = str(graph.nodes[node].get("kind"))
+    return "entity" if kind in ENTITY_KINDS else _TIERS.get(kind, "lane")
+
+
+def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[int]:
+    """The ego, the matched entities, and the nearest others."""
+    ego = graph.ego if graph.ego in graph.nodes else None
+    first = [n for n in ([] if ego is None else [ego]) + sorted(matched) if n in graph.nodes]
+    first = [n for n in dict.fromkeys(first) if tier_of(graph, n) == "entity"]
+    close = _close(graph) if ego is not None and relations != "all" else None
+    others = [
+        node
+        for node, attributes in graph.nodes.items()
+        if node >= 0
+        and node not in first
+        and attributes.get("kind") in ENTITY_KINDS
+        and attributes.get("kind") not in (SCENERY | set(SIGNALS) if close is not None else SCENERY)
+        and (close is None or node in close)
+    ]
+    middle = graph.nodes.get(first[0] if first else -1, {})
+    far = {node: distance(middle, graph.nodes[node]) for node in others}
+    others.sort(key=lambda n: (math.inf if math.isnan(far[n]) else far[n], n))
+    room = MOST if relations == "all" else NEIGHBOURS
+    return first + others[: max(room - len(first), 0)]
+
+
+def _close(graph: SceneGraph) -> set[int]:
+    """Entities that the ego is related to by distance; by anything, where the graph has no distances."""
+    near: set[int] = set()
+    any_way: set[int] = set()
+    for src, relation, dst, _ in graph.edges:
+        if dst == graph.ego and src >= 0:
+            any_way.add(src)
+            if relation in PROXIMITY or relation in _ALONG:
+                near.add(src)
+    return near or any_way
+
+
+def _lanes(
+    graph: SceneGraph, entities: list[int], matched: frozenset[int]
+) -> tuple[list[int], list[int]]:
+    """Lanes that entities are in above all, and what else of the map they are in: crosswalks, off the road."""
+    within: dict[int, list[tuple[bool, int]]] = {}
+    other: list[int] = []
+    wanted = set(entities)
+    for src, relation, dst, attributes in graph.edges:
+        if relation != "isIn" or src not in wanted or dst not in graph.nodes:
+            continue
+        if graph.nodes[dst].get("kind") == "lane":
+            within.setdefault(src, []).append((not attributes.get("is_primary", False), dst))
+        elif graph.nodes[dst].get("kind") in {"crosswalk", "off_road"}:
+            other.append(dst)
+    lanes = [min(within[node])[1] for node in entities if node in within]
+    lanes += [
+        n for n in sorted(matched) if n in graph.nodes and graph.nodes[n].get("kind") == "lane"
+    ]
+    return list(dict.fromkeys(lanes)), list(dict.fromkeys(other))
+
+
+def _lights(graph: SceneGraph, lanes: list[int], matched: frozenset[int]) -> list[int]:
+    """Signals that control the ego's lane, or a matched one."""
+    asked = {n for n in lanes if n in matched} | {ego_lane(graph)}
+    return sorted(
+        {
+            src
+            for src, relation, dst, _ in graph.edges
+            if relation == "controlsTrafficOf" and dst in asked and src in graph.nodes
+        }
+    )
+
+
+def _parts(graph: SceneGraph, lanes: list[int]) -> list[int]:
+    """Roads and junctions that lanes belong to."""
+    inside: dict[int, list[int]] = {}
+    for src, relation, dst, _ in graph.edges:
+        if relation == "isIn" and src < 0 and dst in graph.nodes:
+            inside.setdefault(src, []).append(dst)
+    roads = [road for lane in lanes for road in inside.get(lane, [])]
+    return list(dict.fromkeys([*roads, *(j for road in roads for j in inside.get(road, []))]))
+
+
+def _lines(
+    graph: SceneGraph, tiers: dict[int, Tier], matched: frozenset[int], relations: Relations
+) -> list[DiagramLine]:
+    lines: dict[Family, list[DiagramLine]] = {
+        f: [] for f in ("part", "map", "isIn", "entity", "light", "ego", "matched")
+    }
+    for (a, b), (there, back) in linked(graph).items():
+        if a not in tiers or b not in tiers:
+            continue
+        both = _together(tiers[a], tiers[b], a in matched and b in matched)
+        if there and back and both is not None:
+            rest = tuple(name for name in back if name not in there) or back
+            lines[both].append(DiagramLine(b, a, there, both, rest))
+            continue
+        for src, dst, names in ((b, a, there), (a, b, back)):
+            family = _family(graph, tiers, src, dst, matched)
+            if names and family is not None and _is_asked(family, src, dst, graph, relations):
+                lines[family].append(DiagramLine(src, dst, names, family))
+    return [line for family in lines.values() for line in family]
+
+
+def _together(a: Tier, b: Tier, matched: bool) -> Family | None:  # noqa: FBT001
+    """The family of two nodes whose relations there and back go in one line."""
+    if a == b == "lane":
+        return "map"
+    return "matched" if a == b == "entity" and matched else None
+
+
+def _family(
+    graph: SceneGraph, tiers: dict[int, Tier], src: int, dst: int, matched: frozenset[int]
+) -> Family | None:
+    ends = (tiers[src], tiers[dst])
+    if ends == ("entity", "entity"):
+        if src in matched and dst in matched:
+            return "matched"
+        return "ego" if graph.ego in {src, dst} else "entity"
+    if ends[0] == "entity":
+        return "light" if graph.nodes[src].get("kind") in SIGNALS else "isIn"
+    return "map" if ends == ("lane", "lane") else "part"
+
+
+def _is_asked(family: Family, src: int, dst: int, graph: SceneGraph, relations: Relations) -> bool:
+    if family == "ego":
+        return relations != "none" and (dst == graph.ego or relations == "all")
+    return relations == "all" if family == "entity" else True
+
+
+# Where the nodes of a diagram go: entities where the ego sees them, the parts of the map in rows below ----
+# The same graph gives the same layout, and a small change of the scene a small change of the layout: places
+# come from geometry and from nothing else. Distances are compressed, so that what is near has room and what is
+# far is still there; then nodes that overlap push one another apart. All measures are points.
+
+GAP: Final = (26.0, 11.0)
+"""Room between two nodes, to the sides and up and down, so that lines between them can be seen."""
+ROUNDS: Final = 200
+ROW: Final = 17.0
+"""Height of a row of parts of the map."""
+_PULL: Final = 0.06
+"""Share of the way back to its own place that a node makes in each round."""
+
+
+def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> Floats:
+    """Middles of nodes that lie as their places do, and do not overlap if there is room.
+
+    Parameters
+    ----------
+    places : (N, 2) float64
+        Where things are, in any measure, from the first one; NaN: nowhere, these are put at the border.
+    sizes : (N, 2) float64
+        Width and height of the nodes.
+    box : Rect
+        They stay in it.
+    pinned : int
+        The first nodes that do not move.
+
+    Returns
+    -------
+    (N, 2) float64
+    """
+    if not len(places):
+        return np.zeros((0, 2))
+    low, high = np.array(box[:2]), np.array(box[2:])
+    half = (high - low) / 2
+    away = np.nan_to_num(places - places[0])
+    nowhere = np.isnan(places).any(axis=1)
+    away[nowhere, 1] = np.nanmax(np.abs(away), initial=1.0)
+    # Roads are longer than wide: what is narrow is drawn wider, up to a half.
+    reach = np.maximum(np.abs(away).max(axis=0), np.abs(away).max() / 2)
+    away /= np.maximum(reach, 1e-9)
+    # The root compresses: a thing at a quarter of the way is drawn in the middle.
+    share = np.abs(away).max(axis=1)
+    scale = np.divide(1.0, np.sqrt(share), out=np.zeros_like(share), where=share > 0)
+    room = half - sizes.max(axis=0) / 2
+    wanted = (low + high) / 2 + away * scale[:, None] * room
+    return _freed(_apart(wanted, sizes, box, pinned), sizes, box, pinned)
+
+
+def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
+    """Push nodes apart that overlap, each pair along the shorter way, and pull all back to their places."""
+    count = len(wanted)
+    low = np.array(box[:2]) + sizes / 2
+    high = np.array(box[2:]) - sizes / 2
+    # Those at one place fan out: else nobody would know which way to push.
+    number = np.arange(count)
+    loose = number >= pinned
+    spots = wanted + 0.01 * np.stack([np.cos(number), np.sin(number)], axis=1) * loose[:, None]
+    needed = (sizes[:, None] + sizes[None]) / 2 + GAP
+    for turn in range(ROUNDS):
+        way = spots[:, None] - spots[None]
+        lacking = needed - np.abs(way)
+        meet = (lacking[:, :, 0] > 0) & (lacking[:, :, 1] > 0) & ~np.eye(count, dtype=np.bool_)
+        if not meet.any() and turn > ROUNDS // 2:
+            break
+        across = lacking[:, :, 0] / needed[:, :, 0] < lacking[:, :, 1] / needed[:, :, 1]
+        sign = np.where(way >= 0, 1.0, -1.0)
+        sign = np.where((way == 0) & (number < number[:, None])[..., None], -1, sign)
+        push = np.where(np.stack([across, ~across], axis=2), lacking * sign, 0.0)
+        push[~meet] = 0.0
+        calm = 1.0 if turn < ROUNDS // 2 else 0.0
+        step = 0.3 * push.sum(axis=1) + calm * _PULL * (wanted - spots)
+        spots[loose] += step[loose]
+        spots = np.clip(spots, low, high)
+    return spots
+
+
+def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
+    """Put each node that still lies on an earlier one into the nearest free place, if there is any."""
+    low, high = np.array(box[:2]), np.array(box[2:])
+    spots = spots.copy()
+    for node in range(pinned, len(spots)):
+        needed = (sizes[:node] + sizes[node]) / 2 + 1.0
+        if not (np.abs(spots[:node] - spots[node]) < needed).all(axis=1).any():
+            continue
+        half = sizes[node] / 2
+        steps = (
+            np.arange(low[i] + half[i], high[i] - half[i] + 1e-6, half[i] / (2 - i)) for i in (0, 1)
+        )
+        places = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+        taken = (np.abs(places[:, None] - spots[:node]) < needed).all(axis=2).any(axis=1)
+        if not taken.all():
+            far = np.hypot(*(places - spots[node]).T)
+            spots[node] = places[np.argmin(np.where(taken, np.inf, far))]
+    return spots
+
+
+def rows(order: Floats, widths: Floats, box: Rect) -> tuple[Floats, int]:
+    """Middles of nodes side by side, in as many rows as they need, in an order from left to right.
+
+    Parameters
+    ----------
+    order : (N,) float64
+        What is smaller is further to the left.
+    widths : (N,) float64
+    box : Rect
+        Left and right bound the rows; the first row lies at the top.
+
+    Returns
+    -------
+    spots : (N, 2) float64
+    count : int
+        Number of rows.
+    """
+    left, _, right, top = box
+    placed = np.zeros((len(order), 2))
+    if not len(order):
+        return placed, 0
+    sequence = np.argsort(order, kind="stable")
+    count = _rows_needed(widths, right - left)
+    for row in range(
+        count
+    ):  # dealt out, so that neighbours stand in different rows and have room for arrows
+        inside = sequence[row::count]
+        free = (right - left - widths[inside].sum()) / (len(inside) + 1)
+        ends = np.cumsum(widths[inside] + free)
+        placed[inside, 0] = left + ends - widths[inside] / 2
+        placed[inside, 1] = top - ROW * row - ROW / 2
+    return placed, count
+
+
+def _rows_needed(widths: NDArray[np.float64], room: float) -> int:
+    count = 1
+    while True:
+        fullest = max(
+            widths[row::count].sum() + GAP[0] / 2 * len(widths[row::count]) for row in range(count)
+        )
+        if fullest <= room or count >= len(widths):
+            return count
+        count += 1
+
+
+# A scene graph as nodes and edges, beside the view from above, in the colours of the paper's figures ----
+# Above: entities, where the ego sees them. Below: the lanes that they are in, from left to right as the ego
+# sees them, then roads, then junctions.
+
+_SIZE: Final = 6.6
+_PAD: Final = (9.0, 6.0)
+"""Room that a node has around its text, in all; points."""
+_WORDS: Final = 5.4
+_ARCS: Final = 46.0
+"""Height of the arcs between lanes."""
+_GAP: Final = 16.0
+_LINES, _SLIPS, _NODES = 2.0, 3.0, 4.0
+_QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
+    "entity": (palette.ENTITY_EDGE, 0.5, {"alpha": 0.35}),
+    "isIn": (palette.DIAGRAM_TINTS["lane"], 0.8, {"alpha": 0.75}),
+    "map": (palette.DIAGRAM_TINTS["lane"], 0.7, {}),
+    "part": (palette.DIAGRAM_TINTS["road"], 0.7, {"alpha": 0.8}),
+}
+_RANK: Final = {name: rank for rank, name in enumerate(PROXIMITY)}
+
+
+def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations) -> str:
+    """Draw a scene's graph in a window of a page; returns what of it is shown, in words.
+
+    Parameters
+    ----------
+    page : Page
+    box : Rect
+        Left, bottom, right and top of the window; points.
+    scene : DrawnFrame
+    relations : {"ego", "all", "none"}
+        Which edges among entities are shown.
+    """
+    left, bottom, right, top = box
+    ground = Rectangle(
+        (left, bottom), right - left, top - bottom, facecolor=palette.GROUND, linewidth=0
+    )
+    page.sheet.add_artist(ground)
+    excerpt = excerpt_of(scene.graph, frozenset(scene.matched), relations)
+    diagram = _Diagram(page, box, scene, excerpt)
+    diagram.paint()
+    graph, shown = scene.graph, excerpt.edges()
+    told = [
+        f"shown: {len(excerpt.nodes)} of {counted(len(graph.nodes), 'node')},",
+        f"{shown} of {counted(len(graph.edges), 'edge')}",
+    ]
+    return " ".join(told)
+
+
+def diagram_entries() -> list[Entry]:
+    """Entries of the legend for what occurs in diagrams only."""
+    lane, road = palette.DIAGRAM_TINTS["lane"], palette.DIAGRAM_TINTS["road"]
+    return [
+        Entry("area", "lane, crosswalk", lane),
+        Entry("area", "road, junction", road),
+        Entry("arrow", "isIn", lane, 0.8),
+    ]
+
+
+class _Diagram:
+    """A window with its nodes in their places."""
+
+    def __init__(self, page: Page, box: Rect, scene: DrawnFrame, excerpt: Excerpt) -> None:
+        self._page = page
+        self._scene = scene
+        self._lines = excerpt.lines
+        self._texts = {node: self._text(node) for node in excerpt.nodes}
+        self._sizes = {
+            node: np.add(page.text_size(text, _SIZE, "bold"), _PAD)
+            for node, text in self._texts.items()
+        }
+        self._box = box
+        self._spots = self._placed(excerpt.nodes)
+        self._placer = Placer(box)
+        for node in excerpt.nodes:
+            left, bottom, right, top = self._rect(node)
+            self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
+
+    def paint(self) -> None:
+        for line in self._lines:
+            self._paint_line(line)
+        # What matters most is written first.
+        for line in reversed(self._lines):
+            self._paint_words(line)
+        for node in self._texts:
+            self._paint_node(node)
+
+    # Places ---------------------------------------------------------------------------------------
+
+    def _placed(self, tiers: dict[int, Tier]) -> dict[int, Point]:
+        """Places from the bottom up: junctions, roads, lanes with their arcs, and entities in the rest."""
+        left, bottom, right, top = self._box
+        floor = bottom + 6
+        spots: dict[int, Point] = {}
+        for tier in ("junction", "road", "lane"):
+            nodes = [node for node, of in tiers.items() if of == tier]
+            if not nodes:
+                continue
+            if tier == "lane" and any(line.family == "map" for line in self._lines):
+                floor += _ARCS - _GAP
+            widths = np.array([self._sizes[node][0] for node in nodes])
+            order = np.array([self._aside(node) for node in nodes])
+            _, count = rows(order, widths, (left, 0, right, 0))
+            placed, _ = rows(order, widths, (left, 0, right, floor + count * ROW))
+            spots |= {n: (x, y) for n, (x, y) in zip(nodes, placed.tolist(), strict=True)}
+            floor += count * ROW + _GAP
+        nodes = [node for node, of in tiers.items() if of == "entity"]
+        places = np.array([self._scene.place(node) or (math.nan, math.nan) for node in nodes])
+        sizes = np.array([self._sizes[node] for node in nodes]).reshape(-1, 2)
+        area = (left + 6, floor + 8, right - 6, top - 6)
+        found = scattered(places.reshape(-1, 2), sizes, area)
+        return spots | {n: (x, y) for n, (x, y) in zip(nodes, found.tolist(), strict=True)}
+
+    def _aside(self, node: int) -> float:
+        """How far to the right a part of the map lies: where it is nearest to the ego."""
+        ground = self._scene.ground
+        if ground is not None:
+            near = ground.nearest(node, (0.0, 4.0))
+            if near is not None:
+                return near[0]
+        place = self._scene.place(node)
+        return 0.0 if place is None else place[0]
+
+    def _rect(self, node: int) -> Rect:
+        (x, y), (width, height) = self._spots[node], self._sizes[node]
+        return (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+
+    def _border(self, node: int, towards: Point) -> Point:
+        """Where the line from a node's middle to a point leaves the node."""
+        (x, y), half = self._spots[node], self._sizes[node] / 2
+        dx, dy = towards[0] - x, towards[1] - y
+        steps = [h / abs(d) for h, d in zip(half.tolist(), (dx, dy), strict=True) if abs(d) > 1e-9]
+        step = min([1.0, *steps])
+        return x + step * dx, y + step * dy
+
+    # Drawing --------------------------------------------------------------------------------------
+
+    def _text(self, node: int) -> str:
+        attributes = self._scene.graph.nodes[node]
+        light = attributes.get("light_state")
+        return self._scene.name(node) + ("" if light is None else f": {clean(light, 12)}")
+
+    def _course(self, line: DiagramLine) -> Floats:
+        """(3, 2): start, control point and end of a line's curve."""
+        a, b = self._spots[line.a], self._spots[line.b]
+        if line.family != "map":
+            start, end = self._border(line.a, b), self._border(line.b, a)
+            return np.array([start, np.add(start, end) / 2, end])
+        start = np.array((a[0], a[1] - self._sizes[line.a][1] / 2))
+        end = np.array((b[0], b[1] - self._sizes[line.b][1] / 2))
+        middle = (start + end) / 2
+        depth = min(abs(end[0] - start[0]) * 0.45 + 8.0, 2 * (_ARCS - 10.0))
+        return np.array([start, (middle[0], min(start[1], end[1]) - depth), end])
+
+    def _paint_line(self, line: DiagramLine) -> None:
+        colour, width, look = _pen(line, self._scene)
+        start, control, end = self._course(line)
+        away = control - (start + end) / 2
+        span = end - start
+        length = float(np.hypot(*span))
+        if length < 1.0:
+            return
+        # matplotlib bends to the right of the way by a share of its length.
+        right = np.array((span[1], -span[0])) / length
+        bend = float(away @ right) / length
+        arrow = FancyArrowPatch(
+            tuple(start),
+            tuple(end),
+            arrowstyle="<|-|>" if line.back else "-|>",
+            connectionstyle=f"arc3,rad={bend:.4f}",
+            mutation_scale=5.0 + 0.8 * width,
+            shrinkA=0.0,
+            shrinkB=0.0,
+            color=colour,
+            linewidth=width,
+            zorder=_LINES + (line.family in {"ego", "matched"}) * 0.5,
+            **look,
+        )
+        arrow.set_gid(f"edge-{line.a}-{line.b}")
+        self._page.sheet.add_artist(arrow)
+
+    def _paint_words(self, line: DiagramLine) -> None:
+        text = line.text
+        if not text or line.family == "entity":
+            return
+        start, control, end = self._course(line)
+        size = np.add(self._page.text_size(text, _WORDS), (2.0, 1.5))
+        spots: list[Point] = []
+        for t in (0.5, 0.42, 0.58, 0.34, 0.66, 0.26, 0.74):
+            x, y = (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
+            spots.append((float(x), float(y)))
+        spot = self._placer.first_free(spots, (float(size[0]), float(size[1])))
+        if spot is None:
+            return
+        slip = {
+            "boxstyle": "round,pad=0.1",
+            "facecolor": palette.GROUND,
+            "edgecolor": "none",
+            "alpha": 0.9,
+        }
+        look: dict[str, Any] = {
+            "fontsize": _WORDS,
+            "color": _ink(line),
+            "zorder": _SLIPS,
+            "bbox": slip,
+        }
+        look |= {"ha": "center", "va": "center_baseline", "gid": f"words-{line.a}-{line.b}"}
+        self._page.text(*spot, text, **look)
+
+    def _paint_node(self, node: int) -> None:
+        x, y = self._spots[node]
+        attributes = self._scene.graph.nodes[node]
+        kind = str(attributes.get("kind"))
+        is_ego = node == self._scene.graph.ego
+        fill = palette.DIAGRAM_TINTS.get(kind) or palette.entity_tint(kind, ego=is_ego)
+        edge, width = palette.PAPER, 0.8
+        if kind == "traffic_light":
+            state = str(attributes.get("light_state"))
+            edge, width = palette.LIGHT_EDGES.get(state, palette.FAINT_INK), 1.8
+        if node in self._scene.matched:
+            edge, width = palette.MATCH, 2.6
+        pad = _PAD[0] / 2 / _SIZE
+        box = {
+            "boxstyle": f"round,pad={pad:.3f},rounding_size=0.6",
+            "facecolor": fill,
+            "edgecolor": edge,
+            "linewidth": width,
+        }
+        look: dict[str, Any] = {
+            "fontsize": _SIZE,
+            "weight": "bold",
+            "color": palette.PAPER,
+            "bbox": box,
+        }
+        look |= {"ha": "center", "va": "center_baseline", "zorder": _NODES + is_ego}
+        self._page.text(x, y, self._texts[node], gid=f"vertex-{node}", **look)
+
+
+def _pen(line: DiagramLine, scene: DrawnFrame) -> tuple[str, float, dict[str, Any]]:
+    """Colour, width in points, and what else of its look."""
+    if line.family in {"ego", "matched"}:
+        close = min((r for r in line.relations if r in _RANK), key=_RANK.__getitem__, default=None)
+        colour, width = palette.CLOSENESS[close] if close else (palette.FAR_EDGE, 0.9)
+        return colour, 0.7 * width + 0.3, {}
+    if line.family == "light":
+        state = str(scene.graph.nodes[line.a].get("light_state"))
+        return palette.LIGHT_EDGES.get(state, palette.FAINT_INK), 1.1, {"linestyle": (0, (4, 2))}
+    return _QUIET[line.family]
+
+
+def _ink(line: DiagramLine) -> str:
+    if line.family == "ego":
+        return palette.CLOSENESS["near_coll"][0]
+    return palette.MATCH_EDGE if line.family == "matched" else palette.DIAGRAM_TINTS["road"]

@@ -1,0 +1,302 @@
+"""The ground that a frame stands on: lanes, their markings and directions, crosswalks, scenery."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from matplotlib.path import Path as Outline
+
+import sgstore.draw._page as layers
+import sgstore.draw._palette as palette
+from sgstore.draw._view import SCENERY
+from sgstore.roads import within
+from sgstore.vocabulary import KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.draw._page import Stage
+    from sgstore.draw._view import MapWindow
+    from sgstore.roads import MapNodes, RoadMap
+    from sgstore.world import Floats
+
+
+ARROW_SPACING: Final = 14.0
+"""Way between two arrows on a lane; m."""
+STOREY_HEIGHT: Final = 4.0
+"""Difference of heights at which one lane is drawn over the other; m. Roads cross above this clearance."""
+MOST_STOREYS: Final = 12
+
+
+@dataclass(frozen=True, slots=True)
+class GroundView:
+    """What of a map lies in a view.
+
+    Attributes
+    ----------
+    road_map : RoadMap
+    view : MapWindow
+    outlines : list
+        A shapely geometry, or ``None``, for every node of the map.
+    rows : list of int
+        Rows of the nodes in view.
+    """
+
+    road_map: RoadMap
+    view: MapWindow
+    outlines: list[Any]
+    rows: list[int]
+
+    @classmethod
+    def of(cls, road_map: RoadMap, view: MapWindow) -> GroundView:
+        """The parts of a map that a view, with its corners, can show."""
+        reach = view.radius * math.sqrt(2)
+        _, near = road_map.near(np.array([view.x]), np.array([view.y]), reach)
+        rows = sorted(set((-1 - near).tolist()))
+        return cls(road_map, view, list(road_map.outlines()), rows)
+
+    @property
+    def nodes(self) -> MapNodes:
+        """All nodes of the map."""
+        return self.road_map.nodes
+
+    def of_kind(self, *kinds: str) -> list[int]:
+        """Rows in view that are of one of these kinds and have an outline."""
+        return [
+            r
+            for r in self.rows
+            if KINDS[self.nodes.kind[r]] in kinds and self.outlines[r] is not None
+        ]
+
+    def storeys(self) -> dict[int, int]:
+        """Rows of the lanes in view → storey, counted from the lowest: what lies above is drawn above."""
+        rows = self.of_kind("lane")
+        z = self.nodes.z[rows]
+        low, high = np.nanmin(z, initial=np.inf), np.nanmax(z, initial=-np.inf)
+        step = max(STOREY_HEIGHT, (high - low) / MOST_STOREYS)
+        levels = np.nan_to_num((z - low) / step).astype(int)
+        return dict(zip(rows, levels.tolist(), strict=True))
+
+    def cover(self, places: Floats, z: Floats) -> Floats:
+        """How far above (N, 2) places of the map, at heights z, the highest lane is; m. -inf: there is none.
+
+        The height of a lane is that of its cross section that is nearest.
+        """
+        found = np.full(len(places), -np.inf)
+        ribbons = self.road_map.ribbons
+        for row in self.of_kind("lane"):
+            if not 1 <= row < len(ribbons.offsets):
+                continue
+            inside = np.flatnonzero(within(self.outlines[row], places))
+            if not len(inside):
+                continue
+            part = slice(*ribbons.offsets[row - 1 : row + 1].tolist())
+            x, y = (
+                (getattr(ribbons, f"left_{axis}") + getattr(ribbons, f"right_{axis}"))[part] / 2
+                for axis in "xy"
+            )
+            away = np.hypot(places[inside, :1] - x, places[inside, 1:] - y)
+            height = ribbons.z[part][away.argmin(axis=1)] - z[inside]
+            found[inside] = np.fmax(found[inside], height)
+        return found
+
+    def outline(self, row: int) -> Outline | None:
+        """A node's outline in picture axes; ``None`` where it encloses nothing."""
+        rings = [ring for ring in rings_of(self.outlines[row]) if _is_closed(ring)]
+        paths = [Outline(self.view.place(ring), closed=True) for ring in rings]
+        return Outline.make_compound_path(*paths) if paths else None
+
+    def open_lines(self, rows: Iterable[int]) -> list[Floats]:
+        """Lines of several nodes that enclose nothing, a barrier's for example; picture axes."""
+        rings = [ring for row in rows for ring in rings_of(self.outlines[row])]
+        return [self.view.place(ring) for ring in rings if not _is_closed(ring)]
+
+    def outlines_of(self, rows: Iterable[int]) -> list[Outline]:
+        """Outlines of several nodes in picture axes."""
+        return [o for row in rows if (o := self.outline(row)) is not None]
+
+    def parts(self, node: int) -> list[int]:
+        """Rows whose outlines a node is made of: its own, or the lanes of a road or junction."""
+        row = -1 - node
+        if not 0 <= row < len(self.outlines):
+            return []
+        kind, name = KINDS[self.nodes.kind[row]], self.nodes.name[row]
+        if kind in {"road", "junction"}:
+            column = self.nodes.road if kind == "road" else self.nodes.junction
+            return [r for r in self.of_kind("lane") if column[r] == name]
+        return [row] if self.outlines[row] is not None else []
+
+    def sides(self, row: int) -> tuple[Floats, Floats] | None:
+        """Left and right border of a lane in its direction of travel, as (N, 2) picture coordinates.
+
+        ``None`` for what is no lane.
+        """
+        ribbons = self.road_map.ribbons
+        if not 1 <= row < len(ribbons.offsets):
+            return None
+        part = slice(*ribbons.offsets[row - 1 : row + 1].tolist())
+        left = np.column_stack((ribbons.left_x[part], ribbons.left_y[part]))
+        right = np.column_stack((ribbons.right_x[part], ribbons.right_y[part]))
+        return self.view.place(left), self.view.place(right)
+
+    def middles(self, node: int) -> Floats:
+        """(N, 2) points along the middle of a part of the map, in picture axes; some of them in view."""
+        points: list[Floats] = []
+        for row in self.parts(node):
+            sides = self.sides(row)
+            if sides is not None:
+                points.append(_dense((sides[0] + sides[1]) / 2))
+            else:
+                rings = rings_of(self.outlines[row])
+                points += [
+                    self.view.place(ring[:-1].mean(axis=0)) for ring in rings if len(ring) > 1
+                ]
+        return np.concatenate(points) if points else np.empty((0, 2))
+
+    def spot(self, node: int) -> tuple[float, float] | None:
+        """A point on a part of the map, well in view, where a name can be written; picture axes.
+
+        On a lane it lies on the middle line, if possible 8 m or more from the middle of the picture.
+        """
+        points = self.middles(node)
+        points = points[np.abs(points).max(axis=1, initial=0.0) <= 0.88 * self.view.radius]
+        away = np.hypot(*points.T)
+        return _point(points, np.where(away >= 8.0, away, 1e6 - away))
+
+    def nearest(self, node: int, to: tuple[float, float]) -> tuple[float, float] | None:
+        """The point along the middle of a part of the map that is nearest to a place; picture axes."""
+        points = self.middles(node)
+        return _point(points, np.hypot(*(points - to).T))
+
+
+def paint_ground(stage: Stage, ground: GroundView, *, arrows: bool = True) -> None:
+    """Lanes by type, borders, arrows in the direction of travel, crosswalks and the scenery of the map."""
+    nodes = ground.nodes
+    storeys = ground.storeys()
+    for level in range(max(storeys.values(), default=-1) + 1):
+        lanes = [row for row, storey in storeys.items() if storey == level]
+        _paint_lanes(stage, ground, lanes, level, arrows=arrows)
+    for row in ground.of_kind("crosswalk"):
+        stage.fill_all(_stripes(ground, row), palette.CROSSWALK, z=layers.MARKS, edge=0.0)
+    for row in ground.of_kind(*SCENERY, "unknown"):
+        colour = palette.entity_tint(KINDS[nodes.kind[row]])
+        # Props of a map are mostly areas, traffic islands for example: what stands there must show.
+        thin = 0.18 if KINDS[nodes.kind[row]] == "prop" else 1.0
+        stage.fill_all(ground.outlines_of([row]), colour, z=layers.SCENERY, edge=0.8, alpha=thin)
+        stage.lines(ground.open_lines([row]), colour, z=layers.SCENERY, width=1.2)
+
+
+def _paint_lanes(
+    stage: Stage, ground: GroundView, lanes: list[int], level: int, *, arrows: bool
+) -> None:
+    types = ground.nodes.lane_type
+    by_tint: dict[str, list[int]] = {}
+    for row in sorted(lanes, key=lambda r: (types[r] in palette.TRAVELLED, types[r], r)):
+        by_tint.setdefault(palette.lane_tint(types[row]), []).append(row)
+    z = layers.LANES + level * layers.STOREY
+    for colour, rows in by_tint.items():
+        stage.fill_all(ground.outlines_of(rows), colour, z=z)
+    marked = [r for r in lanes if types[r] in palette.TRAVELLED and not ground.nodes.junction[r]]
+    sides = [side for row in marked if (side := ground.sides(row)) is not None]
+    borders = [border for pair in sides for border in pair]
+    z += 0.8 * layers.STOREY
+    # Parking spaces lie on lanes or beside them; they have no number among these.
+    spaces = [r for r in lanes if types[r] == "parking" and not ground.nodes.lane[r]]
+    outlines = ground.outlines_of(spaces)
+    stage.fill_all(outlines, palette.lane_tint("parking"), z=z - 0.4 * layers.STOREY)
+    borders += [np.asarray(outline.vertices) for outline in outlines]
+    stage.lines(borders, palette.LANE_MARK, z=z, width=min(0.7, 0.16 * stage.points))
+    if arrows:
+        heads = [head for left, right in sides for head in _chevrons((left + right) / 2)]
+        stage.lines(heads, palette.LANE_ARROW, z=z, width=1.1, capstyle="round")
+
+
+def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float) -> None:
+    """Lay a transparent colour over a part of the map; its id in an SVG is that of the node."""
+    parts = ground.parts(node)
+    outlines, gid = ground.outlines_of(parts), f"node-{node}"
+    if outlines:
+        whole = Outline.make_compound_path(*outlines)
+        storeys = ground.storeys()
+        level = max((storeys.get(row, 0) for row in parts), default=0)
+        z = layers.LANES + (level + 0.4) * layers.STOREY
+        stage.fill(whole, colour, z=z, alpha=alpha, gid=gid)
+    stage.lines(ground.open_lines(parts), colour, z=layers.TINTS, width=5.0, gid=gid)
+
+
+def rings_of(geometry: Any) -> list[Floats]:
+    """Rings and lines of a shapely geometry, each (N, 2) float64; points have none."""
+    if geometry is None or geometry.is_empty:
+        return []
+    match geometry.geom_type:
+        case "Polygon":
+            return [
+                np.asarray(ring.coords)[:, :2] for ring in (geometry.exterior, *geometry.interiors)
+            ]
+        case "LineString" | "LinearRing":
+            return [np.asarray(geometry.coords)[:, :2]]
+        case "MultiPolygon" | "MultiLineString" | "GeometryCollection":
+            return [ring for part in geometry.geoms for ring in rings_of(part)]
+        case _:
+            return []
+
+
+def _is_closed(ring: Floats) -> bool:
+    return len(ring) > 2 and bool((ring[0] == ring[-1]).all())
+
+
+def _chevrons(line: Floats) -> list[Floats]:
+    """Arrow heads along a line, evenly spaced; none on what is shorter than half a spacing."""
+    steps = np.hypot(*np.diff(line, axis=0).T)
+    along = np.concatenate(((0.0,), np.cumsum(steps)))
+    count = round(along[-1] / ARROW_SPACING)
+    # A lane that is broken into slivers has no room for arrows, one of absurd length needs no more.
+    if not 1 <= count <= 2000:
+        return []
+    at = (np.arange(count) + 0.5) * along[-1] / count
+    place = np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])
+    ahead = np.column_stack([np.interp(at + 0.5, along, line[:, axis]) for axis in (0, 1)])
+    return [_chevron(p, math.atan2(*(a - p)[::-1])) for p, a in zip(place, ahead, strict=True)]
+
+
+def _chevron(place: Floats, angle: float) -> Floats:
+    head = np.array(((-0.5, 0.55), (0.4, 0.0), (-0.5, -0.55)))
+    cos, sin = math.cos(angle), math.sin(angle)
+    return head @ np.array(((cos, sin), (-sin, cos))) + place
+
+
+def _stripes(ground: GroundView, row: int) -> list[Outline]:
+    """Zebra stripes across the longer axis of a crosswalk: that is the way people walk."""
+    rings = rings_of(ground.outlines[row].minimum_rotated_rectangle)
+    if not rings or len(rings[0]) != 5:
+        return ground.outlines_of([row])
+    corners = ground.view.place(rings[0])
+    a, b, d = corners[0], corners[1], corners[3]
+    walk, across = (b - a, d - a) if np.hypot(*(b - a)) >= np.hypot(*(d - a)) else (d - a, b - a)
+    count = max(2, min(200, round(float(np.hypot(*walk)) / 1.1)))
+    edges = (np.arange(count)[:, None] + (0.25, 0.75)) / count
+    return [
+        Outline(
+            np.array((a + p * walk, a + q * walk, a + q * walk + across, a + p * walk + across))
+        )
+        for p, q in edges
+    ]
+
+
+def _point(points: Floats, cost: Floats) -> tuple[float, float] | None:
+    """The cheapest of some points."""
+    if not len(points):
+        return None
+    x, y = points[cost.argmin()].tolist()
+    return x, y
+
+
+def _dense(line: Floats) -> Floats:
+    """A line with a point every few metres, so that some of a long lane's lie in view."""
+    steps = np.hypot(*np.diff(line, axis=0).T)
+    along = np.concatenate(((0.0,), np.cumsum(steps)))
+    at = np.linspace(0.0, along[-1], int(np.clip(along[-1] / 2.0, 2, 1000)))
+    return np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])

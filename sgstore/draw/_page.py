@@ -1,0 +1,514 @@
+"""The page: drawing primitives, drawing order, and PNG, SVG and GIF output.
+
+What lies on top of what.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import threading
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+from PIL import Image
+
+from sgstore.draw._palette import GROUND, INK, PAPER
+from sgstore.draw._view import clean
+from sgstore.errors import ExportError
+from sgstore.files import OutputFile, write_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Sequence
+
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from sgstore.draw._labels import Rect
+    from sgstore.draw._view import MapWindow
+    from sgstore.world import Floats
+
+    Pixels = NDArray[np.uint8]
+
+
+WINDOW: Final = 0.0
+LANES: Final = 1.0
+STOREY: Final = 0.03
+"""Between one storey of roads and the next; the highest is below the tints."""
+TINTS: Final = 1.4
+MARKS: Final = 1.6
+SCENERY: Final = 1.8
+RINGS: Final = 2.0
+LINKS: Final = 3.0
+HALOS: Final = 3.8
+ARROWS: Final = 4.0
+BODIES: Final = 5.0
+LAMPS: Final = 5.5
+LINK_TEXTS: Final = 6.0
+CAPTIONS: Final = 7.0
+FURNITURE: Final = 9.0
+
+
+# Pictures with 256 colours where that is enough: a third of the bytes, and the eye sees no difference ----
+# A drawing has few colours on its areas and thousands of mixtures along its edges. The commonest keep their
+# own place in the palette, so that areas stay exactly as they were drawn; the other places go to those colours
+# that are furthest from all chosen so far, so that no mixture is moved far. Photographs stay as they are.
+
+PLACES: Final = 256
+COMMONEST: Final = 64
+"""Places of the palette that go to the commonest colours."""
+MOST_COLOURS: Final = 50_000
+"""A picture with more colours than this is a photograph."""
+FURTHEST: Final = 24.0
+"""Greatest distance in RGB, of 0 … 255 each, that a mixture may be moved."""
+
+
+def indexed(picture: Image.Image) -> Image.Image:
+    """An RGB picture with a palette, or the picture itself where 256 colours are not enough."""
+    counted = picture.getcolors(MOST_COLOURS)
+    if counted is None:
+        return picture
+    counted.sort(reverse=True)
+    colours = np.array([colour for _, colour in counted], dtype=np.float32)
+    chosen, nearest, furthest = _palette(colours)
+    if furthest > FURTHEST:
+        return picture
+    places = np.zeros(1 << 24, np.uint8)
+    places[_packed(colours)] = nearest
+    made = Image.fromarray(places[_packed(np.asarray(picture))])
+    made.putpalette(colours[chosen].astype(np.uint8).tobytes())
+    return made
+
+
+def _palette(colours: NDArray[np.float32]) -> tuple[list[int], NDArray[np.intp], float]:
+    """Rows of the chosen colours, the place of each colour's nearest one, and how far the furthest is from it.
+
+    Squares of distances of whole numbers up to 255 are exact in float32.
+    """
+    squares = (colours * colours).sum(axis=1)
+    chosen = list(range(min(COMMONEST, len(colours))))
+    away = squares[:, None] - 2 * (colours @ colours[chosen].T) + squares[chosen]
+    nearest = away.argmin(axis=1)
+    least = away[np.arange(len(colours)), nearest]
+    while len(chosen) < min(PLACES, len(colours)):
+        row = int(least.argmax())
+        away = squares - 2 * (colours @ colours[row]) + squares[row]
+        nearest[away < least] = len(chosen)
+        least = np.minimum(least, away)
+        chosen.append(row)
+    return chosen, nearest, float(np.sqrt(least.max()))
+
+
+def _packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
+    red, green, blue = (colours[..., axis].astype(np.int32) for axis in range(3))
+    return 65536 * red + 256 * green + blue
+
+
+# Animations, written frame by frame: memory does not grow with their length ---------------------
+# The container is put together here, because the drawing package would first gather all frames. Each frame is
+# the rectangle in which it differs from the one before, with a palette of its own.
+#
+# Source: Graphics Interchange Format, version 89a; Netscape's application extension for loops.
+
+LEAST_DELAY: Final = 2
+"""Hundredths of a second that a frame is shown at least: players take less for a tenth of a second."""
+_LOOP: Final = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
+_EXTENSION, _IMAGE = 0x21, 0x2C
+
+
+class Gif:
+    """Writes an animation that repeats for ever; to be used in a ``with``.
+
+    Parameters
+    ----------
+    to : Path
+        Gets its name when all is written; a file that is there is replaced.
+    """
+
+    def __init__(self, to: Path) -> None:
+        self._output = OutputFile(to)
+        self._stream = self._output.stream()
+        self._waiting: tuple[Pixels, int] | None = None
+        self._last: Pixels | None = None
+        self._shown = 100  # the last frame is shown as long as the one before
+        self.frames = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_exception: object) -> None:
+        try:
+            if kind is None and self._waiting is not None:
+                pixels, _ = self._waiting
+                self._write(pixels, self._shown)
+                self._stream.write(b"\x3b")
+                self._output.keep()
+        finally:
+            self._output.discard()
+
+    def add(self, pixels: Pixels, time_s: float) -> None:
+        """Show a picture, (height, width, 3), from a time on; s. All are of one size, and times ascend."""
+        start = round(time_s * 100)
+        if self._waiting is not None:
+            before, since = self._waiting
+            self._shown = max(start - since, LEAST_DELAY)
+            self._write(before, self._shown)
+        self._waiting = (pixels, start)
+
+    def _write(self, pixels: Pixels, delay: int) -> None:
+        """Write a frame that is shown for so many hundredths of a second."""
+        if self._last is None:
+            height, width, _ = pixels.shape
+            self._stream.write(b"GIF89a" + struct.pack("<HHBBB", width, height, 0x70, 0, 0) + _LOOP)
+        left, top, right, bottom = changed(self._last, pixels)
+        palette, content = _coded(pixels[top:bottom, left:right])
+        size = (len(palette) // 3 - 1).bit_length() - 1  # of 2^(size + 1) colours
+        self._stream.write(
+            struct.pack("<BBBBHBB", _EXTENSION, 0xF9, 4, 0x04, min(delay, 65535), 0, 0)
+        )
+        where = (left, top, right - left, bottom - top)
+        self._stream.write(struct.pack("<BHHHHB", _IMAGE, *where, 0x80 | size))
+        self._stream.write(palette + content)
+        self._last = pixels
+        self.frames += 1
+
+
+def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of the part of a picture that is other than before; a pixel at least."""
+    height, width, _ = now.shape
+    if before is None:
+        return 0, 0, width, height
+    other = (before != now).any(axis=2)
+    lines, columns = np.flatnonzero(other.any(axis=1)), np.flatnonzero(other.any(axis=0))
+    if not len(lines):
+        return 0, 0, 1, 1
+    return int(columns[0]), int(lines[0]), int(columns[-1]) + 1, int(lines[-1]) + 1
+
+
+def _coded(pixels: Pixels) -> tuple[bytes, bytes]:
+    """Palette and coded pixels of a picture, as a file of its own has them."""
+    picture = indexed(Image.fromarray(np.ascontiguousarray(pixels)))
+    if picture.mode != "P":
+        picture = picture.quantize(256, dither=Image.Dither.NONE)
+    written = io.BytesIO()
+    picture.save(written, "GIF", optimize=False, interlace=False)
+    return _parts(written.getvalue())
+
+
+def _parts(file: bytes) -> tuple[bytes, bytes]:
+    """The palette of a file with one picture, and its coded pixels."""
+    packed, at = file[10], 13
+    palette = b""
+    if packed & 0x80:
+        length = 3 << ((packed & 7) + 1)
+        palette, at = file[at : at + length], at + length
+    while file[at] == _EXTENSION:
+        at = _behind_blocks(file, at + 2)
+    packed, at = file[at + 9], at + 10
+    if packed & 0x80:
+        length = 3 << ((packed & 7) + 1)
+        palette, at = file[at : at + length], at + length
+    return palette, file[at : _behind_blocks(file, at + 1)]
+
+
+def _behind_blocks(file: bytes, at: int) -> int:
+    while file[at]:
+        at += file[at] + 1
+    return at + 1
+
+
+# The sheet of paper: the only room that knows how pictures are written --------------------------
+# A page is measured in points (1/72 inch) from its lower left corner; a stage is a window on the map
+# upon it, measured in metres. Drawing goes through figures of their own, never through global state;
+# what a user's configuration of the drawing package says does not reach the picture, so that the same
+# frame gives the same bytes.
+
+DPI: Final = 130
+FORMATS: Final = (".png", ".svg")
+PICTURE_PIXELS: Final = 64_000_000
+"""Most pixels of a camera picture that is opened."""
+PICTURE_SIDE: Final = 640
+"""Longest side to which a camera picture is reduced; pixels."""
+
+_STYLE: Final = (
+    "font.",
+    "text.",
+    "path.",
+    "svg.",
+    "savefig.",
+    "figure.",
+    "patch.",
+    "lines.",
+    "axes.",
+    "image.",
+    "agg.",
+)
+_ONE_AT_A_TIME: Final = threading.RLock()
+
+
+@contextmanager
+def own_style() -> Generator[None]:
+    """Draw in the style of this house, whatever the user's configuration says; restores it afterwards."""
+    style: dict[Any, Any] = {k: v for k, v in mpl.rcParamsDefault.items() if k.startswith(_STYLE)}
+    style |= {"svg.fonttype": "none", "svg.hashsalt": "sgstore"}
+    # At this size letters look better unhinted, and are faster.
+    style["text.hinting"] = "none"
+    # The package keeps its settings for the whole process: two pictures at once would mix them.
+    with _ONE_AT_A_TIME, mpl.rc_context(style):
+        yield
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A window on the map upon a page.
+
+    Attributes
+    ----------
+    axes : Axes
+        Measured in metres from the middle of the window.
+    view : MapWindow
+    half : (float, float)
+        Half its width and height; m.
+    points : float
+        Points of the page in a metre.
+    page : Page
+    """
+
+    axes: Axes
+    view: MapWindow
+    half: tuple[float, float]
+    points: float
+    page: Page
+
+    @property
+    def metre(self) -> float:
+        """Metres in one point: sizes that are meant for the eye are given in points."""
+        return 1.0 / self.points
+
+    def rect(self, half_x: float, half_y: float, middle: tuple[float, float]) -> Rect:
+        """A rectangle of the window, given in metres, in points of the page from the window's middle."""
+        (x, y), scale = middle, self.points
+        return (
+            (x - half_x) * scale,
+            (y - half_y) * scale,
+            (x + half_x) * scale,
+            (y + half_y) * scale,
+        )
+
+    def shows(self, x: float, y: float) -> bool:
+        """Whether a point lies in the window."""
+        return abs(x) <= self.half[0] and abs(y) <= self.half[1]
+
+    def fill(
+        self, outline: Outline, colour: str, *, z: float, gid: str | None = None, **look: Any
+    ) -> None:
+        """Fill an outline; ``look`` goes to the patch."""
+        patch = PathPatch(outline, facecolor=colour, zorder=z, **{"linewidth": 0.0, **look})
+        patch.set_gid(gid)
+        self.axes.add_artist(patch)
+
+    def fill_all(
+        self,
+        outlines: Sequence[Outline],
+        colour: str,
+        *,
+        z: float,
+        edge: float = 0.4,
+        alpha: float = 1.0,
+    ) -> None:
+        """Fill many outlines with one colour, with a hairline of the same that closes the seams."""
+        if outlines:
+            self.axes.add_artist(
+                PathCollection(
+                    list(outlines),
+                    facecolors=[colour],
+                    edgecolors=[colour],
+                    linewidths=[edge],
+                    alpha=alpha,
+                    zorder=z,
+                )
+            )
+
+    def lines(
+        self, lines: Sequence[Floats], colour: str, *, z: float, width: float, **look: Any
+    ) -> None:
+        """Draw many lines of (N, 2) picture coordinates in one look."""
+        if lines:
+            self.axes.add_artist(
+                PathCollection(
+                    [Outline(line) for line in lines],
+                    facecolors=["none"],
+                    edgecolors=[colour],
+                    linewidths=[width],
+                    zorder=z,
+                    **look,
+                )
+            )
+
+    def text(self, x: float, y: float, text: str, **look: Any) -> None:
+        """Write in the window; see :meth:`Page.text`."""
+        self.page.write(self.axes, x, y, text, **{"clip_on": True, **look})
+
+
+class Page:
+    """A sheet of paper.
+
+    Parameters
+    ----------
+    width, height : float
+        In points.
+    dpi : float
+        Pixels of an inch, where it is drawn in pixels.
+    """
+
+    def __init__(self, width: float, height: float, dpi: float = DPI) -> None:
+        self.width = width
+        self.height = height
+        self._dpi = dpi
+        self._figure = Figure(figsize=(width / 72, height / 72), dpi=dpi, facecolor=PAPER)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self.sheet = self._axes(0, 0, width, height)
+        self.sheet.set_xlim(0, width)
+        self.sheet.set_ylim(0, height)
+
+    def stage(self, box: Rect, view: MapWindow) -> Stage:
+        """A window upon the page; ``view.radius`` is half its shorter side.
+
+        Parameters
+        ----------
+        box : Rect
+            Left, bottom, right, top on the page.
+        view : MapWindow
+        """
+        left, bottom, right, top = box
+        width, height = right - left, top - bottom
+        points = min(width, height) / (2 * view.radius)
+        half = (width / points / 2, height / points / 2)
+        axes = self._axes(left, bottom, width, height)
+        axes.set_xlim(-half[0], half[0])
+        axes.set_ylim(-half[1], half[1])
+        stage = Stage(axes, view, half, points, self)
+        corners = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))) * half
+        stage.fill(Outline(corners), GROUND, z=WINDOW)
+        return stage
+
+    def text(self, x: float, y: float, text: str, **look: Any) -> None:
+        """Write on the sheet.
+
+        The text is taken as it stands: no markup is interpreted, whatever it holds.
+        """
+        self.write(self.sheet, x, y, text, **look)
+
+    def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
+        """Write on a sheet or in a window, in its own measure."""
+        gid = look.pop("gid", None)
+        style: dict[str, Any] = {"fontsize": 7.0, "color": INK, "va": "baseline", **look}
+        axes.text(x, y, printable(text), parse_math=False, **style).set_gid(gid)
+
+    def text_size(self, text: str, size: float, weight: str = "normal") -> tuple[float, float]:
+        """Width and height of a text; points."""
+        font = FontProperties(size=size, weight=weight)
+        width, height, _ = self._canvas.get_renderer().get_text_width_height_descent(
+            printable(text),
+            font,
+            False,  # noqa: FBT003  its only spelling that all releases know
+        )
+        return width * 72 / self._dpi, height * 72 / self._dpi
+
+    def picture(
+        self, picture: bytes, left: float, top: float, width: float, height: float
+    ) -> float:
+        """Lay a camera picture on the sheet, in a width and height at most; returns its height in points.
+
+        Raises
+        ------
+        ExportError
+            If it is neither JPEG nor PNG, is damaged, or has too many pixels.
+        """
+        pixels = _decoded(picture)
+        scale = min(width / pixels.shape[1], height / pixels.shape[0])
+        width, height = scale * pixels.shape[1], scale * pixels.shape[0]
+        axes = self._axes(left, top - height, width, height)
+        axes.imshow(pixels, extent=(0, 1, 0, 1), aspect="auto", interpolation="antialiased")
+        axes.set_axis_off()
+        return height
+
+    def save(self, to: str | Path) -> None:
+        """Write the page as PNG or SVG, as the ending says; a picture that is there is replaced.
+
+        Raises
+        ------
+        ExportError
+            If the ending is another, or the file cannot be written.
+        """
+        drawn = self._svg() if check_format(to) == "svg" else self._png()
+        write_bytes(to, drawn)
+
+    def _svg(self) -> bytes:
+        written = io.BytesIO()
+        self._figure.savefig(written, format="svg", metadata={"Creator": "sgstore", "Date": None})
+        return written.getvalue()
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8: the page as it is seen."""
+        self._canvas.draw()
+        return np.ascontiguousarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
+
+    def _png(self) -> bytes:
+        written = io.BytesIO()
+        indexed(Image.fromarray(self.pixels())).save(written, "PNG")
+        return written.getvalue()
+
+    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        box = (left / self.width, bottom / self.height, width / self.width, height / self.height)
+        axes = self._figure.add_axes(box)
+        axes.set_axis_off()
+        axes.set_autoscale_on(False)
+        return axes
+
+
+def check_format(to: str | Path) -> str:
+    """``png`` or ``svg``, by the ending of a file's name."""
+    to = Path(to)
+    if to.suffix.lower() not in FORMATS:
+        raise ExportError(
+            f"cannot draw {to.name!r}: a picture is {' or '.join(FORMATS)}, so end the name in one of these"
+        )
+    return to.suffix.lower()[1:]
+
+
+def printable(text: str) -> str:
+    """A text in characters that the font has; ``□`` for others."""
+    known = _characters()
+    return "".join(c if ord(c) in known else "□" for c in clean(text, 200))
+
+
+@cache
+def _characters() -> frozenset[int]:
+    return frozenset(get_font(findfont(FontProperties())).get_charmap())
+
+
+def _decoded(picture: bytes) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    try:
+        with Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
+            if image.width * image.height > PICTURE_PIXELS:
+                raise ExportError(
+                    f"the camera picture has {image.width} by {image.height} pixels, more than is opened"
+                )
+            image.draft("RGB", (PICTURE_SIDE, PICTURE_SIDE))
+            image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+            return np.asarray(image.convert("RGB"))
+    # Decoders of untrusted bytes fail in many ways: each of them means an unusable picture.
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ExportError(f"the camera picture is not a readable JPEG or PNG: {error}") from error

@@ -1,0 +1,187 @@
+"""Colours and short explanations: what a person sees for each kind, lane type, light and relation.
+
+The families are those of the paper's figures: roads blue-grey, entities magenta, the ego orange.
+Nothing is told by hue alone: kinds also differ in lightness, shape and caption, a traffic light by
+which of its three lamps is lit, closeness by the width of the line.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.vocabulary import DIRECTIONS, PROXIMITY
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+PAPER: Final = "#ffffff"
+GROUND: Final = "#f4f5f1"
+INK: Final = "#2b2f36"
+FAINT_INK: Final = "#757b86"
+RING: Final = "#aab1bd"
+RULE: Final = "#d9dce1"
+LANE_MARK: Final = "#ffffff"
+LANE_ARROW: Final = "#f7f9fb"
+CROSSWALK: Final = "#fdfdfb"
+JUNCTION: Final = "#c3cbd8"
+
+EGO: Final = "#e8710a"
+FAR_EDGE: Final = "#e0bd9a"
+EGO_LANE: Final = "#f5d3ae"
+MATCH: Final = "#ffd60a"
+MATCH_EDGE: Final = "#5c4a00"
+MATCH_PAPER: Final = "#fff3b0"
+
+ROAD_EDGE: Final = "#5b7194"
+ENTITY_EDGE: Final = "#b06a9d"
+MIXED_EDGE: Final = "#8a8fa0"
+
+DIAGRAM_TINTS: Final[Mapping[str, str]] = {
+    "lane": "#3f74bd",
+    "crosswalk": "#6f97cf",
+    "off_road": "#8aa3c4",
+    "waypoint": "#6f97cf",
+    "road": "#2c5591",
+    "junction": "#1d3a66",
+}
+"""Nodes of a diagram that are parts of the map; entities have their own colours."""
+
+LANE_TINTS: Final[Mapping[str, str]] = {
+    "driving": "#d3d9e2",
+    "bidirectional": "#d3d9e2",
+    "entry": "#d3d9e2",
+    "exit": "#d3d9e2",
+    "onRamp": "#d3d9e2",
+    "offRamp": "#d3d9e2",
+    "connectingRamp": "#d3d9e2",
+    "slipLane": "#d3d9e2",
+    "bus": "#d8d3e2",
+    "taxi": "#d8d3e2",
+    "HOV": "#d8d3e2",
+    "tram": "#d8d3e2",
+    "rail": "#d8d3e2",
+    "stop": "#dde1e6",
+    "shoulder": "#e2e5e8",
+    "border": "#e6e9e8",
+    "curb": "#dcdcd6",
+    "sidewalk": "#ece5d8",
+    "walking": "#ece5d8",
+    "biking": "#cfe5da",
+    "parking": "#dbe3ee",
+    "median": "#e3e9dc",
+    "restricted": "#e7e2dc",
+    "none": "#eceee9",
+}
+"""Tint of each OpenDRIVE lane type; :func:`lane_tint` knows what to do with any other."""
+
+TRAVELLED: Final = frozenset(
+    {
+        "driving",
+        "bidirectional",
+        "entry",
+        "exit",
+        "onRamp",
+        "offRamp",
+        "connectingRamp",
+        "slipLane",
+        "bus",
+        "taxi",
+        "HOV",
+    }
+)
+"""Lane types that motor traffic travels on: these have markings, and arrows along their centre lines."""
+
+ENTITY_TINTS: Final[Mapping[str, str]] = {
+    "car": "#c2408f",
+    "van": "#93307c",
+    "truck": "#6d2468",
+    "bus": "#6d2468",
+    "trailer": "#6d2468",
+    "train": "#4a1a4c",
+    "vehicle": "#c2408f",
+    "motorcycle": "#d873b5",
+    "bicycle": "#d873b5",
+    "person": "#e3115f",
+    "animal": "#e3115f",
+    "traffic_light": "#3a4250",
+    "stop_sign": "#5a6b85",
+    "yield_sign": "#5a6b85",
+    "speed_limit": "#5a6b85",
+    "sign": "#5a6b85",
+    "prop": "#a9a39b",
+    "building": "#d2cfc9",
+    "pole": "#a9a39b",
+    "barrier": "#a9a39b",
+    "vegetation": "#c6d4ba",
+    "unknown": "#8f8a94",
+}
+
+LIGHT_TINTS: Final[Mapping[str, tuple[str, str, str]]] = {
+    "red": ("#e5383b", "#5a626f", "#5a626f"),
+    "red_yellow": ("#e5383b", "#ffb703", "#5a626f"),
+    "yellow": ("#5a626f", "#ffb703", "#5a626f"),
+    "green": ("#5a626f", "#5a626f", "#2ec4a0"),
+    "flashing": ("#5a626f", "#ffe08a", "#5a626f"),
+    "off": ("#5a626f", "#5a626f", "#5a626f"),
+    "unknown": ("#8d95a3", "#8d95a3", "#8d95a3"),
+}
+"""The three lamps of a traffic light, from the top, by what it shows."""
+
+SIGNAL_TINTS: Final[Mapping[str, str]] = {
+    "traffic_light": INK,
+    "stop_sign": "#c1121f",
+    "yield_sign": "#e07a00",
+    "speed_limit": "#2f6fb0",
+    "sign": "#8d95a3",
+}
+"""Dots of signals on a whole map, where there is no room for their shapes."""
+
+LIGHT_EDGES: Final[Mapping[str, str]] = {
+    "red": "#e5383b",
+    "red_yellow": "#e5383b",
+    "yellow": "#d69a00",
+    "green": "#1f9d80",
+}
+"""Colour of the line from a light to the lane that it controls."""
+
+CLOSENESS: Final[Mapping[str, tuple[str, float]]] = dict(
+    zip(
+        PROXIMITY,
+        (
+            ("#9c2f00", 3.4),
+            ("#bd4500", 2.8),
+            ("#d95f0e", 2.2),
+            ("#ea8536", 1.7),
+            ("#f2a767", 1.2),
+            ("#f3c499", 0.8),
+        ),
+        strict=True,
+    )
+)
+"""Colour and width (points) of the line for each proximity relation, the closest first."""
+
+MEANINGS: Final[Mapping[str, str]] = {
+    **dict(
+        zip(
+            DIRECTIONS,
+            ("ahead", "ahead, to the side", "behind, to the side", "behind"),
+            strict=True,
+        )
+    ),
+    "leads": "next one ahead along the lane",
+    "follows": "next one behind along the lane",
+    "overlaps": "footprints touch",
+    "mayAffect": "a signal that lies ahead on that lane",
+}
+"""What the relations mean that do not say so themselves, seen from the other end."""
+
+
+def lane_tint(lane_type: str) -> str:
+    """Tint of a lane type; that of ``none`` for one that OpenDRIVE does not list."""
+    return LANE_TINTS.get(lane_type, LANE_TINTS["none"])
+
+
+def entity_tint(kind: str, *, ego: bool = False) -> str:
+    """Colour of an entity; the ego's whatever its kind."""
+    return EGO if ego else ENTITY_TINTS.get(kind, ENTITY_TINTS["unknown"])

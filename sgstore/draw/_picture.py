@@ -1,0 +1,367 @@
+"""Frames, maps and contact sheets as pictures, PNG or SVG by the ending of the file's name.
+
+A frame is seen from above with the ego in the middle, heading up. A picture is made for a person who
+has never seen this project: whatever occurs in it is explained beside it, and nothing else is. A file
+that is there already is replaced. The same input gives the same bytes.
+
+Texts that come from traces are cut and shown as they stand; no markup in them is interpreted. In an
+SVG, texts are texts, and the groups of nodes have the ids ``node-17``, ``halo-17``, ``label-17``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from sgstore.draw._links import Relations
+from sgstore.draw._view import clean, counted, number, view_of
+from sgstore.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from sgstore.draw._labels import Rect
+    from sgstore.draw._legend import Entry
+    from sgstore.draw._page import Page
+    from sgstore.draw._scene import DrawnFrame
+    from sgstore.graph import SceneGraph
+    from sgstore.roads import RoadMap
+
+
+__all__ = ["Relations", "SheetFrame", "draw_frame", "draw_map", "draw_sheet"]
+
+_MARGIN: Final = 14.0
+_TITLE: Final = 40.0
+_WINDOW: Final = 520.0
+_PANEL: Final = 244.0
+_CELL: Final = 300.0
+_READ_DIAGRAM: Final = (
+    "above: entities, where the ego sees them; below: the map, from left to right"
+)
+_NS_OF_A_YEAR: Final = 31_536_000 * 10**9
+
+
+def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a picture
+    graph: SceneGraph,
+    road_map: RoadMap | None,
+    to: str | Path,
+    *,
+    highlight: Mapping[str, int] | Sequence[int] = (),
+    picture: bytes | None = None,
+    radius: float | None = None,
+    title: str | None = None,
+    relations: Relations = "ego",
+    north_up: bool = False,
+    diagram: bool = False,
+) -> None:
+    """Draw a frame from above.
+
+    Parameters
+    ----------
+    graph : SceneGraph
+    road_map : RoadMap or None
+        The ground; without one there are entities only.
+    to : str or Path
+        ``….png`` or ``….svg``; a file that is there is replaced.
+    highlight : mapping of str to int, or sequence of int
+        Matched nodes, by the variables they are bound to or alone. Ids that are not in the graph are
+        named beside the picture as not in it.
+    picture : bytes, optional
+        A camera picture, JPEG or PNG, to put beside it.
+    radius : float, optional
+        Half the side of the window; m. By default what shows the entities, 30 to 60 m.
+    title : str, optional
+        By default trace, frame and time.
+    relations : {"ego", "all", "none"}
+        ``ego``: what is near the ego, and all that holds among matched nodes.
+    north_up : bool
+        Otherwise the ego's heading is up.
+    diagram : bool
+        Beside it the graph as nodes and edges; then there is no camera picture.
+
+    Raises
+    ------
+    ExportError
+        If the ending is another, the file cannot be written, or the camera picture cannot be read.
+    MissingExtraError
+        If the drawing packages are not installed.
+    """
+    check_installed()
+    from sgstore.draw._page import check_format, own_style
+    from sgstore.draw._scene import DrawnFrame
+
+    check_format(to)
+    with own_style():
+        matched = matched_nodes(highlight)
+        view = view_of(graph, checked(radius), matched, north_up=north_up)
+        scene = DrawnFrame.of(graph, road_map, matched, view, relations)
+        title = title or title_of(graph)
+        page = (
+            diagram_page(scene, title, relations) if diagram else frame_page(scene, title, picture)
+        )
+        page.save(to)
+
+
+def frame_page(
+    scene: DrawnFrame,
+    title: str,
+    picture: bytes | None,
+    entries: Sequence[Entry] | None = None,
+    dpi: float | None = None,
+) -> Page:
+    """The view from above, and beside it what a camera saw, what was matched, what is around, the legend.
+
+    ``entries``: the legend, by default of what occurs; ``dpi``: see :class:`sgstore.draw._page.Page`.
+    """
+    from sgstore.draw._page import DPI, Page
+    from sgstore.draw._scene import paint_scene
+
+    page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE, dpi or DPI)
+    stage = page.stage((_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW), scene.view)
+    unnamed = paint_scene(stage, scene)
+    _paint_title(page, title, _subtitle(scene, unnamed))
+    _paint_panel(page, scene, stage.half, picture, entries)
+    return page
+
+
+def diagram_page(
+    scene: DrawnFrame,
+    title: str,
+    relations: Relations,
+    entries: Sequence[Entry] | None = None,
+    dpi: float | None = None,
+) -> Page:
+    """The view from above, beside it the graph as nodes and edges, the legend below; see :func:`frame_page`."""
+    from sgstore.draw._atlas import key_height, paint_key
+    from sgstore.draw._diagram import diagram_entries, paint_diagram
+    from sgstore.draw._legend import entries_of
+    from sgstore.draw._page import DPI, Page
+    from sgstore.draw._scene import paint_scene
+
+    half = scene.view.radius
+    known = entries_of(scene, (half, half)) if entries is None else entries
+    key = [*(e for e in known if not e.is_long), *diagram_entries()]
+    foot = key_height(len(key)) + _MARGIN
+    size = (3 * _MARGIN + 2 * _WINDOW, _MARGIN + foot + _WINDOW + _TITLE)
+    page = Page(*size, dpi or DPI)
+    bottom, middle = _MARGIN + foot, 2 * _MARGIN + _WINDOW
+    stage = page.stage((_MARGIN, bottom, _MARGIN + _WINDOW, bottom + _WINDOW), scene.view)
+    unnamed = paint_scene(stage, scene)
+    _paint_title(page, title, _subtitle(scene, unnamed))
+    box = (middle, bottom, middle + _WINDOW, bottom + _WINDOW)
+    told = paint_diagram(page, box, scene, relations)
+    _paint_title(page, "Its scene graph", f"{told}  ·  {_READ_DIAGRAM}", left=middle)
+    paint_key(page, key, (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2))
+    return page
+
+
+@dataclass(frozen=True, slots=True)
+class SheetFrame:
+    """A frame of a contact sheet.
+
+    Attributes
+    ----------
+    graph : SceneGraph
+    road_map : RoadMap or None
+    highlight : mapping of str to int, or sequence of int
+        As in :func:`draw_frame`.
+    caption : str
+        By default trace, frame and time.
+    """
+
+    graph: SceneGraph
+    road_map: RoadMap | None
+    highlight: Mapping[str, int] | Sequence[int] = ()
+    caption: str = ""
+
+
+def draw_sheet(
+    frames: Sequence[SheetFrame],
+    to: str | Path,
+    *,
+    columns: int = 3,
+    radius: float | None = None,
+    title: str | None = None,
+) -> None:
+    """Draw several frames on one sheet, row by row, all to one scale.
+
+    Parameters
+    ----------
+    frames : sequence of SheetFrame
+        At least one, at most 100.
+    to : str or Path
+        As in :func:`draw_frame`.
+    columns : int
+        Frames in a row, at most.
+    radius : float, optional
+        Half the side of each window; m. By default what the frames need, 30 to 60 m.
+    title : str, optional
+
+    Raises
+    ------
+    ExportError, MissingExtraError
+        As in :func:`draw_frame`.
+    """
+    if not 1 <= len(frames) <= 100 or columns < 1:
+        raise ValueError(f"a sheet has 1 to 100 frames in columns, not {len(frames)} in {columns}")
+    check_installed()
+    from sgstore.draw._page import Page, check_format, own_style
+
+    check_format(to)
+    reach = checked(radius) or max(
+        view_of(f.graph, None, matched_nodes(f.highlight)).radius for f in frames
+    )
+    across = min(columns, len(frames))
+    down = -(-len(frames) // across)
+    head = _TITLE if title else _MARGIN
+    step, tall = _CELL + _MARGIN, _CELL + _MARGIN + 8
+    with own_style():
+        page = Page(_MARGIN + across * step, down * tall + head)
+        for index, frame in enumerate(frames):
+            left, top = _MARGIN + index % across * step, page.height - head - index // across * tall
+            _paint_cell(page, frame, (left, top - 10 - _CELL, left + _CELL, top - 10), reach)
+        if title:
+            told = (
+                "seen from above; the ego in the middle, orange; what was matched is marked yellow"
+            )
+            _paint_title(page, title, told)
+        page.save(to)
+
+
+def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> None:
+    """Draw a whole map, north up: lanes by type, junctions, crosswalks and signals.
+
+    Parameters
+    ----------
+    road_map : RoadMap
+    to : str or Path
+        As in :func:`draw_frame`.
+    title : str, optional
+        By default the map's name.
+
+    Raises
+    ------
+    ExportError
+        If the ending is another, the file cannot be written, or the map has no lanes.
+    MissingExtraError
+        If the drawing packages are not installed.
+    """
+    check_installed()
+    from sgstore.draw._atlas import paint_atlas
+    from sgstore.draw._page import Page, check_format, own_style
+
+    check_format(to)
+    with own_style():
+        page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE)
+        window: Rect = (_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW)
+        subtitle = paint_atlas(page, road_map, window, _panel_box(page))
+        _paint_title(page, title or f"map {clean(road_map.name)}", subtitle)
+        page.save(to)
+
+
+def title_of(graph: SceneGraph) -> str:
+    """Trace, number of the frame, and its time: in seconds, or as a date if it is one."""
+    seconds = f"{graph.time_ns / 1e9:.3f} s"
+    if graph.time_ns > _NS_OF_A_YEAR:
+        moment = datetime.fromtimestamp(graph.time_ns / 1e9, UTC)
+        seconds = f"{moment:%Y-%m-%d %H:%M:%S.%f}"[:-3] + " UTC"
+    return f"{clean(graph.trace)}   frame {graph.seq}   {seconds}"
+
+
+def check_installed() -> None:
+    """Refuse to go on without the drawing packages.
+
+    Raises
+    ------
+    MissingExtraError
+        They are not installed.
+    """
+    try:
+        import matplotlib as mpl
+        import PIL
+    except ImportError as error:
+        raise MissingExtraError("drawing", "viz") from error
+    del mpl, PIL
+
+
+def checked(radius: float | None) -> float | None:
+    """A radius that a user gave, if it is one; m."""
+    if radius is not None and not 1.0 <= radius <= 10_000.0:
+        raise ValueError(f"radius is {radius} m, expected 1 to 10,000 m")
+    return radius
+
+
+def matched_nodes(highlight: Mapping[str, int] | Sequence[int]) -> dict[int, str]:
+    """Node id → variables that it is bound to."""
+    if not isinstance(highlight, Mapping):
+        return dict.fromkeys(map(int, highlight), "")
+    matched: dict[int, str] = {}
+    for name, node in highlight.items():
+        matched[int(node)] = f"{matched[int(node)]}, {name}" if int(node) in matched else str(name)
+    return matched
+
+
+def _subtitle(scene: DrawnFrame, unnamed: int) -> str:
+    graph = scene.graph
+    ego = graph.nodes.get(graph.ego, {}) if graph.ego is not None else {}
+    speed = number(ego, "speed")
+    turned_to_ego = scene.view.up == math.radians(number(ego, "heading"))
+    told = [
+        f"seen from above, {'ego heading' if turned_to_ego else 'north'} up",
+        "" if ego else "no ego in this frame",
+        "" if math.isnan(speed) else f"ego at {speed:.1f} m/s ({3.6 * speed:.0f} km/h)",
+        f"scene graph: {counted(len(graph.nodes), 'node')}, {counted(len(graph.edges), 'edge')}",
+        "no road map" if scene.ground is None else "",
+        f"without a place, not drawn: {counted(scene.lost, 'node')}" if scene.lost else "",
+        f"{counted(unnamed, 'name')} left out for lack of room" if unnamed else "",
+    ]
+    return "  ·  ".join(text for text in told if text)
+
+
+def _paint_title(page: Page, title: str, subtitle: str, left: float = _MARGIN) -> None:
+    from sgstore.draw._palette import FAINT_INK
+
+    top = page.height
+    page.text(left, top - 19, clean(title, 110), fontsize=11, weight="bold")
+    page.text(left, top - 32, subtitle, fontsize=7.2, color=FAINT_INK)
+
+
+def _panel_box(page: Page) -> Rect:
+    left = 2 * _MARGIN + _WINDOW
+    return (left, _MARGIN, page.width - _MARGIN, _MARGIN + _WINDOW)
+
+
+def _paint_panel(
+    page: Page,
+    scene: DrawnFrame,
+    half: tuple[float, float],
+    picture: bytes | None,
+    entries: Sequence[Entry] | None,
+) -> None:
+    import sgstore.draw._atlas as side
+    from sgstore.draw._legend import entries_of
+
+    left, bottom, right, top = _panel_box(page)
+    panel = side.Panel(page, left, right, bottom, top)
+    entries = entries_of(scene, half) if entries is None else entries
+    if picture is not None:
+        side.paint_picture(panel, picture)
+    if scene.matched:
+        side.paint_matches(panel, scene)
+    side.paint_surroundings(panel, scene, bottom + side.legend_height(entries))
+    side.paint_legend(panel, entries)
+
+
+def _paint_cell(page: Page, frame: SheetFrame, box: Rect, radius: float) -> None:
+    from sgstore.draw._scene import DrawnFrame, paint_scene
+
+    view = view_of(frame.graph, radius)
+    matched = matched_nodes(frame.highlight)
+    scene = DrawnFrame.of(frame.graph, frame.road_map, matched, view, "ego")
+    paint_scene(page.stage(box, view), scene, every_name=False)
+    caption = clean(frame.caption) if frame.caption else title_of(frame.graph)
+    page.text(box[0], box[3] + 4, clean(caption, 60), fontsize=7.0, weight="bold")

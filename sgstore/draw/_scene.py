@@ -1,0 +1,382 @@
+"""One frame drawn in a window: content, and captions.
+
+What is written in a window: names of nodes, and relations on the lines between them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from matplotlib.path import Path as Outline
+
+import sgstore.draw._page as layers
+import sgstore.draw._palette as palette
+from sgstore.draw._bodies import half_extents, halo, paint_body, velocity_arrow
+from sgstore.draw._furniture import paint_compass, paint_rings, paint_scale
+from sgstore.draw._ground import STOREY_HEIGHT, GroundView, paint_ground, tint
+from sgstore.draw._labels import Placer
+from sgstore.draw._links import ego_lane, links_of, sentences
+from sgstore.draw._view import SCENERY, bodies_of, caption, clean, number, place_of
+from sgstore.vocabulary import SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.draw._labels import Rect
+    from sgstore.draw._links import DrawnLink, Family, Relations
+    from sgstore.draw._page import Stage
+    from sgstore.draw._view import Body, MapWindow
+    from sgstore.graph import SceneGraph
+    from sgstore.roads import RoadMap
+
+
+LABELLED_LINKS: Final = 10
+"""How many of the ego's lines bear their relations, the nearest first: the panel has the others."""
+_LEADER: Final = 9.0
+"""A name further away than this from what it names is tied to it by a line; points."""
+_PEN: Final = 4.5
+
+
+def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect], *, every: bool) -> int:
+    """Names of what was matched, then the ego's, then relations on the lines, then all other names.
+
+    Parameters
+    ----------
+    stage : Stage
+    scene : DrawnFrame
+    reserved : iterable of Rect
+        Room that is taken already.
+    every : bool
+        Otherwise only the matched and the ego are named.
+
+    Returns
+    -------
+    int
+        Names that found no room.
+    """
+    placer = Placer(stage.rect(*stage.half, (0.0, 0.0)))
+    for rect in (*reserved, *(r for b in scene.bodies.values() for r in _room(stage, b))):
+        placer.block(rect)
+    for body in scene.bodies.values():
+        if body.kind not in SCENERY:
+            placer.stand(*_extent(stage, scene, body))
+    first = scene.named_first()
+    for node in first:
+        _paint_name(stage, scene, placer, node)
+    for link in scene.links:
+        if link.family == "matched":
+            _paint_relations(stage, scene, placer, link, sentences(link, scene.matched))
+    if not every:
+        return 0
+    near = scene.near_first()
+    order = {body.node: rank for rank, body in enumerate(near)}
+    close = [k for k in scene.links if k.family == "ego" and k.b in order]
+    for link in sorted(close, key=lambda k: order[k.b])[:LABELLED_LINKS]:
+        _paint_relations(stage, scene, placer, link, [", ".join(link.there[:2])])
+    others = [b for b in near if b.node not in first and _is_named(b) and stage.shows(b.x, b.y)]
+    return sum(not _paint_name(stage, scene, placer, body.node) for body in others)
+
+
+def _paint_name(stage: Stage, scene: DrawnFrame, placer: Placer, node: int) -> bool:
+    matched = node in scene.matched
+    bold = matched or node == scene.graph.ego
+    text, size, weight = scene.name(node), 7.5 if bold else 6.3, "bold" if bold else "normal"
+    width, height = stage.page.text_size(text, size, weight)
+    body = scene.bodies.get(node)
+    if body is None:
+        x, y = (value * stage.points for value in scene.anchor(node))
+        pen = _PEN * matched
+        reach = (4.0 + pen, 4.0 + pen)
+    else:
+        x, y, reach = _extent(stage, scene, body)
+    found = placer.named(x, y, reach, (width + 4, height + 3))
+    if found is None:
+        return False
+    spot, clear = found
+    anchor = (x, y)
+    gaps = [abs(s - a) - r for s, a, r in zip(spot, anchor, reach, strict=True)]
+    if not clear or max(gaps[0] - width / 2, gaps[1] - height / 2) > _LEADER:
+        leader = np.array((anchor, spot)) * stage.metre
+        stage.lines([leader], palette.FAINT_INK, z=layers.ARROWS - 0.1, width=0.5)
+    box = _tag() if matched else _slip(0.72)
+    look = {"fontsize": size, "weight": weight, "zorder": layers.CAPTIONS + bold, "bbox": box}
+    _write(stage, spot, text, gid=f"label-{node}", **look)
+    return True
+
+
+def _paint_relations(
+    stage: Stage, scene: DrawnFrame, placer: Placer, link: DrawnLink, lines: list[str]
+) -> None:
+    ends = scene.ends(link)
+    if ends is None or not any(lines):
+        return
+    size = 6.3 if link.family == "matched" else 5.6
+    width = max(stage.page.text_size(line, size)[0] for line in lines)
+    height = size * 1.3 * len(lines)
+    a, b = ((x * stage.points, y * stage.points) for x, y in ends)
+    spot = placer.along(a, b, (width + 3, height + 2))
+    if spot is None and link.family == "matched":
+        middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
+        spot = placer.beside(*middle, (4.0, 4.0), (width + 3, height + 2))
+    if spot is None:
+        return
+    colour = palette.CLOSENESS["near_coll"][0] if link.family == "ego" else palette.MATCH_EDGE
+    look = {"fontsize": size, "color": colour, "zorder": layers.LINK_TEXTS, "bbox": _slip(0.85)}
+    for row, line in enumerate(lines):
+        up = (len(lines) - 1 - 2 * row) * size * 0.65
+        _write(stage, (spot[0], spot[1] + up), line, gid=f"link-{link.a}-{link.b}-{row}", **look)
+
+
+def _write(stage: Stage, spot: tuple[float, float], text: str, **look: Any) -> None:
+    x, y = (value * stage.metre for value in spot)
+    stage.text(x, y, text, ha="center", va="center_baseline", **look)
+
+
+def _slip(alpha: float) -> dict[str, Any]:
+    """A slip of paper under a text, so that it can be read on any ground."""
+    return {
+        "boxstyle": "round,pad=0.15",
+        "facecolor": palette.PAPER,
+        "edgecolor": "none",
+        "alpha": alpha,
+    }
+
+
+def _tag() -> dict[str, Any]:
+    return {
+        "boxstyle": "round,pad=0.22",
+        "facecolor": palette.MATCH_PAPER,
+        "edgecolor": palette.MATCH_EDGE,
+        "linewidth": 0.5,
+    }
+
+
+def _extent(
+    stage: Stage, scene: DrawnFrame, body: Body
+) -> tuple[float, float, tuple[float, float]]:
+    """The middle of a body on the page, and how far it extends from there, its mark included; points."""
+    half_x, half_y = half_extents(stage, body)
+    pen = _PEN * (body.node in scene.matched)
+    return body.x * stage.points, body.y * stage.points, (half_x + pen, half_y + pen)
+
+
+def _is_named(body: Body) -> bool:
+    return body.kind not in SCENERY and body.kind not in SIGNALS
+
+
+def _room(stage: Stage, body: Body) -> list[Rect]:
+    """Room that a body takes, and its arrow, in small squares."""
+    half_x, half_y = half_extents(stage, body)
+    taken = [stage.rect(half_x * stage.metre, half_y * stage.metre, (body.x, body.y))]
+    way = velocity_arrow(body)
+    if way is not None:
+        half = 2.5 * stage.metre
+        along = np.linspace(1.0, 0.0, max(2, int(np.hypot(*way) / half)), endpoint=False)
+        spots = np.array((body.x, body.y)) + along[:, None] * way
+        taken += [stage.rect(half, half, (x, y)) for x, y in spots.tolist()]
+    return taken
+
+
+# A frame with what of it is shown, and how it is drawn in a window ------------------------------
+
+Point = tuple[float, float]
+
+_SLOPE: Final = 0.1
+"""Roads are no steeper than this, mostly: metres down for each metre away."""
+
+_QUIET: Final[dict[Family, str]] = {
+    "entity": palette.ENTITY_EDGE,
+    "road": palette.ROAD_EDGE,
+    "mixed": palette.MIXED_EDGE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnFrame:
+    """A frame, ready to be drawn.
+
+    Attributes
+    ----------
+    graph : SceneGraph
+    matched : dict
+        Node id → name of the variable that it is bound to, or the empty string.
+    view : MapWindow
+    bodies : dict
+        Node id → body, for what can be drawn.
+    lost : int
+        Entities that the graph has no place for.
+    links : list of DrawnLink
+    ground : GroundView or None
+    """
+
+    graph: SceneGraph
+    matched: dict[int, str]
+    view: MapWindow
+    bodies: dict[int, Body]
+    lost: int
+    links: list[DrawnLink]
+    ground: GroundView | None
+
+    @classmethod
+    def of(
+        cls,
+        graph: SceneGraph,
+        road_map: RoadMap | None,
+        matched: dict[int, str],
+        view: MapWindow,
+        relations: Relations,
+    ) -> DrawnFrame:
+        """Choose what of a frame is shown in a view."""
+        bodies, lost = bodies_of(graph, view)
+        ground = None if road_map is None else GroundView.of(road_map, view)
+        bodies = _with_storeys(graph, bodies, ground)
+        links = links_of(graph, frozenset(matched), relations)
+        return cls(graph, matched, view, {b.node: b for b in bodies}, lost, links, ground)
+
+    def place(self, node: int) -> Point | None:
+        """Where a node is in the picture, or ``None`` where the graph has no place for it."""
+        if node in self.bodies:
+            return self.bodies[node].x, self.bodies[node].y
+        place = place_of(self.graph.nodes.get(node, {}))
+        if place is None:
+            return None
+        ((x, y),) = self.view.place(np.array([place])).tolist()
+        return x, y
+
+    def anchor(self, node: int) -> Point:
+        """Where a node's name belongs. A lane's: what of it is in sight and near."""
+        spot = self.ground.spot(node) if self.ground is not None and node < 0 else None
+        return spot or self.place(node) or (0.0, 0.0)
+
+    def ends(self, link: DrawnLink) -> tuple[Point, Point] | None:
+        """Where a link begins and ends, or ``None`` where one of its nodes has no place.
+
+        Between an entity and a lane it is the shortest way.
+        """
+        a, b = self.place(link.a), self.place(link.b)
+        if self.ground is not None and b is not None and link.a not in self.bodies:
+            a = (self.ground.nearest(link.a, b) if link.b in self.bodies else None) or a
+        if self.ground is not None and a is not None and link.b not in self.bodies:
+            b = (self.ground.nearest(link.b, a) if link.a in self.bodies else None) or b
+        return None if a is None or b is None else (a, b)
+
+    def name(self, node: int) -> str:
+        """What a node is called, with its variable where it was matched: ``p = person 12``."""
+        text = caption(node, self.graph.nodes.get(node, {}))
+        if node in self.bodies and self.bodies[node].below:
+            text += f", {self.bodies[node].below:.0f} m below"
+        variable = clean(self.matched.get(node, ""), 16)
+        return f"{variable} = {text}" if variable else text
+
+    def near_first(self) -> list[Body]:
+        """The bodies, those nearest to the middle first."""
+        return sorted(self.bodies.values(), key=lambda b: (math.hypot(b.x, b.y), b.node))
+
+    def named_first(self) -> list[int]:
+        """What is named whatever else is: the matched nodes, and the ego."""
+        ego = self.graph.ego
+        also = [ego] if ego in self.bodies and ego not in self.matched else []
+        return [node for node in self.matched if self.is_shown(node)] + also
+
+    def is_shown(self, node: int) -> bool:
+        """Whether a node can be pointed at in the picture."""
+        place = (
+            self.ground.spot(node) if self.has_outline(node) and self.ground else self.place(node)
+        )
+        return place is not None and max(map(abs, place)) <= self.view.radius
+
+    def has_outline(self, node: int) -> bool:
+        """Whether a node is a part of the map that has an outline in view."""
+        return node < 0 and self.ground is not None and bool(self.ground.parts(node))
+
+
+def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | None) -> list[Body]:
+    """The bodies, of which those know it that lie below a road that is drawn over them.
+
+    Without a map it is the ego that tells: what is a storey deeper than it, and not only down a slope.
+    """
+    nodes = [graph.nodes[body.node] for body in bodies]
+    z = np.array([number(node, "z") for node in nodes], np.float64)
+    places = np.array([place_of(node) or (0.0, 0.0) for node in nodes]).reshape(-1, 2)
+    if ground is not None:
+        heights = np.nan_to_num([number(node, "height") for node in nodes])
+        above = ground.cover(places, z - heights / 2)
+    else:
+        ego = graph.nodes.get(graph.ego, {}) if graph.ego is not None else {}
+        above = number(ego, "z") - z
+        away = np.hypot(*(places - (place_of(ego) or (np.nan, np.nan))).T)
+        above[~(above > _SLOPE * away)] = 0.0
+    return [
+        replace(body, below=float(height)) if height >= STOREY_HEIGHT else body
+        for body, height in zip(bodies, above.tolist(), strict=True)
+    ]
+
+
+def paint_scene(stage: Stage, scene: DrawnFrame, *, every_name: bool = True) -> int:
+    """Draw a frame in its window; returns the number of names that found no room.
+
+    Without ``every_name`` only the ego and what was matched are named.
+    """
+    if scene.ground is not None:
+        _paint_map(stage, scene, scene.ground)
+    rings = paint_rings(stage) if scene.graph.ego in scene.bodies else []
+    for link in scene.links:
+        _paint_link(stage, scene, link)
+    for node in scene.matched:
+        _paint_halo(stage, scene, node)
+    for body in scene.near_first():
+        paint_body(stage, body)
+    reserved = (*rings, paint_scale(stage), paint_compass(stage))
+    return paint_texts(stage, scene, reserved, every=every_name)
+
+
+def _paint_map(stage: Stage, scene: DrawnFrame, ground: GroundView) -> None:
+    paint_ground(stage, ground)
+    lane = ego_lane(scene.graph)
+    if lane is not None and lane not in scene.matched:
+        tint(stage, ground, lane, palette.EGO_LANE, 0.65)
+    for node in scene.matched:
+        if node not in scene.bodies:
+            tint(stage, ground, node, palette.MATCH, 0.5)
+
+
+def _paint_link(stage: Stage, scene: DrawnFrame, link: DrawnLink) -> None:
+    ends = scene.ends(link)
+    if ends is None:
+        return
+    colour, width, look = _pen(scene, link)
+    if link.family == "matched":
+        stage.lines(
+            [np.array(ends)], palette.MATCH, z=layers.LINKS, width=width + 3.0, capstyle="round"
+        )
+    stage.lines([np.array(ends)], colour, z=layers.LINKS + 0.1, width=width, **look)
+
+
+def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]]:
+    """Colour, width in points, and what else of its look."""
+    if link.family in _QUIET:
+        return _QUIET[link.family], 0.5, {"alpha": 0.45}
+    if "controlsTrafficOf" in link.there + link.back:
+        lights = [scene.graph.nodes[node].get("light_state") for node in (link.a, link.b)]
+        known = [palette.LIGHT_EDGES[str(s)] for s in lights if str(s) in palette.LIGHT_EDGES]
+        return (known or [palette.FAINT_INK])[0], 1.1, {"linestyle": (0, (4, 2))}
+    if link.closeness is None:
+        return (palette.MATCH_EDGE if link.family == "matched" else palette.FAR_EDGE), 0.9, {}
+    colour, width = palette.CLOSENESS[link.closeness]
+    return colour, width, {}
+
+
+def _paint_halo(stage: Stage, scene: DrawnFrame, node: int) -> None:
+    """A mark as of a yellow pen; what has an outline on the ground is tinted instead."""
+    place = scene.place(node)
+    if place is None or (node not in scene.bodies and scene.has_outline(node)):
+        return
+    shape, width = halo(stage, scene.bodies.get(node), place)
+    path = Outline(shape, closed=True)
+    edge = {"joinstyle": "round", "edgecolor": palette.MATCH_EDGE, "linewidth": width + 1.4}
+    stage.fill(path, "none", z=layers.HALOS, gid=None, **edge)
+    pen = edge | {"edgecolor": palette.MATCH, "linewidth": width}
+    stage.fill(path, "none", z=layers.HALOS + 0.1, gid=f"halo-{node}", **pen)

@@ -1,0 +1,354 @@
+"""Pictures and animations of frames of a store.
+
+A clip as an animation: the pictures of its frames, all to one scale and with one legend.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from sgstore.draw._legend import entries_of
+from sgstore.draw._page import Gif, own_style
+from sgstore.draw._picture import (
+    check_installed,
+    checked,
+    diagram_page,
+    draw_frame,
+    frame_page,
+    matched_nodes,
+    title_of,
+)
+from sgstore.draw._scene import DrawnFrame
+from sgstore.draw._view import view_of
+from sgstore.errors import ExportError, StoreError
+from sgstore.opendrive import read_map
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from sgstore.draw._legend import Entry
+    from sgstore.draw._links import Relations
+    from sgstore.graph import SceneGraph
+    from sgstore.matches import Matches
+    from sgstore.query import Store
+    from sgstore.roads import RoadMap
+    from sgstore.store import FrameRef
+
+
+DPI: Final = 85.0
+"""Pixels of an inch: an animation is watched and not studied, and has many pictures."""
+ENDING: Final = ".gif"
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A frame of a clip.
+
+    Attributes
+    ----------
+    graph : SceneGraph
+    highlight : mapping of str to int
+        As in :func:`sgstore.draw.draw_frame`.
+    picture : bytes or None
+        What the camera saw; ``None``: what it saw before stays.
+    """
+
+    graph: SceneGraph
+    highlight: Mapping[str, int]
+    picture: bytes | None = None
+
+
+class Film:
+    """Draws shots into an animation; to be used in a ``with``.
+
+    Parameters
+    ----------
+    to : Path
+        ``….gif``; a file that is there is replaced when all is drawn.
+    road_map : RoadMap or None
+    samples : sequence of Shot
+        Some of the shots, from all of the clip: they tell the scale and what the legend explains.
+    relations, radius, north_up, diagram
+        As in :func:`sgstore.draw.draw_frame`.
+
+    Raises
+    ------
+    ExportError
+        The ending is another, or the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        to: str | Path,
+        road_map: RoadMap | None,
+        samples: Sequence[Shot],
+        *,
+        relations: Relations = "ego",
+        radius: float | None = None,
+        north_up: bool = False,
+        diagram: bool = False,
+    ) -> None:
+        to = Path(to)
+        if to.suffix.lower() != ENDING:
+            raise ExportError(f"cannot draw a clip into {to.name!r}: end the name in {ENDING}")
+        self._map = road_map
+        self._relations: Relations = relations
+        self._north_up = north_up
+        self._diagram = diagram
+        self._radius = checked(radius) or max(
+            (view_of(s.graph, None, matched_nodes(s.highlight)).radius for s in samples),
+            default=None,
+        )
+        self._entries = self._legend(samples)
+        self._picture: bytes | None = None
+        self._start_ns: int | None = None
+        self._gif = Gif(to)
+
+    def __enter__(self) -> Self:
+        self._gif.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
+        self._gif.__exit__(kind, *exception)
+
+    def add(self, shot: Shot) -> None:
+        """Draw the next shot."""
+        graph, self._picture = shot.graph, shot.picture or self._picture
+        start = self._start_ns = graph.time_ns if self._start_ns is None else self._start_ns
+        scene, title = self._scene(shot), title_of(graph)
+        with own_style():
+            page = (
+                diagram_page(scene, title, self._relations, self._entries, DPI)
+                if self._diagram
+                else frame_page(scene, title, self._picture, self._entries, DPI)
+            )
+            self._gif.add(page.pixels(), (graph.time_ns - start) / 1e9)
+
+    def _scene(self, shot: Shot) -> DrawnFrame:
+        matched = matched_nodes(shot.highlight)
+        view = view_of(shot.graph, self._radius, matched, north_up=self._north_up)
+        return DrawnFrame.of(shot.graph, self._map, matched, view, self._relations)
+
+    def _legend(self, samples: Sequence[Shot]) -> list[Entry]:
+        """Entries of all samples, each once, in the order of the first that has it."""
+        found: dict[Entry, None] = {}
+        for shot in samples:
+            scene = self._scene(shot)
+            half = scene.view.radius
+            found |= dict.fromkeys(entries_of(scene, (half, half)))
+        signs = [entry.sign for entry in found]
+        return sorted(found, key=lambda entry: signs.index(entry.sign))
+
+
+# Pictures of frames of a store: its graph, its map, what a query matches in it, and what a camera saw ----
+
+NO_CAMERA: Final = "none"
+
+FPS: Final = 10.0
+"""Pictures a second of an animation."""
+MOST_FPS: Final = 50.0
+"""Players show no more: see :data:`sgstore.draw._page.LEAST_DELAY`."""
+SAMPLES: Final = 8
+"""Frames of a clip that are looked at before it is drawn."""
+
+_RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
+
+_PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
+"""How JPEG and PNG begin. Pictures stand whole in their messages, whatever encodes these."""
+
+
+def draw_stored(  # noqa: PLR0913  as many options as the picture has
+    store: Store,
+    frame: int | str,
+    to: str | Path,
+    *,
+    matches: Matches | None = None,
+    camera: str | None = None,
+    relations: Relations = "ego",
+    radius: float | None = None,
+    north_up: bool = False,
+    diagram: bool = False,
+) -> bool:
+    """Draw a frame of a store from above.
+
+    Parameters
+    ----------
+    store : Store
+    frame : int or str
+        ``frame_id``, ``TRACE#SEQ`` or ``TRACE@12.3s``.
+    to : str or Path
+        ``….png`` or ``….svg``; a file that is there is replaced.
+    matches : Matches, optional
+        What they bind in this frame is marked.
+    camera : str, optional
+        Channel of the picture to put beside it; by default the first that carries pictures, ``none`` for none.
+    relations, radius, north_up, diagram
+        See :func:`sgstore.draw.draw_frame`.
+
+    Returns
+    -------
+    bool
+        Whether the query matches in this frame.
+
+    Raises
+    ------
+    StoreError, ExportError, MissingExtraError, TraceError
+        There is no such frame or channel; the picture cannot be made; the recording is gone or was replaced.
+    """
+    with store.file.snapshot():
+        ref = store.file.frame(frame)
+        bindings = matches.bindings(ref) if matches is not None else []
+        draw_frame(
+            store.file.graph(ref.frame_id),
+            map_of(store, ref.trace),
+            to,
+            highlight=bindings[0] if bindings else {},
+            picture=None if diagram else _picture(store, ref, camera),
+            relations=relations,
+            radius=radius,
+            north_up=north_up,
+            diagram=diagram,
+        )
+    return bool(bindings)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRange:
+    """Frames of a trace from one to another, both included; each is named as everywhere: ``town@12s``."""
+
+    first: str
+    last: str
+
+
+def range_of(text: str) -> FrameRange | None:
+    """The frames that ``TRACE@12s..18s`` or ``TRACE#120..180`` means; ``None`` if it is a frame.
+
+    >>> range_of("town@12.5s..18s")
+    FrameRange(first='town@12.5s', last='town@18s')
+    >>> range_of("town#120..180").last, range_of("town#120")
+    ('town#180', None)
+    """
+    found = _RANGE.fullmatch(text.strip())
+    if found is None:
+        return None
+    trace, mark, first, last = found.groups()
+    unit = "s" if mark == "@" else ""
+    first, last = (f"{trace}{mark}{end.removesuffix('s')}{unit}" for end in (first, last))
+    return FrameRange(first, last)
+
+
+def draw_clip(  # noqa: PLR0913  as many options as the picture has
+    store: Store,
+    frames: FrameRange,
+    to: str | Path,
+    *,
+    matches: Matches | None = None,
+    camera: str | None = None,
+    relations: Relations = "ego",
+    radius: float | None = None,
+    north_up: bool = False,
+    diagram: bool = False,
+    fps: float = FPS,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> int:
+    """Draw a clip of a store as an animation that runs as fast as the trace did.
+
+    Parameters
+    ----------
+    frames : FrameRange
+    to : str or Path
+        ``….gif``; a file that is there is replaced.
+    fps : float
+        Pictures a second at most; of frames that come faster some are left out.
+    on_frame : function, optional
+        Called with the number of pictures drawn and of all, after each.
+    store, matches, camera, relations, radius, north_up, diagram
+        See :func:`draw_stored`.
+
+    Returns
+    -------
+    int
+        Pictures in which the query matches.
+
+    Raises
+    ------
+    StoreError, ExportError, MissingExtraError, TraceError
+        As of :func:`draw_stored`; or the clip ends before it begins.
+    """
+    check_installed()
+
+    if not 0 < fps <= MOST_FPS:
+        raise ValueError(f"fps is {fps}, expected a number up to {MOST_FPS:g}")
+
+    def shot(ref: FrameRef, *, seen: bool) -> Shot:
+        # The store is kept open for one frame at a time, so that others can write while this one draws.
+        with store.file.snapshot():
+            bindings = matches.bindings(ref) if matches is not None else []
+            picture = _picture(store, ref, camera) if seen and not diagram else None
+            return Shot(store.file.graph(ref.frame_id), bindings[0] if bindings else {}, picture)
+
+    with store.file.snapshot():
+        chosen = _chosen(store, frames, fps)
+        road_map = map_of(store, chosen[0].trace)
+    spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
+    samples = [shot(chosen[number], seen=False) for number in spread]
+    look: dict[str, Any] = {"relations": relations, "radius": radius}
+    look |= {"north_up": north_up, "diagram": diagram}
+    marked = 0
+    with Film(to, road_map, samples, **look) as film:
+        for number, ref in enumerate(chosen, start=1):
+            now = shot(ref, seen=True)
+            film.add(now)
+            marked += bool(now.highlight)
+            if on_frame is not None:
+                on_frame(number, len(chosen))
+    return marked
+
+
+def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
+    """The frames of a clip that are drawn: the first, and each that comes late enough after the last one."""
+    first, last = store.file.frame(frames.first), store.file.frame(frames.last)
+    if last.seq < first.seq:
+        raise ExportError(f"the clip from {frames.first} to {frames.last} ends before it begins")
+    chosen: list[FrameRef] = []
+    due: float | None = None
+    for seq in range(first.seq, last.seq + 1):
+        frame = store.file.frame(f"{first.trace}#{seq}")
+        # A little grace: the clock of a trace is not that exact. One that runs back starts anew.
+        if due is None or not due - 2e9 / fps <= frame.time_ns < due:
+            chosen.append(frame)
+            due = frame.time_ns + 0.95e9 / fps
+    return chosen
+
+
+def map_of(store: Store, trace: str) -> RoadMap | None:
+    """The road map of a trace of a store; ``None`` if it has none."""
+    found = store.file.road_map_text(trace)
+    return read_map(found[1], found[0]) if found else None
+
+
+def _picture(store: Store, frame: FrameRef, camera: str | None) -> bytes | None:
+    """What the camera saw nearest to the frame, as JPEG or PNG; ``None`` if it saw nothing then."""
+    if camera == NO_CAMERA:
+        return None
+    try:
+        message = store.payload(frame, camera or _camera_of(store, frame.trace))
+    except StoreError:
+        if camera:
+            raise
+        return None
+    start = _PICTURE.search(message)
+    if start is None:
+        raise ExportError(
+            f"no JPEG or PNG in the message of the camera at {frame.trace}#{frame.seq}"
+        )
+    return message[start.start() :]
+
+
+def _camera_of(store: Store, trace: str) -> str:
+    """The first channel that carries pictures; empty if none does."""
+    topics = (c.topic for c in store.file.channels(trace) if c.schema.endswith("CompressedImage"))
+    return min(topics, default="")

@@ -1,0 +1,335 @@
+"""Timelines: one lane per entity, as text or as a picture.
+
+Swim lanes: when what matches or is violated in a trace, one lane for each who; as text for a terminal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.draw._palette import EGO, FAINT_INK, GROUND, INK, ROAD_EDGE, RULE
+from sgstore.lang import parse
+from sgstore.lang.syntax import CheckClause
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from sgstore.draw._page import Page
+    from sgstore.matches import Interval
+    from sgstore.query import Store
+
+
+LETTERS: Final = 60
+"""Letters that a trace is long."""
+
+FULL, PART, NONE = "█", "▌", "·"
+NAME: Final = 36
+"""Letters of the name of a lane, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaneSpan:
+    """When something holds, in s since the trace began.
+
+    Attributes
+    ----------
+    start, end : float
+    violation : bool
+        Whether it should not.
+    """
+
+    start: float
+    end: float
+    violation: bool
+
+
+@dataclass(slots=True)
+class Lane:
+    """What one line tells: a pattern or a check, and who.
+
+    Attributes
+    ----------
+    name, who : str
+    verdict : str
+        Of a check; ``unknown`` of a trace that cannot answer; else empty.
+    spans : list of LaneSpan
+        In order; they may overlap.
+    reason : str
+        Why it is unknown; else empty.
+    """
+
+    name: str
+    who: str = ""
+    verdict: str = ""
+    spans: list[LaneSpan] = field(default_factory=list[LaneSpan])
+    reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """What stands beside it."""
+        return " · ".join(part for part in (self.name, self.who) if part)
+
+
+@dataclass(slots=True)
+class Timeline:
+    """The lanes of a trace.
+
+    Attributes
+    ----------
+    trace : str
+    seconds : float
+        From its first frame to its last.
+    lanes : list of Lane
+    """
+
+    trace: str
+    seconds: float
+    lanes: list[Lane] = field(default_factory=list[Lane])
+
+
+def timelines(
+    store: Store,
+    asked: Mapping[str, tuple[str, Mapping[str, Any]]],
+    traces: str | Collection[str] = (),
+) -> list[Timeline]:
+    """The swim lanes of the traces of a store.
+
+    Parameters
+    ----------
+    store : Store
+    asked : mapping of str to (str, mapping)
+        Texts, of ``CHECK`` statements or of one ``MATCH`` each, with the values of their parameters, by what
+        their lanes are called; a check is called by its own name.
+    traces : str or collection of str
+        The only one or ones that are told; empty: all.
+
+    Returns
+    -------
+    list of Timeline
+        Of every trace that is asked, in the order of the store; a check that holds has a lane without spans,
+        and so has what a trace cannot answer, with the reason.
+
+    Raises
+    ------
+    QueryError
+        A text has no meaning.
+    """
+    wanted = {traces} - {""} if isinstance(traces, str) else {*traces}
+    found = {
+        one.name: Timeline(one.name, (one.end_ns - one.start_ns) / 1e9)
+        for one in store.info()
+        if not wanted or one.name in wanted
+    }
+    for name, (text, values) in asked.items():
+        checks = any(isinstance(one, CheckClause) for one in parse(text))
+        lanes = _checked(store, text, values) if checks else _matched(store, name, text, values)
+        for of, lane in lanes:
+            if of in found:
+                found[of].lanes.append(lane)
+    return list(found.values())
+
+
+def _checked(store: Store, text: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Lane]]:
+    for verdict in store.check(text, **values):
+        lane = Lane(verdict.check, "", verdict.verdict, reason=verdict.reason)
+        of_whom = [one for one in verdict.witnesses if one.violations]
+        if not of_whom:
+            lane.spans = _spans(verdict.violations, violation=True)
+            yield verdict.trace, lane
+        for witness in of_whom:
+            who = ", ".join(witness.names.values())
+            spans = _spans(witness.violations, violation=True)
+            yield verdict.trace, Lane(verdict.check, who, verdict.verdict, spans)
+
+
+def _matched(
+    store: Store, name: str, text: str, values: Mapping[str, Any]
+) -> Iterator[tuple[str, Lane]]:
+    lanes: dict[tuple[str, str], Lane] = {}
+    matches = store.find(text, **values)
+    for interval in matches.intervals():
+        told = interval.values
+        nodes = [f"{name}.name" for name in told if f"{name}.name" in told]  # without RETURN
+        who = ", ".join(str(told[name]) for name in nodes or told)
+        lane = lanes.setdefault((interval.trace, who), Lane(name, who))
+        lane.spans += _spans((interval,), violation=False)
+    for (trace, _), lane in lanes.items():
+        yield trace, lane
+    for trace, reason in matches.reasons.items():
+        yield trace, Lane(name, "", "unknown", reason=reason)
+
+
+def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
+    return [LaneSpan(one.start, one.end, violation) for one in intervals]
+
+
+def lines_of(timeline: Timeline, letters: int = LETTERS) -> list[str]:
+    """A timeline as lines of text; each letter stands for an equal part of the trace.
+
+    ``█``: it holds, or is violated, for most of the part; ``▌``: in some of it; ``·``: nowhere in it.
+    """
+    head = f"{timeline.trace}  0 … {timeline.seconds:.1f} s"
+    if not timeline.lanes:
+        return [head, "  nothing"]
+    labels = [_cut(lane.label) for lane in timeline.lanes]
+    width = max(map(len, labels))
+    lines = [head]
+    for label, lane in zip(labels, timeline.lanes, strict=True):
+        lines.append(
+            f"  {label.ljust(width)}  {_letters(lane, timeline.seconds, letters)}  {_told(lane)}"
+        )
+    return [line.rstrip() for line in lines]
+
+
+def _letters(lane: Lane, seconds: float, letters: int) -> str:
+    part = max(seconds, 1e-9) / letters
+    covered = [0.0] * letters
+    touched = [False] * letters
+    for start, end in _merged(lane.spans):
+        first = min(int(start / part), letters - 1)
+        last = min(int(end / part), letters - 1)
+        for place in range(first, last + 1):
+            touched[place] = True
+            covered[place] += max(min(end, (place + 1) * part) - max(start, place * part), 0.0)
+    return "".join(
+        FULL if share > part / 2 else PART if some else NONE
+        for share, some in zip(covered, touched, strict=True)
+    )
+
+
+def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
+    """Times that spans cover, each once."""
+    found: list[tuple[float, float]] = []
+    for span in sorted(spans, key=lambda one: one.start):
+        if found and span.start <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], span.end)
+        else:
+            found.append((span.start, span.end))
+    return found
+
+
+def _told(lane: Lane) -> str:
+    """How often, and for how long together."""
+    if not lane.spans:
+        return lane.verdict
+    seconds = sum(end - start for start, end in _merged(lane.spans))
+    what = "violated" if lane.spans[0].violation else "found"
+    times = "once" if len(lane.spans) == 1 else f"{len(lane.spans)} times"
+    return f"{what} {times}, {seconds:.1f} s"
+
+
+def _cut(label: str) -> str:
+    return label if len(label) <= NAME else f"{label[: NAME - 1]}…"
+
+
+# Swim lanes of a trace as a picture: when what matches or is violated, one lane for each who ----
+
+MOST_LANES: Final = 400
+"""Lanes that a picture shows; the title says of more."""
+
+_WIDTH: Final = 720.0
+_LEFT: Final = 190.0
+_RIGHT: Final = 20.0
+_LANE: Final = 15.0
+_BAR: Final = 9.0
+_ABOVE: Final = 26.0
+_BELOW: Final = 26.0
+_TOP: Final = 34.0
+_LEAST: Final = 1.5
+"""Width of the shortest bar; points."""
+_LETTERS: Final = 44
+_REASON: Final = 100
+"""Letters of a reason, at most."""
+
+
+def draw_timelines(timelines: list[Timeline], to: Path) -> None:
+    """Draw the swim lanes of traces, one trace under the other, each on its own time.
+
+    Parameters
+    ----------
+    timelines : list of Timeline
+        At least one.
+    to : Path
+        ``….png`` or ``….svg``; a file that is there is replaced.
+
+    Raises
+    ------
+    ExportError
+        The ending is another, or the file cannot be written.
+    MissingExtraError
+        The packages for drawing are not installed.
+    """
+    from sgstore.draw._picture import check_installed
+
+    check_installed()
+    from sgstore.draw._page import Page, check_format, own_style
+
+    check_format(to)
+    left = MOST_LANES
+    shown: list[tuple[Timeline, int]] = []
+    for timeline in timelines:
+        shown.append((timeline, min(max(len(timeline.lanes), 1), left)))
+        left = max(left - len(timeline.lanes), 0)
+    shown = [(timeline, lanes) for timeline, lanes in shown if lanes]
+    height = _TOP + sum(_ABOVE + lanes * _LANE + _BELOW for _, lanes in shown)
+    with own_style():
+        page = Page(_WIDTH, height)
+        _legend(page, height, sum(len(one.lanes) for one in timelines) - MOST_LANES)
+        top = height - _TOP
+        for timeline, lanes in shown:
+            _draw(page, timeline, lanes, top)
+            top -= _ABOVE + lanes * _LANE + _BELOW
+        page.save(to)
+
+
+def _legend(page: Page, height: float, more: int) -> None:
+    x, y = 14.0, height - 20
+    for colour, word in ((ROAD_EDGE, "found"), (EGO, "violated")):
+        page.sheet.fill(
+            [x, x + 14, x + 14, x], [y, y, y + _BAR, y + _BAR], color=colour, linewidth=0
+        )
+        page.text(x + 19, y + 1.5, word, fontsize=8)
+        x += 76
+    if more > 0:
+        page.text(x, y + 1.5, f"{more} more lanes are not shown", fontsize=8, color=FAINT_INK)
+
+
+def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
+    start, end = _LEFT, _WIDTH - _RIGHT
+    seconds = max(timeline.seconds, 1e-9)
+    low, high = top - _ABOVE - lanes * _LANE, top - _ABOVE
+    page.text(14, top - 18, timeline.trace[:80], fontsize=9, weight="bold")
+    for value in _ticks(timeline.seconds):
+        at = start + value / seconds * (end - start)
+        page.sheet.plot([at, at], [low, high], color=RULE, linewidth=0.6, zorder=1)
+        page.text(at, low - 11, f"{value:g} s", ha="center", color=FAINT_INK)
+    if not timeline.lanes:
+        page.text(start, high - 10, "nothing", color=FAINT_INK)
+    for number, lane in enumerate(timeline.lanes[:lanes]):
+        base = high - (number + 1) * _LANE + (_LANE - _BAR) / 2
+        label = lane.label if len(lane.label) <= _LETTERS else f"{lane.label[: _LETTERS - 1]}…"
+        page.text(start - 6, base + 1.8, label, ha="right", fontsize=7, color=INK)
+        _bar(page, (start, end), base, GROUND)
+        if not lane.spans and lane.verdict == "unknown":
+            said = f"cannot be told: {lane.reason}" if lane.reason else "cannot be told"
+            said = said if len(said) <= _REASON else f"{said[: _REASON - 1]}…"
+            page.text(start + 4, base + 1.8, said, fontsize=7, color=FAINT_INK)
+        for span in lane.spans:
+            a, z = (start + t / seconds * (end - start) for t in (span.start, span.end))
+            _bar(page, (a, max(z, a + _LEAST)), base, EGO if span.violation else ROAD_EDGE)
+
+
+def _bar(page: Page, ends: tuple[float, float], base: float, colour: str) -> None:
+    a, z = ends
+    box = [a, z, z, a], [base, base, base + _BAR, base + _BAR]
+    page.sheet.fill(*box, color=colour, linewidth=0, zorder=0.5 if colour == GROUND else 2)
+
+
+def _ticks(seconds: float) -> list[float]:
+    """Round times, some eight."""
+    step = next(
+        (s * 10**p for p in range(-3, 9) for s in (1, 2, 5) if seconds / (s * 10**p) <= 9), 1e9
+    )
+    return [round(number * step, 6) for number in range(int(seconds / step) + 1)]

@@ -1,0 +1,47 @@
+# The face of this package: what others may import from it.
+
+from ._clips import ClipSource as ClipSource
+from ._clips import WrittenClip as WrittenClip
+from ._clips import WrittenFile as WrittenFile
+from ._labels import FEW as FEW
+from ._labels import ClipFrames as ClipFrames
+from ._labels import Export as Export
+from ._labels import Labels as Labels
+from ._labels import parse_labels as parse_labels
+from ._nx import graphs_of as graphs_of
+from ._recorder import Recorder as Recorder
+from ._recorder import Written as Written
+from ._registry import EXPORTERS as EXPORTERS
+from ._registry import GROUP as GROUP
+from ._registry import Exporter as Exporter
+from ._registry import Write as Write
+from ._registry import around_frames as around_frames
+from ._registry import exporter_named as exporter_named
+from ._registry import exporters as exporters
+from ._registry import labelled as labelled
+from ._registry import write_export as write_export
+from ._registry import write_stored as write_stored
+
+__all__ = [
+    "ClipFrames",
+    "ClipSource",
+    "EXPORTERS",
+    "Export",
+    "Exporter",
+    "FEW",
+    "GROUP",
+    "Labels",
+    "Recorder",
+    "Write",
+    "Written",
+    "WrittenClip",
+    "WrittenFile",
+    "around_frames",
+    "exporter_named",
+    "exporters",
+    "graphs_of",
+    "labelled",
+    "parse_labels",
+    "write_export",
+    "write_stored",
+]

@@ -1,0 +1,361 @@
+"""Conversion to Foxglove messages: sensor data and scene graphs.
+
+What sensors measured → messages of Foxglove's types, which Foxglove, Lichtblick and our own reader show.
+
+Pictures are PNG. What is neither a picture nor points is JSON.
+
+Source: foxglove-sdk, schemas (public lists of fields).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+from google.protobuf import (
+    descriptor_pb2,
+    descriptor_pool,
+    duration_pb2,
+    message_factory,
+    timestamp_pb2,
+)
+
+from sgstore.exporters._sensors import png
+from sgstore.vocabulary import DIRECTIONS, PROXIMITY
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from numpy.typing import NDArray
+
+    from sgstore.graph import SceneGraph
+
+
+_FIELD: Final = descriptor_pb2.FieldDescriptorProto
+_SCALARS: Final = {
+    "double": _FIELD.TYPE_DOUBLE,
+    "string": _FIELD.TYPE_STRING,
+    "bytes": _FIELD.TYPE_BYTES,
+    "fixed32": _FIELD.TYPE_FIXED32,
+    "bool": _FIELD.TYPE_BOOL,
+}
+_GOOGLE: Final = {"Timestamp": timestamp_pb2.DESCRIPTOR, "Duration": duration_pb2.DESCRIPTOR}
+_TYPES: Final = {
+    "Vector3": "x=1:double y=2:double z=3:double",
+    "Quaternion": "x=1:double y=2:double z=3:double w=4:double",
+    "Pose": "position=1:Vector3 orientation=2:Quaternion",
+    "PackedElementField": "name=1:string offset=2:fixed32 type=3:PackedElementField.NumericType",
+    "CompressedImage": "timestamp=1:Timestamp data=2:bytes format=3:string frame_id=4:string",
+    "CameraCalibration": "timestamp=1:Timestamp width=2:fixed32 height=3:fixed32"
+    " distortion_model=4:string D=5:double* K=6:double* R=7:double* P=8:double* frame_id=9:string",
+    "PointCloud": "timestamp=1:Timestamp frame_id=2:string pose=3:Pose point_stride=4:fixed32"
+    " fields=5:PackedElementField* data=6:bytes",
+}
+"""Fields of the messages, ``name=number:type``, with * if repeated; each after those that it needs."""
+_ENUMS: Final = {
+    "PackedElementField.NumericType": "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64",
+}
+"""Their enumerations, by owner and name, numbered from 0."""
+_NUMERIC_OF: Final = {"f4": 7, "f8": 8, "u4": 5, "i4": 6, "u1": 1}
+
+IMAGE, CALIBRATION, CLOUD = "CompressedImage", "CameraCalibration", "PointCloud"
+
+
+def schema() -> bytes:
+    """The descriptors of all messages, as an MCAP file carries them."""
+    return _file().SerializeToString()
+
+
+@cache
+def _file() -> descriptor_pb2.FileDescriptorSet:
+    return descriptors(_TYPES, _ENUMS)
+
+
+def descriptors(
+    types: Mapping[str, str], enums: Mapping[str, str]
+) -> descriptor_pb2.FileDescriptorSet:
+    """Descriptors of messages of Foxglove's, and of what of Google's they need.
+
+    Parameters
+    ----------
+    types : mapping
+        Name → fields, ``name=number:type``, with * if repeated; each after those that it needs.
+    enums : mapping
+        ``Owner.Name`` → words, numbered from 0.
+    """
+    needed = " ".join(types.values())
+    used = [file for name, file in _GOOGLE.items() if f":{name}" in needed]
+    google = [descriptor_pb2.FileDescriptorProto.FromString(file.serialized_pb) for file in used]
+    file = descriptor_pb2.FileDescriptorProto(
+        name="foxglove.proto",
+        package="foxglove",
+        syntax="proto3",
+        dependency=[file.name for file in google],
+    )
+    for name, items in types.items():
+        message = file.message_type.add(name=name)
+        for item in items.split():
+            label, _, rest = item.partition("=")
+            number, _, kind = rest.partition(":")
+            field = message.field.add(name=label, number=int(number))
+            field.label = _FIELD.LABEL_REPEATED if kind.endswith("*") else _FIELD.LABEL_OPTIONAL
+            _set_type(field, kind.removesuffix("*"), enums)
+        for name_of, words in enums.items():
+            owner, _, own = name_of.partition(".")
+            if owner == name:
+                enum = message.enum_type.add(name=own)
+                for number, word in enumerate(words.split()):
+                    enum.value.add(name=word, number=number)
+    return descriptor_pb2.FileDescriptorSet(file=[*google, file])
+
+
+def _set_type(
+    field: descriptor_pb2.FieldDescriptorProto, kind: str, enums: Mapping[str, str]
+) -> None:
+    if kind in _SCALARS:
+        field.type = _SCALARS[kind]
+    elif kind in enums:
+        field.type, field.type_name = _FIELD.TYPE_ENUM, f".foxglove.{kind}"
+    else:
+        package = "google.protobuf" if kind in _GOOGLE else "foxglove"
+        field.type, field.type_name = _FIELD.TYPE_MESSAGE, f".{package}.{kind}"
+
+
+@cache
+def message_type(name: str) -> type[Any]:
+    """The class of a message."""
+    return class_of(_file(), name)
+
+
+def class_of(files: descriptor_pb2.FileDescriptorSet, name: str) -> type[Any]:
+    """The class of a message that descriptors describe."""
+    pool = descriptor_pool.DescriptorPool()
+    for file in files.file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+
+
+def image(pixels: NDArray[np.uint8], time_ns: int, frame_id: str) -> bytes:
+    """A picture, (height, width, 3), as ``foxglove.CompressedImage``."""
+    out = message_type(IMAGE)(format="png", frame_id=frame_id, data=png(pixels))
+    stamp(out, time_ns)
+    return out.SerializeToString()
+
+
+def calibration(width: int, height: int, fov: float, time_ns: int, frame_id: str) -> bytes:
+    """A pinhole camera without distortion, by its field of view across, in degrees."""
+    focal = width / (2 * math.tan(math.radians(fov) / 2))
+    x, y = width / 2, height / 2
+    out = message_type(CALIBRATION)(
+        width=width, height=height, frame_id=frame_id, distortion_model="plumb_bob", D=[0.0] * 5
+    )
+    out.K.extend([focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0])
+    out.R.extend([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    out.P.extend([focal, 0.0, x, 0.0, 0.0, focal, y, 0.0, 0.0, 0.0, 1.0, 0.0])
+    stamp(out, time_ns)
+    return out.SerializeToString()
+
+
+def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
+    """Points, a structured array, as ``foxglove.PointCloud`` in the sensor's own axes."""
+    out = message_type(CLOUD)(frame_id=frame_id, data=points.tobytes())
+    out.point_stride = points.dtype.itemsize
+    out.pose.orientation.w = 1.0
+    for name, (kind, offset, *_) in (points.dtype.fields or {}).items():
+        out.fields.add(name=name, offset=offset, type=_NUMERIC_OF[kind.str[1:]])
+    stamp(out, time_ns)
+    return out.SerializeToString()
+
+
+def values(told: dict[str, Any], time_ns: int) -> bytes:
+    """Values by name, as JSON with their time."""
+    about = {"timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}} | told
+    return json.dumps(_plain(about), allow_nan=False).encode()
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON knows it: what is no number is null."""
+    match value:
+        case float() if not math.isfinite(value):
+            return None
+        case dict():
+            return {key: _plain(item) for key, item in value.items()}
+        case list():
+            return [_plain(item) for item in value]
+        case _:
+            return value
+
+
+def stamp(message: Any, time_ns: int) -> None:
+    """Set the field ``timestamp`` of a message."""
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+
+
+# Scene graphs → ``foxglove.SceneUpdate``: what Foxglove, Lichtblick and Rerun draw in their views of space
+# ------------------------------------------------------------------------------------------------
+# Entities are boxes with their names, parts of the map are dots, edges are lines from centre to centre, those
+# of one relation one thing to be drawn, so that a viewer can show and hide them. Each message takes the place
+# of the one before it. Places are those of the scene graph: metres, in the axes of the road map.
+#
+# Source: foxglove-sdk, schemas ``SceneUpdate``, ``SceneEntity`` and what they are made of.
+
+NAME: Final = "foxglove.SceneUpdate"
+AXES: Final = "map"
+"""What the axes of all scene graphs are called: as CARLA's bridge and most ROS systems call the world."""
+
+_SCENE_TYPES: Final = {
+    "Vector3": "x=1:double y=2:double z=3:double",
+    "Quaternion": "x=1:double y=2:double z=3:double w=4:double",
+    "Point3": "x=1:double y=2:double z=3:double",
+    "Pose": "position=1:Vector3 orientation=2:Quaternion",
+    "Color": "r=1:double g=2:double b=3:double a=4:double",
+    "KeyValuePair": "key=1:string value=2:string",
+    "ArrowPrimitive": "pose=1:Pose shaft_length=2:double shaft_diameter=3:double head_length=4:double"
+    " head_diameter=5:double color=6:Color",
+    "CubePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
+    "SpherePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
+    "CylinderPrimitive": "pose=1:Pose size=2:Vector3 bottom_scale=3:double top_scale=4:double color=5:Color",
+    "LinePrimitive": "type=1:LinePrimitive.Type pose=2:Pose thickness=3:double scale_invariant=4:bool"
+    " points=5:Point3* color=6:Color colors=7:Color* indices=8:fixed32*",
+    "TriangleListPrimitive": "pose=1:Pose points=2:Point3* color=3:Color colors=4:Color* indices=5:fixed32*",
+    "TextPrimitive": "pose=1:Pose billboard=2:bool font_size=3:double scale_invariant=4:bool color=5:Color"
+    " text=6:string",
+    "ModelPrimitive": "pose=1:Pose scale=2:Vector3 color=3:Color override_color=4:bool url=5:string"
+    " media_type=6:string data=7:bytes",
+    "SceneEntityDeletion": "timestamp=1:Timestamp type=2:SceneEntityDeletion.Type id=3:string",
+    "SceneEntity": "timestamp=1:Timestamp frame_id=2:string id=3:string lifetime=4:Duration"
+    " frame_locked=5:bool metadata=6:KeyValuePair* arrows=7:ArrowPrimitive* cubes=8:CubePrimitive*"
+    " spheres=9:SpherePrimitive* cylinders=10:CylinderPrimitive* lines=11:LinePrimitive*"
+    " triangles=12:TriangleListPrimitive* texts=13:TextPrimitive* models=14:ModelPrimitive*",
+    "SceneUpdate": "deletions=1:SceneEntityDeletion* entities=2:SceneEntity*",
+}
+_SCENE_ENUMS: Final = {
+    "LinePrimitive.Type": "LINE_STRIP LINE_LOOP LINE_LIST",
+    "SceneEntityDeletion.Type": "MATCHING_ID ALL",
+}
+_ALL, _LINE_LIST = 1, 2
+
+Colour = tuple[float, float, float, float]
+
+EGO_COLOUR: Final[Colour] = (0.1, 0.45, 0.95, 0.9)
+COLOURS: Final[dict[str, Colour]] = {
+    **dict.fromkeys(("person", "animal"), (0.95, 0.45, 0.1, 0.9)),
+    **dict.fromkeys(("bicycle", "motorcycle"), (0.95, 0.75, 0.1, 0.9)),
+    **dict.fromkeys(
+        ("car", "truck", "van", "bus", "trailer", "train", "vehicle"), (0.45, 0.5, 0.55, 0.9)
+    ),
+    **dict.fromkeys(("lane", "road", "junction", "crosswalk"), (0.6, 0.6, 0.6, 0.6)),
+}
+LIGHTS: Final[dict[str, Colour]] = {
+    "red": (0.9, 0.1, 0.1, 1.0),
+    "yellow": (0.95, 0.8, 0.1, 1.0),
+    "red_yellow": (0.95, 0.5, 0.1, 1.0),
+    "green": (0.1, 0.7, 0.2, 1.0),
+}
+OTHERS: Final[Colour] = (0.7, 0.7, 0.65, 0.5)
+RELATION_COLOURS: Final[dict[str, Colour]] = {
+    **dict.fromkeys(DIRECTIONS, (0.3, 0.5, 0.9, 0.35)),
+    **{name: (0.9, 0.15 + 0.13 * i, 0.1, 0.9 - 0.12 * i) for i, name in enumerate(PROXIMITY)},
+    **dict.fromkeys(("toLeftOf", "toRightOf"), (0.5, 0.4, 0.8, 0.35)),
+    **dict.fromkeys(("leads", "follows"), (0.1, 0.65, 0.6, 0.9)),
+    **dict.fromkeys(("controlsTrafficOf", "mayAffect"), (0.8, 0.2, 0.6, 0.8)),
+    "overlaps": (1.0, 0.0, 0.0, 1.0),
+    "sees": (0.2, 0.7, 0.2, 0.4),
+}
+OTHER_RELATIONS: Final[Colour] = (0.55, 0.55, 0.55, 0.5)
+
+DOT: Final = 0.5
+"""Diameter of what has no size; m."""
+LINE: Final = 2.0
+"""Width of edges; pixels."""
+TEXT: Final = 12.0
+"""Size of names; pixels."""
+
+
+def scene_schema() -> bytes:
+    """The descriptors of the message, as an MCAP file carries them."""
+    return _files().SerializeToString()
+
+
+@cache
+def _files() -> FileDescriptorSet:
+    return descriptors(_SCENE_TYPES, _SCENE_ENUMS)
+
+
+@cache
+def _scene_update() -> type[Any]:
+    return class_of(_files(), "SceneUpdate")
+
+
+def message(graph: SceneGraph, log_time_ns: int) -> bytes:
+    """A scene graph as a message; a node without a place is not drawn, nor are its edges."""
+    update = _scene_update()()
+    gone = update.deletions.add(type=_ALL)
+    stamp(gone, log_time_ns)
+    places = {node: _place(about) for node, about in graph.nodes.items()}
+    for node, about in graph.nodes.items():
+        place = places[node]
+        if place is not None:
+            _add_node(_entity(update, about["name"], log_time_ns), node, about, place)
+    lines: dict[str, Any] = {}
+    for src, relation, dst, _ in graph.edges:
+        ends = places.get(src), places.get(dst)
+        if None in ends:
+            continue
+        if relation not in lines:
+            entity = _entity(update, f"edges {relation}", log_time_ns)
+            lines[relation] = entity.lines.add(
+                type=_LINE_LIST, thickness=LINE, scale_invariant=True
+            )
+            lines[relation].pose.orientation.w = 1.0
+            _paint(lines[relation].color, RELATION_COLOURS.get(relation, OTHER_RELATIONS))
+        for end in ends:
+            x, y, z = end or (0.0, 0.0, 0.0)
+            lines[relation].points.add(x=x, y=y, z=z)
+    return update.SerializeToString(deterministic=True)
+
+
+def _entity(update: Any, name: str, log_time_ns: int) -> Any:
+    entity = update.entities.add(frame_id=AXES, id=name)
+    stamp(entity, log_time_ns)
+    return entity
+
+
+def _add_node(
+    entity: Any, node: int, about: dict[str, Any], place: tuple[float, float, float]
+) -> None:
+    entity.metadata.add(key="node_id", value=str(node))
+    for key in ("kind", "special", "speed", "light_state"):
+        if key in about:
+            entity.metadata.add(key=key, value=str(about[key]))
+    solid = node >= 0 and all(about.get(side) for side in ("length", "width", "height"))
+    body = entity.cubes.add() if solid else entity.spheres.add()
+    body.pose.position.x, body.pose.position.y, body.pose.position.z = place
+    half = math.radians(about.get("heading", 0.0)) / 2
+    body.pose.orientation.z, body.pose.orientation.w = math.sin(half), math.cos(half)
+    size = (about["length"], about["width"], about["height"]) if solid else (DOT, DOT, DOT)
+    body.size.x, body.size.y, body.size.z = size
+    colour = LIGHTS.get(about.get("light_state", ""), COLOURS.get(about["kind"], OTHERS))
+    _paint(body.color, EGO_COLOUR if about.get("is_ego") else colour)
+    if node >= 0 and not about.get("is_static"):
+        name = entity.texts.add(
+            text=about["name"], billboard=True, font_size=TEXT, scale_invariant=True
+        )
+        name.pose.position.x, name.pose.position.y = place[:2]
+        name.pose.position.z = place[2] + about.get("height", 0.0) / 2 + DOT
+        name.pose.orientation.w = 1.0
+        _paint(name.color, (1.0, 1.0, 1.0, 1.0))
+
+
+def _place(about: dict[str, Any]) -> tuple[float, float, float] | None:
+    if "x" not in about or "y" not in about:
+        return None
+    return about["x"], about["y"], about.get("z", 0.0)
+
+
+def _paint(color: Any, colour: Colour) -> None:
+    color.r, color.g, color.b, color.a = colour

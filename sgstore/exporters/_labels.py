@@ -1,0 +1,383 @@
+"""What is exported: clips of a store, and labels of frames by queries.
+
+Labels from queries: a value for each frame, by name.
+
+A label is an expression of the language about a frame (``ego.speed * 3.6``, ``EXISTS
+{(ego)-[:near]->(:Person)}``), or a whole query, which is true in the frames that it finds and false in the
+others. What is not known stays so: a label has no value in a frame without an ego if it speaks of the ego, nor
+in traces that cannot answer.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import ExportError, QueryError, TextSpan
+from sgstore.exporters._clips import ClipSource
+from sgstore.store import SEQ_BITS, trace_of
+from sgstore.world import tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from sgstore.matches import Matches
+    from sgstore.query import Store
+    from sgstore.store import StoredTrace
+    from sgstore.world import Clip, Ints
+
+
+NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,62}")
+
+_QUERY: Final = re.compile(r"\s*(MATCH|USING|DEFINE|HOLDS|NOT\s+MATCH)\b", re.IGNORECASE)
+"""How a whole query begins; whatever else is an expression."""
+
+TAKEN: Final = frozenset(
+    {"clip", "frame_id", "trace", "trace_id", "seq", "time_ns", "log_time_ns", "t", "ego", "map"}
+)
+"""Names of columns of frames."""
+
+
+def parse_labels(pairs: Iterable[str]) -> dict[str, str]:
+    """``NAME=TEXT`` as names and texts.
+
+    Raises
+    ------
+    ExportError
+        A name is missing, no name, taken, or comes twice.
+    """
+    found: dict[str, str] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        name = name.strip()
+        if not equals or not text.strip() or not NAME.fullmatch(name):
+            raise ExportError(
+                f"not a label: {pair!r}; expected NAME=EXPRESSION, the name of letters, digits and '_'"
+            )
+        if name.lower() in TAKEN | {n.lower() for n in found}:
+            raise ExportError(
+                f"the label {name!r} needs another name: there is a column of that name"
+            )
+        found[name] = text.strip()
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """Labels of frames.
+
+    Attributes
+    ----------
+    texts : mapping of str to str
+        What each label asks.
+    frame_id : int64, shape (n,)
+        Ascending.
+    values : mapping of str to object, shape (n,)
+        Truth values, numbers or texts; ``None`` where nothing is known.
+    """
+
+    texts: Mapping[str, str]
+    frame_id: Ints
+    values: Mapping[str, np.ndarray[Any, np.dtype[np.object_]]]
+
+    @classmethod
+    def asked(
+        cls, store: Store, texts: Mapping[str, str], frame_id: Ints, **parameters: object
+    ) -> Labels:
+        """Ask a store for the labels of some frames.
+
+        Parameters
+        ----------
+        store : Store
+        texts : mapping
+            Name → expression or query.
+        frame_id : int64
+            The frames, in any order; repetitions do not matter.
+        **parameters
+            Values of ``$name`` in them.
+
+        Raises
+        ------
+        QueryError
+            A text is neither an expression nor a query.
+        ExportError
+            An expression has several values in one frame.
+        """
+        wanted = np.unique(frame_id)
+        values = {
+            name: _asked(store, name, text, wanted, parameters) for name, text in texts.items()
+        }
+        return cls(texts, wanted, values)
+
+    def of(self, frame_id: Ints) -> dict[str, list[Any]]:
+        """The labels of frames, all of which were asked for, by name."""
+        rows = np.searchsorted(self.frame_id, frame_id)
+        return {name: values[rows].tolist() for name, values in self.values.items()}
+
+
+def _asked(
+    store: Store, name: str, text: str, wanted: Ints, parameters: Mapping[str, object]
+) -> np.ndarray[Any, np.dtype[np.object_]]:
+    values = np.full(len(wanted), None, object)
+    if _QUERY.match(text):
+        matches = store.find(text, **parameters)
+        left_out = {store.file.trace(trace).trace_id for trace in matches.left_out}
+        values[~np.isin(trace_of(wanted), list(left_out))] = False
+        found = np.fromiter((frame.frame_id for frame in matches.frames()), np.int64)
+        values[_rows(wanted, found)[1]] = True
+        return values
+    for row, answer in _answers(store, text, wanted, parameters):
+        if len(np.unique(row)) < len(row):
+            raise ExportError(f"the label {name!r} has several values in one frame: {text}")
+        values[row] = answer
+    return values
+
+
+def _answers(
+    store: Store, text: str, wanted: Ints, parameters: Mapping[str, object]
+) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
+    """Rows of frames and values of an expression: of those with an ego, then of those without."""
+    value = f"{text}) AS label"
+    try:
+        matches = store.find(_OF_EGO + value, **parameters)
+    except QueryError as error:
+        raise _of_expression(error, text) from None
+    if matches.columns != ("frame_of_label", "label"):
+        raise ExportError(f"not one expression: {text}")
+    row, answer = _columns(matches, wanted)
+    yield row, answer
+    answered = np.zeros(len(wanted), np.bool_)
+    answered[row] = True
+    if answered.all():
+        return
+    row, answer = _columns(store.find(_OF_ANYTHING + value, **parameters), wanted)
+    yield row[~answered[row]], answer[~answered[row]]
+
+
+_RETURNED: Final = "RETURN DISTINCT frame.id AS frame_of_label, ("
+_OF_EGO: Final = f"MATCH (:Ego) {_RETURNED}"
+_OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
+"""What comes before an expression."""
+
+
+def _of_expression(error: QueryError, text: str) -> QueryError:
+    """What is wrong with an expression, shown in what was written and not in the query that it became."""
+    if error.span is None:
+        return QueryError(error.reason, text=text, hint=error.hint)
+    before, end = len(_OF_EGO), len(text)
+    start, stop = (min(max(place - before, 0), end) for place in (error.span.start, error.span.end))
+    reason = error.reason.replace("found ')'", "the text ends") if start == end else error.reason
+    return QueryError(reason, text=text, span=TextSpan(start, stop), hint=error.hint)
+
+
+def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
+    """Rows of the frames that are wanted, and what was found of them."""
+    found = matches.numpy()
+    of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))
+    values = found["label"].astype(object)
+    values[np.ma.getmaskarray(found["label"])] = None
+    return row, np.asarray(values, object)[of]
+
+
+def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
+    """Which of some frames are wanted, and their rows in what is."""
+    row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
+    of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
+    return of, row[of]
+
+
+# What is to be exported: clips of a store, and the frames in them with their labels -------------
+
+WINDOW: Final = 240
+"""Frames that are read from the store at once, as columns."""
+FEW: Final = 60
+"""The same, where single graphs are made of them: records take ten times the space of columns."""
+
+_FRAMES: Final = """
+SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames
+WHERE frame_id >= $first AND frame_id <= $last AND log_time_ns >= $start AND log_time_ns <= $end
+ORDER BY frame_id
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """An export: which clips of which store, and how.
+
+    Attributes
+    ----------
+    store : Store
+    clips : tuple of Clip
+        Log times, both ends included; intervals may overlap.
+    labels : Labels, optional
+        Values of the frames, by name; see :mod:`sgstore.exporters._labels`.
+    abstraction : str
+        What the graphs are seen as; empty: as the format has it by itself.
+    with_graph : bool
+        Whether clips of recordings bring the scene graphs with them.
+    channels : tuple of str
+        Topics of the sensors that are wanted; empty: all.
+    clouds : str
+        What clouds of points are written as: ``pcd``, ``npy`` or ``bin``.
+    provenance : mapping
+        What is to be known of it: ``query``, and whatever else the caller has.
+    progress : callable, optional
+        Called with the number of frames done and of all.
+    """
+
+    store: Store
+    clips: tuple[Clip, ...]
+    labels: Labels | None = None
+    abstraction: str = ""
+    with_graph: bool = False
+    channels: tuple[str, ...] = ()
+    clouds: str = "pcd"
+    provenance: Mapping[str, str] = field(default_factory=dict[str, str])
+    progress: Callable[[int, int], None] | None = None
+
+    def sources(self) -> dict[str, ClipSource]:
+        """The recordings of the traces of the clips."""
+        traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
+        return {
+            name: ClipSource(
+                trace.path,
+                trace.digest,
+                self.store.file.context(name),
+                tolerance_ns(trace.period_ns),
+            )
+            for name, trace in traces.items()
+        }
+
+    def trace(self, name: str) -> StoredTrace:
+        """A trace of the store."""
+        return self.store.file.trace(name)
+
+    def frames(self) -> Iterator[ClipFrames]:
+        """The frames of the clips, clip by clip; a frame comes with each clip that it is in.
+
+        Raises
+        ------
+        ExportError
+            There is no frame in a clip.
+        """
+        for number, clip in enumerate(self.clips, 1):
+            frames = ClipFrames.of(self, number, clip)
+            if not len(frames):
+                raise ExportError(
+                    f"no frame of {clip.trace!r} between {clip.start_ns} and {clip.end_ns} ns"
+                )
+            yield frames
+
+    def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
+        """The frames of the clips, at most ``size`` at a time, of one clip each; tells the progress."""
+        for frames in self.frames():
+            yield from frames.windows(size)
+            self.tell(frames.number, len(self.clips))
+
+    def fresh_windows(self) -> Iterator[ClipFrames]:
+        """As :meth:`windows`, but a frame comes with the first clip alone that it is in."""
+        for frames in self.windows():
+            time = frames.log_time_ns
+            slack = tolerance_ns(self.trace(frames.clip.trace).period_ns)
+            known = np.zeros(len(frames), np.bool_)
+            for clip in self.clips[: frames.number - 1]:
+                if clip.trace == frames.clip.trace:
+                    reach = clip.widened(slack)
+                    known |= (time >= reach.start_ns) & (time <= reach.end_ns)
+            if not known.all():
+                yield frames.take(np.flatnonzero(~known))
+
+    def tell(self, done: int, of: int) -> None:
+        """Tell how far it is."""
+        if self.progress is not None:
+            self.progress(done, of)
+
+    def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
+        """The labels of frames, by name."""
+        return {} if self.labels is None else self.labels.of(frame_id)
+
+    def about(self) -> dict[str, Any]:
+        """What a manifest tells of it: clips, labels, and where all comes from."""
+        traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
+        return {
+            "clips": [
+                {
+                    "trace": clip.trace,
+                    "start_ns": clip.start_ns,
+                    "end_ns": clip.end_ns,
+                    "source": traces[clip.trace].path.name,
+                    "source_sha256": traces[clip.trace].digest,
+                }
+                for clip in self.clips
+            ],
+            "labels": {} if self.labels is None else dict(self.labels.texts),
+            "provenance": dict(self.provenance),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ClipFrames:
+    """Frames of a clip, in order of their numbers; shape (n,).
+
+    Attributes
+    ----------
+    number : int
+        Of the clip in its export, counted from 1.
+    clip : Clip
+    frame_id, seq, time_ns, log_time_ns : int64
+    t : float64
+        Since the trace began; s.
+    """
+
+    number: int
+    clip: Clip
+    frame_id: Ints
+    seq: Ints
+    time_ns: Ints
+    log_time_ns: Ints
+    t: np.ndarray[Any, np.dtype[np.float64]]
+
+    @classmethod
+    def of(cls, export: Export, number: int, clip: Clip) -> ClipFrames:
+        """The frames of the trace of a clip whose log times lie in it."""
+        trace = export.trace(clip.trace)
+        trace_id, reach = trace.trace_id, clip.widened(tolerance_ns(trace.period_ns))
+        found = export.store.file.arrays(
+            _FRAMES,
+            {
+                "first": trace_id << SEQ_BITS,
+                "last": (trace_id + 1 << SEQ_BITS) - 1,
+                "start": reach.start_ns,
+                "end": reach.end_ns,
+            },
+        )
+        return cls(
+            number,
+            clip,
+            frame_id=found["frame_id"].astype(np.int64),
+            seq=found["seq"].astype(np.int64),
+            time_ns=found["time_ns"].astype(np.int64),
+            log_time_ns=found["log_time_ns"].astype(np.int64),
+            t=found["t"].astype(np.float64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.frame_id)
+
+    def take(self, rows: slice | Ints) -> ClipFrames:
+        """Some of them, in their order."""
+        columns = ("frame_id", "seq", "time_ns", "log_time_ns", "t")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+
+    def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
+        """All of them, ``size`` at a time."""
+        for start in range(0, len(self), size):
+            yield self.take(slice(start, start + size))
+
+    @property
+    def bounds(self) -> dict[str, int]:
+        """The first and the last ``frame_id``, as values of ``$first`` and ``$last``."""
+        return {"first": int(self.frame_id[0]), "last": int(self.frame_id[-1])}

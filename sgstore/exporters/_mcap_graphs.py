@@ -1,0 +1,260 @@
+"""What clips of recordings bring with them besides their messages: scene graphs, and labels of frames.
+
+Channels, each with one message a frame, at the frame's log time:
+
+* ``/sgstore/graph``: the scene graph as JSON (:data:`GRAPH_SCHEMA`), with the labels;
+* ``/sgstore/scene``: the same to be drawn, ``foxglove.SceneUpdate`` in protobuf;
+* ``/sgstore/labels``: the labels alone, as JSON, where no graph is wanted.
+
+The metadata of these channels says ``sgstore: derived``: they are made of the recording and no part of it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from mcap.records import Channel, Schema
+
+import sgstore.exporters._foxglove as foxglove_scene
+from sgstore.errors import ExportError
+from sgstore.exporters._labels import FEW, ClipFrames
+from sgstore.exporters._nx import graphs_of
+from sgstore.readers import DERIVED
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from sgstore.exporters._labels import Export
+    from sgstore.exporters._mcap_writer import McapWriter
+    from sgstore.graph import SceneGraph
+
+
+GRAPH: Final = "/sgstore/graph"
+SCENE: Final = "/sgstore/scene"
+LABELS: Final = "/sgstore/labels"
+
+_LABEL_VALUES: Final[dict[str, Any]] = {
+    "type": "object",
+    "description": "Values of the labels that were asked for; null where one is not known.",
+    "additionalProperties": {"type": ["boolean", "number", "string", "null"]},
+}
+_FRAME: Final[dict[str, Any]] = {
+    "timestamp": {
+        "type": "object",
+        "title": "time",
+        "description": "Log time of the frame.",
+        "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+    },
+    "trace": {"type": "string", "description": "Name of the trace in its store."},
+    "frame_id": {"type": "string", "description": "64-bit id of the frame in its store."},
+    "seq": {"type": "integer", "description": "Number of the frame in its trace, from 0."},
+    "time_ns": {"type": "string", "description": "Simulation time; ns."},
+    "labels": _LABEL_VALUES,
+}
+GRAPH_SCHEMA: Final[dict[str, Any]] = {
+    "$schema": "https://json-schema.org/draft/2020-12/schema",
+    "title": "sgstore.SceneGraph",
+    "description": "The scene graph of a frame. Metres, seconds, m/s, degrees; axes of the road map.",
+    "type": "object",
+    "properties": {
+        **_FRAME,
+        "ego": {"type": ["integer", "null"], "description": "Id of the ego's node."},
+        "nodes": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "description": "What is known of a node; ids below zero are parts of the map.",
+                "properties": {
+                    "id": {"type": "integer"},
+                    "kind": {"type": "string"},
+                    "name": {"type": "string"},
+                    "is_ego": {"type": "boolean"},
+                    "is_static": {"type": "boolean"},
+                },
+                "required": ["id", "kind", "name"],
+            },
+        },
+        "edges": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "src": {"type": "integer"},
+                    "relation": {"type": "string"},
+                    "dst": {"type": "integer"},
+                },
+                "required": ["src", "relation", "dst"],
+            },
+        },
+    },
+    "required": ["timestamp", "trace", "frame_id", "seq", "nodes", "edges"],
+}
+LABEL_SCHEMA: Final[dict[str, Any]] = {
+    "$schema": "https://json-schema.org/draft/2020-12/schema",
+    "title": "sgstore.Labels",
+    "type": "object",
+    "properties": _FRAME,
+    "required": ["timestamp", "trace", "frame_id", "seq", "labels"],
+}
+
+Message = tuple[int, int, int, bytes]
+"""Channel, sequence number, log time in ns, data."""
+
+
+@dataclass(slots=True)
+class _Kind:
+    """One of the channels."""
+
+    topic: str
+    schema: str
+    schema_encoding: str
+    schema_data: bytes
+    encoding: str
+    number: int = 0
+
+
+def is_added(channel: Channel) -> bool:
+    """Whether a channel was made by an export, and is no part of the recording."""
+    return all(channel.metadata.get(key) == value for key, value in DERIVED.items())
+
+
+class Added:
+    """The channels that clips of an export bring with them.
+
+    Parameters
+    ----------
+    export : Export
+    """
+
+    def __init__(self, export: Export) -> None:
+        self._export = export
+        graphs, labels = _as_json(GRAPH_SCHEMA), _as_json(LABEL_SCHEMA)
+        kinds = [_Kind(LABELS, "sgstore.Labels", "jsonschema", labels, "json")]
+        if export.with_graph:
+            scene = foxglove_scene.scene_schema()
+            kinds = [
+                _Kind(GRAPH, "sgstore.SceneGraph", "jsonschema", graphs, "json"),
+                _Kind(SCENE, foxglove_scene.NAME, "protobuf", scene, "protobuf"),
+            ]
+        self._kinds = kinds
+
+    def definitions(
+        self, schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
+    ) -> Iterator[Schema | Channel]:
+        """Schemas and channels, with numbers that a recording does not use.
+
+        Raises
+        ------
+        ExportError
+            It uses all numbers that there are.
+        """
+        schema, channel = max(schemas, default=0), max(channels, default=0)
+        if max(schema, channel) + len(self._kinds) >= 1 << 16:
+            raise ExportError("the recording leaves no numbers for channels of scene graphs")
+        for i, kind in enumerate(self._kinds, 1):
+            kind.number = channel + i
+            yield Schema(schema + i, kind.schema_data, kind.schema_encoding, kind.schema)
+            yield Channel(kind.number, kind.topic, kind.encoding, dict(DERIVED), schema + i)
+
+    def channels(self) -> list[tuple[int, str, str]]:
+        """Number, topic and schema of each, as they were defined last."""
+        return [(kind.number, kind.topic, kind.schema) for kind in self._kinds]
+
+    def messages(self, number: int) -> Iterator[Message]:
+        """The messages of the frames of a clip, by its number, in order of log time."""
+        frames = ClipFrames.of(self._export, number, self._export.clips[number - 1])
+        order = frames.log_time_ns.argsort(kind="stable")
+        sequence = 0
+        for start in range(0, len(frames), FEW):
+            # Graphs are read by ranges of frames: those of a window are near each other.
+            rows = order[start : start + FEW]
+            rows.sort()
+            window = frames.take(rows)
+            found = list(self._of_window(window))
+            for at in window.log_time_ns.argsort(kind="stable").tolist():
+                for kind, data in zip(self._kinds, found[at], strict=True):
+                    yield kind.number, sequence, int(window.log_time_ns[at]), data
+                sequence += 1
+
+    def _of_window(self, frames: ClipFrames) -> Iterator[tuple[bytes, ...]]:
+        columns = self._export.label_columns(frames.frame_id)
+        labels = [
+            {name: values[row] for name, values in columns.items()} for row in range(len(frames))
+        ]
+        heads = [_head(frames, row) | {"labels": of} for row, of in enumerate(labels)]
+        if not self._export.with_graph:
+            yield from ((_as_json(head),) for head in heads)
+            return
+        for row, graph in enumerate(graphs_of(self._export, frames)):
+            told = _as_json(heads[row] | _graph(graph))
+            yield told, foxglove_scene.message(graph, int(frames.log_time_ns[row]))
+
+
+class Waiting:
+    """Messages that wait until it is their turn among others, in order of log time."""
+
+    def __init__(self, writer: McapWriter, messages: Iterable[Message]) -> None:
+        self._writer = writer
+        self._messages = iter(messages)
+        self._next = next(self._messages, None)
+
+    def write_before(self, log_time_ns: int) -> None:
+        """Write those of earlier log times."""
+        while self._next is not None and self._next[2] < log_time_ns:
+            self._write(self._next)
+
+    def write_rest(self) -> None:
+        """Write all that are left."""
+        while self._next is not None:
+            self._write(self._next)
+
+    def _write(self, message: Message) -> None:
+        channel, sequence, time_ns, data = message
+        self._writer.message(channel, sequence, time_ns, time_ns, memoryview(data))
+        self._next = next(self._messages, None)
+
+
+def _head(frames: ClipFrames, row: int) -> dict[str, Any]:
+    seconds, rest = divmod(int(frames.log_time_ns[row]), 1_000_000_000)
+    return {
+        "timestamp": {"sec": seconds, "nsec": rest},
+        "trace": frames.clip.trace,
+        "frame_id": str(int(frames.frame_id[row])),
+        "seq": int(frames.seq[row]),
+        "time_ns": str(int(frames.time_ns[row])),
+    }
+
+
+def _graph(graph: SceneGraph) -> dict[str, Any]:
+    return {
+        "ego": graph.ego,
+        "nodes": [{"id": node} | about for node, about in graph.nodes.items()],
+        "edges": [
+            {"src": src, "dst": dst} | about
+            for src, dst, about in graph.to_networkx().edges(data=True)
+        ],
+    }
+
+
+def _as_json(value: Any) -> bytes:
+    """As JSON; numbers that are none are null."""
+    try:
+        text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    except ValueError:
+        text = json.dumps(_finite(value), ensure_ascii=False, separators=(",", ":"))
+    return text.encode("utf-8", "backslashreplace")
+
+
+def _finite(value: Any) -> Any:
+    match value:
+        case float() if not math.isfinite(value):
+            return None
+        case dict():
+            return {key: _finite(item) for key, item in value.items()}
+        case list():
+            return [_finite(item) for item in value]
+        case _:
+            return value

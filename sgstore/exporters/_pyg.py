@@ -1,0 +1,346 @@
+"""Graphs to learn from, as columns that :mod:`sgstore.exporters.graph_data` hands to PyTorch Geometric.
+
+A folder ``graphs`` of ``.npy`` files, which are mapped into memory and nothing else (no pickle), and
+``graphs.json``, which says what the numbers mean. Graph i has the rows ``node_ptr[i]`` to ``node_ptr[i + 1]``
+of the columns of nodes, and of those of edges accordingly; its ``edge_index`` counts its own nodes from 0.
+Clips are ranges of graphs, and so sequences.
+
+Graphs are as the abstraction ``roadscene2vec`` has them, with the types and relations of that tool in its order
+(so that a type is the column of its one-hot feature, and a relation the type of its edge), or as another
+abstraction has them, with its labels in alphabetical order. Beside its type, a node has its place as the ego
+sees it.
+
+Source: RoadScene2Vec (Malawade et al., 2022), its configuration (names of actors and relations, their order).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+
+from sgstore.errors import ExportError
+from sgstore.exporters._clips import WrittenFile
+from sgstore.exporters.graph_data import ABOUT, FOLDER, FORMAT, VERSION, GraphData
+from sgstore.store import FrameSpans
+from sgstore.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from sgstore.abstractions import GraphColumns, Labelled
+    from sgstore.exporters._labels import ClipFrames, Export
+
+
+BY_ITSELF: Final = "roadscene2vec"
+"""The abstraction without another one."""
+
+ACTORS: Final = ("ego_car", "car", "moto", "bicycle", "ped", "lane", "light", "sign", "road")
+RELATIONS: Final = (
+    *("isIn", "inDFrontOf", "inSFrontOf", "atDRearOf", "atSRearOf", "toLeftOf", "toRightOf"),
+    *("near_coll", "super_near", "very_near", "near", "visible"),
+)
+"""Types of nodes and of edges of RoadScene2Vec, in its order."""
+
+_TYPE_OF: Final = {
+    **dict.fromkeys(("Left Lane", "Middle Lane", "Right Lane"), "lane"),
+    "Root Road": "road",
+}
+FEATURES: Final = (
+    ("ahead", "m", "of the ego's centre, along its heading"),
+    ("left", "m", "of the ego's centre, across its heading"),
+    ("up", "m", "above the ego's centre"),
+    ("heading", "rad", "less the ego's heading, in (-pi, pi]"),
+)
+"""Columns of ``node_feature``: name, unit, meaning. NaN where a place, or the ego, is not known."""
+
+
+_KINDS: Final = {
+    "frame_id": ("<i8", 0),
+    "time_ns": ("<i8", 0),
+    "clip": ("<i4", 0),
+    "node_ptr": ("<i8", 0),
+    "edge_ptr": ("<i8", 0),
+    "node_type": ("<i2", 0),
+    "node_id": ("<i8", 0),
+    "node_feature": ("<f4", len(FEATURES)),
+    "edge_index": ("<i4", 2),
+    "edge_type": ("<i2", 0),
+}
+"""Columns: type, and how many numbers a row has; 0: one, and no further axis."""
+
+
+class _Column:
+    """An ``.npy`` file that grows; its head is written again when its length is known."""
+
+    def __init__(self, file: Path, dtype: str, width: int = 0) -> None:
+        self._dtype = np.dtype(dtype)
+        self._width = width
+        self._rows = 0
+        self._stream = file.open("xb")
+        self._head()
+
+    def _head(self) -> None:
+        shape = (self._rows, self._width) if self._width else (self._rows,)
+        # Numpy leaves room in it for the largest number there is, so that its length stays the same.
+        np.lib.format.write_array_header_1_0(
+            self._stream,
+            {"descr": self._dtype.str, "fortran_order": False, "shape": shape},
+        )
+
+    def add(self, values: NDArray[Any]) -> None:
+        """Append rows."""
+        self._rows += len(values)
+        self._stream.write(np.ascontiguousarray(values, self._dtype).tobytes())
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._stream.seek(0)
+        self._head()
+        self._stream.close()
+
+
+@dataclass(slots=True)
+class _TensorColumns:
+    """All columns, and what is written of them so far."""
+
+    folder: Path
+    labels: Mapping[str, _LabelKind]
+    types: list[str] = field(default_factory=list[str])
+    relations: list[str] = field(default_factory=list[str])
+    nodes: int = 0
+    edges: int = 0
+    clips: list[list[int]] = field(default_factory=list[list[int]])
+    of: dict[str, _Column] = field(default_factory=dict[str, _Column])
+
+    def __enter__(self) -> Self:
+        kinds = _KINDS | {f"label_{name}": ("<f8", 0) for name in self.labels}
+        for name, (dtype, width) in kinds.items():
+            self.of[name] = _Column(self.folder / f"{name}.npy", dtype, width)
+        for name in ("node_ptr", "edge_ptr"):
+            self.of[name].add(np.zeros(1))
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        for column in self.of.values():
+            column.close()
+
+    def add(self, frames: ClipFrames, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Append graphs."""
+        count = len(frames)
+        if len(self.clips) < frames.number:
+            start = self.clips[-1][1] if self.clips else 0
+            self.clips.append([start, start])
+        self.clips[-1][1] += count
+        per = {
+            "frame_id": frames.frame_id,
+            "time_ns": frames.time_ns,
+            "clip": np.full(count, frames.number - 1),
+            "node_ptr": self.nodes + np.cumsum(columns["nodes"]),
+            "edge_ptr": self.edges + np.cumsum(columns["edges"]),
+        }
+        self.nodes += int(columns["nodes"].sum())
+        self.edges += int(columns["edges"].sum())
+        for name, column in self.of.items():
+            column.add(per[name] if name in per else columns[name])
+
+
+@dataclass(frozen=True, slots=True)
+class _LabelKind:
+    """What the numbers of a label mean. ``kind``: ``bool``, ``number`` or ``text``; of texts, all ``words``."""
+
+    kind: str
+    words: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, values: list[Any]) -> _LabelKind:
+        known = [value for value in values if value is not None]
+        if all(isinstance(value, bool) for value in known):
+            return cls("bool")
+        if all(isinstance(value, int | float) for value in known):
+            return cls("number")
+        return cls("text", tuple(sorted({str(value) for value in known})))
+
+    def numbers(self, values: list[Any]) -> NDArray[np.float64]:
+        """Values as numbers; NaN where one is not known."""
+        place = {word: i for i, word in enumerate(self.words)}
+        told = [place[str(v)] if self.words and v is not None else v for v in values]
+        return np.array([np.nan if value is None else float(value) for value in told])
+
+
+def write(export: Export, folder: Path) -> list[WrittenFile]:
+    """Write the graphs of all frames, and read them again."""
+    spans = FrameSpans(export.store.file, export.abstraction or BY_ITSELF)
+    labels = (
+        {}
+        if export.labels is None
+        else {name: _LabelKind.of(of.tolist()) for name, of in export.labels.values.items()}
+    )
+    place = folder / FOLDER
+    place.mkdir()
+    columns = _TensorColumns(place, labels)
+    fixed = normalize_name(spans.abstraction.name) == normalize_name(BY_ITSELF)
+    if fixed:
+        columns.types += ACTORS
+        columns.relations += RELATIONS
+    with columns:
+        for frames in export.windows():
+            columns.add(frames, _columns_of(export, frames, spans, columns))
+    if not fixed:
+        columns.types = _sorted(place / "node_type.npy", columns.types)
+        columns.relations = _sorted(place / "edge_type.npy", columns.relations)
+    about = _about(export, spans.abstraction.name, columns)
+    text = json.dumps(about, indent=2, ensure_ascii=False) + "\n"
+    (folder / ABOUT).write_text(text, encoding="utf-8")
+    _test(folder, columns)
+    graphs = sum(last - first for first, last in columns.clips)
+    return [
+        WrittenFile.of(folder / ABOUT, "clips", len(columns.clips)),
+        WrittenFile.of(place, "graphs", graphs),
+    ]
+
+
+def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[str, Any]:
+    texts = {} if export.labels is None else export.labels.texts
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "abstraction": abstraction,
+        "node_types": columns.types,
+        "relations": columns.relations,
+        "node_features": [
+            {"name": name, "unit": unit, "meaning": meaning} for name, unit, meaning in FEATURES
+        ],
+        "labels": {
+            name: {"text": texts[name], "kind": of.kind, "words": list(of.words)}
+            for name, of in columns.labels.items()
+        },
+        "clips": [
+            {"trace": c.trace, "start_ns": c.start_ns, "end_ns": c.end_ns, "graphs": span}
+            for c, span in zip(export.clips, columns.clips, strict=True)
+        ],
+    }
+
+
+def _columns_of(
+    export: Export, frames: ClipFrames, spans: FrameSpans, columns: _TensorColumns
+) -> dict[str, NDArray[Any]]:
+    """The columns of the graphs of some frames; ``nodes`` and ``edges`` say how many each has."""
+    found, seen, labelled = spans.labelled(**frames.bounds)
+    wanted = np.full(len(found), -1)
+    wanted[np.searchsorted(found, frames.seq)] = np.arange(len(frames))
+    of_node = wanted[labelled.node_frame]
+    kept = np.flatnonzero(of_node >= 0)
+    kept = kept[np.argsort(of_node[kept], kind="stable")]
+    nodes = np.bincount(of_node[kept], minlength=len(frames))
+    start = np.cumsum(nodes) - nodes
+    local = np.zeros(len(labelled.node), np.int64)
+    local[kept] = np.arange(len(kept)) - start[of_node[kept]]
+    frame, src, label, dst = _edges(labelled)
+    of_edge = wanted[frame]
+    order = np.flatnonzero(of_edge >= 0)
+    order = order[np.argsort(of_edge[order], kind="stable")]
+    ends = [local[_row(labelled, frame[order], end[order])] for end in (src, dst)]
+    named = np.array(labelled.labels or ("",), object)
+    own = normalize_name(spans.abstraction.name) == normalize_name(BY_ITSELF)
+    numbers = export.label_columns(frames.frame_id)
+    return {
+        "nodes": nodes,
+        "edges": np.bincount(of_edge[order], minlength=len(frames)),
+        "node_type": _codes(
+            columns.types, named[labelled.node_label[kept]], _TYPE_OF if own else {}
+        ),
+        "node_id": labelled.node[kept],
+        "node_feature": _features(seen, labelled.node_frame[kept], labelled.node[kept]),
+        "edge_index": np.stack(ends, axis=1),
+        "edge_type": _codes(columns.relations, named[label[order]], {}),
+    } | {f"label_{name}": columns.labels[name].numbers(of) for name, of in numbers.items()}
+
+
+def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:
+    """Edges with one label each: frame, source, label, destination."""
+    bundles = labelled.bundles[::-1]  # a label below zero counts from the end
+    several = [(i,) for i in range(len(labelled.labels))] + [tuple(of) for of in bundles]
+    many = np.array([len(of) for of in several] or [0])
+    flat = np.array([one for of in several for one in of] or [0], np.int64)
+    starts = np.cumsum(many) - many
+    index = np.where(labelled.label < 0, len(several) + labelled.label, labelled.label)
+    count = many[index] if len(index) else np.zeros(0, np.int64)
+    edge = np.repeat(np.arange(len(index)), count)
+    within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+    label = flat[starts[index[edge]] + within] if len(edge) else np.zeros(0, np.int64)
+    return labelled.frame[edge], labelled.src[edge], label, labelled.dst[edge]
+
+
+def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.int64]:
+    """Rows of nodes in frames; they are in ascending order."""
+    low = int(labelled.node.min(initial=0))
+    span = int(labelled.node.max(initial=0)) - low + 1
+    keys = labelled.node_frame * span + (labelled.node - low)
+    return np.searchsorted(keys, frame * span + (node - low)).astype(np.int64)
+
+
+def _codes(
+    known: list[str], labels: NDArray[np.object_], meaning: Mapping[str, str]
+) -> NDArray[np.int64]:
+    """Numbers of labels; those that are new are appended to what is known."""
+    texts, inverse = np.unique(labels.astype(str), return_inverse=True)
+    place = {name: i for i, name in enumerate(known)}
+    codes: list[int] = []
+    for text in texts.tolist():
+        name = meaning.get(text, text) if text not in place else text
+        if name not in place:
+            place[name] = len(known)
+            known.append(name)
+        codes.append(place[name])
+    return np.array(codes or [0], np.int64)[inverse] if len(labels) else np.zeros(0, np.int64)
+
+
+def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.float64]:
+    """Places of nodes as the ego of their frame sees them; see :data:`FEATURES`."""
+    row = seen.row_of(frame, node)
+    ego = np.full(seen.frames, -1)
+    own = np.flatnonzero(seen.is_ego)
+    ego[seen.node_frame[own]] = own
+    at = ego[frame]
+    known = (row >= 0) & (at >= 0)
+    dx, dy, dz, turned = (
+        np.where(known, of[row] - of[at], np.nan) for of in (seen.x, seen.y, seen.z, seen.heading)
+    )
+    heading = np.where(known, seen.heading[at], np.nan)
+    ahead = dx * np.cos(heading) + dy * np.sin(heading)
+    left = dy * np.cos(heading) - dx * np.sin(heading)
+    turned -= 2 * np.pi * np.ceil((turned - np.pi) / (2 * np.pi))
+    return np.stack([ahead, left, dz, turned], axis=1)
+
+
+def _sorted(file: Path, names: list[str]) -> list[str]:
+    """Names in alphabetical order; the numbers of them in a file are changed accordingly, in pieces."""
+    order = sorted(range(len(names)), key=names.__getitem__)
+    place = np.zeros(len(names) + 1, np.int16)
+    place[order] = np.arange(len(names))
+    mapped = np.lib.format.open_memmap(file, mode="r+")
+    for start in range(0, len(mapped), 1 << 20):
+        mapped[start : start + (1 << 20)] = place[mapped[start : start + (1 << 20)]]
+    mapped.flush()
+    return [names[i] for i in order]
+
+
+def _test(folder: Path, columns: _TensorColumns) -> None:
+    """Read all of it again.
+
+    Raises
+    ------
+    ExportError
+        It is not what was written.
+    """
+    data = GraphData(folder)
+    found = len(data), len(data.columns["node_type"]), len(data.columns["edge_type"])
+    if found != (sum(last - first for first, last in columns.clips), columns.nodes, columns.edges):
+        raise ExportError(f"{FOLDER}: what was written cannot be read back")
+    data.check()

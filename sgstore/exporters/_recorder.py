@@ -1,0 +1,219 @@
+"""A run as it goes → one MCAP file: frames as OSI, the road map, and what sensors measured.
+
+Everything bears simulation time as its log time, so that sensors and frames are joined by it to the nanosecond.
+The file is written aside and takes its name when it is finished; memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from mcap.records import Channel, Schema
+
+import sgstore.exporters._foxglove as foxglove
+import sgstore.exporters._osi_messages as osi_messages
+from sgstore.errors import ExportError
+from sgstore.exporters._clips import tool
+from sgstore.exporters._mcap_writer import McapWriter
+from sgstore.readers import SensorCloud, SensorPicture
+
+if TYPE_CHECKING:
+    from sgstore.readers import SensorReading
+    from sgstore.step import Frame
+
+
+TRUTH: Final = "ground_truth"
+ROAD_MAP: Final = "ground_truth_map"
+"""Topics of the frames and of the road map, as other producers have them."""
+
+PROTOBUF: Final = "protobuf"
+_JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": "object"}}}'
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What a recording holds.
+
+    Attributes
+    ----------
+    path : Path
+    frames : int
+    messages : dict
+        Topic → number of messages.
+    start_ns, end_ns : int
+        Simulation time of the first and of the last frame; ns. 0 without any.
+    """
+
+    path: Path
+    frames: int
+    messages: dict[str, int]
+    start_ns: int
+    end_ns: int
+
+
+class Recorder:
+    """Writes a run as it goes; to be used in a ``with``.
+
+    Parameters
+    ----------
+    to : str or Path
+        ``….mcap``; nothing is overwritten.
+    map_text, map_name : str
+        The road map as OpenDRIVE; empty: none.
+    sensors : mapping
+        Name of each sensor → its blueprint, for the file's description.
+
+    Raises
+    ------
+    ExportError
+        There is a file already, or none can be written there.
+
+    Notes
+    -----
+    A run that is broken off, by an interrupt or an error, leaves what was recorded until then. If there is
+    no frame in it, there is no file.
+    """
+
+    def __init__(
+        self,
+        to: str | Path,
+        *,
+        map_text: str = "",
+        map_name: str = "",
+        sensors: dict[str, str] | None = None,
+    ) -> None:
+        to = Path(to)
+        if to.suffix.lower() != ".mcap":
+            raise ExportError(f"cannot record into {to.name!r}: end the name in .mcap")
+        if to.exists():
+            raise ExportError(f"{to}: there is a file already; nothing is overwritten")
+        self._to = to
+        self._aside = to.with_name(f"{to.name}.part")
+        try:
+            self._stream = self._aside.open("xb")
+        except FileExistsError as error:
+            reason = "another recording is being written there, or was left behind"
+            raise ExportError(f"{self._aside}: {reason}") from error
+        except OSError as error:
+            raise ExportError(f"{self._aside}: {error.strerror or error}") from error
+        self._writer = McapWriter(self._stream, "", tool(), "zstd")
+        self._describe(sensors or {})
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._osi = osi_messages.OsiFrames()
+        self._map = (map_text, map_name)
+        self._times: tuple[int, int] | None = None
+        self._frames = 0
+        self.written: Written | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def frame(self, frame: Frame) -> None:
+        """Write a frame.
+
+        Raises
+        ------
+        ExportError
+            Its time is below 0, which MCAP has no number for, or the disk is full.
+        """
+        time_ns = frame.time_ns
+        if time_ns < 0:
+            raise ExportError(f"a frame at {time_ns} ns: a recording begins at 0 or later")
+        if self._times is None:
+            text, name = self._map
+            if text:
+                data = osi_messages.map_message(text, name)
+                schema = (osi_messages.ROAD_MAP, PROTOBUF, osi_messages.types().map_schema)
+                self._write(ROAD_MAP, schema, time_ns, data)
+        schema = (osi_messages.SENSOR_VIEW, PROTOBUF, osi_messages.types().view_schema)
+        self._write(TRUTH, schema, time_ns, self._osi.message(frame))
+        self._times = (self._times[0] if self._times else time_ns, time_ns)
+        self._frames += 1
+
+    def reading(self, reading: SensorReading) -> None:
+        """Write what a sensor measured.
+
+        Raises
+        ------
+        ExportError
+            The disk is full.
+        """
+        data, time_ns, name = reading.data, max(reading.time_ns, 0), reading.sensor
+        topic = f"/ego/{name}"
+        if isinstance(data, SensorPicture):
+            height, width, _ = data.pixels.shape
+            if f"{topic}/calibration" not in self._channels:
+                about = foxglove.calibration(width, height, data.fov, time_ns, name)
+                self._write_foxglove(f"{topic}/calibration", foxglove.CALIBRATION, time_ns, about)
+            content = foxglove.image(data.pixels, time_ns, name)
+            self._write_foxglove(f"{topic}/image", foxglove.IMAGE, time_ns, content)
+        elif isinstance(data, SensorCloud):
+            content = foxglove.cloud(data.points, time_ns, name)
+            self._write_foxglove(f"{topic}/points", foxglove.CLOUD, time_ns, content)
+        else:
+            schema = ("sgstore.Values", "jsonschema", _JSON_SCHEMA)
+            self._write(topic, schema, time_ns, foxglove.values(data, time_ns), "json")
+
+    def close(self) -> None:
+        """Finish the file and give it its name."""
+        if self._stream.closed:
+            return
+        try:
+            self._writer.finish()
+            self._stream.close()
+            if self._frames:
+                self._aside.replace(self._to)
+            else:
+                self._aside.unlink()
+        except OSError as error:
+            raise ExportError(f"{self._aside}: {error.strerror or error}") from error
+        counts = {topic: self._writer.counts[number] for topic, number in self._channels.items()}
+        start, end = self._times or (0, 0)
+        self.written = Written(self._to, self._frames, counts, start, end)
+
+    def _describe(self, sensors: dict[str, str]) -> None:
+        version = ".".join(map(str, osi_messages.VERSION))
+        names = ("version", "min_osi_version", "max_osi_version")
+        self._writer.metadata("net.asam.osi.trace", dict.fromkeys(names, version))
+        self._writer.metadata("sgstore.record", {f"sensor.{k}": v for k, v in sensors.items()})
+
+    def _write_foxglove(self, topic: str, name: str, time_ns: int, data: bytes) -> None:
+        self._write(topic, (f"foxglove.{name}", PROTOBUF, foxglove.schema()), time_ns, data)
+
+    def _write(
+        self,
+        topic: str,
+        schema: tuple[str, str, bytes],
+        time_ns: int,
+        data: bytes,
+        encoding: str = PROTOBUF,
+    ) -> None:
+        try:
+            number = self._channels.get(topic)
+            if number is None:
+                number = self._define(topic, schema, encoding)
+            sequence = self._writer.counts[number]
+            self._writer.message(number, sequence, time_ns, time_ns, memoryview(data))
+        except OSError as error:
+            raise ExportError(f"{self._aside}: {error.strerror or error}") from error
+
+    def _define(self, topic: str, schema: tuple[str, str, bytes], encoding: str) -> int:
+        name, schema_encoding, data = schema
+        if name not in self._schemas:
+            self._schemas[name] = len(self._schemas) + 1
+            record = Schema(self._schemas[name], data, schema_encoding, name)
+            self._writer.define(record)
+        number = len(self._channels) + 1
+        about: dict[str, Any] = {}
+        if name.startswith("osi3."):
+            version = ".".join(map(str, osi_messages.VERSION))
+            about = {"net.asam.osi.trace.channel.osi_version": version}
+        self._writer.define(Channel(number, topic, encoding, about, self._schemas[name]))
+        self._channels[topic] = number
+        return number

@@ -1,0 +1,535 @@
+"""Files and folders that appear complete or not at all.
+
+Folders for what is on its way, which live no longer than their owner.
+
+Each is locked for as long as its process lives, and removed with it. What a killed process leaves is removed by
+the next one that needs such a folder at the same place: only if nobody holds its lock, so surely not under
+somebody's hands. Where a file system knows no locks, nothing is taken for left behind.
+"""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import io
+import os
+import re
+import secrets
+import select
+import shutil
+import stat
+import sys
+import tempfile
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from sgstore.errors import ExportError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator
+    from typing import BinaryIO, TextIO
+
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there a folder in use cannot be removed anyway
+    fcntl = None
+
+
+PREFIX: Final = "sgstore-held-"
+"""How the folders of processes begin, in the folder for temporary files."""
+
+_FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
+
+
+class HeldFolder:
+    """A new folder that is locked for as long as its process lives.
+
+    Parameters
+    ----------
+    parent : Path
+    prefix : str
+        How its name begins. Folders there that begin so and whose processes are gone are removed.
+    undo : callable, optional
+        Called with each of these before it is removed.
+
+    Attributes
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OSError
+        Nothing can be written there.
+    """
+
+    def __init__(
+        self, parent: Path, prefix: str, undo: Callable[[Path], None] | None = None
+    ) -> None:
+        sweep(parent, prefix, undo)
+        self._parent, self._prefix = parent, prefix
+        self._owner = os.getpid()
+        self._lock: int | None = None
+        self.path = parent / f"{prefix}{self._owner}"
+        # An interrupt may come before whoever needs it can remove it.
+        atexit.register(self.remove)
+        try:
+            while True:
+                self.path = parent / f"{prefix}{self._owner}-{secrets.token_hex(4)}"
+                self.path.mkdir(mode=0o700)
+                if self._locked():
+                    return
+        except OSError:
+            atexit.unregister(self.remove)
+            raise
+
+    def _locked(self) -> bool:
+        """Lock the folder, unless someone took it for a dead one before it was locked."""
+        if fcntl is None:
+            return True
+        try:
+            lock = os.open(self.path, _FLAGS)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        except OSError:  # a file system without locks, on which nobody takes it for dead
+            os.close(lock)
+            return True
+        with suppress(FileNotFoundError):
+            if os.path.samestat(self.path.stat(), os.fstat(lock)):
+                self._lock = lock
+                return True
+        os.close(lock)
+        return False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.remove()
+
+    def remove(self) -> None:
+        """Remove it with all that is in it; a process that was forked from the owner leaves it alone."""
+        if os.getpid() != self._owner:
+            return
+        shutil.rmtree(self.path, ignore_errors=True)
+        if self._lock is not None:
+            with suppress(OSError):  # closed by a removal that was interrupted
+                os.close(self._lock)
+            self._lock = None
+        # A process of ours may outlive us for a moment, and write into the folder while it is removed.
+        sweep(self._parent, self._prefix)
+        atexit.unregister(self.remove)
+
+
+def sweep(parent: Path, prefix: str, undo: Callable[[Path], None] | None = None) -> None:
+    """Remove the folders of :class:`HeldFolder` whose processes are gone, each after it was undone."""
+    if fcntl is None:
+        return
+    names: list[str] = []
+    with suppress(OSError), os.scandir(parent) as entries:
+        names = [entry.name for entry in entries if entry.name.startswith(prefix)]
+    for name in names:
+        with suppress(
+            OSError
+        ):  # its process lives, it is another user's, or someone else removed it
+            _remove_dead(parent / name, undo)
+
+
+def _remove_dead(folder: Path, undo: Callable[[Path], None] | None) -> None:
+    lock = os.open(folder, _FLAGS)
+    try:
+        if fcntl is not None and os.fstat(lock).st_uid == os.geteuid():
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if undo is not None:
+                undo(folder)
+            shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)
+
+
+_mine: dict[tuple[int, Path], Path] = {}
+"""The folder of this process, by the process and the folder for temporary files."""
+
+
+def temporary_folder() -> Path:
+    """The folder of this process for what does not fit into memory; it is removed when the process ends.
+
+    If it cannot be made it does not exist: who writes there is told so then.
+    """
+    root = _root()
+    key = os.getpid(), root
+    if key not in _mine:
+        try:
+            held = HeldFolder(root, PREFIX)
+        except OSError:
+            _mine[key] = root / f"{PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
+        else:
+            _mine[key] = held.path
+    return _mine[key]
+
+
+def new_place(name: str) -> Path:
+    """A place in the folder of this process where nothing is yet."""
+    return temporary_folder() / f"{name}-{secrets.token_hex(4)}"
+
+
+@contextmanager
+def working_folder(name: str) -> Generator[Path]:
+    """A folder in that of this process, for as long as the block lasts.
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
+    """
+    folder = new_place(name)
+    folder.mkdir(mode=0o700, parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _root() -> Path:
+    try:
+        return Path(tempfile.gettempdir()).resolve()
+    except FileNotFoundError:  # none of the usual places can be written, or their disks are full
+        return Path(os.environ.get("TMPDIR") or "/tmp").resolve()  # noqa: S108  only names it
+
+
+# How files are written: beside, under a name of their own, and renamed when all is there --------
+# So a full disk, a crash or an interrupt loses nothing of a file that was there before, and nobody ever reads
+# half a file. What cannot be replaced by a renaming (a pipe, a device, ``/dev/stdout``) is written into.
+
+FILE_PREFIX: Final = ".sgstore-held-"
+"""How the folders begin in which files are written, beside the places where they belong."""
+
+_DESCRIPTOR: Final = re.compile(r"/dev/fd/(\d+)|/proc/self/fd/(\d+)")
+_NOT_THERE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
+"""Why a file may be one that can be written, but not replaced."""
+
+
+_CONTROLS: Final = {
+    code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
+}
+
+
+def without_controls(text: str) -> str:
+    r"""A text in which characters that a terminal may take for orders are escapes: ``\x1b``.
+
+    Line feeds and tabs are no danger.
+    """
+    return text if text.isprintable() else text.translate(_CONTROLS)
+
+
+class ReaderGoneError(ExportError):
+    """Whoever read what is written has gone away, as ``head`` does: there is no reason to go on."""
+
+
+class Stream(io.RawIOBase):
+    """A descriptor that is written to; what goes wrong is an :class:`ExportError` that names it.
+
+    Parameters
+    ----------
+    descriptor : int
+    name : str
+        For messages.
+    quiet : bool
+        Whether what cannot be written is dropped without a word.
+    owned : bool
+        Whether the descriptor is closed with it.
+
+    Notes
+    -----
+    After the first error everything is dropped: buffers that are emptied later find nothing to complain of.
+    """
+
+    def __init__(
+        self, descriptor: int, name: str, *, quiet: bool = False, owned: bool = True
+    ) -> None:
+        super().__init__()
+        self._owned = owned
+        self._descriptor = descriptor
+        self._name = name
+        self._quiet = quiet
+        self.lost = False
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def seekable(self) -> bool:
+        """Whether it is a file that has places."""
+        try:
+            os.lseek(self._descriptor, 0, os.SEEK_CUR)
+        except OSError:
+            return False
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        """Go to a place; bytes from the beginning."""
+        return os.lseek(self._descriptor, offset, whence)
+
+    def fileno(self) -> int:
+        """The descriptor."""
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        return os.isatty(self._descriptor)
+
+    def write(self, data: Any, /) -> int:
+        """Write bytes, all of them; how many."""
+        left = memoryview(data).cast("B")
+        size = len(left)
+        while left and not self.lost:
+            try:
+                left = left[os.write(self._descriptor, left) :]
+            except BlockingIOError:  # somebody else made it so; we can wait
+                select.select([], [self._descriptor], [])
+            except OSError as error:
+                self._fail(error)
+        return size
+
+    def close(self) -> None:
+        """Close it; a network's file system may say only now that a disk is full."""
+        if self.closed:
+            return
+        super().close()
+        if not self._owned:
+            return
+        try:
+            os.close(self._descriptor)
+        except OSError as error:
+            if not self.lost:
+                self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.lost = True
+        if isinstance(error, BrokenPipeError):
+            raise ReaderGoneError(f"{self._name}: nobody reads it any more") from error
+        if not self._quiet:
+            raise ExportError(f"{self._name}: {error.strerror or error}") from error
+
+
+class OutputFile:
+    """A file on its way.
+
+    Parameters
+    ----------
+    to : str or Path
+        Where it belongs. A file that is there is replaced, and keeps its rights; a link stays one.
+
+    Raises
+    ------
+    ExportError
+        Nothing can be written there.
+    """
+
+    def __init__(self, to: str | Path) -> None:
+        self._to = Path(to)
+        self._stack = ExitStack()
+        self._stream: io.BufferedWriter | None = None
+        with _told(self._to):
+            self._target = _target(self._to)
+            self._in_place = self._target is None
+            self._path = None if self._target is None else self._folder(self._target) / "output"
+            if self._path is not None and self._to.suffix:
+                self._path = self._path.with_suffix(self._to.suffix)
+
+    def _folder(self, target: Path) -> Path:
+        try:
+            return self._stack.enter_context(HeldFolder(target.parent, FILE_PREFIX)).path
+        except OSError as error:
+            if error.errno not in _NOT_THERE or not target.exists():
+                raise
+            self._in_place = True
+            return self._stack.enter_context(working_folder("output"))
+
+    def path(self) -> Path:
+        """Where a file is to be made that :meth:`keep` puts in its place."""
+        if self._path is None:
+            with _told(self._to):
+                self._path = self._stack.enter_context(working_folder("output")) / "output"
+        return self._path
+
+    def stream(self) -> BinaryIO:
+        """A stream for its bytes, instead of :meth:`path`; it is closed with the output."""
+        with _told(self._to):
+            if self._path is None:
+                descriptor = _descriptor(self._to)
+            else:
+                descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        self._stream = io.BufferedWriter(Stream(descriptor, str(self._to)), 1 << 16)
+        return self._stream
+
+    def keep(self) -> None:
+        """It is complete: put it where it belongs.
+
+        Raises
+        ------
+        ExportError
+            It cannot be written; what was there before is still there.
+        """
+        try:
+            if self._stream is not None:
+                self._stream.close()
+            if self._path is not None:
+                with _told(self._to):
+                    self._put(self._path)
+        finally:
+            self.discard()
+
+    def _put(self, place: Path) -> None:
+        target = self._target
+        if target is None or self._in_place:
+            _copy(place, target or self._to, str(self._to))
+            return
+        if target.exists():
+            _as_before(place, target)
+        try:
+            place.replace(target)
+        except OSError as error:
+            if error.errno not in _NOT_THERE or not target.exists():
+                raise
+            _copy(place, target, str(self._to))
+
+    def discard(self) -> None:
+        """Forget it; what was there before is still there."""
+        if self._stream is not None and not self._stream.closed:
+            raw = self._stream.raw
+            if isinstance(raw, Stream):
+                raw.lost = True
+            self._stream.close()
+        self._stack.close()
+
+
+@contextmanager
+def _complete(to: str | Path) -> Generator[OutputFile]:
+    """An output that is kept when the block ends, and discarded if it raises."""
+    output = OutputFile(to)
+    try:
+        yield output
+        output.keep()
+    finally:
+        output.discard()
+
+
+@contextmanager
+def written(to: str | Path) -> Generator[BinaryIO]:
+    """A stream of bytes that is in its file when the block ends, all of it or nothing.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written; what was there before is still there.
+    """
+    with _complete(to) as output:
+        yield output.stream()
+
+
+@contextmanager
+def written_text(to: str | Path) -> Generator[TextIO]:
+    """The same for text in UTF-8, line ends as they are given; what has no code is written as an escape."""
+    with written(to) as stream:
+        text = io.TextIOWrapper(stream, "utf-8", errors="backslashreplace", newline="")
+        yield text
+        text.detach()
+
+
+@contextmanager
+def written_at(to: str | Path) -> Generator[Path]:
+    """A place where a file is to be made, which is in its own place when the block ends.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written; what was there before is still there.
+    """
+    with _complete(to) as output, _told(Path(to)):
+        yield output.path()
+
+
+def write_bytes(to: str | Path, data: bytes) -> None:
+    """Write a file as a whole.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written; what was there before is still there.
+    """
+    with written(to) as stream:
+        stream.write(data)
+
+
+@contextmanager
+def _told(to: Path) -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ExportError(f"{to}: {error.strerror or error}") from error
+    except ValueError as error:  # a name with a zero byte in it
+        raise ExportError(f"{str(to)!r}: {error}") from error
+
+
+def _target(to: Path) -> Path | None:
+    """The file that is to be replaced, behind all links; ``None``: what is there can only be written into."""
+    try:
+        about = to.stat()
+    except FileNotFoundError:
+        return Path(os.path.realpath(to))
+    if stat.S_ISDIR(about.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(about.st_mode) or _open_here(to, about) is not None:
+        return None
+    if not os.access(to, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    return Path(os.path.realpath(to))
+
+
+def _open_here(to: Path, about: os.stat_result) -> int | None:
+    """The descriptor of this process that a name means: of ``/dev/stdout``, say, wherever that goes."""
+    named = _DESCRIPTOR.fullmatch(str(to))
+    if named:
+        return int(named[1] or named[2])
+    for descriptor in (1, 2):
+        with suppress(OSError):
+            if os.path.samestat(about, os.fstat(descriptor)):
+                return descriptor
+    return None
+
+
+def _descriptor(to: Path) -> int:
+    """A descriptor to write into what is there."""
+    mine = _open_here(to, to.stat())
+    if mine is None:
+        return os.open(to, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):  # what was said before comes before
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()
+    return os.dup(mine)
+
+
+def _copy(place: Path, to: Path, name: str) -> None:
+    """Write what is in a file into another that cannot be replaced."""
+    about = to.stat()
+    plain = stat.S_ISREG(about.st_mode) and _open_here(to, about) is None
+    descriptor = os.open(to, os.O_WRONLY | os.O_TRUNC) if plain else _descriptor(to)
+    with place.open("rb") as source, io.BufferedWriter(Stream(descriptor, name)) as sink:
+        shutil.copyfileobj(source, sink)
+
+
+def _as_before(place: Path, target: Path) -> None:
+    """Give a new file the rights of the one that it replaces, and bring it to the disk before that is gone."""
+    about = target.stat()
+    with suppress(OSError):
+        os.chown(place, about.st_uid, about.st_gid)
+    place.chmod(stat.S_IMODE(about.st_mode))
+    descriptor = os.open(place, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,554 @@
+"""File formats of graphs: node-link JSON, and tables of edges.
+
+Text files of strangers, line by line, within bounds; ``.xz``, ``.gz`` and ``.bz2`` are unpacked.
+"""
+
+from __future__ import annotations
+
+import bz2
+import csv
+import gzip
+import json
+import lzma
+import re
+import stat
+import sys
+import zlib
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import StringIO
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import TraceError
+from sgstore.importing._resolve import (
+    LONGEST,
+    NO_ATTRIBUTES,
+    GivenEdge,
+    GivenGraph,
+    GivenNode,
+    check_size,
+    wrong,
+)
+from sgstore.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterator
+    from pathlib import Path
+
+
+MAX_LINE: Final = 32 << 20
+"""Longest line; bytes. A graph of 100,000 nodes and their attributes is half of it."""
+
+MAX_TEXT: Final = 1 << 36
+"""Most bytes of a file, unpacked: 64 GiB."""
+
+MAX_RATIO: Final = 2_000
+"""Most bytes, unpacked, for each byte of a file beyond the first GiB: text is never packed so well."""
+
+_FREE: Final = 1 << 30
+_PACKED: Final = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
+
+
+def stem_of(path: Path) -> str:
+    """The name of a file without what says how it is written: ``graphs.csv.xz`` is ``graphs``."""
+    name = path.name
+    for ending in (*_PACKED, ".csv", ".json", ".ndjson", ".jsonl"):
+        if name.lower().endswith(ending) and len(name) > len(ending):
+            name = name[: -len(ending)]
+    return name
+
+
+@contextmanager
+def lines_of(path: Path) -> Generator[Iterator[str]]:
+    """The lines of a file, with their ends.
+
+    Raises
+    ------
+    TraceError
+        It cannot be opened, is no regular file, is no UTF-8, or exceeds a bound; it says in which line.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise TraceError("no regular file", path=path)
+        opened = _PACKED.get(path.suffix.lower())
+        file = opened(path, "rb") if opened else path.open("rb")
+    except OSError as error:
+        raise TraceError(f"cannot be read: {error.strerror or error}", path=path) from error
+    with file:
+        yield _lines(path, file, status.st_size)
+
+
+def _lines(path: Path, file: Any, size: int) -> Iterator[str]:
+    number = total = 0
+    while True:
+        number += 1
+        try:
+            line = file.readline(MAX_LINE + 1)
+        except (OSError, EOFError, ValueError, lzma.LZMAError, zlib.error) as error:
+            raise wrong(path, f"line {number}", f"cannot be read: {error}") from error
+        if not line:
+            return
+        if len(line) > MAX_LINE:
+            raise wrong(path, f"line {number}", f"longer than {MAX_LINE >> 20} MiB")
+        total += len(line)
+        if total > MAX_TEXT or total > _FREE + MAX_RATIO * size:
+            raise wrong(
+                path, f"line {number}", f"{total:,} bytes unpacked, from a file of {size:,}"
+            )
+        try:
+            yield line.decode("utf-8-sig" if number == 1 else "utf-8")
+        except UnicodeDecodeError as error:
+            raise wrong(
+                path, f"line {number}", f"no UTF-8 at byte {error.start} of the line"
+            ) from error
+
+
+# Graphs as rows, an edge each: node, edge, node. S3C's files, and CSV with a header that says what is what
+# ------------------------------------------------------------------------------------------------
+# Rows of one graph stand together. In a row without relation and second node the first node stands alone.
+
+S3C: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")
+"""The header of S3C's files. (Woodlief et al., "S3C", ICSE 2024.)"""
+
+_NAMES: Final = {
+    "graph": ("graph", "frame", "frame_id", "sg", "image"),
+    "src": ("src", "source", "node1", "from"),
+    "relation": ("relation", "edge", "label"),
+    "dst": ("dst", "target", "node2", "to"),
+    "src_kind": ("src_kind", "kind1", "source_kind", "node1_class"),
+    "dst_kind": ("dst_kind", "kind2", "target_kind", "node2_class"),
+    "src_is_ego": ("src_is_ego",),
+    "dst_is_ego": ("dst_is_ego",),
+    "time": ("t", "time", "time_s"),
+    "time_ns": ("time_ns",),
+    "images": ("images", "n_img"),
+}
+"""What a column is → what it may be called."""
+
+_IGNORED: Final = frozenset({"ds", "t_id"})
+"""Columns of S3C that say nothing that a graph has: the data set, and the number of a row."""
+
+MAX_ROW: Final = 1 << 20
+"""Longest row, with all the lines that it goes over; characters."""
+
+
+@dataclass(frozen=True, slots=True)
+class _RowColumns:
+    """Places of the columns in a row; -1: there is none. ``place``: where edges stand, but for the row."""
+
+    graph: int
+    src: int
+    relation: int
+    dst: int
+    src_kind: int
+    dst_kind: int
+    src_is_ego: int
+    dst_is_ego: int
+    time: int
+    time_ns: int
+    images: int
+    names: tuple[str, ...]
+    lost: tuple[int, ...]
+    place: str
+
+
+def read_s3c(path: Path) -> Iterator[GivenGraph]:
+    """The graphs of a file of S3C, in its order.
+
+    Raises
+    ------
+    TraceError
+        Its header is another one, or a row is not what it must be.
+    """
+    return _read(path, S3C)
+
+
+def read_csv(path: Path) -> Iterator[GivenGraph]:
+    """The graphs of a CSV file: columns ``graph, src, relation, dst`` and, if they are there, others.
+
+    These are ``src_kind``, ``dst_kind``, ``src_is_ego``, ``dst_is_ego``, ``t`` (s) or ``time_ns``, and
+    ``images``. They may be called as S3C, pandas and networkx call them.
+
+    Raises
+    ------
+    TraceError
+        A column is missing or comes twice, or a row is not what it must be.
+    """
+    return _read(path, ())
+
+
+def _read(path: Path, header: tuple[str, ...]) -> Iterator[GivenGraph]:
+    with lines_of(path) as lines:
+        rows = _CsvLines(path, lines)
+        reader = csv.reader(rows, strict=True)
+        try:
+            first = next(reader, None)
+            columns = _columns_of(path, first, header)
+            yield from _graphs(path, rows.each(reader), columns)
+        except csv.Error as error:
+            raise wrong(path, f"row {reader.line_num}", f"no CSV: {error}") from error
+
+
+class _CsvLines:
+    """Lines for a CSV reader, which takes as many of them as a row goes over: not too many."""
+
+    def __init__(self, path: Path, lines: Iterator[str]) -> None:
+        self._path = path
+        self._lines = lines
+        self._number = self._taken = 0
+
+    def __iter__(self) -> Iterator[str]:
+        for line in self._lines:
+            self._number += 1
+            self._taken += len(line)
+            if self._taken > MAX_ROW:
+                where = f"line {self._number}"
+                raise wrong(self._path, where, f"a row of more than {MAX_ROW:,} characters")
+            yield line
+
+    def each(self, rows: Iterator[list[str]]) -> Iterator[list[str]]:
+        """The rows, each of which may be as long again."""
+        self._taken = 0
+        for row in rows:
+            yield row
+            self._taken = 0
+
+
+def _columns_of(path: Path, first: list[str] | None, header: tuple[str, ...]) -> _RowColumns:
+    if first is None:
+        raise wrong(path, "", "empty; expected a header")
+    names = tuple(name.strip() for name in first)
+    if header and names != header:
+        raise wrong(
+            path,
+            "row 1",
+            f"expected the header of S3C, {','.join(header)}; found {','.join(names)[:200]}"
+            " (another table of edges can be read with --format csv)",
+        )
+    places: dict[str, int] = {}
+    known: set[int] = set()
+    for what, words in _NAMES.items():
+        found = [
+            i
+            for i, name in enumerate(names)
+            if normalize_name(name) in set(map(normalize_name, words))
+        ]
+        if len(found) > 1:
+            both = " and ".join(names[i] for i in found)
+            raise wrong(path, "row 1", f"columns {both} both say {what!r}; expected one")
+        if not found and what in {"graph", "src", "relation", "dst"}:
+            raise wrong(
+                path,
+                "row 1",
+                f"no column {what!r} (or {', '.join(words[1:])}); found {','.join(names)[:200]}",
+            )
+        places[what] = found[0] if found else -1
+        known.update(found)
+    lost = [i for i, name in enumerate(names) if i not in known and name not in _IGNORED]
+    place = f"row {{}}, column {names[places['relation']]}"
+    return _RowColumns(**places, names=names, lost=tuple(lost), place=place)
+
+
+def _graphs(path: Path, rows: Iterator[list[str]], columns: _RowColumns) -> Iterator[GivenGraph]:
+    graph: GivenGraph | None = None
+    number = 1
+    for number, row in enumerate(rows, start=2):
+        if not row:
+            continue
+        if len(row) != len(columns.names):
+            raise wrong(path, f"row {number}", f"{len(row)} columns, expected {len(columns.names)}")
+        name = row[columns.graph]
+        if graph is None or name != graph.name:
+            if graph is not None:
+                yield graph
+            graph = _opened(path, number, row, columns)
+        _add(path, graph, number, row, columns)
+        check_size(path, f"row {number}", graph)
+    if graph is None:
+        raise wrong(path, "", "no row beside the header; expected graphs")
+    yield graph
+
+
+def _opened(path: Path, number: int, row: list[str], columns: _RowColumns) -> GivenGraph:
+    """A new graph, from its first row."""
+    name = row[columns.graph]
+    if not name or len(name) > LONGEST:
+        where = f"row {number}, column {columns.names[columns.graph]}"
+        raise wrong(path, where, f"expected the name of a graph, of 1 to {LONGEST} characters")
+    graph = GivenGraph(name, number)
+    if columns.images >= 0:
+        graph.images = int(_number(path, number, row, columns, columns.images, 1, 1 << 31))
+    if columns.time_ns >= 0:
+        place = columns.time_ns
+        graph.time_ns = int(_number(path, number, row, columns, place, -(1 << 62), 1 << 62))
+    elif columns.time >= 0:
+        graph.time_ns = round(_number(path, number, row, columns, columns.time, -4e9, 4e9) * 1e9)
+    return graph
+
+
+def _number(
+    path: Path,
+    number: int,
+    row: list[str],
+    columns: _RowColumns,
+    place: int,
+    low: float,
+    high: float,
+) -> float:
+    text = row[place].strip()
+    where = f"row {number}, column {columns.names[place]}"
+    try:
+        value = int(text) if text.lstrip("+-").isdigit() and len(text) < 20 else float(text)
+    except ValueError:
+        raise wrong(path, where, f"expected a number, found {text[:80]!r}") from None
+    if not low <= value <= high:
+        raise wrong(path, where, f"{text[:80]} is out of range")
+    return value
+
+
+def _add(path: Path, graph: GivenGraph, number: int, row: list[str], columns: _RowColumns) -> None:
+    src = _node(
+        path, graph, number, row, columns, (columns.src, columns.src_kind, columns.src_is_ego)
+    )
+    relation, dst = row[columns.relation].strip(), row[columns.dst].strip()
+    for place in columns.lost:
+        if row[place]:
+            what = f"column {columns.names[place]}"
+            graph.lost[what] = graph.lost.get(what, 0) + 1
+    if not relation and not dst:
+        return
+    if not relation or len(relation) > LONGEST:
+        where = f"row {number}, column {columns.names[columns.relation]}"
+        what = "empty, beside a second node" if not relation else f"{len(relation)} characters"
+        raise wrong(path, where, f"{what}; expected a relation")
+    dst = _node(
+        path, graph, number, row, columns, (columns.dst, columns.dst_kind, columns.dst_is_ego)
+    )
+    if not graph.edges or graph.edges[-1].relation != relation:
+        graph.characters += len(relation)
+    graph.edges.append(
+        GivenEdge(src, sys.intern(relation), dst, columns.place, number, NO_ATTRIBUTES)
+    )
+
+
+def _node(
+    path: Path,
+    graph: GivenGraph,
+    number: int,
+    row: list[str],
+    columns: _RowColumns,
+    places: tuple[int, int, int],
+) -> str:
+    """Take note of a node; its name."""
+    place, kind_place, ego_place = places
+    name = row[place].strip()
+    where = f"row {number}, column {columns.names[place]}"
+    if not name or len(name) > LONGEST:
+        raise wrong(path, where, f"expected the name of a node, of 1 to {LONGEST} characters")
+    label = row[kind_place].strip() if kind_place >= 0 else ""
+    known = graph.nodes.get(name)
+    if known is None:
+        known = graph.nodes[name] = GivenNode(name, label, where)
+        graph.characters += len(name) + len(label)
+    elif label and known.label and known.label != label:
+        raise wrong(path, where, f"{name!r} is {label!r} here and {known.label!r} in {known.where}")
+    else:
+        known.label = known.label or label
+    if ego_place >= 0 and (text := row[ego_place].strip()):
+        known.attributes["is_ego"] = text.lower() in {"true", "1", "t", "yes"}
+    return known.name
+
+
+# Graphs as networkx writes them: node-link JSON, one graph a line, a list of graphs, or one graph ----
+
+MAX_DOCUMENT: Final = 32 << 20
+"""Longest text that is not one graph a line; characters."""
+
+MAX_VALUES: Final = 3_000_000
+"""Most values in one JSON document, counted before it is read: each takes up to a hundred bytes."""
+
+_TOO_MANY: Final = f"more than {MAX_VALUES:,} values in one JSON document; write one graph a line"
+
+_WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
+
+_LABELS: Final = ("kind", "base_class", "label")
+"""Attributes that say what a node is; the first that is there. (sgstore, CARLASGG, networkx.)"""
+
+_RELATIONS: Final = ("relation", "label", "type")
+"""Attributes that say what an edge is; the first that is there, else its key if that is a text."""
+
+
+def read_nodelink(path: Path) -> Iterator[GivenGraph]:
+    """The graphs of a file, in its order.
+
+    Of a graph ``name`` (or ``frame_id``), ``time_ns`` or ``t`` (s), and ``ego`` (a node's id) are read; of a
+    node ``kind``, ``base_class`` or ``label``, ``is_ego``, and the attributes that nodes have here, in the
+    same units; of an edge ``relation``, ``label``, ``type`` or its key.
+
+    Raises
+    ------
+    TraceError
+        It is no JSON, no node-link graph, an undirected one, or exceeds a bound; it says in which line or
+        graph.
+    """
+    for number, (where, document) in enumerate(_documents(path)):
+        yield _graph(path, number, where, document)
+
+
+def _documents(path: Path) -> Iterator[tuple[str, Any]]:
+    """JSON documents, and where they stand."""
+    with lines_of(path) as lines:
+        numbered = enumerate(lines, start=1)
+        number, first = next((one for one in numbered if one[1].strip()), (0, ""))
+        if not number:
+            raise wrong(path, "", "empty; expected a graph")
+        try:
+            document = _parsed(first)
+        except ValueError:
+            yield from _whole(path, number, chain([first], lines))
+            return
+        if isinstance(document, list):
+            yield from _whole(path, number, chain([first], lines))
+            return
+        yield f"line {number}", document
+        for later, line in numbered:
+            if not line.strip():
+                continue
+            try:
+                yield f"line {later}", _parsed(line)
+            except ValueError as error:
+                raise wrong(path, f"line {later}", f"no JSON: {error}") from error
+
+
+def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
+    """The documents of a text that is more than one a line."""
+    parts = StringIO()
+    values = 0
+    for part in lines:
+        parts.write(part)
+        values += _values(part)
+        if values > MAX_VALUES:
+            raise wrong(path, "", _TOO_MANY)
+        if parts.tell() > MAX_DOCUMENT:
+            raise wrong(
+                path,
+                "",
+                f"one JSON document of more than {MAX_DOCUMENT >> 20} Mi characters; write one graph a line",
+            )
+    text = parts.getvalue()
+    parts.close()
+    try:
+        document = _parsed(text)
+    except json.JSONDecodeError as error:
+        where = f"line {line - 1 + error.lineno}, column {error.colno}"
+        raise wrong(path, where, f"no JSON: {error.msg}") from error
+    except ValueError as error:
+        raise wrong(path, "", f"no JSON: {error}") from error
+    if not isinstance(document, list):
+        yield f"line {line}", document
+        return
+    if not document:
+        raise wrong(path, "", "an empty list; expected graphs")
+    for number, one in enumerate(document):
+        yield f"graph {number}", one
+
+
+def _values(text: str) -> int:
+    """About how many values there are in a piece of JSON: never fewer."""
+    return sum(map(text.count, "[{,"))
+
+
+def _parsed(text: str) -> Any:
+    """A JSON document.
+
+    Raises
+    ------
+    ValueError
+        It is none, or nested beyond reason.
+    """
+    if _values(text) > MAX_VALUES:
+        raise ValueError(_TOO_MANY)
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def _graph(path: Path, number: int, where: str, document: Any) -> GivenGraph:
+    if not isinstance(document, dict) or not isinstance(document.get("nodes"), list):
+        raise wrong(path, where, "no node-link graph: expected an object with a list 'nodes'")
+    if document.get("directed", True) is False:
+        raise wrong(
+            path, where, "an undirected graph; relations have a direction: expected directed"
+        )
+    links = document.get("edges", document.get("links", []))
+    if not isinstance(links, list):
+        raise wrong(path, where, "expected a list 'edges' or 'links'")
+    about = document.get("graph") or {}
+    if isinstance(about, list):  # as networkx wrote it once: pairs
+        about = dict(pair for pair in about if isinstance(pair, list) and len(pair) == 2)
+    if not isinstance(about, dict):
+        raise wrong(path, where, "expected an object 'graph'")
+    name = about.get("name") or about.get("frame_id") or document.get("name") or f"graph {number}"
+    graph = GivenGraph(str(name)[:LONGEST], number + 1)
+    graph.time_ns = _time(path, where, about)
+    for row, node in enumerate(document["nodes"]):
+        _add_node(path, graph, f"{where}, node {row}", node)
+    ego = about.get("ego")
+    if ego is not None and _text(ego) in graph.nodes:
+        graph.nodes[_text(ego)].attributes["is_ego"] = True
+    place = f"{where}, edge {{}}"
+    for row, edge in enumerate(links):
+        _add_edge(path, graph, (place, row), edge)
+    check_size(path, where, graph)
+    return graph
+
+
+def _time(path: Path, where: str, about: dict[str, Any]) -> int | None:
+    for key, unit, most in (("time_ns", 1, 1 << 62), ("t", 1e9, 4e9)):
+        value = about.get(key)
+        if value is None:
+            continue
+        if isinstance(value, str) and _WHOLE.fullmatch(value):
+            value = int(value)  # 64-bit numbers come as texts, because JSON readers round them
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= most:
+            raise wrong(path, where, f"expected a time in {key!r}, found {str(value)[:80]}")
+        return round(value * unit)
+    return None
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+
+
+def _add_node(path: Path, graph: GivenGraph, where: str, node: Any) -> None:
+    if not isinstance(node, dict) or "id" not in node:
+        raise wrong(path, where, "expected an object with an 'id'")
+    name = _text(node["id"])
+    if not name or len(name) > LONGEST:
+        raise wrong(path, where, f"expected an id of 1 to {LONGEST} characters")
+    if name in graph.nodes:
+        raise wrong(path, where, f"the id {name!r} comes twice")
+    attributes = {key: value for key, value in node.items() if key != "id"}
+    label = next((attributes[key] for key in _LABELS if isinstance(attributes.get(key), str)), "")
+    graph.nodes[name] = GivenNode(name, label, where, attributes)
+
+
+def _add_edge(path: Path, graph: GivenGraph, at: tuple[str, int], edge: Any) -> None:
+    where = at[0].replace("{}", str(at[1]), 1)
+    if not isinstance(edge, dict) or not {"source", "target"} <= edge.keys():
+        raise wrong(path, where, "expected an object with 'source' and 'target'")
+    src, dst = _text(edge["source"]), _text(edge["target"])
+    for end in (src, dst):
+        if end not in graph.nodes:
+            raise wrong(path, where, f"no node {end[:80]!r} in this graph")
+    told = next((key for key in (*_RELATIONS, "key") if isinstance(edge.get(key), str)), None)
+    if told is None:
+        raise wrong(
+            path, where, f"says no relation; expected one of {', '.join(_RELATIONS)}, or a key"
+        )
+    skipped = {"source", "target", "key", *_RELATIONS}
+    attributes = {key: value for key, value in edge.items() if key not in skipped}
+    graph.edges.append(GivenEdge(src, edge[told], dst, *at, attributes or NO_ATTRIBUTES))

@@ -1,0 +1,738 @@
+"""The meaning of imported labels, relations and attributes.
+
+Graphs as files give them: names, labels and rows, before they mean anything here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from array import array
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import ConfigError, TraceError
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    KINDS,
+    LANE_TYPES,
+    LIGHT_STATE_CODE,
+    MAP_KINDS,
+    RELATION_CODE,
+    RELATIONS,
+    VEHICLE_LIGHTS,
+    kind_named,
+    kinds_labelled,
+    labels,
+    normalize_name,
+    relation_named,
+    suggestion,
+    type_meanings,
+    vague_kind,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+MAX_NODES: Final = 200_000
+MAX_EDGES: Final = 1_000_000
+MAX_NAMES: Final = 32 << 20
+"""Most nodes and edges of one graph, and characters of the names in it: a few hundred MB, whatever is in it."""
+
+LONGEST: Final = 1_000
+"""Longest name; characters."""
+
+NO_ATTRIBUTES: Final[Mapping[str, Any]] = MappingProxyType({})
+
+
+@dataclass(slots=True)
+class GivenNode:
+    """A node of a graph in a file.
+
+    Attributes
+    ----------
+    name : str
+        What tells it from the other nodes of its graph, and makes it the same thing in another graph of the
+        file.
+    label : str
+        What the file says that it is; empty: its name says it (``car_3``, ``Ego Lane``).
+    where : str
+        Place in the file, for people: ``row 17, column node1``.
+    attributes : dict
+    """
+
+    name: str
+    label: str
+    where: str
+    attributes: dict[str, Any] = field(default_factory=dict[str, Any])
+
+
+@dataclass(slots=True)
+class GivenEdge:
+    """An edge between nodes, by their names.
+
+    Its place is kept as a number and a text that all edges of a kind share: a graph may have very many.
+    """
+
+    src: str
+    relation: str
+    dst: str
+    place: str
+    number: int
+    attributes: Mapping[str, Any]
+
+    @property
+    def where(self) -> str:
+        """Place in the file, for people."""
+        return self.place.replace("{}", str(self.number), 1)
+
+
+@dataclass(slots=True)
+class GivenGraph:
+    """One graph of a file, which becomes a frame.
+
+    Attributes
+    ----------
+    name : str
+        What the file calls it: an image, a number. Unique in its file.
+    place : int
+        Row or line where it begins, from 1.
+    nodes : dict
+        By name.
+    edges : list of GivenEdge
+    time_ns : int or None
+        Its time, where the file tells it; ns.
+    images : int
+        How many frames of the source it stands for: S3C gives one graph for each class.
+    lost : dict
+        What of it cannot be kept → how often.
+    characters : int
+        Of its names together.
+    """
+
+    name: str
+    place: int
+    nodes: dict[str, GivenNode] = field(default_factory=dict[str, GivenNode])
+    edges: list[GivenEdge] = field(default_factory=list[GivenEdge])
+    time_ns: int | None = None
+    images: int = 1
+    lost: dict[str, int] = field(default_factory=dict[str, int])
+    characters: int = 0
+
+
+def check_size(path: Path, where: str, graph: GivenGraph) -> None:
+    """Refuse a graph that is larger than any scene.
+
+    Raises
+    ------
+    TraceError
+        It has more nodes, edges or characters of names than it may have.
+    """
+    for number, most, what in (
+        (len(graph.nodes), MAX_NODES, "nodes"),
+        (len(graph.edges), MAX_EDGES, "edges"),
+        (graph.characters, MAX_NAMES, "characters of names"),
+    ):
+        if number > most:
+            raise wrong(path, where, f"more than {most:,} {what} in graph {graph.name!r}")
+
+
+def wrong(path: Path, where: str, reason: str) -> TraceError:
+    """The error of a place in a file."""
+    return TraceError(f"{where}: {reason}" if where else reason, path=path)
+
+
+# What the labels and relations of other tools mean: kinds and relations of the vocabulary -------
+
+EGOS: Final = frozenset({"ego", "egocar", "egovehicle", "hero"})
+"""Labels of the ego, folded; it is a car unless the file says more. (S3C, RoadScene2Vec, CARLA.)"""
+
+_PARTS: Final = (
+    ("off_road", re.compile(r"off[ _]?road", re.IGNORECASE)),
+    (
+        "lane",
+        re.compile(
+            r"ego lane|(left|right) \d+ of ego lane|opposing lane( \d+)?|(left|middle|right) lane"
+            r"|lane_(left|middle|right)|lane( .+)?",
+            re.IGNORECASE,
+        ),
+    ),
+    ("road", re.compile(r"(root )?road( .+)?", re.IGNORECASE)),
+    ("junction", re.compile(r"(junction|intersection)( .+)?", re.IGNORECASE)),
+    ("crosswalk", re.compile(r"crosswalk( .+)?", re.IGNORECASE)),
+)
+"""Parts of the road as S3C, CARLASGG and RoadScene2Vec write them."""
+
+_SHORT: Final = {
+    "moto": "motorcycle",
+    "motorbike": "motorcycle",
+    "bike": "bicycle",
+    "cyclist": "bicycle",
+    "ped": "person",
+    "light": "traffic_light",
+    "trafficsignal": "traffic_light",
+    "stopsign": "stop_sign",
+    "tree": "vegetation",
+}
+"""Other words for kinds: those of RoadScene2Vec's actors, and of Scenic."""
+
+_NUMBERED: Final = re.compile(r"(.+?)[_ ](\d+)")
+"""A label with the number that tells it from others of its kind: ``car_3``, ``car 3``."""
+
+OTHER: Final = "other"
+"""What ``unknown_as`` calls the kind ``unknown``."""
+
+
+@dataclass(frozen=True, slots=True)
+class LabelMeaning:
+    """What a node is.
+
+    Attributes
+    ----------
+    kind : str
+    is_ego : bool
+    type_name : str
+        The file's own label, where it says more than the kind.
+    special, subkind : str
+    """
+
+    kind: str
+    is_ego: bool = False
+    type_name: str = ""
+    special: str = ""
+    subkind: str = ""
+
+    @property
+    def is_part(self) -> bool:
+        """Whether it is a part of the road, and no entity."""
+        return self.kind in MAP_KINDS
+
+
+@dataclass(frozen=True)
+class Words:
+    """How labels and relations are understood.
+
+    Parameters
+    ----------
+    kinds : mapping
+        Label → kind: what the client says, before all else.
+    relations : mapping
+        The same of relations.
+    unknown_as : str
+        The kind of what no word is known for: any kind of an entity, or ``other``, which is ``unknown``.
+        Relations that are unknown are then left out, and counted. Empty: they are errors.
+
+    Raises
+    ------
+    ConfigError
+        A kind or a relation that is given is none.
+    """
+
+    kinds: Mapping[str, str] = field(default_factory=dict[str, str])
+    relations: Mapping[str, str] = field(default_factory=dict[str, str])
+    unknown_as: str = ""
+
+    def __post_init__(self) -> None:
+        for label, kind in self.kinds.items():
+            if not _kind(kind):
+                raise ConfigError(_no_kind(f"--kind {label}={kind}", kind))
+        for name, relation in self.relations.items():
+            if relation_named(relation) is None:
+                like = suggestion(relation, RELATIONS)
+                hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(RELATIONS)}"
+                raise ConfigError(f"--relation {name}={relation}: no such relation; {hint}")
+        if self.unknown_as and self._fallback not in ENTITY_KINDS:
+            raise ConfigError(_no_kind(f"--unknown-as {self.unknown_as}", self.unknown_as))
+
+    @property
+    def _fallback(self) -> str:
+        known = "unknown" if self.unknown_as == OTHER else _kind(self.unknown_as)
+        return known or ""
+
+    def meaning(self, name: str, label: str) -> LabelMeaning | None:
+        """What a node of this name and label is; ``None``: nobody knows."""
+        for text in dict.fromkeys((label, name) if label else (name, _plain(name))):
+            found = self._meant(text)
+            if found is not None:
+                return found
+        if not self.unknown_as:
+            return None
+        own = label or _plain(name)
+        return LabelMeaning(self._fallback, type_name=own, subkind=own)
+
+    def _meant(self, text: str) -> LabelMeaning | None:
+        given = {normalize_name(label): kind for label, kind in self.kinds.items()}
+        if normalize_name(text) in given:
+            return LabelMeaning(_kind(given[normalize_name(text)]), type_name=text)
+        if normalize_name(text) in EGOS:
+            return LabelMeaning("car", is_ego=True)
+        for kind, form in _PARTS:
+            if form.fullmatch(text):
+                return LabelMeaning(kind)
+        if kind := _kind(text):
+            return LabelMeaning(kind)
+        return _simulators(text)
+
+    def relation(self, name: str) -> str | None:
+        """The relation of the vocabulary that a name means; ``None``: nobody knows."""
+        given = {normalize_name(own): relation for own, relation in self.relations.items()}
+        return relation_named(given.get(normalize_name(name), name))
+
+    def why_not_kind(self, name: str, label: str) -> str:
+        """Why a node is not understood, and what can be done."""
+        text = label or _plain(name)
+        several = kinds_labelled(text)
+        known = [*labels(), *_SHORT]
+        like = suggestion(text, known)
+        hint = f" (did you mean {like!r}?)" if like else ""
+        if several:
+            hint = f" (it can be any of {', '.join(several)})"
+        return (
+            f"{text!r} is of no kind that is known{hint}; say what it is with --kind {text!r}=KIND,"
+            " or --unknown-as other for all such"
+        )
+
+    def why_not_relation(self, name: str) -> str:
+        """Why a relation is not understood, and what can be done."""
+        like = suggestion(name, RELATIONS)
+        hint = f" (did you mean {like!r}?)" if like else ""
+        return (
+            f"{name!r} is no relation that is known{hint}; say what it is with --relation {name!r}=RELATION,"
+            " or --unknown-as other to leave such edges out"
+        )
+
+    def as_dict(self) -> dict[str, object]:
+        """All of it as plain values, in one order."""
+        return {
+            "kinds": dict(sorted(self.kinds.items())),
+            "relations": dict(sorted(self.relations.items())),
+            "unknown_as": self.unknown_as,
+        }
+
+
+def _plain(name: str) -> str:
+    """A name without the number at its end."""
+    numbered = _NUMBERED.fullmatch(name)
+    return numbered[1] if numbered else name
+
+
+def _kind(text: str) -> str:
+    """The one kind that a word means; empty if it is none or several."""
+    return kind_named(_SHORT.get(normalize_name(text), text)) or ""
+
+
+def _simulators(text: str) -> LabelMeaning | None:
+    """What the type name of a simulator means: itself, or what stands before one of its dots."""
+    meanings = type_meanings()
+    name = text.lower()
+    while name:
+        if name in meanings:
+            found = meanings[name]
+            return LabelMeaning(
+                found.kind, type_name=text, special=found.special, subkind=found.subkind
+            )
+        name = name.rpartition(".")[0]
+    kind = vague_kind(text)
+    return None if kind == "unknown" else LabelMeaning(kind, type_name=text)
+
+
+def _no_kind(what: str, kind: str) -> str:
+    like = suggestion(kind, KINDS)
+    hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(KINDS)}"
+    return f"{what}: no such kind; {hint}"
+
+
+# What files say of nodes and edges, in the units that people read, as the columns of the house ----
+
+_RADIANS: Final = frozenset({"heading", "pitch", "roll", "yaw_rate", "heading_error"})
+"""Numbers that are degrees outside."""
+
+STATE_NUMBERS: Final = (
+    *("x", "y", "z", "heading", "pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
+    *("length", "width", "height", "steer", "throttle", "brake"),
+)
+PART_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
+PART_TEXTS: Final = ("lane_type", "road", "junction", "turn")
+PART_WHOLE: Final = ("section", "lane")
+LANE_NUMBERS: Final = {
+    "overlap": "overlap",
+    "lane_offset": "offset",
+    "offset": "offset",
+    "heading_error": "heading_error",
+    "along": "along",
+}
+"""Numbers of an edge ``isIn`` → columns of :class:`sgstore.graph.LaneStates`."""
+
+_SAID: Final = frozenset(
+    {"kind", "base_class", "label", "name", "ident", "is_ego", "is_static", "id"}
+)
+"""Attributes that are read elsewhere, or say again what a graph says."""
+
+_FOLLOWING: Final = frozenset({"accel", "node_id"})
+"""Attributes that follow from others."""
+
+_DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
+_TEXTS: Final = frozenset({"special", "subkind", "type_name", "type"})
+
+
+def state_of(
+    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
+) -> dict[str, float]:
+    """What is known of an entity in a frame: columns of :class:`sgstore.world.States`; all else is lost.
+
+    Raises
+    ------
+    TraceError
+        A value is not what its attribute takes.
+    """
+    found: dict[str, float] = {}
+    lights = 0
+    for name, value in attributes.items():
+        if value is None or name in _SAID or name in _FOLLOWING or name in _TEXTS:
+            continue
+        if name in STATE_NUMBERS:
+            found[name] = _number(path, where, name, value)
+        elif name == "light_state":
+            found[name] = _light_state(path, where, value)
+        elif name in VEHICLE_LIGHTS or name in _DERIVED:
+            lights |= int(bool(value)) << (
+                VEHICLE_LIGHTS.index(name) if name in VEHICLE_LIGHTS else 0
+            )
+            if name in VEHICLE_LIGHTS:
+                found["lights"] = lights
+            else:
+                found["derived"] = int(found.get("derived", 0)) | int(
+                    bool(value)
+                ) << _DERIVED.index(name)
+        elif name == "speed":
+            _number(path, where, name, value)
+        else:
+            lost[f"attribute {name}"] = lost.get(f"attribute {name}", 0) + 1
+    _speed(attributes, found, lost)
+    return found
+
+
+def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[str, int]) -> None:
+    """A speed without a velocity: along the heading, if that is known."""
+    speed = attributes.get("speed")
+    if speed is None or "vx" in found:
+        return
+    if "heading" not in found:
+        lost["attribute speed (no heading)"] = lost.get("attribute speed (no heading)", 0) + 1
+        return
+    found["vx"] = float(speed) * math.cos(found["heading"])
+    found["vy"] = float(speed) * math.sin(found["heading"])
+
+
+def part_of(
+    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
+) -> dict[str, Any]:
+    """What is known of a part of the road: columns of :class:`sgstore.roads.MapNodes`; all else is lost.
+
+    Raises
+    ------
+    TraceError
+        A value is not what its attribute takes.
+    """
+    found: dict[str, Any] = {}
+    for name, value in attributes.items():
+        if value is None or name in _SAID or name in _FOLLOWING:
+            continue
+        if name in PART_NUMBERS:
+            found[name] = _number(path, where, name, value)
+        elif name in PART_WHOLE:
+            found[name] = int(_number(path, where, name, value))
+        elif name in PART_TEXTS:
+            found[name] = str(value)[:200]
+        else:
+            lost[f"attribute {name}"] = lost.get(f"attribute {name}", 0) + 1
+    kinds = {normalize_name(kind): kind for kind in LANE_TYPES}
+    if "lane_type" in found:
+        if normalize_name(found["lane_type"]) not in kinds:
+            raise wrong(path, where, f"no type of lanes: {found['lane_type']!r}")
+        found["lane_type"] = kinds[normalize_name(found["lane_type"])]
+    return found
+
+
+def lane_state_of(
+    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
+) -> dict[str, float]:
+    """What is known of how an entity lies in a lane; ``primary`` is 1 or 0 where the file says it."""
+    found: dict[str, float] = {}
+    for name, value in attributes.items():
+        if value is None:
+            continue
+        if name in LANE_NUMBERS:
+            found[LANE_NUMBERS[name]] = _number(path, where, name, value)
+        elif name in {"is_primary", "primary"}:
+            found["primary"] = float(bool(value))
+        else:
+            lost[f"attribute {name} of edges"] = lost.get(f"attribute {name} of edges", 0) + 1
+    return found
+
+
+def gap_of(path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]) -> float:
+    """The gap of an edge ``leads`` or ``follows``; NaN where it is not known."""
+    others_lost(attributes, lost, ("gap",))
+    value = attributes.get("gap")
+    return float("nan") if value is None else _number(path, where, "gap", value)
+
+
+def others_lost(
+    attributes: Mapping[str, Any], lost: dict[str, int], kept: tuple[str, ...] = ()
+) -> None:
+    """Count the attributes of an edge that cannot be kept."""
+    for name, value in attributes.items():
+        if value is not None and name not in kept:
+            lost[f"attribute {name} of edges"] = lost.get(f"attribute {name} of edges", 0) + 1
+
+
+def columns_of(rows: list[dict[str, float]]) -> dict[str, NDArray[Any]]:
+    """Rows as columns, NaN, or what stands for nothing, where one says nothing."""
+    empty = {"lights": -1, "light_state": -1, "derived": 0}
+    types = {"lights": np.int64, "light_state": np.int8, "derived": np.int64}
+    names = {name for row in rows for name in row}
+    return {
+        name: np.array(
+            [row.get(name, empty.get(name, math.nan)) for row in rows], types.get(name, np.float64)
+        )
+        for name in sorted(names)
+    }
+
+
+def _number(path: Path, where: str, name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+        if isinstance(value, float) and math.isnan(value):
+            return value
+        raise wrong(path, where, f"expected a number as {name!r}, found {str(value)[:80]!r}")
+    return math.radians(value) if name in _RADIANS else float(value)
+
+
+def _light_state(path: Path, where: str, value: Any) -> int:
+    code = LIGHT_STATE_CODE.get(str(value).lower())
+    if code is None:
+        known = ", ".join(LIGHT_STATE_CODE)
+        raise wrong(path, where, f"no state of a light: {str(value)[:80]!r}; there are: {known}")
+    return code
+
+
+# What the graphs of a file mean: entities, parts of the road, relations; and what all have together ----
+
+OFF_ROAD: Final = ("off_road", "off_road")
+"""The part that whatever is on no lane is in; there is one."""
+
+MAX_PARTS: Final = 500_000
+MAX_ENTITIES: Final = 500_000
+"""Most parts of the road, and entities, in one file."""
+
+_REMEMBERED: Final = 1 << 16
+"""Names whose meaning is remembered."""
+
+Part = tuple[str, str]
+"""A part of the road: its kind and its name."""
+
+
+@dataclass(slots=True)
+class Meant:
+    """A graph whose words are understood.
+
+    Attributes
+    ----------
+    graph : GivenGraph
+    entities : dict
+        Name → node and what it is.
+    parts : dict
+        Name → part of the road.
+    ego : str
+        Name of the ego; empty without one.
+    edges : list of (GivenEdge, int)
+        With the codes of their relations.
+    """
+
+    graph: GivenGraph
+    entities: dict[str, tuple[GivenNode, LabelMeaning]]
+    parts: dict[str, Part]
+    ego: str
+    edges: list[tuple[GivenEdge, int]]
+
+
+class Understanding:
+    """Understands the graphs of one file, one after another."""
+
+    def __init__(self, path: Path, words: Words) -> None:
+        self._path = path
+        self._words = words
+        self._known: dict[tuple[str, str], LabelMeaning | None] = {}
+        self._relations: dict[str, str | None] = {}
+
+    def of(self, graph: GivenGraph) -> Meant:
+        """What a graph means; what has no meaning is left out and counted in ``graph.lost``, or is an error.
+
+        Raises
+        ------
+        TraceError
+            A node or a relation is not known, there are two egos, or the ego is no entity.
+        """
+        meant = Meant(graph, {}, {}, "", [])
+        taken: dict[Part, str] = {}
+        for node in graph.nodes.values():
+            meaning = self._meaning(node)
+            told = node.attributes.get("is_ego")
+            is_ego = meaning.is_ego if told is None else bool(told)
+            if not meaning.is_part:
+                meant.entities[node.name] = (node, meaning)
+                if is_ego:
+                    self._check_ego(meant, node)
+                    meant.ego = node.name
+                continue
+            if is_ego:
+                raise wrong(self._path, node.where, f"the ego cannot be a {meaning.kind}")
+            part = _part(node, meaning)
+            if part in taken:
+                both = f"{taken[part]!r} and {node.name!r}"
+                raise wrong(self._path, node.where, f"{both} are the same {part[0]} {part[1]!r}")
+            taken[part] = node.name
+            meant.parts[node.name] = part
+        for edge in graph.edges:
+            relation = self._relation(edge)
+            if relation is not None:
+                meant.edges.append((edge, RELATION_CODE[relation]))
+            else:
+                what = f"relation {edge.relation}"
+                graph.lost[what] = graph.lost.get(what, 0) + 1
+        return meant
+
+    def _check_ego(self, meant: Meant, node: GivenNode) -> None:
+        if meant.ego:
+            reason = (
+                f"{meant.ego!r} and {node.name!r} are both the ego of graph {meant.graph.name!r}"
+            )
+            raise wrong(self._path, node.where, f"{reason}; expected one")
+
+    def _meaning(self, node: GivenNode) -> LabelMeaning:
+        key = (node.name, node.label)
+        if key not in self._known:
+            if len(self._known) >= _REMEMBERED:
+                self._known.clear()
+            self._known[key] = self._words.meaning(node.name, node.label)
+        meaning = self._known[key]
+        if meaning is None:
+            raise wrong(self._path, node.where, self._words.why_not_kind(node.name, node.label))
+        return meaning
+
+    def _relation(self, edge: GivenEdge) -> str | None:
+        if edge.relation not in self._relations:
+            if len(self._relations) >= _REMEMBERED:
+                self._relations.clear()
+            self._relations[edge.relation] = self._words.relation(edge.relation)
+        relation = self._relations[edge.relation]
+        if relation is None and not self._words.unknown_as:
+            raise wrong(self._path, edge.where, self._words.why_not_relation(edge.relation))
+        return relation
+
+
+@dataclass(slots=True)
+class FileMeaning:
+    """What all graphs of a file have together.
+
+    Attributes
+    ----------
+    graphs : int
+    parts : dict
+        The parts of the road, with what is known of each where it comes first; ``off_road`` is the first.
+    relations : set of int
+        Codes of the relations that occur.
+    ego : str
+        Name of the ego, if it is the same wherever there is one.
+    timed : int
+        Graphs that tell their time.
+    lost : dict
+        What is known of parts of the road and cannot be kept → how often.
+    """
+
+    graphs: int = 0
+    parts: dict[Part, dict[str, Any]] = field(default_factory=lambda: {OFF_ROAD: {}})
+    relations: set[int] = field(default_factory=set[int])
+    ego: str = ""
+    timed: int = 0
+    lost: dict[str, int] = field(default_factory=dict[str, int])
+
+
+def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeaning:
+    """Go through a file once: everything that is wrong with it is found here.
+
+    Raises
+    ------
+    TraceError
+        As :meth:`Understanding.of`; some graphs tell their time and others do not; there are too many parts.
+    """
+    found, understanding = FileMeaning(), Understanding(path, words)
+    egos: set[str] = set()
+    entities: set[int] = set()
+    names = _GraphNames(path)
+    for graph in graphs:
+        names.see(graph)
+        meant = understanding.of(graph)
+        found.graphs += 1
+        found.timed += graph.time_ns is not None
+        if found.timed not in {0, found.graphs}:
+            reason = (
+                f"graph {graph.name!r} and those before it do not agree on whether there are times"
+            )
+            raise wrong(path, f"row {graph.place}", f"{reason}; expected all or none")
+        for name, part in meant.parts.items():
+            if part not in found.parts:
+                node = graph.nodes[name]
+                found.parts[part] = part_of(path, node.where, node.attributes, found.lost)
+        if len(found.parts) > MAX_PARTS:
+            raise wrong(path, f"row {graph.place}", f"more than {MAX_PARTS:,} parts of the road")
+        entities.update(hash((name, meaning.kind)) for name, (_, meaning) in meant.entities.items())
+        if len(entities) > MAX_ENTITIES:
+            raise wrong(path, f"row {graph.place}", f"more than {MAX_ENTITIES:,} entities")
+        found.relations.update(relation for _, relation in meant.edges)
+        if meant.ego and len(egos) < 2:
+            egos.add(meant.ego)
+    names.check()
+    found.ego = egos.pop() if len(egos) == 1 else ""
+    return found
+
+
+class _GraphNames:
+    """Looks whether graphs of a file have different names, of which 16 bytes each are remembered."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._digests = array("Q")
+        self._places = array("q")
+
+    def see(self, graph: GivenGraph) -> None:
+        digest = blake2b(graph.name.encode("utf-8", "surrogatepass"), digest_size=8).digest()
+        self._digests.append(int.from_bytes(digest, "little"))
+        self._places.append(graph.place)
+
+    def check(self) -> None:
+        digests = np.frombuffer(self._digests, np.uint64)
+        order = np.argsort(digests, kind="stable")
+        again = np.flatnonzero(digests[order[1:]] == digests[order[:-1]])
+        if len(again):
+            first, second = (self._places[int(order[i])] for i in (again[0], again[0] + 1))
+            reason = (
+                f"a graph of the same name begins at {first} already; expected names that differ,"
+            )
+            reason += " and the rows of a graph together"
+            raise wrong(self._path, f"row {second}", reason)
+
+
+def _part(node: GivenNode, meaning: LabelMeaning) -> Part:
+    if meaning.kind == "off_road":
+        return OFF_ROAD
+    told = node.attributes.get("name")
+    return meaning.kind, told if isinstance(told, str) and told else node.name

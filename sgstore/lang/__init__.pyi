@@ -1,0 +1,133 @@
+# The face of this package: what others may import from it.
+
+from . import ir as ir
+from . import syntax as syntax
+from ._bind import CheckInCatalog as CheckInCatalog
+from ._bind import bind_checks as bind_checks
+from ._bind import bind_query as bind_query
+from ._bind_temporal import FUTURE as FUTURE
+from ._catalog import Attribute as Attribute
+from ._catalog import Catalog as Catalog
+from ._catalog import TableFacts as TableFacts
+from ._catalog import TraceFacts as TraceFacts
+from ._catalog import Triple as Triple
+from ._catalog import Type as Type
+from ._compared import Compared as Compared
+from ._compared import compared_in_check as compared_in_check
+from ._compared import compared_in_query as compared_in_query
+from ._compared import notes_on as notes_on
+from ._compile import Compiled as Compiled
+from ._compile import Layout as Layout
+from ._compile import compile_checks as compile_checks
+from ._compile import compile_query as compile_query
+from ._compile import unnumbered_text as unnumbered_text
+from ._compile import value_text as value_text
+from ._evaluate import Binding as Binding
+from ._evaluate import Evaluate as Evaluate
+from ._evaluate import FrameView as FrameView
+from ._external import CLOCK as CLOCK
+from ._external import CLOCK_OF_TRACES as CLOCK_OF_TRACES
+from ._external import TOLD_WEATHER as TOLD_WEATHER
+from ._external import TRACES as TRACES
+from ._external import ExternalRelation as ExternalRelation
+from ._external import entities as entities
+from ._external import relation as relation
+from ._external import traces_with as traces_with
+from ._external import with_places as with_places
+from ._humanize import for_people as for_people
+from ._needs import MOTION as MOTION
+from ._needs import Need as Need
+from ._needs import RelationScope as RelationScope
+from ._needs import of_check as of_check
+from ._needs import of_query as of_query
+from ._parse import joined as joined
+from ._parse import parse as parse
+from ._patterns import Pattern as Pattern
+from ._patterns import node_of_kind as node_of_kind
+from ._patterns import pattern_of as pattern_of
+from ._plan import TRACE_OF_BUCKET as TRACE_OF_BUCKET
+from ._plan import Window as Window
+from ._plan import in_order as in_order
+from ._plan import traces_of as traces_of
+from ._results import CONSTANTS as CONSTANTS
+from ._results import EXTENTS as EXTENTS
+from ._results import Gathered as Gathered
+from ._results import SqlStatement as SqlStatement
+from ._results import about_frame as about_frame
+from ._rewrite import rewritten as rewritten
+from ._search import ScopeSearch as ScopeSearch
+from ._search import expression as expression
+from ._why_not import WhyNot as WhyNot
+from ._why_not import WhyNotSteps as WhyNotSteps
+from ._why_not import looked_up as looked_up
+from ._why_not import why_not as why_not
+from .library import NamedPattern as NamedPattern
+from .library import pattern_named as pattern_named
+from .library import patterns as patterns
+
+__all__ = [
+    "Attribute",
+    "Binding",
+    "CheckInCatalog",
+    "CLOCK",
+    "CLOCK_OF_TRACES",
+    "CONSTANTS",
+    "Catalog",
+    "Compared",
+    "Compiled",
+    "EXTENTS",
+    "Evaluate",
+    "ExternalRelation",
+    "FUTURE",
+    "FrameView",
+    "Gathered",
+    "Layout",
+    "MOTION",
+    "NamedPattern",
+    "Need",
+    "Pattern",
+    "RelationScope",
+    "ScopeSearch",
+    "SqlStatement",
+    "TOLD_WEATHER",
+    "TRACES",
+    "TRACE_OF_BUCKET",
+    "TableFacts",
+    "TraceFacts",
+    "Triple",
+    "Type",
+    "WhyNot",
+    "WhyNotSteps",
+    "Window",
+    "about_frame",
+    "bind_checks",
+    "bind_query",
+    "compared_in_check",
+    "compared_in_query",
+    "compile_checks",
+    "compile_query",
+    "entities",
+    "expression",
+    "for_people",
+    "in_order",
+    "ir",
+    "joined",
+    "looked_up",
+    "node_of_kind",
+    "notes_on",
+    "of_check",
+    "of_query",
+    "parse",
+    "pattern_named",
+    "pattern_of",
+    "patterns",
+    "relation",
+    "rewritten",
+    "syntax",
+    "traces_of",
+    "traces_with",
+    "unnumbered_text",
+    "value_text",
+    "why_not",
+    "with_places",
+]

@@ -1,0 +1,726 @@
+"""The binder: syntax trees of queries and checks become IR.
+
+Syntax tree → bound query: labels, relations, attributes, variables and functions are known from here on.
+
+Everything that can be the user's fault is found here or in the parser, before any SQL exists.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryError, TextSpan
+from sgstore.lang import ir as b
+from sgstore.lang import ir as o
+from sgstore.lang import syntax as s
+from sgstore.lang._bind_expressions import (
+    bind,
+    condition,
+    edge_attribute,
+    node_attribute,
+    parameter,
+)
+from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled
+from sgstore.lang._catalog import Catalog, Type
+from sgstore.lang._functions import FUNCTIONS
+from sgstore.lang._symbols import (
+    RESERVED,
+    THE_EGO,
+    ScopeBuilder,
+    Session,
+    Symbol,
+    SymbolTable,
+    asked,
+)
+from sgstore.lang.syntax import CheckClause as WrittenCheck
+from sgstore.lang.syntax import Define, MatchClause
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    RELATION_ALIASES,
+    RELATIONS,
+    kinds_labelled,
+    labels,
+    normalize_name,
+    relation_named,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from sgstore.lang.syntax import QuantifierClause, Statement
+
+
+SETTINGS: Final = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION", "DATASET", "MATCHES", "GAPS", "END")
+"""What may stand after ``USING``."""
+
+
+def bind_query(
+    text: str, statements: Sequence[s.Statement], catalog: Catalog, parameters: Mapping[str, Any]
+) -> b.Query:
+    """The meaning of a text: its one ``MATCH``, with the predicates that it defines.
+
+    Parameters
+    ----------
+    text : str
+        For messages.
+    statements : sequence of Statement
+        As parsed.
+    catalog : Catalog
+        Of the store that is asked.
+    parameters : mapping of str to value
+        Values of ``$name``.
+
+    Raises
+    ------
+    QueryNameError
+        A label, relation, attribute, variable, function or parameter is not known.
+    QueryError
+        Types do not fit, or a part has no meaning where it stands.
+    """
+    session = Session(text, parameters)
+    session.ask(catalog)
+    match = _only_match(statements, session)
+    settings = chosen(match.settings, session, catalog)
+    if settings.end is not None:
+        session.refuse("USING END belongs to CHECK", match.settings[0].span)
+    if settings.gaps == "unknown":
+        session.refuse("USING GAPS unknown belongs to CHECK", match.settings[0].span)
+    query = _of_one_step(match, session) if _is_plain(match) else _of_steps(match, session)
+    refuse_unused(session)
+    refuse_strange(session, catalog)
+    return replace(
+        query,
+        relations=frozenset(session.relations),
+        injective=session.injective,
+        ego=settings.ego,
+        unknown_is_false=settings.unknown_is_false,
+        policy=settings.policy or "all",
+        gaps=settings.gaps or "break",
+    )
+
+
+def _is_plain(match: s.MatchClause) -> bool:
+    """Whether it is one pattern, without a duration or a name."""
+    first = match.sequence.steps[0]
+    if len(match.sequence.steps) > 1 or not isinstance(first, s.StepClause):
+        return False
+    return bool(first.block.paths) and not first.hold and first.name is None
+
+
+def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
+    """A pattern of single frames; it becomes a sequence of one step if it looks at other frames as well."""
+    names = SymbolTable(session, ScopeBuilder(session))
+    bind_block(match.block, names)
+    result = _result(match.returns, names)
+    scope = names.scope.finished()  # after RETURN, where the ego may be named, as anywhere
+    where = tuple(settled(part, session) for part in scope.where)
+    when = tuple(part for part in where if b.is_temporal(part))
+    if not when and not any(b.is_temporal(value) for value in values_of(result)):
+        return b.Query(replace(scope, where=where), result, frozenset())
+    still = replace(scope, where=tuple(part for part in where if not b.is_temporal(part)))
+    step = o.BoundStep(still, when, None, absent=False, span=match.block.span)
+    return b.Query(_told(scope), result, frozenset(), steps=(step,))
+
+
+def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
+    """A sequence of steps."""
+    found = bind_sequence(match.sequence, session, bind_block)
+    names = SymbolTable(session, found.scope(), found.meanings)
+    result = _result(match.returns, names)
+    found.take_in_ego(names.scope)
+    steps, links = tuple(found.steps), tuple(found.links)
+    return b.Query(_told(names.scope.finished()), result, frozenset(), steps=steps, links=links)
+
+
+def _told(scope: b.Scope) -> b.Scope:
+    """What is known of a match once it is found: nodes and edges that have names, ends of these, the ego."""
+    edges = tuple(edge for edge in scope.edges if edge.named)
+    ends = {end for edge in edges for end in (edge.src, edge.dst)}
+    told = {
+        k for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other or k in ends
+    }
+    nodes = {key: node for key, node in scope.nodes.items() if key in told}
+    return replace(scope, nodes=nodes, edges=edges, where=(), distinct=frozenset())
+
+
+def values_of(result: b.Result) -> tuple[b.Bound, ...]:
+    """The expressions that a result speaks of: what it returns, orders by and samples by."""
+    values = [column.value for column in result.columns]
+    values += [key.value for key in result.order if not isinstance(key.value, str)]
+    per = result.sample.per if result.sample else None
+    return (*values, *([per] if per is not None and not isinstance(per, str) else []))
+
+
+def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchClause:
+    found: s.MatchClause | None = None
+    for statement in statements:
+        if isinstance(statement, s.Define):
+            define(statement, session)
+        elif isinstance(statement, s.CheckClause):
+            session.refuse(
+                "a CHECK has a verdict, and no matches",
+                statement.span,
+                "ask for it by check: sgstore check STORE …",
+            )
+        elif found is not None:
+            session.refuse("one MATCH at a time", statement.span)
+        else:
+            found = statement
+    if found is None:
+        names = [
+            d.name for d in session.predicates.values() if isinstance(d.body, s.SequenceClause)
+        ]
+        hint = f"add MATCH {names[0]}()" if names else "add MATCH …"
+        session.refuse("nothing is asked", TextSpan(0, len(session.text)), hint)
+    return found
+
+
+def define(statement: s.Define, session: Session) -> None:
+    """Take over a definition.
+
+    Raises
+    ------
+    QueryError
+        The name is taken: by another definition, or by a function. (Predicates of the library are not in the
+        way: a query may define its own.)
+    """
+    name = normalize_name(statement.name)
+    if name in session.predicates:
+        session.refuse(f"'{statement.name}' is defined twice", statement.name_span)
+    if name in {normalize_name(function) for function in FUNCTIONS}:
+        session.refuse(f"'{statement.name}' is a function already", statement.name_span)
+    session.predicates[name] = statement
+
+
+@dataclass(slots=True)
+class UsingChoice:
+    """What ``USING`` chooses; ``None``: nothing."""
+
+    ego: str | None = None
+    unknown_is_false: bool = False
+    policy: str | None = None
+    gaps: str | None = None
+    end: str | None = None
+
+
+def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> UsingChoice:
+    """What a statement chooses by ``USING``.
+
+    Raises
+    ------
+    QueryNameError
+        There is no such setting, or no such value of it.
+    """
+    found = UsingChoice()
+    for setting in settings:
+        name, value = normalize_name(setting.name), _setting_value(setting, session)
+        if name in _CHOICES:
+            _choose(found, setting, value, session)
+        elif name == "ego":
+            egos = {trace.ego for trace in catalog.traces if trace.ego}
+            if value not in egos:
+                session.unknown("ego", value, setting.span, egos)
+            found.ego = value
+        elif name == "dataset":
+            asked(value, setting.span, session)
+        elif name == "abstraction":
+            if normalize_name(value) not in catalog.sets:
+                known = [one.name for one in catalog.sets.values()]
+                hint = None if known else "the store has none yet: sgstore derive makes them"
+                session.unknown("abstraction", value, setting.span, known, hint)
+        else:
+            session.unknown("setting", setting.name, setting.span, SETTINGS)
+    return found
+
+
+_CHOICES: Final = {
+    "nodes": ("distinct", "any"),
+    "unknown": ("false",),
+    "matches": ("all", "first", "longest"),
+    "gaps": ("break", "bridge", "unknown"),
+    "end": ("strong", "weak", "pending"),
+}
+
+
+def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session) -> None:
+    """Take note of a setting whose values are a closed list."""
+    name, word = normalize_name(setting.name), value.lower()
+    if word not in _CHOICES[name]:
+        session.unknown(f"value of {setting.name}", value, setting.span, _CHOICES[name])
+    match name:
+        case "nodes":
+            session.injective = word == "distinct"
+        case "unknown":
+            found.unknown_is_false = True
+        case "matches":
+            found.policy = word
+        case "gaps":
+            found.gaps = word
+        case _:
+            found.end = word
+
+
+def _setting_value(setting: s.Setting, session: Session) -> str:
+    if isinstance(setting.value, str):
+        return setting.value
+    return str(parameter(setting.value, SymbolTable(session, ScopeBuilder(session))))
+
+
+def refuse_unused(session: Session) -> None:
+    """Refuse parameters that came with a query and are not in it."""
+    unused = sorted(set(session.parameters) - session.used)
+    if unused:
+        raise QueryError(
+            f"the query has no parameter '{unused[0]}'",
+            hint=f"it would be written ${unused[0]}",
+        )
+
+
+def refuse_strange(session: Session, catalog: Catalog) -> None:
+    """Refuse relations that the abstraction that is asked does not have."""
+    if catalog.relations is None:
+        return
+    strange = sorted(session.relations - catalog.relations)
+    if strange:
+        raise QueryError(
+            f"the abstraction {catalog.name!r} has no relation '{strange[0]}'",
+            hint=f"it has: {', '.join(sorted(catalog.relations)) or 'none'}",
+        )
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+def bind_block(block: s.Block, names: SymbolTable) -> None:
+    """Bind the paths and the condition of a block into the scope of ``names``.
+
+    Names of all nodes and edges are known before any condition is bound, so that a condition inside a node
+    may speak of what stands further on.
+    """
+    pending: list[tuple[s.NodePattern | s.EdgePattern, str]] = []
+    for path in block.paths:
+        keys = [_node(node, names) for node in path.nodes]
+        pending += zip(path.nodes, keys, strict=True)
+        for edge, left, right in zip(path.edges, keys, keys[1:], strict=False):
+            pending.append((edge, _edge(edge, left, right, names)))
+    for pattern, key in pending:
+        _inline(pattern, key, names)
+    if block.where is not None:
+        names.scope.where += conjuncts(condition(block.where, names))
+
+
+def conjuncts(expression: b.Bound) -> list[b.Bound]:
+    """The conditions that an expression joins by ``AND``."""
+    if isinstance(expression, b.Operation) and expression.word == "AND":
+        return [part for operand in expression.operands for part in conjuncts(operand)]
+    return [expression]
+
+
+def _node(node: s.NodePattern, names: SymbolTable) -> str:
+    kinds = kinds_of(node.label, names.session) if node.label else b.ANY
+    if not kinds:
+        names.session.refuse("no node can have this label", node.span)
+    key = _known_node(node, names)
+    if key is None:
+        _refuse_bare_label(node, names)
+        key = names.scope.add(node.name, kinds, node.span, named=node.name is not None)
+        if node.name is not None:
+            names.meanings[node.name] = Symbol(node=key)
+        return key
+    if node.label:
+        names.scope.narrow(key, kinds)
+        if not names.scope.kinds(key):
+            names.session.refuse(f"'{node.name}' has two labels that no node has both", node.span)
+        if key in names.scope.outer:
+            names.scope.where.append(b.LabelTest(key, kinds))
+    return key
+
+
+def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
+    """``(Car)`` would be any node, called Car, and that is not what is meant."""
+    if node.name and node.name[0].isupper() and not node.label and node.name in labels():
+        names.session.refuse(
+            f"({node.name}) would be any node, called {node.name}",
+            node.name_span,
+            f"a label stands behind a colon: (:{node.name})",
+        )
+
+
+def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
+    """The key of a node that the pattern speaks of again; ``None`` for a new one."""
+    if node.name is None:
+        return None
+    if node.name in RESERVED:
+        names.session.refuse(f"'{node.name}' cannot name a node", node.name_span)
+    meaning = names.meaning(node.name)
+    if meaning is None:
+        return _the_ego(node, names)
+    if meaning.node is None:
+        names.session.refuse(f"'{node.name}' is not a node", node.name_span)
+    names.scope.mention(meaning.node)
+    return meaning.node
+
+
+def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
+    """The key of the ego, if the pattern speaks of it by the name that is always bound."""
+    if node.name != THE_EGO:
+        return None
+    if names.scope.parent is None:
+        key = names.scope.add(THE_EGO, b.EGO, node.span, named=True)
+        names.session.the_ego = key
+        names.meanings[THE_EGO] = Symbol(node=key)
+        return key
+    return names.node(THE_EGO, node.name_span)
+
+
+def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str:
+    session = names.session
+    if edge.name is not None and names.meaning(edge.name) is not None:
+        session.refuse(f"'{edge.name}' is bound already", edge.span)
+    if edge.name is not None and edge.low is not None:
+        session.refuse(
+            "a repeated edge cannot have a name", edge.span, "-[:near*1..3]->, or edge by edge"
+        )
+    if edge.name is not None and not edge.label and relation_named(edge.name):
+        session.refuse(
+            f"-[{edge.name}]-> would be an edge of any relation, called {edge.name}",
+            edge.span,
+            f"a relation stands behind a colon: -[:{edge.name}]->",
+        )
+    relations = _relations(edge.label, session) if edge.label else b.ANY_RELATION
+    if not relations:
+        session.refuse(
+            "no edge can have this label: an edge has one relation",
+            edge.span,
+            "two edges: (a)-[:near]->(b), (a)-[:visible]->(b)",
+        )
+    key = session.key(edge.name)
+    src, dst = (right, left) if edge.direction == "left" else (left, right)
+    low, high = edge.low or 1, edge.high or 1
+    if edge.name is not None:
+        names.meanings[edge.name] = Symbol(edge=key)
+    names.scope.edges.append(
+        b.Edge(
+            key,
+            src,
+            dst,
+            relations,
+            edge.direction == "any",
+            low,
+            high,
+            edge.name is not None,
+            edge.span,
+        )
+    )
+    return key
+
+
+def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable) -> None:
+    """The properties and the condition that stand inside a node or an edge."""
+    for prop in pattern.properties:
+        attribute_of = node_attribute if isinstance(pattern, s.NodePattern) else edge_attribute
+        attribute = attribute_of(key, prop.name, prop.name_span, names)
+        names.scope.where.append(_equality(attribute, prop, names))
+    if pattern.where is not None:
+        names.scope.where += conjuncts(condition(pattern.where, names))
+
+
+def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:
+    """``name: value`` as a comparison; the attribute stands in it under a name that no query can write."""
+    inner = names.body({"": Symbol(value=attribute)})
+    inner.parent = names
+    span = TextSpan(prop.name_span.start, prop.value.span.end)
+    return condition(s.Comparison("=", s.Variable("", prop.name_span), prop.value, span), inner)
+
+
+def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
+    """What a node with a label may be.
+
+    Raises
+    ------
+    QueryNameError
+        There is no such label.
+    """
+    if isinstance(label, s.Label):
+        return _labelled(label, session)
+    operands = [kinds_of(operand, session) for operand in label.operands]
+    result = operands[0]
+    for operand in operands[1:]:
+        result = result & operand if label.word == "&" else result | operand
+    return ~result if label.word == "!" else result
+
+
+def _labelled(label: s.Label, session: Session) -> b.Kinds:
+    if label.name == "%":
+        return b.ANY
+    if normalize_name(label.name) == "ego":
+        return b.EGO
+    kinds = kinds_labelled(label.name)
+    if kinds is None:
+        if relation_named(label.name):
+            session.refuse(
+                f"'{label.name}' is a relation, not a label",
+                label.span,
+                f"write -[:{label.name}]->",
+            )
+        session.unknown("label", label.name, label.span, labels())
+    every = frozenset(kinds)
+    return b.Kinds(every & frozenset(ENTITY_KINDS), every)
+
+
+def _relations(label: s.LabelExpression, session: Session) -> frozenset[str]:
+    if isinstance(label, s.Label):
+        return _related(label, session)
+    operands = [_relations(operand, session) for operand in label.operands]
+    result = operands[0]
+    for operand in operands[1:]:
+        result = result & operand if label.word == "&" else result | operand
+    return b.ANY_RELATION - result if label.word == "!" else result
+
+
+def _related(label: s.Label, session: Session) -> frozenset[str]:
+    if label.name == "%":
+        return b.ANY_RELATION
+    relation = relation_named(label.name)
+    if relation is None:
+        if kinds_labelled(label.name):
+            session.refuse(
+                f"'{label.name}' is a label of nodes, not a relation",
+                label.span,
+                f"write (x:{label.name})",
+            )
+        session.unknown("relation", label.name, label.span, (*RELATIONS, *RELATION_ALIASES))
+    session.relations.add(relation)
+    return frozenset({relation})
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+_FORMS: Final[dict[str, b.Form]] = {
+    "intervals": "intervals",
+    "clips": "clips",
+    "subgraphs": "subgraphs",
+}
+
+
+def _result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
+    if returns is None:
+        return b.Result()
+    inner = SymbolTable(names.session, names.scope, names.meanings, names.parent, aggregates=True)
+    item = _special(returns, names.session)
+    form = item.form if item is not None else "value"
+    result = b.Result(
+        form=_FORMS.get(form, "rows"),
+        columns=tuple(_column(item, inner) for item in returns.items if item.form == "value"),
+        whole=any(item.form == "all" for item in returns.items),
+        framed=form == "frames",
+        distinct=returns.distinct,
+        limit=returns.limit,
+        before=item.before if item else 0,
+        after=item.after if item else 0,
+    )
+    _check_result(result, returns, names.session)
+    if result.aggregated or result.form in {"intervals", "clips"}:
+        # Each comes once as it is, and DISTINCT must not drop what is counted.
+        result = replace(result, distinct=False)
+    order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
+    return replace(result, order=order, sample=_sampling(returns.sample, result, inner))
+
+
+def _special(returns: s.Returns, session: Session) -> s.Item | None:
+    """The one result that is no value: ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``."""
+    special = [item for item in returns.items if item.form not in {"value", "all"}]
+    if len(special) > 1:
+        session.refuse("one of FRAMES, INTERVALS, SUBGRAPHS and CLIPS at a time", special[1].span)
+    return special[0] if special else None
+
+
+def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
+    assert item.value is not None  # noqa: S101 - the form of the item says so
+    value = settled(bind(item.value, names), names.session)
+    if value.type is Type.list:
+        names.session.refuse("a list cannot be returned", item.span)
+    _refuse_mixed(value, item.value.span, names.session)
+    text = names.session.text[item.value.span.start : item.value.span.end]
+    return b.ReturnColumn(item.name or " ".join(text.split()), value)
+
+
+def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
+    """Refuse a value that is of each match and of all matches at once."""
+    counted = any(isinstance(part, b.Aggregate) for part in b.walk(value))
+    if counted and _of_each(value):
+        session.refuse(
+            "a value of each match cannot stand beside one of all matches",
+            span,
+            "return both by themselves: x.speed, AVG(x.speed)",
+        )
+
+
+def _of_each(value: b.Bound) -> bool:
+    """Whether a value speaks of single matches, but for what is counted of all."""
+    if isinstance(value, b.Operation):
+        return any(_of_each(operand) for operand in value.operands)
+    return not isinstance(value, b.Aggregate | b.Value | b.Choices)
+
+
+def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
+    """What to order or to sample by: the name of a result, or a value of each match."""
+    own = {column.name: column.value for column in result.columns}
+    known = (*result.names, *own)
+    taken = isinstance(value, s.Variable) and names.meaning(value.name) is not None
+    if isinstance(value, s.Variable) and (value.name in own or (value.name in known and not taken)):
+        return value.name
+    if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
+        names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
+    found = settled(bind(value, replace(names, aliases=own)), names.session)
+    _refuse_mixed(found, value.span, names.session)
+    if isinstance(found, b.Value):
+        hint = f"name a value, or one of: {', '.join(known)}"
+        names.session.refuse("a constant puts nothing in an order", value.span, hint)
+    same = next((column.name for column in result.columns if column.value == found), None)
+    if same is not None:
+        return same
+    counted = any(isinstance(part, b.Aggregate) for part in b.walk(found))
+    one_each = not (result.distinct or result.framed or result.aggregated)
+    listed = result.form in {"rows", "subgraphs"}
+    if not listed or not (result.aggregated if counted else one_each):
+        names.session.refuse(
+            "only by what is returned can these results be ordered or sampled",
+            value.span,
+            f"name one of: {', '.join(known)}",
+        )
+    return found
+
+
+def _sampling(sample: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
+    if sample is None:
+        return None
+    if result.aggregated or (result.distinct and not (result.whole or result.framed)):
+        reason = "SAMPLE chooses among matches, and these are not listed"
+        names.session.refuse(reason, sample.span, "LIMIT n gives the first ones, by ORDER BY")
+    return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))
+
+
+def _check_result(result: b.Result, returns: s.Returns, session: Session) -> None:
+    names = [*result.names, *(column.name for column in result.columns)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        session.refuse(f"two results are called '{twice}'", returns.span, "name them with AS")
+    listed = result.form != "rows" or result.whole or result.framed
+    if result.aggregated and listed:
+        hint = "a number for each row is COUNT {(a)-[:near]->(b)} AS n"
+        if result.form in {"intervals", "clips"}:
+            hint = "how many frames each interval has is there anyhow, as frames"
+        session.refuse("matches are either counted or listed, not both", returns.span, hint)
+
+
+# ``CHECK``: what must be true of a trace, bound -------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CheckInCatalog:
+    """A check with the catalog that it was bound to: of the store, or of the abstraction that it names."""
+
+    check: o.BoundCheck
+    catalog: Catalog
+
+
+def bind_checks(
+    text: str,
+    statements: Sequence[Statement],
+    seen: Callable[[Statement], Catalog],
+    parameters: Mapping[str, Any],
+) -> tuple[CheckInCatalog, ...]:
+    """Every ``CHECK`` of a text, with the predicates that it defines before it.
+
+    Parameters
+    ----------
+    text : str
+        For messages.
+    statements : sequence of Statement
+    seen : function
+        The catalog that a statement is asked of.
+    parameters : mapping of str to value
+        Values of ``$name``.
+
+    Raises
+    ------
+    QueryError
+        There is none, or one has no meaning; it says where.
+    """
+    found: list[CheckInCatalog] = []
+    defined: dict[str, Define] = {}
+    used: set[str] = set()
+    for statement in statements:
+        session = Session(text, parameters, dict(defined), used=used)
+        if isinstance(statement, Define):
+            defined[normalize_name(statement.name)] = statement
+        elif isinstance(statement, MatchClause):
+            session.refuse("a MATCH has matches, and no verdict", statement.span, "ask it by find")
+        else:
+            catalog = seen(statement)
+            session.ask(catalog)
+            name = statement.name or f"check {len(found) + 1}"
+            if name in {one.check.name for one in found}:
+                session.refuse(f"two checks are called '{name}'", statement.span)
+            found.append(CheckInCatalog(_check(statement, name, session, catalog), catalog))
+    session = Session(text, parameters, used=used)
+    if not found:
+        session.refuse("nothing is checked", TextSpan(0, len(text)), "add CHECK ALWAYS …")
+    refuse_unused(session)
+    return tuple(found)
+
+
+def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog) -> o.BoundCheck:
+    settings = chosen(written.settings, session, catalog)
+    if settings.policy is not None:
+        session.refuse("USING MATCHES belongs to sequences", written.settings[0].span)
+    scope = StepScope(session)
+    names = SymbolTable(session, scope)
+    quantifiers = tuple(_quantifier(one, names, scope) for one in written.quantifiers)
+    formula = settled(condition(written.formula, names), session)
+    reset = None
+    if written.reset is not None:
+        reset = settled(condition(written.reset, names), session)
+    refuse_strange(session, catalog)
+    return o.BoundCheck(
+        name,
+        replace(scope.finished(), distinct=scope.distinct()),
+        quantifiers,
+        formula,
+        reset,
+        frozenset(session.relations),
+        session.injective,
+        settings.ego,
+        settings.unknown_is_false,
+        settings.end or "strong",
+        settings.gaps or "break",
+    )
+
+
+def _quantifier(
+    written: QuantifierClause, names: SymbolTable, scope: StepScope
+) -> o.BoundQuantifier:
+    session = names.session
+    keys: list[str] = []
+    for node in written.nodes:
+        if node.name in RESERVED or names.meaning(node.name) is not None:
+            session.refuse(f"'{node.name}' is bound already", node.span)
+        kinds = kinds_of(node.label, session)
+        if not kinds:
+            session.refuse("no node can have this label", node.span)
+        key = scope.add(node.name, kinds, node.span, named=True)
+        names.meanings[node.name] = Symbol(node=key)
+        keys.append(key)
+    where = None
+    if written.where is not None:
+        where = settled(condition(written.where, names), session)
+        if b.is_temporal(where):
+            session.refuse(
+                "what restricts a quantifier looks at one frame",
+                written.where.span,
+                "put it into the formula: … IMPLIES …",
+            )
+    return o.BoundQuantifier(written.word, tuple(keys), where, written.absent)

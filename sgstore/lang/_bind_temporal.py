@@ -1,0 +1,636 @@
+"""The binder of temporal operators and sequences.
+
+What looks at other frames than one: operators of time, functions of how something went, lengths of time.
+
+They stand in conditions of a ``MATCH``, in what it returns, and in a ``CHECK``; inside braces only one frame is
+looked at.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryError
+from sgstore.lang import ir as b
+from sgstore.lang import ir as o
+from sgstore.lang import syntax as s
+from sgstore.lang._bind_expressions import bind, condition, number_of, parameter
+from sgstore.lang._catalog import Type
+from sgstore.lang._parse import parse
+from sgstore.lang._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
+from sgstore.lang.library import patterns
+from sgstore.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from sgstore.errors import TextSpan
+
+
+MAX_NS: Final = 10**18
+"""The longest time that a query may speak of: some 30 years; ns."""
+
+_UNBOUNDED: Final = frozenset({"NEXT", "WEAKNEXT", "PREVIOUS"})
+_LENGTH: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min|frames)", re.IGNORECASE)
+_COMPARISONS: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
+
+
+def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
+    """An operator of time.
+
+    Raises
+    ------
+    QueryError
+        It stands inside braces, its operands are no conditions, or its bound is none.
+    """
+    _refuse_in_block(e.word, e.span, names)
+    operands = tuple(condition(operand, names) for operand in e.operands)
+    if e.bound is None:
+        return b.Tense(e.word, operands)
+    if e.word in _UNBOUNDED:
+        names.session.refuse(f"{e.word} has no bound", e.span)
+    low = length(e.bound[0], names)
+    if e.bound[1] is None:
+        return b.Tense(e.word, operands, low.amount, None, low.frames)
+    high = length(e.bound[1], names)
+    if low.frames != high.frames and low.amount:
+        names.session.refuse("a bound is either in time or in frames", e.bound[1].span)
+    if high.amount < low.amount:
+        names.session.refuse("the bound ends before it begins", e.bound[1].span)
+    return b.Tense(e.word, operands, low.amount, high.amount, high.frames)
+
+
+def length(e: s.Duration | s.Parameter, names: SymbolTable) -> o.Length:
+    """A length of time: as written, or what a parameter is: a number of seconds, or a text such as ``2s``.
+
+    Raises
+    ------
+    QueryError
+        It is no length of time, or one that is too long.
+    """
+    amount, unit = (e.amount, e.unit) if isinstance(e, s.Duration) else _given(e, names)
+    if unit == "frames":
+        if amount != int(amount):
+            names.session.refuse("expected a whole number of frames", e.span)
+        return o.Length(int(amount), frames=True)
+    ns = s.Duration(amount, unit, e.span).ns
+    if not 0 <= ns <= MAX_NS:
+        names.session.refuse("no length of time that a trace may have", e.span)
+    return o.Length(ns, frames=False)
+
+
+def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
+    value = parameter(e, names)
+    if isinstance(value, int | float) and not isinstance(value, bool) and value == value:  # noqa: PLR0124 - no NaN
+        return float(min(value, 1e300)), "s"
+    found = _LENGTH.fullmatch(value.strip()) if isinstance(value, str) else None
+    if found is None:
+        names.session.refuse(
+            f"the parameter '{e.name}' is no length of time",
+            e.span,
+            "give it a number of seconds, or a text such as '2s' or '10frames'",
+        )
+    return float(found[1]), found[2].lower()
+
+
+def timespan(e: s.Duration) -> b.Value:
+    """A length of time as a number: of seconds, or of frames where such are counted."""
+    if e.unit == "frames":
+        return b.Value(e.amount, Type.number, unit="frames", span=e.span)
+    return b.Value(e.ns / 1e9, Type.number, unit="s", span=e.span)
+
+
+# Functions of how something went ------------------------------------------------------------------
+
+
+def course(e: s.Call, names: SymbolTable) -> b.Bound:
+    """A call of ``prev``, ``delta``, ``run_length``, ``since_true``, ``age``, ``exists_now`` or ``t``.
+
+    Raises
+    ------
+    QueryError
+        Its arguments do not fit, or it stands inside braces.
+    """
+    word = normalize_name(e.name)
+    _refuse_in_block(f"{e.name}()", e.name_span, names)
+    wanted = 2 if word == "delta" else 1
+    if len(e.arguments) != wanted:
+        found = len(e.arguments)
+        reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {found}"
+        names.session.refuse(reason, e.span)
+    return COURSES[word](e, names)
+
+
+def _previous(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    value = bind(e.arguments[0], names)
+    _refuse_nested(e, value, names)
+    if value.type not in {Type.number, Type.text, Type.boolean}:
+        names.session.refuse(f"prev() takes a value, not a {value.type.value}", e.arguments[0].span)
+    return b.SignalCall("prev", value, type=value.type)
+
+
+def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    value = number_of(e.arguments[0], names)
+    _refuse_nested(e, value, names)
+    back = e.arguments[1]
+    if not isinstance(back, s.Duration | s.Parameter):
+        names.session.refuse("expected a length of time such as 2s", back.span)
+    by = length(back, names)
+    return b.SignalCall("delta", value, by.amount, by.frames)
+
+
+def _run_length(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    return b.SignalCall("run_length", _of_past(e, names), frames=True)
+
+
+def _since_true(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    return b.SignalCall("since_true", _of_past(e, names))
+
+
+def _of_past(e: s.Call, names: SymbolTable) -> b.Bound:
+    found = condition(e.arguments[0], names)
+    ahead = next((p for p in b.walk(found) if isinstance(p, b.Tense) and p.word in FUTURE), None)
+    if ahead is not None:
+        names.session.refuse(
+            f"{e.name}() looks back, but {ahead.word} in it looks ahead", e.arguments[0].span
+        )
+    return found
+
+
+def _age(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    return b.SignalCall("age", _node(e, names))
+
+
+def _exists_now(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    return b.SignalCall("exists_now", _node(e, names), type=Type.boolean)
+
+
+def _node(e: s.Call, names: SymbolTable) -> b.NodeValue:
+    found = bind(e.arguments[0], names)
+    if not isinstance(found, b.NodeValue):
+        names.session.refuse(f"{e.name}() takes a node", e.arguments[0].span)
+    return found
+
+
+def _moment(e: s.Call, names: SymbolTable) -> b.Bound:
+    argument = e.arguments[0]
+    meaning = names.meaning(argument.name) if isinstance(argument, s.Variable) else None
+    if meaning is None or not isinstance(meaning.value, b.StepTime):
+        names.session.refuse(
+            "t() takes the name of a step, after RETURN", argument.span, "MATCH … AS name THEN …"
+        )
+    return meaning.value
+
+
+FUTURE: Final = frozenset({"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"})
+"""Operators that look ahead."""
+
+COURSES: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
+    "prev": _previous,
+    "delta": _delta,
+    "runlength": _run_length,
+    "sincetrue": _since_true,
+    "age": _age,
+    "existsnow": _exists_now,
+    "t": _moment,
+}
+"""Functions of how something went, by folded name."""
+
+
+def _refuse_in_block(word: str, span: TextSpan, names: SymbolTable) -> None:
+    if names.scope.parent is not None:
+        names.session.refuse(
+            f"{word} looks at other frames, and inside braces there is but one",
+            span,
+            "name the node outside: MATCH (v:Vehicle) WHERE …, or FORALL (v:Vehicle) in a CHECK",
+        )
+
+
+def _refuse_nested(e: s.Call, value: b.Bound, names: SymbolTable) -> None:
+    if b.is_temporal(value):
+        names.session.refuse(f"{e.name}() takes a value of one frame", e.arguments[0].span)
+
+
+# Lengths of runs ----------------------------------------------------------------------------------
+
+
+def settled(expression: b.Bound, session: Session) -> b.Bound:
+    """An expression in which every length of a run counts what it is compared with: frames, or time.
+
+    Raises
+    ------
+    QueryError
+        A number of frames is compared with something else.
+    """
+    found = _settled(expression)
+    for value in _lengths(found):
+        if value.unit == "frames" and value.span is not None:
+            session.refuse(
+                "a number of frames is compared with run_length() and since_true() only", value.span
+            )
+    return found
+
+
+def _settled(expression: b.Bound) -> b.Bound:
+    match expression:
+        case b.Operation(word, operands, kind):
+            parts = tuple(_settled(operand) for operand in operands)
+            if word in _COMPARISONS:
+                parts = _compared(parts)
+            return b.Operation(word, parts, kind)
+        case b.Tense(operands=operands):
+            return replace(expression, operands=tuple(_settled(operand) for operand in operands))
+        case b.SignalCall(operand=operand):
+            return replace(expression, operand=_settled(operand))
+        case b.Aggregate(operand=operand) if operand is not None:
+            return replace(expression, operand=_settled(operand))
+        case _:
+            return expression
+
+
+def _compared(parts: tuple[b.Bound, ...]) -> tuple[b.Bound, ...]:
+    """The sides of a comparison, the lengths of runs in them as the numbers beside them count."""
+    inside = [part for side in parts for part in b.walk(side)]
+    if not any(isinstance(p, b.SignalCall) and p.word in _RUNS for p in inside):
+        return parts
+    units = {p.unit for p in inside if isinstance(p, b.Value)}
+    frames = True if "frames" in units else False if "s" in units else None
+    return tuple(_counting(side, frames) for side in parts)
+
+
+_RUNS: Final = frozenset({"run_length", "since_true"})
+
+
+def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT001 - what is counted
+    match expression:
+        case b.Operation(word, operands, kind):
+            return b.Operation(word, tuple(_counting(o, frames) for o in operands), kind)
+        case b.SignalCall(word=word) if word in _RUNS and frames is not None:
+            return replace(expression, frames=frames)
+        case b.Value(unit="frames"):
+            return replace(expression, unit="")
+        case _:
+            return expression
+
+
+def _lengths(expression: b.Bound) -> Iterator[b.Value]:
+    """The lengths of time in an expression and in the blocks in it."""
+    for part in b.walk(expression):
+        match part:
+            case b.Value():
+                yield part
+            case b.BlockValue(scope=scope, value=value):
+                for inner in (*scope.where, *([value] if value is not None else [])):
+                    yield from _lengths(inner)
+            case _:
+                pass
+
+
+# Sequences: the steps and links of a ``MATCH``, bound; scenarios become the steps that they stand for ----
+# Each step is a scope of its own, about one frame. A node that several steps speak of has the same key in all
+# of them: it is the same entity.
+
+MAX_STEPS: Final = 50
+"""Most steps that a sequence may have, those of scenarios in it included."""
+
+SEQUENCES: Final = frozenset({"concept", "scenario"})
+"""Kinds of patterns of the library that stand for steps."""
+
+
+@dataclass(slots=True)
+class StepScope(ScopeBuilder):
+    """The scope of one step, which may speak of nodes that other steps have bound.
+
+    Attributes
+    ----------
+    known : dict of str to Node
+        What those steps have bound, by key.
+    """
+
+    known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
+
+    def mention(self, key: str) -> None:
+        """Take note that a node is spoken of; one of another step becomes one of this step, too."""
+        if key not in self.nodes and key in self.known:
+            self.nodes[key] = self.known[key]
+
+    def kinds(self, key: str) -> b.Kinds:
+        """What a node may be here."""
+        return self.nodes[key].kinds if key in self.nodes else self.known[key].kinds
+
+    def the_ego(self, span: TextSpan) -> str:
+        """The key of the ego: of the node that is labelled so, here or in another step; or a new one."""
+        for node in (*self.nodes.values(), *self.known.values()):
+            if not node.kinds.other:
+                self.mention(node.key)
+                return node.key
+        return self.add("ego", b.EGO, span, named=False)
+
+
+@dataclass(slots=True)
+class BoundSequence:
+    """A sequence as it is bound.
+
+    Attributes
+    ----------
+    session : Session
+    known : dict of str to Node
+        The nodes that steps have bound and that others may speak of: those with names, and the ego.
+    edges : list of Edge
+        Those with names.
+    ends : dict of str to Node
+        The nodes at their ends, named or not.
+    meanings : dict of str to Symbol
+        What names mean after all steps.
+    steps, links : list
+    """
+
+    session: Session
+    known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
+    edges: list[b.Edge] = field(default_factory=list[b.Edge])
+    ends: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
+    meanings: dict[str, Symbol] = field(default_factory=dict[str, Symbol])
+    steps: list[o.BoundStep] = field(default_factory=list[o.BoundStep])
+    links: list[o.StepLink] = field(default_factory=list[o.StepLink])
+
+    def scope(self) -> ScopeBuilder:
+        """What values of a match speak of: nodes and edges that have names, and the ego."""
+        return ScopeBuilder(self.session, nodes=self.ends | self.known, edges=list(self.edges))
+
+    def take_in_ego(self, told: ScopeBuilder) -> None:
+        """Make the ego a node of the last step that happens, if it is named in none, but somewhere.
+
+        ``told`` is what values of a match speak of.
+        """
+        key = self.session.the_ego
+        happen = [number for number, step in enumerate(self.steps) if not step.absent]
+        if key is None or any(key in self.steps[number].scope.nodes for number in happen):
+            return
+        spoken_of = [scope.nodes for scope in (told, *(step.scope for step in self.steps))]
+        told.nodes[key] = ego = next(nodes[key] for nodes in spoken_of if key in nodes)
+        last = self.steps[happen[-1]]
+        pairs = {(other, key) for other in last.scope.nodes} if self.session.injective else set()
+        scope = replace(
+            last.scope,
+            nodes={**last.scope.nodes, key: ego},
+            distinct=last.scope.distinct | pairs,
+        )
+        self.steps[happen[-1]] = replace(last, scope=scope)
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """A step as it stands in the text, with the values of the scenario that it belongs to.
+
+    ``called`` is where that is named, if its own text is in the library.
+    """
+
+    step: s.StepClause
+    values: Mapping[str, Any] | None
+    name: str
+    called: TextSpan | None = None
+
+
+def bind_sequence(
+    sequence: s.SequenceClause, session: Session, bind_block: Callable[[s.Block, SymbolTable], None]
+) -> BoundSequence:
+    """The steps of a ``MATCH``.
+
+    Parameters
+    ----------
+    sequence : syntax.BoundSequence
+    session : Session
+    bind_block : function
+        Binds paths and a condition; it belongs to the binder.
+
+    Raises
+    ------
+    QueryError
+        A step or a link has no meaning where it stands.
+    """
+    found = BoundSequence(session)
+    steps, links = _spelled_out(sequence, session, 0)
+    if len(steps) > MAX_STEPS:
+        session.refuse(f"a sequence has at most {MAX_STEPS} steps", sequence.span)
+    _check_absent(steps, links, session)
+    for written in steps:
+        _bind_step(written, found, bind_block)
+    found.links = [_link(link, values, session) for link, values in links]
+    return found
+
+
+def _spelled_out(
+    sequence: s.SequenceClause, session: Session, depth: int
+) -> tuple[list[_Written], list[tuple[s.LinkClause, Mapping[str, Any] | None]]]:
+    """Steps and links, scenarios being what they stand for."""
+    steps: list[_Written] = []
+    links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = []
+    for number, step in enumerate(sequence.steps):
+        if number:
+            links.append((sequence.links[number - 1], None))
+        if isinstance(step, s.StepClause):
+            steps.append(_Written(step, None, ""))
+            continue
+        shipped = _shipped(step, session)
+        if shipped is not None:
+            inner, between = _spelled_out(shipped, session, depth + 1)
+            steps += [replace(w, name=step.name, called=step.name_span) for w in inner]
+            links += [(link, {}) for link, _ in between]
+            continue
+        definition = _scenario(step, session)
+        if depth >= MAX_STEPS:
+            session.refuse(f"{definition.name}() is defined by itself", step.name_span)
+        body = definition.body
+        assert isinstance(body, s.SequenceClause)  # noqa: S101 - it was found as a scenario
+        values = _values(step, definition, session)
+        inner, between = _spelled_out(body, session, depth + 1)
+        steps += [
+            replace(w, values={**values, **(w.values or {})}, name=definition.name) for w in inner
+        ]
+        links += [(link, {**values, **(more or {})}) for link, more in between]
+    return steps, links
+
+
+def _shipped(step: s.ScenarioStep, session: Session) -> s.SequenceClause | None:
+    """The sequence of a pattern of the library; ``None`` if the text defines the name, or nothing has it."""
+    name = normalize_name(step.name)
+    if name in session.predicates:
+        return None
+    like = (p for p in patterns().values() if normalize_name(p.name) == name)
+    entry = patterns().get(step.name) or next(like, None)  # CutIn and cut_in are two
+    if entry is None or entry.kind not in SEQUENCES:
+        return None
+    names = SymbolTable(session, ScopeBuilder(session))
+    values = {given.name: _given_text(given.value, names) for given in step.given}
+    try:
+        statements = parse(entry.written(**values))
+    except QueryError as error:
+        session.refuse(error.reason, step.span, error.hint)
+    found: s.SequenceClause | None = None
+    for statement in statements:
+        if isinstance(statement, s.Define):
+            session.predicates.setdefault(normalize_name(statement.name), statement)
+        elif isinstance(statement, s.MatchClause):
+            found = statement.sequence
+    return found
+
+
+def _given_text(value: s.Constant | s.Duration | s.Parameter, names: SymbolTable) -> Any:
+    if isinstance(value, s.Parameter):
+        return parameter(value, names)
+    return value.value if isinstance(value, s.Constant) else f"{value.amount:g}{value.unit}"
+
+
+def _scenario(step: s.ScenarioStep, session: Session) -> s.Define:
+    known = {k: d for k, d in session.predicates.items() if isinstance(d.body, s.SequenceClause)}
+    found = known.get(normalize_name(step.name))
+    if found is None:
+        names = [definition.name for definition in known.values()]
+        names += [entry.name for entry in patterns().values() if entry.kind in SEQUENCES]
+        session.unknown("scenario", step.name, step.name_span, names)
+    return found
+
+
+def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dict[str, Any]:
+    """The values of a scenario's parameters: those given, or else their own."""
+    formals = {formal.name: formal for formal in definition.parameters}
+    names = SymbolTable(session, ScopeBuilder(session))
+    values: dict[str, Any] = {f.name: _value(f.default) for f in formals.values() if f.default}
+    for given in step.given:
+        if given.name not in formals:
+            session.unknown(f"parameter of {definition.name}", given.name, given.span, formals)
+        if isinstance(given.value, s.Parameter):
+            values[given.name] = parameter(given.value, names)
+        else:
+            values[given.name] = _value(given.value)
+    missing = [name for name in formals if name not in values]
+    if missing:
+        session.refuse(
+            f"{definition.name} needs a value of {missing[0]}",
+            step.span,
+            f"write MATCH {definition.name}({missing[0]} = …)",
+        )
+    return values
+
+
+def _value(value: s.Constant | s.Duration) -> Any:
+    if isinstance(value, s.Constant):
+        return value.value
+    return f"{value.amount:g}frames" if value.unit == "frames" else value.ns / 1e9
+
+
+def _check_absent(
+    steps: list[_Written], links: list[tuple[s.LinkClause, Any]], session: Session
+) -> None:
+    """Refuse what must not happen where it has no neighbour to stand beside."""
+    for number, written in enumerate(steps):
+        if not written.step.absent:
+            continue
+        before = links[number - 1][0] if number else None
+        if before is None:
+            session.refuse(
+                "a sequence begins with something that happens",
+                written.step.span,
+                "a frame in which something is not: MATCH … WHERE NOT EXISTS {…}",
+            )
+        after = links[number][0] if number < len(links) else None
+        last = after is None
+        if before.kind != "then" or (not last and (before.after or before.within)):
+            session.refuse("before NOT MATCH stands THEN alone", before.span, "… THEN NOT MATCH …")
+        if last and (before.within is None or before.after is not None):
+            session.refuse(
+                "a sequence that ends with NOT MATCH says for how long",
+                written.step.span,
+                "write THEN WITHIN 5s NOT MATCH …",
+            )
+        if after is not None and after.kind != "then":
+            session.refuse("after NOT MATCH stands THEN", after.span)
+        if after is not None and steps[number + 1].step.absent:
+            session.refuse("between two steps one NOT MATCH", steps[number + 1].step.span)
+
+
+def _bind_step(
+    written: _Written, found: BoundSequence, bind_block: Callable[[s.Block, SymbolTable], None]
+) -> None:
+    session, step = found.session, written.step
+    scope = StepScope(session, known=dict(found.known))
+    names = SymbolTable(session, scope, dict(found.meanings))
+    with _Values(session, written):
+        if step.block.paths:
+            bind_block(step.block, names)
+        elif step.block.where is not None:
+            scope.where.append(condition(step.block.where, names))
+        where = [part for whole in scope.where for part in _settled_parts(whole, session)]
+        hold = _hold(step.hold, names) if step.hold else None
+    scope.where = [part for part in where if not b.is_temporal(part)]
+    when = tuple(part for part in where if b.is_temporal(part))
+    found.steps.append(o.BoundStep(scope.finished(), when, hold, step.absent, step.span))
+    if step.absent:
+        return
+    shared = {k: n for k, n in scope.nodes.items() if n.role == "named" or not n.kinds.other}
+    found.known |= {k: n for k, n in shared.items() if k not in found.known}
+    named = [edge for edge in scope.edges if edge.named]
+    found.edges += named
+    found.ends |= {end: scope.nodes[end] for edge in named for end in (edge.src, edge.dst)}
+    found.meanings |= names.meanings
+    _name_step(step, found)
+
+
+def _settled_parts(expression: b.Bound, session: Session) -> Iterator[b.Bound]:
+    if isinstance(expression, b.Operation) and expression.word == "AND":
+        for operand in expression.operands:
+            yield from _settled_parts(operand, session)
+    else:
+        yield settled(expression, session)
+
+
+def _name_step(step: s.StepClause, found: BoundSequence) -> None:
+    if step.name is None:
+        return
+    if step.name in found.meanings or step.name in {*RESERVED, "ego"}:
+        found.session.refuse(f"'{step.name}' is bound already", step.span)
+    found.meanings[step.name] = Symbol(value=b.StepTime(len(found.steps) - 1))
+
+
+def _hold(hold: s.HoldClause, names: SymbolTable) -> o.BoundHold:
+    return o.BoundHold(hold.comparison, length(hold.duration, names), hold.inclusive)
+
+
+def _link(link: s.LinkClause, values: Mapping[str, Any] | None, session: Session) -> o.StepLink:
+    names = SymbolTable(session, ScopeBuilder(session))
+    with _Values(session, _Written(_NOTHING, values, "")):
+        after = length(link.after, names) if link.after else None
+        within = length(link.within, names) if link.within else None
+    if after and within:
+        if after.frames != within.frames:
+            session.refuse("a bound is either in time or in frames", link.span)
+        if within.amount < after.amount:
+            session.refuse("the bound ends before it begins", link.span)
+    return o.StepLink(link.kind, after, within)
+
+
+_NOTHING: Any = None
+
+
+class _Values:
+    """While a scenario's text is bound, its parameters are its own, and its errors say its name."""
+
+    def __init__(self, session: Session, written: _Written) -> None:
+        self._session, self._written = session, written
+        self._outside = session.parameters
+
+    def __enter__(self) -> None:
+        if self._written.values is not None:
+            self._session.parameters = self._written.values
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self._session.parameters = self._outside
+        if self._written.name and isinstance(error, QueryError):
+            raise type(error)(
+                f"in {self._written.name}(): {error.reason}",
+                text=self._session.text,
+                span=self._written.called or error.span,
+                hint=error.hint,
+            ) from None

@@ -1,0 +1,690 @@
+"""The compiler: text to SQL statements, with subgraphs and ``--explain``.
+
+``RETURN SUBGRAPHS``: each match as a small graph, from the columns of one statement.
+
+The graph of a match has the nodes that the pattern binds, those without a name too, with all that is known of
+them, and the edges that it asks for. A path of exactly n edges is there edge by edge; one of m to n edges is
+one edge from end to end, whose relation is written ``isIn*1..3``. An edge that was asked for either way runs as
+it is written, and says so.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import sgstore.lang._results as results
+from sgstore.lang._bind import bind_checks, bind_query
+from sgstore.lang._catalog import (
+    EDGE_ATTRIBUTES,
+    FRAME_ATTRIBUTES,
+    NODE_ATTRIBUTES,
+    Attribute,
+    Catalog,
+    Type,
+)
+from sgstore.lang._external import SPAN, ExternalMatches, nothing, with_places
+from sgstore.lang._parse import parse
+from sgstore.lang._rewrite import rewritten, unfold_paths
+from sgstore.lang._symbols import traces_in
+from sgstore.lang.ir import (
+    ANY,
+    ANY_RELATION,
+    FRAME_COLUMNS,
+    Aggregate,
+    BlockValue,
+    Bound,
+    Choices,
+    Edge,
+    EdgeAttribute,
+    EdgeRelation,
+    FrameAttribute,
+    Kinds,
+    LabelTest,
+    Node,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    PairNumber,
+    Query,
+    Result,
+    ReturnColumn,
+    Scope,
+    SignalCall,
+    StepTime,
+    Tense,
+    TraceAttribute,
+    Value,
+)
+from sgstore.lang.syntax import CheckClause, MatchClause
+from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS, normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from sgstore.lang._bind import CheckInCatalog
+    from sgstore.lang._catalog import TraceFacts
+    from sgstore.lang._external import ExternalRelation
+    from sgstore.lang._plan import Window
+    from sgstore.lang._results import SqlStatement
+    from sgstore.lang.syntax import Statement
+
+
+Record = dict[str, Any]
+"""A node or an edge as networkx has it in node-link form."""
+
+COLUMNS: Final = ("nodes", "edges")
+"""Columns of a graph in a row: lists of :data:`Record`."""
+
+_TWICE: Final = frozenset({"id", "type"})
+"""Attributes that are there already, or under their own names (``type_name``, ``lane_type``)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _ValuePlace:
+    """A node or an edge of the pattern, and where its values stand in a row."""
+
+    part: Node | Edge
+    first: int
+    names: tuple[str, ...]
+
+    def known(self, row: Sequence[Any]) -> Record:
+        """What is known of it: the values that are not missing."""
+        values = zip(self.names, row[self.first :], strict=False)
+        return {name: value for name, value in values if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A query whose rows hold all that the graphs of its matches are made of.
+
+    Attributes
+    ----------
+    query : Query
+        As bound; it returns frames with values, and each match is one row.
+    columns : tuple of str
+        Names of the columns of :meth:`row`.
+    """
+
+    query: Query
+    columns: tuple[str, ...]
+    _places: tuple[_ValuePlace, ...]
+    _width: int
+
+    @classmethod
+    def of(cls, query: Query) -> Layout:
+        """How the graphs of the matches of a query are had; what it returns beside them is kept."""
+        scope = _bound_variables(query)
+        result = query.result
+        kept = result.form == "subgraphs" or result.whole
+        own = result.columns if kept else ()
+        columns, places = list(own), list[_ValuePlace]()
+        for part in (*scope.nodes.values(), *scope.edges):
+            if isinstance(part, Edge) and part.high > 1:
+                places.append(_ValuePlace(part, 0, ()))
+                continue
+            known = _of_node(part) if isinstance(part, Node) else _of_edge(part)
+            first = len(FRAME_COLUMNS) + len(columns)
+            places.append(_ValuePlace(part, first, tuple(name for name, _ in known)))
+            columns += [ReturnColumn(f":{part.key}.{name}", value) for name, value in known]
+        framed = replace(
+            result if kept else Result(),
+            form="rows",
+            columns=tuple(columns),
+            whole=False,
+            framed=True,
+        )
+        names = (*FRAME_COLUMNS, *(column.name for column in own), *COLUMNS)
+        width = len(FRAME_COLUMNS) + len(own)
+        return cls(replace(query, scope=scope, result=framed), names, tuple(places), width)
+
+    def row(self, row: Sequence[Any]) -> tuple[Any, ...]:
+        """A row of the query as a row with a graph."""
+        bound = {place.part.key: place.known(row) for place in self._places}
+        parts = [(place.part, bound[place.part.key]) for place in self._places]
+        return (*row[: self._width], *graph_of(parts))
+
+    def graph(
+        self,
+        nodes: Mapping[str, int],
+        edges: Mapping[str, tuple[str, Mapping[str, Any]]],
+        known: Mapping[int, Mapping[str, Any]],
+    ) -> tuple[list[Record], list[Record]]:
+        """The graph of a match that was found in memory.
+
+        Parameters
+        ----------
+        nodes : mapping of str to int
+            Ids by key.
+        edges : mapping of str to (str, mapping)
+            Relation and attributes by key.
+        known : mapping of int to mapping
+            Attributes of the nodes of the frame.
+        """
+        parts: list[tuple[Node | Edge, Record]] = []
+        for place in self._places:
+            key, part = place.part.key, place.part
+            if isinstance(part, Node):
+                about: Mapping[str, Any] = {"id": nodes[key], **known[nodes[key]]}
+            else:
+                relation, attributes = edges.get(key, ("", {}))
+                about = {"relation": relation, **attributes}
+            parts.append((part, {name: about[name] for name in place.names if name in about}))
+        return graph_of(parts)
+
+
+def _bound_variables(query: Query) -> Scope:
+    """The pattern with all its nodes and single edges bound, those of a path of exactly n edges too."""
+    scope = unfold_paths(query, Catalog()).scope
+    nodes = {
+        key: replace(node, role="unnamed") if node.role == "hidden" else node
+        for key, node in scope.nodes.items()
+    }
+    edges = tuple(replace(edge, named=True) if edge.high == 1 else edge for edge in scope.edges)
+    return replace(scope, nodes=nodes, edges=edges)
+
+
+def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record], list[Record]]:
+    """Nodes and edges of a match, in the order of the pattern.
+
+    Parameters
+    ----------
+    parts : sequence of (Node or Edge, dict)
+        All nodes of the pattern with what is known of each, its ``id`` too; then the edges, with ``relation``
+        and attributes.
+
+    Returns
+    -------
+    nodes : list of dict
+        ``id``, ``variables`` (names in the pattern), and attributes. A node that several variables mean is
+        there once.
+    edges : list of dict
+        ``source`` and ``target`` (ids), ``relation``, and attributes; ``either_way`` where the pattern leaves
+        the direction open. An edge that the pattern asks for twice is there once.
+    """
+    ids: dict[str, int] = {}
+    nodes: dict[int, Record] = {}
+    edges: dict[tuple[Any, ...], Record] = {}
+    for part, known in parts:
+        if isinstance(part, Node):
+            node = ids[part.key] = known["id"]
+            record = nodes.setdefault(node, {"id": node, "variables": [], **known})
+            record["variables"] += [part.key] if part.role == "named" else []
+            continue
+        ends: Record = {"source": ids[part.src], "target": ids[part.dst]}
+        record = ends | {"relation": path_text(part)} | known
+        record |= {"either_way": True} if part.both else {}
+        edges[(*ends.values(), record["relation"], part.both)] = record
+    return list(nodes.values()), list(edges.values())
+
+
+def path_text(edge: Edge) -> str:
+    """What a path of edges is called: ``isIn*1..3``, ``*2..4``."""
+    relations = "|".join(sorted(edge.relations)) if edge.relations != ANY_RELATION else ""
+    return f"{relations}*{edge.low}..{edge.high}"
+
+
+def _of_node(node: Node) -> list[tuple[str, NodeValue | NodeAttribute]]:
+    """The id of a node, and the attributes that it can have."""
+    known: list[tuple[str, NodeValue | NodeAttribute]] = [("id", NodeValue(node.key))]
+    return known + [
+        (attribute.name, NodeAttribute(node.key, attribute, attribute.type))
+        for attribute in NODE_ATTRIBUTES.values()
+        if attribute.kinds & node.kinds.every and attribute.name not in _TWICE
+    ]
+
+
+def _of_edge(edge: Edge) -> list[tuple[str, EdgeRelation | EdgeAttribute]]:
+    known: list[tuple[str, EdgeRelation | EdgeAttribute]] = [("relation", EdgeRelation(edge.key))]
+    return known + [
+        (attribute.name, EdgeAttribute(edge.key, attribute, attribute.type))
+        for attribute in edge_attributes(edge)
+    ]
+
+
+def edge_attributes(edge: Edge) -> Iterator[Attribute]:
+    """The attributes that an edge of a pattern can be asked for."""
+    if edge.high > 1 or len(edge.relations) > 1:
+        return
+    for attribute in EDGE_ATTRIBUTES.values():
+        gap = attribute.name == "gap"
+        if gap and edge.relations <= {"leads", "follows"} and not edge.both:
+            yield attribute
+        if not gap and edge.relations == frozenset({"isIn"}):
+            yield attribute
+
+
+def shown(
+    nodes: Sequence[Mapping[str, Any]], edges: Sequence[Mapping[str, Any]]
+) -> tuple[str, str]:
+    """Nodes and edges of a graph as texts for people: ``e = car 0, v = car 3``, ``car 0 -near-> car 3``."""
+    called = {node["id"]: str(node.get("name", node["id"])) for node in nodes}
+    named = (" = ".join([*node["variables"], called[node["id"]]]) for node in nodes)
+    lines = (
+        f"{called[edge['source']]} -{edge['relation']}-{'>' * ('either_way' not in edge)} "
+        f"{called[edge['target']]}"
+        for edge in edges
+    )
+    return ", ".join(named), ", ".join(lines)
+
+
+# The stages of the compiler as text, for ``--explain`` ------------------------------------------
+
+_PLACES: Final = frozenset({"span", "name_span"})
+_INFIX: Final = frozenset(
+    {"AND", "OR", "XOR", "IMPLIES", "=", "<>", "<", "<=", ">", ">=", "IN"}
+    | {"+", "-", "*", "/", "%", "STARTS WITH", "ENDS WITH", "CONTAINS", "=~"}
+)
+
+
+def tree_text(part: Any) -> str:
+    """A syntax tree, one part a line; places in the text and what is absent are left out."""
+    return "\n".join(_tree(part, ""))
+
+
+def _tree(part: Any, indent: str) -> list[str]:
+    if not is_dataclass(part) or isinstance(part, type):
+        return [f"{indent}{part!r}"]
+    lines = [indent + type(part).__name__]
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if field.name in _PLACES or value in (None, (), False):
+            continue
+        inner = value if isinstance(value, tuple) else (value,)
+        if any(is_dataclass(item) for item in inner):
+            lines.append(f"{indent}  {field.name}:")
+            lines += [line for item in inner for line in _tree(item, indent + "    ")]
+        else:
+            lines[0] += f" {field.name}={value!r}"
+    return lines
+
+
+def statements_text(statements: tuple[Statement, ...]) -> str:
+    """The syntax trees of a text."""
+    return "\n".join(tree_text(statement) for statement in statements)
+
+
+def query_text(query: Query) -> str:
+    """A bound query: what may be bound to what, under which conditions."""
+    lines = _scope(query.scope, "")
+    result = query.result
+    shown = [f"{column.name} = {value_text(column.value)}" for column in result.columns]
+    lines.append(f"return {result.form}" + (f": {', '.join(shown)}" if shown else ""))
+    if query.ego is not None:
+        lines.append(f"ego {query.ego!r}")
+    return "\n".join(lines)
+
+
+def _scope(scope: Scope, indent: str) -> list[str]:
+    lines = [
+        f"{indent}node {node.key}: {kinds_text(node.kinds)}"
+        + ("" if node.role == "named" else f" ({node.role})")
+        for node in scope.nodes.values()
+    ]
+    lines += [f"{indent}outside {key}: {kinds_text(kinds)}" for key, kinds in scope.outer.items()]
+    lines += [f"{indent}edge {edge.key}: {edge_text(edge)}" for edge in scope.edges]
+    lines += [f"{indent}where {value_text(condition, indent)}" for condition in scope.where]
+    pairs = ", ".join(f"{a} ≠ {b}" for a, b in sorted(scope.distinct))
+    return [*lines, f"{indent}distinct {pairs}"] if pairs else lines
+
+
+def edge_text(edge: Edge) -> str:
+    """An edge between the keys of its nodes."""
+    some = [relation for relation in RELATIONS if relation in edge.relations]
+    label = "" if edge.relations == ANY_RELATION else f":{'|'.join(some)}"
+    times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
+    arrow = "-" if edge.both else "->"
+    return f"({edge.src})-[{label}{times}]{arrow}({edge.dst})"
+
+
+def kinds_text(kinds: Kinds) -> str:
+    """What a node may be."""
+    if kinds == ANY:
+        return "anything"
+    entities = frozenset(ENTITY_KINDS)
+    if not kinds.other:
+        which = "" if kinds.ego == entities else f", a {_kinds(kinds.ego)}"
+        return "the ego" + which
+    without = "" if kinds.ego == kinds.other & entities else ", not the ego"
+    if kinds.ego - kinds.other:
+        without = ", or the ego"
+    return _kinds(kinds.other) + without
+
+
+def _kinds(kinds: frozenset[str]) -> str:
+    return "|".join(kind for kind in KINDS if kind in kinds) or "nothing"
+
+
+def unnumbered_text(value: Bound) -> str:
+    """An expression as :func:`value_text` prints it, without the numbers that tell unnamed nodes apart."""
+    return _NUMBERED.sub(lambda found: "#" if found[0][0] == "#" else found[0], value_text(value))
+
+
+_NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
+"""Texts, which are left as they are, and numbers of nodes."""
+
+
+def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each
+    """An expression, nearly as one would write it."""
+    match value:
+        case Value(value=constant):
+            return "NULL" if constant is None else repr(constant)
+        case Choices(items=items):
+            return "[" + ", ".join(value_text(item) for item in items) + "]"
+        case Operation():
+            return _operation(value, indent)
+        case BlockValue():
+            return _block(value, indent)
+        case Tense() | SignalCall() | StepTime():
+            return _over_time(value, indent)
+        case Aggregate(word=word, operand=operand, distinct=distinct):
+            inner = "*" if operand is None else value_text(operand, indent)
+            return f"{word}({'DISTINCT ' * distinct}{inner})"
+        case _:
+            return _leaf(value)
+
+
+def _over_time(value: Tense | SignalCall | StepTime, indent: str) -> str:
+    match value:
+        case Tense(word=word, operands=operands):
+            bound = _bound(value)
+            if len(operands) == 1:
+                return f"{word}{bound} {value_text(operands[0], indent)}"
+            left, right = (value_text(operand, indent) for operand in operands)
+            return f"({left} {word}{bound} {right})"
+        case SignalCall(word=word, operand=operand):
+            by = f", {_length(value.by, frames=value.frames)}" if word == "delta" else ""
+            counted = " in frames" if word in {"run_length", "since_true"} and value.frames else ""
+            return f"{word}({value_text(operand, indent)}{by}){counted}"
+        case StepTime(step=step):
+            return f"t(step {step + 1})"
+
+
+def _bound(tense: Tense) -> str:
+    if not tense.low and tense.high is None:
+        return ""
+    high = "INF" if tense.high is None else _length(tense.high, frames=tense.frames)
+    return f"[{_length(tense.low, frames=tense.frames)}, {high}]"
+
+
+def _length(amount: int, *, frames: bool) -> str:
+    return f"{amount}frames" if frames else f"{amount / 1e9:g}s"
+
+
+def _leaf(value: Bound) -> str:
+    match value:
+        case NodeValue(node=node):
+            text = node
+        case NodeAttribute(node=owner) | EdgeAttribute(edge=owner):
+            text = f"{owner}.{value.attribute.name}"
+        case FrameAttribute(attribute=attribute) if attribute.of_store:
+            text = attribute.name
+        case FrameAttribute(attribute=attribute):
+            text = f"frame.{attribute.name}"
+        case TraceAttribute(attribute=attribute):
+            text = f"trace.{attribute.name}"
+        case EdgeRelation(edge=edge):
+            text = f"type({edge})"
+        case PairNumber(function=function, a=a, b=b):
+            text = f"{function}({a}, {b})"
+        case LabelTest(node=node, kinds=kinds):
+            text = f"{node} is {kinds_text(kinds)}"
+        case _:
+            text = repr(value)
+    return text
+
+
+def _operation(operation: Operation, indent: str) -> str:
+    parts = [value_text(operand, indent) for operand in operation.operands]
+    word = operation.word
+    if word in _INFIX:
+        return "(" + f" {word} ".join(parts) + ")"
+    if word.startswith("IS "):
+        return f"({parts[0]} {word})"
+    if word in {"NOT", "negative"}:
+        return f"{'NOT ' if word == 'NOT' else '-'}{parts[0]}"
+    return f"{word}({', '.join(parts)})"
+
+
+def _block(block: BlockValue, indent: str) -> str:
+    inside = _scope(block.scope, indent + "    ")
+    if block.value is not None:
+        inside.append(f"{indent}    value {value_text(block.value, indent)}")
+    return "\n".join([f"{block.word} {{", *inside, f"{indent}  }}"])
+
+
+# Text → statements, by way of the stages: parse, bind, rewrite, emit. Each is a pure function ----
+
+
+@dataclass(frozen=True, slots=True)
+class Compiled:
+    """A query that can be asked of a store.
+
+    Attributes
+    ----------
+    text : str
+        As it was written.
+    bound : Query
+        As the binder gave it.
+    query : Query
+        Rewritten.
+    catalog : Catalog
+        What it was compiled against: that of the abstraction which it names, or of the store.
+    stored : Catalog, optional
+        Of the store.
+    finder : function, optional
+        Of a query with steps: gives what matches, with what is worked out for each match, in the whole traces
+        of a window.
+    """
+
+    text: str
+    bound: Query
+    query: Query
+    catalog: Catalog
+    stored: Catalog | None = None
+    finder: Callable[[tuple[Bound, ...], Window | None], ExternalRelation] | None = None
+
+    @property
+    def layout(self) -> Layout | None:
+        """If it returns graphs: how they are made of its rows."""
+        return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of what it returns."""
+        if self.layout is not None:
+            return self.layout.columns
+        return replace(self, finder=None).rows().columns
+
+    @property
+    def chosen(self) -> tuple[TraceFacts, ...]:
+        """The traces that it asks, those that cannot answer it among them."""
+        only, ego = self.catalog.only, self.query.ego
+        chosen = [t for t in self.catalog.traces if ego in {None, t.ego}]
+        return tuple(t for t in chosen if only is None or t.trace_id in only)
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Names of the traces that cannot answer it, because they know nothing of a relation, and why."""
+        if self.query.unknown_is_false:
+            return {}
+        wanted = self.query.relations
+        missing = {trace.name: sorted(wanted - trace.answers) for trace in self.chosen}
+        return {n: f"it knows nothing of {', '.join(some)}" for n, some in missing.items() if some}
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the traces that cannot answer it, because they know nothing of a relation."""
+        return tuple(self.reasons)
+
+    def rows(self, window: Window | None = None) -> SqlStatement:
+        """What it returns."""
+        return self._rows(self.query, window)
+
+    def _rows(self, query: Query, window: Window | None) -> SqlStatement:
+        query, writer, span = self._told(query, window)
+        return results.rows(query, self.catalog, window, writer, span)
+
+    def _told(
+        self, query: Query, window: Window | None
+    ) -> tuple[Query, ExternalMatches | None, results.Span | None]:
+        """What says the matches of a query that looks at several frames; of any other nothing does."""
+        if not query.steps:
+            return query, None, None
+        query, places = with_places(query)
+        span = SPAN if len(query.steps) > 1 else None
+        told = (*places.values(), *(span or ()))
+        find, asked = self.finder, tuple(places)
+        if find is None:
+            return (
+                query,
+                ExternalMatches(query, self.catalog, nothing(query, len(told)), told),
+                span,
+            )
+        if window is not None:
+            return query, ExternalMatches(query, self.catalog, find(asked, window), told), span
+        return query, ExternalMatches(query, self.catalog, partial(find, asked), told), span
+
+    def frames(self, window: Window | None = None) -> SqlStatement:
+        """The frames that match, each once, with their log times."""
+        query, writer, _ = self._told(replace(self.query, result=Result()), window)
+        return results.frames(query, self.catalog, window, writer)
+
+    def bindings(self, window: Window | None = None) -> SqlStatement:
+        """Frames and what the variables are bound to, whatever ``RETURN`` says."""
+        return self._rows(replace(self.query, result=Result()), window)
+
+    def intervals(self, window: Window | None = None) -> SqlStatement:
+        """Intervals in which what it returns stays the same; without ``RETURN``, what it binds.
+
+        Of a query that returns rows these are all intervals, whatever its order and its limit.
+        """
+        query, result = self.query, self.query.result
+        if result.whole or result.aggregated or self.layout is not None:
+            query = results.with_bindings(query)
+        elif result.form != "intervals":
+            result = Result(form="intervals", columns=result.columns, whole=False)
+            query = replace(query, result=result)
+        return self._rows(query, window)
+
+    def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
+        """Clips around the frames that match; the offsets of ``RETURN CLIPS`` win over those given.
+
+        Parameters
+        ----------
+        before_ns, after_ns : int
+            What is added before the first and after the last frame of each; ns.
+        window : Window, optional
+        """
+        result = self.query.result
+        if result.form != "clips":
+            result = Result(form="clips", whole=False, before=-before_ns, after=after_ns)
+        return self._rows(replace(self.query, result=result), window)
+
+    @property
+    def in_windows(self) -> bool:
+        """Whether its rows can be had window by window: if none depends on those of other windows."""
+        result = self.query.result
+        framed = result.whole or result.framed or result.form != "rows"
+        across = result.distinct and not framed
+        return not (result.order or result.sample or result.aggregated or across)
+
+    @property
+    def limited_to_frames(self) -> Compiled | None:
+        """If it lists a limited number of rows: the query that says of each its frame and log time."""
+        result = self.query.result
+        if result.limit is None or result.form != "rows" or result.aggregated:
+            return None
+        time = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
+        columns = (*result.columns, ReturnColumn(f":{results.LOG_TIME}", time))
+        result = replace(result, framed=True, columns=columns)
+        return replace(self, query=replace(self.query, result=result))
+
+    def stages(self) -> str:
+        """What became of the text, stage by stage."""
+        statements = parse(self.text)
+        statement = self.rows()
+        values = "".join(f"\n${i} = {v!r}" for i, v in enumerate(statement.values, start=1))
+        parts = (
+            ("parse", statements_text(statements)),
+            ("bind", query_text(self.bound)),
+            ("rewrite", query_text(self.query)),
+            ("emit", statement.sql + values),
+        )
+        return "\n\n".join(f"---- {name}\n{text}" for name, text in parts)
+
+    def count(self, window: Window | None = None) -> SqlStatement:
+        """How many frames match."""
+        query, writer, _ = self._told(replace(self.query, result=Result()), window)
+        return results.count(query, self.catalog, window, writer)
+
+
+def compile_query(
+    text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
+) -> Compiled:
+    """A query that can be asked of a store.
+
+    Parameters
+    ----------
+    text : str
+        One ``MATCH``, with the predicates that it needs.
+    catalog : Catalog
+        Of the store.
+    parameters : mapping of str to value
+        Values of ``$name``: numbers, texts, truth values, or lists of these.
+
+    Raises
+    ------
+    QuerySyntaxError
+        The text is not a sentence of the language.
+    QueryNameError
+        It names what is not known.
+    QueryError
+        Its types do not fit together.
+    """
+    statements = parse(text)
+    seen = _seen(statements, catalog, parameters or {})
+    bound = bind_query(text, statements, seen, parameters or {})
+    whole = Layout.of(bound).query if bound.result.form == "subgraphs" else bound
+    query = whole if whole.steps else rewritten(whole, seen)
+    return Compiled(text, bound, query, seen, catalog)
+
+
+def compile_checks(
+    text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
+) -> tuple[CheckInCatalog, ...]:
+    """The checks of a text, bound; what they need of single frames is compiled when it is asked.
+
+    Parameters
+    ----------
+    text : str
+        ``CHECK`` statements, with the predicates that they need.
+    catalog, parameters
+        As in :func:`compile_query`.
+
+    Raises
+    ------
+    QueryError
+        As in :func:`compile_query`; or there is no check.
+    """
+    given = parameters or {}
+    return bind_checks(text, parse(text), lambda one: _seen([one], catalog, given), given)
+
+
+def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
+    """The catalog of the abstraction that a query names and of its dataset, if they are known."""
+    seen = catalog
+    for statement in statements:
+        for setting in (
+            statement.settings if isinstance(statement, MatchClause | CheckClause) else ()
+        ):
+            value = setting.value
+            name = value if isinstance(value, str) else str(parameters.get(value.name, ""))
+            if normalize_name(setting.name) == "abstraction":
+                chosen = catalog.sets.get(normalize_name(name), catalog)
+                seen = replace(chosen, sets=catalog.sets, only=seen.only)
+            elif normalize_name(setting.name) == "dataset":
+                seen = replace(seen, only=traces_in(name, catalog.traces, catalog.tables))
+    return seen

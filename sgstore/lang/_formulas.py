@@ -1,0 +1,721 @@
+"""SQL expressions: values, attributes, conditions and numbers of pairs.
+
+The numbers of a pair of entities as SQL, each in terms of others: the formulas of the view ``pairs``.
+
+A *raw* column belongs to one of the two, ``a`` or ``b``: position about the trace's origin, heading in
+radians, velocity, box. Numbers are computed in layers, one statement within the other, because DuckDB shares
+named columns and not repeated expressions.
+"""
+
+from __future__ import annotations
+
+import re
+import string
+from dataclasses import dataclass, field
+from functools import cache, reduce
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.lang._catalog import DERIVED, Attribute, DisplayUnit, Home, Type
+from sgstore.lang.ir import (
+    Aggregate,
+    BlockValue,
+    Bound,
+    Choices,
+    EdgeAttribute,
+    EdgeRelation,
+    FrameAttribute,
+    LabelTest,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    PairNumber,
+    SignalCall,
+    StepTime,
+    Tense,
+    TraceAttribute,
+    Value,
+)
+from sgstore.quoting import literal, quoted
+from sgstore.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.lang._kinds import Profile
+    from sgstore.lang.ir import Edge
+
+
+_HALF: Final = {
+    "la": "{alength} / 2",
+    "wa": "{awidth} / 2",
+    "lb": "{blength} / 2",
+    "wb": "{bwidth} / 2",
+}
+_PAIR: Final = {
+    "dx": "{bx} - {ax}",
+    "dy": "{by} - {ay}",
+    "dz": "{bz} - {az}",
+    "dvx": "{bvx} - {avx}",
+    "dvy": "{bvy} - {avy}",
+    "turn": "{bheading} - {aheading}",
+    **_HALF,
+    "ca": "cos({aheading})",
+    "sa": "sin({aheading})",
+    "cb": "cos({bheading})",
+    "sb": "sin({bheading})",
+    "planar": "sqrt({dx} * {dx} + {dy} * {dy})",
+    "dist": "sqrt({dx} * {dx} + {dy} * {dy} + {dz} * {dz})",
+    "lon": "{dx} * {ca} + {dy} * {sa}",
+    "lat": "{dy} * {ca} - {dx} * {sa}",
+    "back": "{dx} * {cb} + {dy} * {sb}",
+    "side": "{dy} * {cb} - {dx} * {sb}",
+    "course": "CASE WHEN {dx} = 0 AND {dy} = 0 THEN 0 * {aheading}"
+    " ELSE degrees(atan2({dy}, {dx}) - {aheading}) END",
+    "turned": "degrees({turn})",
+    "bearing": "{course} - 360 * ceil(({course} - 180) / 360)",
+    "rel_heading": "{turned} - 360 * ceil(({turned} - 180) / 360)",
+    # What is not known stays so: greatest() would pass over it.
+    "lon_gap": "CASE WHEN {out1} < 0 THEN 0 ELSE {out1} END",
+    "lat_gap": "CASE WHEN {out2} < 0 THEN 0 ELSE {out2} END",
+    "sighted": "degrees({bheading} - atan2({dy}, {dx}))",
+    "apparent_heading": "CASE WHEN {planar} > 0"
+    " THEN {sighted} - 360 * ceil(({sighted} - 180) / 360) END",
+    "rel_speed": "sqrt({dvx} * {dvx} + {dvy} * {dvy})",
+    "closing_speed": "-({dx} * {dvx} + {dy} * {dvy}) / nullif({planar}, 0)",
+    "pace": "sqrt({avx} * {avx} + {avy} * {avy})",
+    "headway": "CASE WHEN {lon} > 0 AND {pace} > 0.1 AND {la} + {lb} IS NOT NULL"
+    " THEN greatest({lon} - {la} - {lb}, 0) / {pace} END",
+    # No two boxes are nearer than their circumscribed circles; a micrometre makes up for rounding.
+    "at_least": "{planar} - sqrt({la} * {la} + {wa} * {wa}) - sqrt({lb} * {lb} + {wb} * {wb}) - 1e-6",
+    "co": "abs(cos({turn}))",
+    "si": "abs(sin({turn}))",
+    "hand": "CASE WHEN cos({turn}) * sin({turn}) < 0 THEN -1 ELSE 1 END",
+    # Distance from the octagon that the two boxes make: out and past each of its four near edges.
+    "reach1": "{la} + {lb} * {co} + {wb} * {si}",
+    "reach2": "{wa} + {lb} * {si} + {wb} * {co}",
+    "reach3": "{lb} + {la} * {co} + {wa} * {si}",
+    "reach4": "{wb} + {la} * {si} + {wa} * {co}",
+    "out1": "abs({lon}) - {reach1}",
+    "out2": "abs({lat}) - {reach2}",
+    "out3": "abs({back}) - {reach3}",
+    "out4": "abs({side}) - {reach4}",
+    "past1": "abs(CASE WHEN {lon} < 0 THEN -{lat} ELSE {lat} END"
+    " - {hand} * ({lb} * {si} - {wb} * {co})) - {wa}",
+    "past2": "abs(CASE WHEN {lat} < 0 THEN -{lon} ELSE {lon} END"
+    " - {hand} * ({lb} * {co} - {wb} * {si})) - {la}",
+    "past3": "abs(CASE WHEN {back} < 0 THEN -{side} ELSE {side} END"
+    " + {hand} * ({la} * {si} - {wa} * {co})) - {wb}",
+    "past4": "abs(CASE WHEN {side} < 0 THEN -{back} ELSE {back} END"
+    " + {hand} * ({la} * {co} - {wa} * {si})) - {lb}",
+    "gap": "CASE WHEN {la} + {wa} + {lb} + {wb} IS NULL THEN NULL"
+    " WHEN greatest({out1}, {out2}, {out3}, {out4}) <= 0 THEN 0 ELSE sqrt(least("
+    + ", ".join(
+        f"CASE WHEN {{out{i}}} > 0 THEN {{out{i}}} * {{out{i}}}"
+        f" + greatest({{past{i}}}, 0) * greatest({{past{i}}}, 0) END"
+        for i in (1, 2, 3, 4)
+    )
+    + ")) END",
+    "closing_time": "CASE WHEN {closing_speed} > 0 THEN {gap} / {closing_speed} END",
+    # When the boxes overlap on each axis of both, which is turned so that b moves along it: from … to …
+    "drift1": "{dvx} * {ca} + {dvy} * {sa}",
+    "drift2": "{dvy} * {ca} - {dvx} * {sa}",
+    "drift3": "{dvx} * {cb} + {dvy} * {sb}",
+    "drift4": "{dvy} * {cb} - {dvx} * {sb}",
+    "place1": "CASE WHEN {drift1} < 0 THEN -{lon} ELSE {lon} END",
+    "place2": "CASE WHEN {drift2} < 0 THEN -{lat} ELSE {lat} END",
+    "place3": "CASE WHEN {drift3} < 0 THEN -{back} ELSE {back} END",
+    "place4": "CASE WHEN {drift4} < 0 THEN -{side} ELSE {side} END",
+    # Never 0: what stands on an axis meets there in ages, or has met for ages.
+    **{f"rate{i}": f"abs({{drift{i}}}) + 1e-200" for i in (1, 2, 3, 4)},
+    "meets": f"greatest({', '.join(f'(-{{reach{i}}} - {{place{i}}}) / {{rate{i}}}' for i in (1, 2, 3, 4))})",
+    "parts": f"least({', '.join(f'({{reach{i}}} - {{place{i}}}) / {{rate{i}}}' for i in (1, 2, 3, 4))})",
+    "ttc": "CASE WHEN {meets} <= {parts} AND {parts} >= 0 AND ({rel_speed} >= 1e-6 OR {meets} <= 0)"
+    " AND {reach1} + {reach2} IS NOT NULL THEN greatest({meets}, 0) END",
+    # Of two that move straight on, the distance shrinks by no more than this in a second, now or later.
+    "approach": "greatest(coalesce({closing_speed}, 0), 0)",
+}
+"""Numbers of a pair (a, b) in terms of the columns of both and of one another, as in the view ``pairs``."""
+
+
+WAY: Final = "lane_dist"
+"""The number that no layer computes: it is looked up, by lanes and what lies between them."""
+
+
+def way_text(frame: str, a: str, b: str, conditions: Iterable[str]) -> str:
+    """How far it is along the lanes from a to b.
+
+    Parameters
+    ----------
+    frame, a, b : str
+        Columns of the frame and of both ids.
+    conditions : iterable of str
+        What is known of the rows ``"a"`` and ``"b"`` of ``lane_state`` besides, so that fewer are looked at.
+    """
+    # Each row is tied to the frame asked for, not to the others: that is what tells DuckDB where to begin.
+    more = "".join(f"\n        AND {condition}" for condition in conditions)
+    ahead = """min(CASE WHEN "way" >= 0 THEN "way" END)"""
+    behind = """max(CASE WHEN "way" < 0 THEN "way" END)"""
+    return f"""(
+    SELECT CASE WHEN {behind} IS NULL OR {ahead} <= -{behind} THEN {ahead} ELSE {behind} END
+    FROM (
+      SELECT "r"."start" + (CAST("b"."along" AS DOUBLE) - CAST("a"."along" AS DOUBLE)) AS "way"
+      FROM "lane_state" AS "a", "lane_state" AS "b", "frame" AS "f", "map_reach" AS "r"
+      WHERE "a"."frame_id" = {frame} AND "a"."node_id" = {a} AND "a"."is_own"
+        AND "b"."frame_id" = {frame} AND "b"."node_id" = {b} AND "b"."is_own"
+        AND "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
+        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"{more}
+    ) AS "ways" WHERE "way" BETWEEN -200 AND 200
+  )"""  # noqa: S608  columns that the compiler named
+
+
+@cache
+def parts_of(name: str) -> tuple[str, ...]:
+    """The numbers and raw columns that a number of a pair is made of."""
+    return tuple(sorted({f for _, f, _, _ in string.Formatter().parse(_PAIR[name]) if f}))
+
+
+@cache
+def stage_of(name: str) -> int:
+    """How many layers of a statement come before a number of a pair; 0 for a raw column."""
+    return 1 + max(stage_of(part) for part in parts_of(name)) if name in _PAIR else 0
+
+
+@cache
+def needed_for(name: str) -> frozenset[str]:
+    """A number of a pair with all that it is made of."""
+    if name not in _PAIR:
+        return frozenset({name})
+    return frozenset({name}).union(*(needed_for(part) for part in parts_of(name)))
+
+
+def pair_column(name: str, a: str, b: str) -> str:
+    """The column of a number of a pair, or of a raw column (``ax``: x of a)."""
+    if name in _PAIR:
+        return quoted(f"{name}({a}, {b})")
+    return quoted(f"{a if name[0] == 'a' else b}:{name[1:]}")
+
+
+def pair_text(name: str, a: str, b: str) -> str:
+    """A number of a pair in terms of the columns of the layers before."""
+    columns = {part: pair_column(part, a, b) for part in parts_of(name)}
+    return _PAIR[name].format_map(columns)
+
+
+# Pieces of SQL text: values, attributes, conditions, and the numbers of pairs of entities -------
+# Portable SQL only: what stands here runs on DuckDB and can be carried to other engines. Every identifier is
+# quoted, every value of the user's is bound; words of the vocabulary stand in the text.
+
+
+@dataclass(slots=True)
+class BoundValues:
+    """The values of the user's that a statement binds, in order."""
+
+    items: list[Any] = field(default_factory=list[Any])
+
+    def add(self, value: object) -> str:
+        """The placeholder of a value."""
+        self.items.append(value)
+        return f"${len(self.items)}"
+
+
+@dataclass(slots=True)
+class Select:
+    """A statement in the making: one line for each column, table and condition."""
+
+    columns: list[str] = field(default_factory=list[str])
+    tables: list[str] = field(default_factory=list[str])
+    where: list[str] = field(default_factory=list[str])
+    group: list[str] = field(default_factory=list[str])
+    having: list[str] = field(default_factory=list[str])
+    order: list[str] = field(default_factory=list[str])
+    limit: int | None = None
+    distinct: bool = False
+
+    def text(self) -> str:
+        """The statement."""
+        head = "SELECT DISTINCT " if self.distinct else "SELECT "
+        lines = [head + ",\n  ".join(self.columns)]
+        lines += ["FROM " + "\n  ".join(self.tables)] if self.tables else []
+        lines += ["WHERE " + "\n  AND ".join(self.where)] if self.where else []
+        lines += ["GROUP BY " + ", ".join(self.group)] if self.group else []
+        lines += ["HAVING " + "\n  AND ".join(self.having)] if self.having else []
+        lines += ["ORDER BY " + ", ".join(self.order)] if self.order else []
+        lines += [f"LIMIT {self.limit}"] if self.limit is not None else []
+        return "\n".join(lines)
+
+    def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
+        """Add a table; without conditions it goes with every row."""
+        if not self.tables:
+            self.tables.append(table)
+            self.where += conditions
+        elif conditions:
+            self.tables.append(f"{how} {table} ON " + " AND ".join(conditions))
+        else:
+            self.tables.append(f"CROSS JOIN {table}")
+
+
+def indented(text: str) -> str:
+    """A statement within another."""
+    return "\n".join(f"    {line}" for line in text.splitlines())
+
+
+def nested(text: str, name: str) -> str:
+    """A statement as a table."""
+    return f"(\n{indented(text)}\n  ) AS {quoted(name)}"
+
+
+# Values of nodes ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Aliases:
+    """Aliases under which the tables of a node's attributes stand in a statement; ``None``: not there."""
+
+    state: str | None = None
+    entity: str | None = None
+    map: str | None = None
+    trace: str | None = None
+
+
+_ORIGINS: Final = {
+    DisplayUnit.east: "origin_x",
+    DisplayUnit.north: "origin_y",
+    DisplayUnit.up: "origin_z",
+}
+PLACES: Final = ", ".join(literal(kind) for kind in MAP_KINDS)
+"""Kinds of parts of the map that are no entities, as its signs and lights are."""
+
+_ABSENT: Final = {
+    Type.number: "CAST(NULL AS DOUBLE)",
+    Type.text: "CAST(NULL AS VARCHAR)",
+    Type.boolean: "CAST(NULL AS BOOLEAN)",
+}
+
+
+def attribute_text(attribute: Attribute, at: Aliases) -> str:
+    """The value of an attribute of a node that lives in one of some places."""
+    if attribute.unit is DisplayUnit.label:
+        return _label(at)
+    if attribute.name == "kind" and at.state and not (at.entity or at.map):
+        return f"{at.state}.{quoted('kind')}"
+    parts = [
+        _part(attribute, home, f"{alias}.{quoted(attribute.columns[home])}", alias, at.trace)
+        for home, alias in (
+            (Home.state, at.state),
+            (Home.entity, at.entity),
+            (Home.scenery, at.entity),
+            (Home.map, at.map),
+        )
+        if alias is not None and home in attribute.columns
+    ]
+    if attribute.name == "is_ego":
+        parts.append("FALSE")
+    if not parts:
+        return _ABSENT[attribute.type]
+    if attribute.values and len(parts) > 1:
+        parts = [f"CAST({part} AS VARCHAR)" for part in parts]
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
+    """Whose number a node id is: an entity's the trace's, and, below 0, a part of the map's the map's."""
+    if not profile.mapped:
+        return trace
+    of_map = f"coalesce({road_map}, -1 - ({trace}))"
+    return (
+        of_map if profile.places == 1 else f"CASE WHEN {node} >= 0 THEN {trace} ELSE {of_map} END"
+    )
+
+
+def role_text(frame: str, node: str) -> str:
+    """What a lane is to the ego in a frame."""
+    on = [f'"r"."frame_id" = {frame}', f'"r"."node_id" = {node}']
+    role = Select(['any_value("r"."role")'], ['"roles" AS "r"'], on)
+    return f"({role.text()})"
+
+
+def _part(attribute: Attribute, home: Home, column: str, alias: str, trace: str | None) -> str:
+    number = f"CAST({column} AS DOUBLE)"
+    unit = attribute.unit
+    if unit in _ORIGINS and home is not Home.map:
+        return f"({number} + {trace}.{quoted(_ORIGINS[unit])})"
+    if unit in _BITS:
+        bit = 2 ** _BITS[unit].index(attribute.name)
+        return f"({column} & {bit}) <> 0"
+    if (unit, home) in _STILL:
+        return _STILL[unit, home].format(column)
+    if unit is DisplayUnit.along:
+        ay, heading = (f"CAST({alias}.{quoted(c)} AS DOUBLE)" for c in ("ay", "heading"))
+        return f"({number} * cos({heading}) + {ay} * sin({heading}))"
+    if unit is DisplayUnit.given:
+        return f"CASE WHEN {alias}.{quoted('node_id')} IS NOT NULL THEN {column} IS NOT NULL END"
+    plain = number if attribute.type is Type.number else column
+    return _CONVERTED.get(unit, "{1}").format(column, plain)
+
+
+_BITS: Final = {
+    DisplayUnit.light: VEHICLE_LIGHTS,
+    DisplayUnit.derived: tuple(f"derived_{what}" for what in DERIVED),
+}
+_STILL: Final = {
+    (DisplayUnit.standing, Home.map): "CASE WHEN {0} IS NOT NULL THEN TRUE END",
+    (DisplayUnit.velocity, Home.scenery): "CASE WHEN {0} THEN 0e0 END",
+    (DisplayUnit.velocity, Home.map): f"CASE WHEN {{0}} NOT IN ({PLACES}) THEN 0e0 END",
+}
+"""What is said of that which never moves."""
+
+_CONVERTED: Final = {DisplayUnit.degrees: "degrees({1})", DisplayUnit.whole: "CAST({0} AS BIGINT)"}
+
+
+def _label(at: Aliases) -> str:
+    parts: list[str] = []
+    if at.map:
+        parts.append(f"{at.map}.{quoted('name')}")
+    told = at.entity or (None if at.map else at.state)
+    if told:
+        kind = f"CAST({told}.{quoted('kind')} AS VARCHAR)"
+        parts.append(f"{kind} || ' ' || CAST({told}.{quoted('node_id')} AS VARCHAR)")
+    if not parts:
+        return _ABSENT[Type.text]
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def as_type(column: str, kind: Type) -> str:
+    """A column of a user's own table as a value of patterns."""
+    return f"CAST({column} AS {_NATIVE[kind]})"
+
+
+_NATIVE: Final = {Type.number: "DOUBLE", Type.text: "VARCHAR", Type.boolean: "BOOLEAN"}
+
+
+def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, map_: str) -> str:
+    """The value of an attribute of the frame or of the trace."""
+    attribute = leaf.attribute
+    home, column = next(iter(attribute.columns.items()))
+    if attribute.unit in {
+        DisplayUnit.seen,
+        DisplayUnit.counted,
+        DisplayUnit.weather,
+        DisplayUnit.clock,
+    }:
+        return _looked_up(attribute, frame)
+    if attribute.table:
+        value = as_type(f'"u".{quoted(column)}', attribute.type)
+        on = [f'"u"."frame_id" = {frame}."frame_id"']
+        rows = Select([f"any_value({value})"], [f'{quoted(attribute.table)} AS "u"'], on)
+        return f"({rows.text()})"
+    alias = map_ if home is Home.map else frame if isinstance(leaf, FrameAttribute) else trace
+    value = f"{alias}.{quoted(column)}"
+    match attribute.unit:
+        case DisplayUnit.seconds:
+            return f"(CAST({value} - {trace}.{quoted('start_ns')} AS DOUBLE) / 1e9)"
+        case DisplayUnit.span:
+            return f"(CAST({value} AS DOUBLE) / 1e9)"
+        case DisplayUnit.classed:
+            return _class_text(column, frame)
+        case _:
+            return value
+
+
+def _class_text(abstraction: str, frame: str) -> str:
+    """The class of a frame in an abstraction."""
+    on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {literal(abstraction)}']
+    classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
+    return f"({classes.text()})"
+
+
+def _looked_up(attribute: Attribute, frame: str) -> str:
+    """What other frames, or events, say of a frame."""
+    column = next(iter(attribute.columns.values()))
+    if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
+        return _weather_text(column, frame)
+    held = f'"k"."abstraction" = {literal(column)}'
+    if attribute.unit is DisplayUnit.seen:
+        classes = Select(['"k"."class"'], ['"classes" AS "k"'], [held, '"k"."class" IS NOT NULL'])
+        if attribute.table:
+            frames = Select(['"u"."frame_id"'], [f'{quoted(attribute.table)} AS "u"'])
+            classes.where.append(f'"k"."frame_id" IN ({frames.text()})')
+        else:
+            classes.where.append(among('"k"."frame_id" >> 24', list(attribute.traces)))
+        return f"({_class_text(column, frame)} IN ({classes.text()}))"
+    counts = Select(['"k"."class"', 'count(*) AS "frames"'], ['"classes" AS "k"'], [held])
+    counts.group = ['"k"."class"']
+    number = Select(['any_value("n"."frames")'], [nested(counts.text(), "n")])
+    number.where = [f'"n"."class" = {_class_text(column, frame)}']
+    return f"({number.text()})"
+
+
+def _weather_text(word_: str, frame: str) -> str:
+    """A word of the last event of weather and light of a trace, up to the frame."""
+    told = f'regexp_extract("v"."detail", \'(^|, ){word_}=([^,]*)\', 2)'
+    if word_ == "time_of_day":
+        parts = [
+            f"CAST(split_part({told}, ':', {n}) AS DOUBLE) / {60 ** (n - 1)}" for n in (1, 2, 3)
+        ]
+        since = f'({frame}."time_ns" - "v"."time_ns") / 3.6e12'
+        value = f"({' + '.join(parts)} + {since}) % 24"
+        said = f"{told} <> ''"
+    elif word_ == "temperature":
+        value, said = f"CAST(split_part({told}, ' ', 1) AS DOUBLE)", f"{told} <> ''"
+    else:
+        value, said = f"nullif({told}, '')", "TRUE"
+    on = [
+        f'"v"."trace_id" = {frame}."trace_id"',
+        '"v"."kind" = \'environment\'',
+        f'"v"."frame_id" <= {frame}."frame_id"',
+        said,
+    ]
+    last = Select([f'arg_max({value}, "v"."time_ns")'], ['"events" AS "v"'], on)
+    return f"({last.text()})"
+
+
+# Expressions ---------------------------------------------------------------------------------------
+
+Leaf = (
+    NodeValue
+    | NodeAttribute
+    | EdgeRelation
+    | EdgeAttribute
+    | FrameAttribute
+    | TraceAttribute
+    | PairNumber
+    | BlockValue
+)
+"""What an expression is made of, as far as a statement must bring it as a column."""
+
+_INFIX: Final = frozenset({"AND", "OR"})
+_TESTS: Final = {
+    "STARTS WITH": "starts_with",
+    "ENDS WITH": "ends_with",
+    "CONTAINS": "contains",
+    "=~": "regexp_full_match",
+}
+_COMPARISONS: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
+
+
+def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
+    """An expression; ``leaf`` gives the text of the columns in it."""
+    match expression:
+        case Value():
+            return _value(expression, values)
+        case Operation():
+            return _operation(expression, leaf, values)
+        case Aggregate(operand=FrameAttribute(attribute=Attribute(name="held")) as held):
+            return f"CAST(coalesce(sum({leaf(held)}), 0) AS BIGINT)"
+        case Aggregate(word=name, operand=operand, distinct=distinct):
+            inner = "*" if operand is None else expression_text(operand, leaf, values)
+            return f"{name}({'DISTINCT ' * distinct}{inner})"
+        case NodeAttribute(attribute=attribute) if attribute.values:
+            return f"CAST({leaf(expression)} AS VARCHAR)"
+        case Choices() | LabelTest() | Tense() | SignalCall() | StepTime():
+            raise TypeError(f"{expression} is no column")
+        case _:
+            return leaf(expression)
+
+
+def _value(value: Value, values: BoundValues) -> str:
+    if value.value is None:
+        return "NULL"
+    if isinstance(value.value, bool):
+        return "TRUE" if value.value else "FALSE"
+    if value.closed:
+        return literal(str(value.value))
+    return values.add(value.value)
+
+
+_WHOLE: Final = re.compile(r"""\$\d+|\w+|"[^"]*"(\."[^"]*")*|'[^']*'""")
+"""A placeholder, a word or a number, a column, a text: what needs no brackets."""
+
+_BRACKETS: Final = re.compile(r"""(?:"[^"]*"|'[^']*'|[^"'()])*([()])""")
+
+
+def operand_text(text: str) -> str:
+    """A text that can stand beside any operator: in brackets, unless it is one word or one call."""
+    return text if _WHOLE.fullmatch(text) or _is_call(text) else f"({text})"
+
+
+def _is_call(text: str) -> bool:
+    """Whether a text is in brackets already, perhaps with the name of a function before them."""
+    if not re.match(r"\w*\(", text):
+        return False
+    depth = 0
+    for bracket in _BRACKETS.finditer(text):
+        depth += 1 if bracket[1] == "(" else -1
+        if depth == 0:
+            return bracket.end() == len(text)
+    return False
+
+
+def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
+    name = operation.word
+    if name in _COMPARISONS:
+        left, right = (_compared(o, operation, leaf, values) for o in operation.operands)
+        return f"{operand_text(left)} {name} {operand_text(right)}"
+    if name == "IN":
+        return _membership(operation, leaf, values)
+    parts = [expression_text(operand, leaf, values) for operand in operation.operands]
+    if name in _TESTS:
+        return f"{_TESTS[name]}({parts[0]}, {parts[1]})"
+    return _function(name, parts)
+
+
+_TEMPLATES: Final = {
+    "NOT": "NOT {0}",
+    "IMPLIES": "(NOT {0} OR {1})",
+    "IS NULL": "{0} IS NULL",
+    "IS NOT NULL": "{0} IS NOT NULL",
+    "negative": "(- {0})",
+    "/": "({0} / nullif({1}, 0))",
+    "%": "({0} % nullif({1}, 0))",
+    "+": "({0} + {1})",
+    "-": "({0} - {1})",
+    "*": "({0} * {1})",
+    "sqrt": "CASE WHEN {0} >= 0 THEN sqrt({0}) END",
+    "name": "{0} || ' ' || CAST({1} AS VARCHAR)",
+    "whose": "CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END",
+}
+
+
+def _function(name: str, parts: list[str]) -> str:
+    """What stands between, before or around its operands."""
+    operands = [operand_text(part) for part in parts]
+    if name in _INFIX:
+        return "(" + f" {name} ".join(operands) + ")"
+    if name == "XOR":  # unknown if one part is, as <> is
+        return reduce(lambda left, right: f"({left} <> {right})", operands)
+    if name in _TEMPLATES:
+        return _TEMPLATES[name].format(*operands)
+    if name in {"min", "max"}:
+        known = " AND ".join(f"{operand} IS NOT NULL" for operand in operands)
+        extreme = {"min": "least", "max": "greatest"}[name]
+        return f"CASE WHEN {known} THEN {extreme}({', '.join(parts)}) END"
+    return f"{name}({', '.join(parts)})"
+
+
+def _compared(
+    operand: Bound, operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues
+) -> str:
+    """One side of a comparison: a column of the vocabulary is compared with its words as it is."""
+    closed = all(
+        (isinstance(o, Value) and o.closed) or (isinstance(o, NodeAttribute) and o.attribute.values)
+        for o in operation.operands
+    )
+    words = any(isinstance(o, Value) for o in operation.operands)
+    if closed and words and operation.word in {"=", "<>"} and isinstance(operand, NodeAttribute):
+        return leaf(operand)
+    return expression_text(operand, leaf, values)
+
+
+def _membership(operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
+    operand, choices = operation.operands
+    assert isinstance(choices, Choices)  # noqa: S101 - the binder built it so
+    if not choices.items:
+        return "FALSE"
+    if isinstance(operand, NodeAttribute) and all(item.closed for item in choices.items):
+        text = leaf(operand)
+    else:
+        text = expression_text(operand, leaf, values)
+    return f"{operand_text(text)} IN ({', '.join(_value(item, values) for item in choices.items)})"
+
+
+def leaves(expression: Bound) -> Iterable[Leaf]:
+    """The columns that an expression is made of."""
+    match expression:
+        case Value() | Choices() | LabelTest() | Tense() | SignalCall() | StepTime():
+            return
+        case Operation(operands=operands):
+            for operand in operands:
+                yield from leaves(operand)
+        case Aggregate(operand=operand):
+            if operand is not None:
+                yield from leaves(operand)
+        case _:
+            yield expression
+
+
+def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> list[str]:
+    """Columns of the relations here that bind nodes and edges."""
+    return [quoted(f"{key}.id") for key in sorted(nodes)] + [
+        quoted(f"{key}.type") for key in sorted(edges)
+    ]
+
+
+def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
+    """The table with the attributes of an edge, and its columns for the ends with the nodes that they must be.
+
+    Of an ``isIn`` edge the ends are an entity, whose id is 0 or above, and a lane, whose id is below. A gap is
+    kept once, with who follows first.
+    """
+    if "isIn" in edge.relations:
+        ends = (f"greatest({src}, {dst})", f"least({src}, {dst})") if edge.both else (src, dst)
+        return "lane_state", dict(zip(("node_id", "lane"), ends, strict=True))
+    behind, ahead = (dst, src) if "leads" in edge.relations else (src, dst)
+    return "lane_gap", {"src": behind, "dst": ahead}
+
+
+def lane_text(leaf: Leaf, alias: str) -> str:
+    """The value of an attribute of an edge, whose row of :func:`edge_table` stands under an alias."""
+    assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
+    return attribute_text(leaf.attribute, Aliases(state=alias))
+
+
+def is_position(leaf: Leaf) -> bool:
+    """Whether a value is stored about the trace's origin."""
+    return isinstance(leaf, NodeAttribute) and leaf.attribute.unit in {
+        DisplayUnit.east,
+        DisplayUnit.north,
+        DisplayUnit.up,
+    }
+
+
+def is_constant(leaf: Leaf) -> bool:
+    """Whether a value of an entity never changes."""
+    if not isinstance(leaf, NodeAttribute):
+        return False
+    return Home.entity in leaf.attribute.columns or leaf.attribute.unit is DisplayUnit.label
+
+
+def among(column: str, numbers: list[int]) -> str:
+    """Whether a column is one of some numbers of ours."""
+    return f"({column}) IN ({', '.join(map(str, numbers))})" if numbers else "FALSE"
+
+
+def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> str:
+    """A condition on one node, given the column of its id and where its values stand."""
+
+    def leaf(found: Leaf) -> str:
+        if isinstance(found, NodeAttribute) and found.attribute.unit is not DisplayUnit.binding:
+            return attribute_text(found.attribute, at)
+        return node
+
+    return expression_text(condition, leaf, values)
+
+
+def bound_text(
+    condition: Bound, nodes: Mapping[str, str], edges: Mapping[str, str], values: BoundValues
+) -> str:
+    """A condition on ids of nodes and relations of edges, given their columns."""
+
+    def leaf(found: Leaf) -> str:
+        match found:
+            case EdgeRelation(edge=edge):
+                return f"CAST({edges[edge]} AS VARCHAR)"
+            case NodeValue(node=node) | NodeAttribute(node=node):
+                return nodes[node]
+            case _:
+                raise TypeError(found)
+
+    return expression_text(condition, leaf, values)
+
+
+def trace_text(condition: Bound, trace: str, values: BoundValues) -> str:
+    """A condition on the trace alone, given the column of its id."""
+    select = Select(['"t"."trace_id"'], ['"trace" AS "t"'])
+    select.join('"map" AS "m"', ['"m"."map_id" = "t"."map_id"'], "LEFT JOIN")
+
+    def leaf(found: Leaf) -> str:
+        assert isinstance(found, TraceAttribute)  # noqa: S101 - the condition was filed so
+        return frame_text(found, "", '"t"', '"m"')
+
+    select.where.append(expression_text(condition, leaf, values))
+    return f"{trace} IN (\n{indented(select.text())}\n  )"

@@ -1,0 +1,304 @@
+"""Calls in expressions: functions of entities and numbers, predicates, and what is counted of all matches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import QueryError
+from sgstore.lang import ir as b
+from sgstore.lang import syntax as s
+from sgstore.lang._bind_expressions import bind, number_of
+from sgstore.lang._catalog import NODE_ATTRIBUTES, Type
+from sgstore.lang._hints import FUNCTIONS_TOLD
+from sgstore.lang._needs import in_range
+from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
+from sgstore.lang.library import pattern_named, patterns, predicates
+from sgstore.vocabulary import ENTITY_KINDS, normalize_name, relation_named
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+
+PAIR_FUNCTIONS: Final[Mapping[str, str]] = {
+    "dist": "distance between the centres, in space; m",
+    "gap": "shortest distance between the footprints; m",
+    "lon": "how far b's centre lies ahead of a's, in a's axes; m",
+    "lat": "how far b's centre lies to the left of a's, in a's axes; m",
+    "bearing": "direction of b's centre in a's axes, positive to the left; degrees",
+    "rel_heading": "b's heading less a's; degrees",
+    "lon_gap": "how far the footprints are apart along a's axis; 0 where they overlap in it; m",
+    "lat_gap": "how far the footprints are apart across a's axis; 0 where they overlap in it; m",
+    "apparent_heading": "b's heading less the direction from a to b: 0 is a tail, 180 a front; degrees",
+    "lane_dist": "from centre to centre along the lanes, negative where b is behind; m; NULL beyond 200 m",
+    "closing_speed": "how fast the centres approach one another; m/s",
+    "closing_time": "the gap at the closing speed; s; NULL where the centres do not approach",
+    "ttc": "time until the footprints touch if both keep their velocity; s; 0 where they overlap, NULL: never",
+    "headway": "time until a has come as far as b is now, from bumper to bumper; s; NULL if b is not ahead",
+    "rel_speed": "length of the difference of the velocities; m/s",
+}
+"""Functions of two entities a and b; NULL where a number is missing."""
+
+_PAIR_ALIASES: Final = {"distance": "dist", "thw": "headway"}
+_NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
+_EXTREME: Final = frozenset({"min", "max"})
+_AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
+_OTHERS: Final = frozenset(
+    {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", "lower", "upper"}
+)
+_COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
+_TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
+FUNCTIONS: Final = frozenset(
+    {*PAIR_FUNCTIONS, *_NUMERIC, *_EXTREME, *_OTHERS, *_AGGREGATES, *_COURSES}
+)
+
+MAX_CALLS: Final = 30
+"""Deepest nesting of predicates."""
+
+
+def call(e: s.Call, names: SymbolTable) -> b.Bound:
+    """A call of a function or of a predicate.
+
+    Raises
+    ------
+    QueryNameError
+        There is none of that name.
+    QueryError
+        Its arguments do not fit.
+    """
+    name = normalize_name(e.name)
+    if name in names.session.predicates:
+        return _predicate(e, names)
+    if name in _TEMPORAL:
+        from sgstore.lang._bind_temporal import (
+            course,  # it holds expressions, and expressions calls
+        )
+
+        return course(e, names)
+    if names.aggregates and name in _AGGREGATES and len(e.arguments) == 1:
+        return _aggregate(name, e, names)
+    if name in _FUNCTIONS:
+        return _FUNCTIONS[name](e, names)
+    if name in _AGGREGATES:
+        word = e.name.upper()
+        inner = "(a)-[:near]->(b)" if word == "COUNT" else "(a)-[:near]->(b) | b.speed"
+        if names.aggregated:
+            names.session.refuse("what is counted of all matches cannot stand in another", e.span)
+        names.session.refuse(
+            f"{e.name}() may stand after RETURN only",
+            e.span,
+            f"in a condition: {word} {{{inner}}} > 2",
+        )
+    return _standard(name, e, names)
+
+
+def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
+    """A predicate of the standard library, which is read when it is needed."""
+    found = predicates().get(name)
+    if found is None:
+        defined = [*names.session.predicates.values(), *predicates().values()]
+        known = [*PAIR_FUNCTIONS, *sorted(FUNCTIONS - PAIR_FUNCTIONS.keys())]
+        known += [one.name for one in defined]
+        names.session.unknown("function", e.name, e.name_span, known, _no_function(e.name))
+    names.session.predicates[name] = found
+    return _predicate(e, names)
+
+
+def _no_function(name: str) -> str | None:
+    """What a name is that is no function: an attribute, a relation, a sequence; ``None``: no idea."""
+    word = normalize_name(name)
+    if word in FUNCTIONS_TOLD:
+        return FUNCTIONS_TOLD[word]
+    if relation_named(name):
+        return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
+    if word in NODE_ATTRIBUTES:
+        return f"it is an attribute: x.{NODE_ATTRIBUTES[word].name}"
+    if any(normalize_name(known) == word for known in patterns()):
+        return f"it is a sequence of the library: MATCH {name}()"
+    return None
+
+
+def call_hint(name: str) -> str | None:
+    """How a function or a predicate of that name is written; ``None`` if there is none."""
+    word = normalize_name(name)
+    if word in _AGGREGATES:
+        return None
+    found = predicates().get(word)
+    if found is not None:
+        formals = ", ".join(formal.name for formal in found.parameters)
+        return f"it is a predicate: {found.name}({formals})"
+    if word in _PAIRS:
+        return f"it is a function: {_PAIRS[word]}(a, b)"
+    return None
+
+
+def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
+    if not low <= len(e.arguments) <= high:
+        wanted = str(low) if low == high else f"{low} or more"
+        names.session.refuse(
+            f"{e.name}() takes {wanted} argument{'s' * (wanted != '1')}, found {len(e.arguments)}",
+            e.span,
+            _signature(normalize_name(e.name)),
+        )
+
+
+def _signature(name: str) -> str | None:
+    """How a function of two entities, or a predicate of the library, is called, and what it is."""
+    if name in _PAIRS:
+        return f"{_PAIRS[name]}(a, b): {PAIR_FUNCTIONS[_PAIRS[name]]}"
+    found = predicates().get(name)
+    if found is None:
+        return None
+    formals = ", ".join(formal.name for formal in found.parameters)
+    return f"{found.name}({formals}): {pattern_named(found.name).sentence}"
+
+
+def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
+    _expect(e, 2, 2, names)
+    function = _PAIRS[normalize_name(e.name)]
+    keys = [_entity(function, argument, names) for argument in e.arguments]
+    return b.PairNumber(function, keys[0], keys[1])
+
+
+def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
+    found = bind(argument, names)
+    if not isinstance(found, b.NodeValue):
+        names.session.refuse(
+            f"{function}() takes two entities", argument.span, f"write {function}(a, b)"
+        )
+    kinds = names.scope.kinds(found.node).every
+    if not kinds & frozenset(ENTITY_KINDS):
+        names.session.refuse(
+            f"{function}() takes two entities, and this is a {' or '.join(sorted(kinds))}",
+            argument.span,
+            "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along",
+        )
+    return found.node
+
+
+def _in_range(e: s.Call, names: SymbolTable) -> b.Bound:
+    _expect(e, 2, 2, names)
+    one, other = (_entity("in_range", argument, names) for argument in e.arguments)
+    return in_range(one, other, names.session.traces)
+
+
+def _numeric(e: s.Call, names: SymbolTable) -> b.Operation:
+    _expect(e, 1, 1, names)
+    return b.Operation(normalize_name(e.name), (number_of(e.arguments[0], names),), Type.number)
+
+
+def _extreme(e: s.Call, names: SymbolTable) -> b.Operation:
+    _expect(e, 2, 100, names)
+    return b.Operation(
+        normalize_name(e.name), tuple(number_of(a, names) for a in e.arguments), Type.number
+    )
+
+
+def _coalesce(e: s.Call, names: SymbolTable) -> b.Operation:
+    _expect(e, 1, 100, names)
+    found = tuple(bind(argument, names) for argument in e.arguments)
+    types = {f.type for f in found} - {Type.null}
+    if len(types) > 1 or types & {Type.node, Type.list}:
+        names.session.refuse("coalesce() takes values of one type", e.span)
+    return b.Operation("coalesce", found, types.pop() if types else Type.null)
+
+
+def _known(e: s.Call, names: SymbolTable) -> b.Operation:
+    _expect(e, 1, 1, names)
+    return b.Operation("IS NOT NULL", (bind(e.arguments[0], names),), Type.boolean)
+
+
+def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
+    _expect(e, 1, 1, names)
+    argument = e.arguments[0]
+    meaning = names.meaning(argument.name) if isinstance(argument, s.Variable) else None
+    if meaning is None or meaning.edge is None:
+        names.session.refuse(
+            "type() takes an edge variable", argument.span, "-[d:near|visible]-> and type(d)"
+        )
+    if all(edge.key != meaning.edge for edge in names.scope.edges):
+        names.session.refuse("an edge is known only in the pattern that binds it", argument.span)
+    return b.EdgeRelation(meaning.edge)
+
+
+def _text_function(e: s.Call, names: SymbolTable) -> b.Operation:
+    _expect(e, 1, 1, names)
+    found = bind(e.arguments[0], names)
+    if found.type is not Type.text:
+        names.session.refuse(f"{e.name}() takes a text", e.arguments[0].span)
+    return b.Operation(normalize_name(e.name), (found,), Type.text)
+
+
+def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
+    _expect(e, 0, 1, names)
+    if not e.arguments:
+        return class_count("RSV")
+    found = bind(e.arguments[0], names)
+    if not isinstance(found, b.Value) or not isinstance(found.value, str):
+        names.session.refuse(f"{e.name}() takes the name of an abstraction", e.arguments[0].span)
+    return class_count(abstraction_named(found.value, e.arguments[0].span, names.session))
+
+
+def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
+    names.session.refuse(
+        f"{e.name}() may stand after IN only", e.span, f"write frame.class IN {e.name}('train')"
+    )
+
+
+def _aggregate(name: str, e: s.Call, names: SymbolTable) -> b.Aggregate:
+    inner = SymbolTable(names.session, names.scope, names.meanings, names.parent, aggregated=True)
+    if name in {"avg", "sum"}:
+        return b.Aggregate(name, number_of(e.arguments[0], inner), distinct=False, type=Type.number)
+    operand = bind(e.arguments[0], inner)
+    if name == "count":
+        return b.Aggregate(name, operand, e.distinct, Type.number)
+    if operand.type not in {Type.number, Type.text}:
+        names.session.refuse(f"{e.name}() takes numbers or texts", e.arguments[0].span)
+    return b.Aggregate(name, operand, distinct=False, type=operand.type)
+
+
+def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
+    session = names.session
+    definition = session.predicates[normalize_name(e.name)]
+    if isinstance(definition.body, s.SequenceClause):
+        session.refuse(
+            f"{definition.name} is a scenario, which is a sequence and no condition",
+            e.name_span,
+            f"write MATCH {definition.name}()",
+        )
+    if definition.name in session.calls or len(session.calls) > MAX_CALLS:
+        session.refuse(f"{definition.name}() is defined by itself", e.name_span)
+    _expect(e, len(definition.parameters), len(definition.parameters), names)
+    meanings = {
+        formal.name: _meaning(argument, names)
+        for formal, argument in zip(definition.parameters, e.arguments, strict=True)
+    }
+    session.calls.append(definition.name)
+    try:
+        return bind(definition.body, names.body(meanings))
+    except QueryError as error:
+        reason = f"in {definition.name}(): {error.reason}"
+        hint = error.hint or _signature(normalize_name(definition.name))
+        raise type(error)(reason, text=session.text, span=e.span, hint=hint) from None
+    finally:
+        session.calls.pop()
+
+
+def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:
+    found = bind(argument, names)
+    return Symbol(node=found.node) if isinstance(found, b.NodeValue) else Symbol(value=found)
+
+
+_PAIRS: Final = {normalize_name(name): name for name in PAIR_FUNCTIONS} | _PAIR_ALIASES
+_FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
+    **dict.fromkeys(_PAIRS, _pair),
+    **dict.fromkeys(_NUMERIC, _numeric),
+    **dict.fromkeys(_EXTREME, _extreme),
+    "classcount": _class_count,
+    "coalesce": _coalesce,
+    "inrange": _in_range,
+    CLASSES: _after_in,
+    "known": _known,
+    "type": _type,
+    "lower": _text_function,
+    "upper": _text_function,
+}

@@ -1,0 +1,168 @@
+"""Node kinds in tables, and kinds that conditions imply.
+
+Where nodes live in the tables, and which rows are of which kinds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang._catalog import DisplayUnit, Home
+from sgstore.lang.ir import ANY_RELATION, Bound, Operation, PairNumber, Scope
+from sgstore.quoting import literal
+from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.lang._catalog import Attribute, Catalog
+    from sgstore.lang.ir import Edge, Kinds
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Where the nodes that a variable may be bound to live: their kinds in each place."""
+
+    moving: frozenset[str]
+    fixed: frozenset[str]
+    mapped: frozenset[str]
+
+    @classmethod
+    def of(cls, kinds: Kinds, catalog: Catalog) -> Profile:
+        """The profile of nodes of some kinds; what occurs nowhere is taken to move or to be of the map."""
+        moving = kinds.every & catalog.moving
+        fixed, mapped = kinds.other & catalog.fixed, kinds.other & catalog.mapped
+        if not moving | fixed | mapped:
+            entities = frozenset(ENTITY_KINDS)
+            return cls(kinds.every & entities, frozenset(), kinds.every - entities)
+        return cls(moving, fixed, mapped)
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """All kinds that they may be of."""
+        return self.moving | self.fixed | self.mapped
+
+    @property
+    def places(self) -> int:
+        """In how many places they live."""
+        return sum(map(bool, (self.moving, self.fixed, self.mapped)))
+
+    def has(self, home: Home) -> bool:
+        """Whether values that live in a home may be theirs."""
+        kinds = {
+            Home.state: self.moving,
+            Home.entity: self.moving | self.fixed,
+            Home.scenery: self.fixed,
+            Home.map: self.mapped,
+        }
+        return bool(kinds[home])
+
+
+def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
+    """The homes of an attribute that must be joined for nodes that live in some places.
+
+    Of what moves, a state is there anyway, so a constant that states repeat is taken from there.
+    """
+    label = attribute.unit is DisplayUnit.label
+    homes = {Home.entity, Home.map} if label else set(attribute.columns)
+    if Home.state in homes and not profile.fixed:
+        homes -= {Home.entity}
+    return {home for home in homes if profile.has(home)}
+
+
+def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[str]) -> list[str]:
+    """Conditions on a column of kinds and one of the ego's mark (``None``: never the ego).
+
+    ``held`` are all kinds that the column has: a condition that they all meet is left out.
+    """
+    if ego is None:
+        return _among(kinds.other, kind, held)
+    if not kinds.other:
+        return [ego, *_among(kinds.ego, kind, held & frozenset(ENTITY_KINDS))]
+    if not kinds.ego and held & frozenset(ENTITY_KINDS):
+        return [f"NOT {ego}", *_among(kinds.other, kind, held)]
+    if kinds.ego == kinds.other & frozenset(ENTITY_KINDS) or not kinds.ego:
+        return _among(kinds.other, kind, held)
+    one = " AND ".join([ego, *_among(kinds.ego, kind, held)])
+    other = " AND ".join([f"NOT {ego}", *_among(kinds.other, kind, held)])
+    return [f"({one} OR {other})"]
+
+
+def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str]:
+    if held <= kinds:
+        return []
+    return [_one_of(column, [kind for kind in KINDS if kind in kinds])]
+
+
+def _one_of(column: str, words: list[str]) -> str:
+    if len(words) == 1:
+        return f"{column} = {literal(words[0])}"
+    return f"{column} IN ({', '.join(map(literal, words))})" if words else "FALSE"
+
+
+def edge_conditions(
+    catalog: Catalog, scope: Scope, edge: Edge, alias: str, *, moving: bool, swapped: bool = False
+) -> list[str]:
+    """Conditions on the relation and the kinds of a row of ``edge`` (``moving``) or of ``map_edge``.
+
+    ``swapped``: the row runs from the edge's ``dst`` to its ``src``.
+    """
+    table = catalog.edges if moving else catalog.map_edges
+    held = [triple for triple in table if triple[0] in edge.relations]
+    conditions: list[str] = []
+    if edge.relations != ANY_RELATION:
+        relations = [relation for relation in RELATIONS if relation in edge.relations]
+        conditions += [_one_of(f'{alias}."relation"', relations)]
+    ends = (edge.dst, edge.src) if swapped else (edge.src, edge.dst)
+    for side, (end, key) in enumerate(zip(("src", "dst"), ends, strict=True), start=1):
+        conditions += kind_conditions(
+            scope.kinds(key),
+            f'{alias}."{end}_kind"',
+            f'{alias}."{end}_is_ego"' if moving else None,
+            frozenset(triple[side] for triple in held),
+        )
+    return conditions
+
+
+def alias_of(edge: Edge) -> str:
+    """What an edge is called in a statement: its key, and its relation if it is one."""
+    return (
+        f"{edge.key}:{next(iter(edge.relations))}" if len(edge.relations) == 1 else f"{edge.key}:"
+    )
+
+
+# What conditions say of kinds of nodes: numbers of pairs are of entities, and what is compared is known ----
+
+_ENTITIES: Final = frozenset(ENTITY_KINDS)
+_COMPARED: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
+_STRICT: Final = frozenset(
+    {"+", "-", "*", "/", "%", "negative", "abs", "sqrt", "floor", "ceil", "round", "min", "max"}
+)
+"""Operations that are unknown where one operand is."""
+
+
+def entities_of_pairs(scope: Scope) -> Scope:
+    """Nodes whose pair is compared are entities: of others the number is unknown, and a comparison never true.
+
+    Else a node without a label would be tried with every part of the map around.
+    """
+    nodes = dict(scope.nodes)
+    for condition in scope.where:
+        if isinstance(condition, Operation) and condition.word in _COMPARED:
+            for pair in (p for operand in condition.operands for p in _needed(operand)):
+                for key in {pair.a, pair.b} & set(nodes):
+                    nodes[key] = replace(nodes[key], kinds=nodes[key].kinds.only(_ENTITIES))
+    return replace(scope, nodes=nodes)
+
+
+def _needed(expression: Bound) -> Iterator[PairNumber]:
+    """The numbers of pairs without which an expression is unknown."""
+    match expression:
+        case PairNumber():
+            yield expression
+        case Operation(word=word, operands=operands) if word in _STRICT:
+            for operand in operands:
+                yield from _needed(operand)
+        case _:
+            pass

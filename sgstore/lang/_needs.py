@@ -1,0 +1,362 @@
+"""What a trace must know to answer a question.
+
+Whether the relations of a pair of entities were computed at all: what a missing edge says.
+
+A scene graph relates the pairs that the settings of its trace name: the ego with what is in range, what moves
+with what is near. Of such a pair a missing edge says that the relation does not hold; of any other it says
+nothing. ``in_range(a, b)`` is written in terms of distances and labels, so it is answered wherever these are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang._catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Attribute, DisplayUnit, Type
+from sgstore.lang.ir import (
+    ANY,
+    EGO,
+    Bound,
+    Choices,
+    Kinds,
+    LabelTest,
+    NodeAttribute,
+    Operation,
+    PairNumber,
+    TraceAttribute,
+    Value,
+)
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    SIGNALS,
+    VEHICLE_LIGHTS,
+    VEHICLES,
+    kinds_labelled,
+    normalize_name,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from typing import Self
+
+    from sgstore.lang._catalog import TraceFacts
+    from sgstore.lang.ir import BoundCheck
+
+
+_ENTITY: Final = ANY.only(frozenset(ENTITY_KINDS))
+_SIGNAL: Final = ANY.only(frozenset(SIGNALS))
+_VEHICLE: Final = ANY.only(frozenset(VEHICLES))
+
+
+@dataclass(frozen=True, slots=True)
+class RelationScope:
+    """Which pairs of entities are related, as :class:`sgstore.config.Pairs` says it.
+
+    Attributes
+    ----------
+    within, ego_within : float
+    ego, static : bool
+    kinds : tuple of pairs of str
+    between : str
+        What distances are measured between: :attr:`sgstore.config.Proximity.between`.
+    """
+
+    within: float = 25.0
+    ego: bool = True
+    static: bool = False
+    ego_within: float = 0.0
+    kinds: tuple[tuple[str, ...], ...] = ()
+    between: str = "centres"
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Self | None:
+        """As the settings of a trace have it; ``None`` where they do not say it."""
+        pairs = settings.get("pairs")
+        if pairs is None:
+            return None
+        kinds = tuple(tuple(labels) for labels in pairs["kinds"])
+        between = settings["proximity"]["between"]
+        names = ("within", "ego", "static", "ego_within")
+        return cls(**{name: pairs[name] for name in names}, kinds=kinds, between=between)
+
+
+def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
+    """Whether the relations of two nodes were computed.
+
+    Parameters
+    ----------
+    a, b : str
+        Keys of the nodes.
+    traces : iterable of TraceFacts
+        Those that are asked.
+
+    Returns
+    -------
+    Bound
+        False of what is no entity; unknown in traces whose settings are not known.
+    """
+    of: dict[RelationScope | None, list[int]] = {}
+    for trace in traces:
+        of.setdefault(trace.reach, []).append(trace.trace_id)
+    if len(of) < 2:
+        return _related(a, b, next(iter(of), RelationScope()))
+    number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
+    return _any(
+        _all_in_scope(
+            Operation(
+                "IN", (number, Choices(tuple(Value(i, Type.number) for i in ids))), Type.boolean
+            ),
+            _related(a, b, reach),
+        )
+        for reach, ids in of.items()
+    )
+
+
+def _related(a: str, b: str, reach: RelationScope | None) -> Bound:
+    if reach is None:
+        return Value(None, Type.boolean)
+    ego = _any(LabelTest(node, EGO) for node in (a, b))
+    ways: list[Bound] = []
+    if reach.ego:
+        close = [_up_to(a, b, reach.ego_within, reach)] if reach.ego_within > 0 else []
+        ways.append(_all_in_scope(ego, *close))
+    if reach.within > 0:
+        near = _up_to(a, b, reach.within, reach)
+        move = [_not(test) for node in (a, b) for test in (_still(node), LabelTest(node, _SIGNAL))]
+        further = [_not(ego)] if reach.ego else []
+        ways.append(_all_in_scope(*further, *move, near))
+        if reach.static:
+            ways.append(_all_in_scope(*further, _still(a), _still(b), near))
+    listed = [
+        _all_in_scope(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
+        for pair in reach.kinds
+        for one, other in (pair, pair[::-1])
+    ]
+    entities = [LabelTest(node, _ENTITY) for node in (a, b)]
+    return _all_in_scope(*entities, *([_any(listed)] if listed else []), _any(ways))
+
+
+def _labelled(label: str) -> Kinds:
+    return (
+        EGO if normalize_name(label) == "ego" else ANY.only(frozenset(kinds_labelled(label) or ()))
+    )
+
+
+def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
+    """Whether two nodes are no further apart; what has no place is near nothing."""
+    limit = Value(bound, Type.number)
+    if reach.between == "origins":
+        return _any(
+            _all_in_scope(*tests, _no_more(distance, limit))
+            for tests, distance in _between_origins(a, b)
+        )
+    distance = _pair("dist", a, b)
+    if reach.between == "footprints":  # one without extent is a point
+        distance = Operation("coalesce", (_pair("gap", a, b), distance), Type.number)
+    return _no_more(distance, limit)
+
+
+def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
+    """Distances of origins, and of what they are: that of a vehicle that moves lies on the ground."""
+    for low_a in (True, False):
+        for low_b in (True, False):
+            tests = [_lies_low(a, yes=low_a), _lies_low(b, yes=low_b)]
+            centres = _apart(_number(a, "z"), _number(b, "z"))
+            origins = _apart(_origin(a, low=low_a), _origin(b, low=low_b))
+            dist = _pair("dist", a, b)
+            planar = _of("-", _of("*", dist, dist), _of("*", centres, centres))
+            yield (
+                tests,
+                Operation("sqrt", (_of("+", planar, _of("*", origins, origins)),), Type.number),
+            )
+
+
+def _lies_low(node: str, *, yes: bool) -> Bound:
+    low = _all_in_scope(LabelTest(node, _VEHICLE), _not(_still(node)))
+    return low if yes else _not(low)
+
+
+def _origin(node: str, *, low: bool) -> Bound:
+    half = _of("/", _number(node, "height"), Value(2, Type.number))
+    return _of("-", _number(node, "z"), half) if low else _number(node, "z")
+
+
+def _apart(a: Bound, b: Bound) -> Bound:
+    return _of("-", b, a)
+
+
+def _no_more(distance: Bound, limit: Bound) -> Bound:
+    near = Operation("<=", (distance, limit), Type.boolean)
+    return Operation("coalesce", (near, Value(value=False, type=Type.boolean)), Type.boolean)
+
+
+def _pair(function: str, a: str, b: str) -> Bound:
+    return PairNumber(function, a, b)
+
+
+def _number(node: str, name: str) -> Bound:
+    return NodeAttribute(node, NODE_ATTRIBUTES[name], Type.number)
+
+
+def _still(node: str) -> Bound:
+    return NodeAttribute(node, NODE_ATTRIBUTES["isstatic"], Type.boolean)
+
+
+def _of(word: str, *operands: Bound) -> Bound:
+    return Operation(word, operands, Type.number)
+
+
+def _not(condition: Bound) -> Bound:
+    return Operation("NOT", (condition,), Type.boolean)
+
+
+def _all_in_scope(*conditions: Bound) -> Bound:
+    return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
+
+
+def _any(conditions: Iterable[Bound]) -> Bound:
+    found = tuple(conditions)
+    if len(found) < 2:
+        return found[0] if found else Value(value=False, type=Type.boolean)
+    return Operation("OR", found, Type.boolean)
+
+
+# What a trace must know so that it can answer a question at all ---------------------------------
+# A condition that is unknown is not true, and false where time begins. So of a trace that has no ego
+# ``ALWAYS ego.speed < 20`` would be false, and of one that never tells a speed, too. Such a trace cannot
+# answer: it is left out, and its verdict is unknown. What a question *needs* is told here: that the ego is
+# there, and that what is measured of its variables is known of any of them in any frame.
+#
+# Only what is measured counts. Of an attribute whose absence says something itself (a lane without ``turn``
+# is in no junction, a car without ``special`` is an ordinary one), nothing is unknown. What stands in
+# ``known``, ``IS NULL`` and ``coalesce`` says what is to be done without it, and variables of blocks are
+# asked to exist.
+
+MOTION: Final = frozenset({"speed", "vx", "vy", "vz", "accel", "ax", "ay", "az", "yaw_rate"})
+"""What nothing has that never moves."""
+
+MEASURED: Final = MOTION | {
+    *("heading", "pitch", "roll", "length", "width", "height"),
+    *("steer", "throttle", "brake", "light_state", "parked", "speed_limit", "curvature"),
+    *VEHICLE_LIGHTS,
+}
+"""Attributes of nodes that are unknown where nobody told them."""
+
+_SIZE: Final = ("length", "width")
+_OF_PAIRS: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("gap", "lon_gap", "lat_gap"), _SIZE),
+    **dict.fromkeys(("closing_speed", "rel_speed", "closing_time"), ("vx",)),
+    **dict.fromkeys(("ttc", "headway"), ("vx", "length")),
+}
+"""What numbers of two nodes are made of, beside their places."""
+
+_TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce"})
+"""What is known even of what is not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Something that a trace must know.
+
+    Attributes
+    ----------
+    node : str
+        The variable; empty: the frame.
+    kinds : Kinds or None
+        What it may be.
+    attribute : Attribute or None
+        That must be known of it in some frame, if there is one; ``None``: that there is one.
+    """
+
+    node: str
+    kinds: b.Kinds | None
+    attribute: Attribute | None
+
+    @property
+    def reason(self) -> str:
+        """What is told of a trace that does not."""
+        if self.attribute is None:
+            return "it has no ego"
+        of = "" if self.kinds is None else f" of {self.node}"
+        return f"{self.attribute.name}{of} is never known"
+
+
+def of_check(check: BoundCheck) -> tuple[Need, ...]:
+    """What a trace must know to answer a check; nothing where ``USING UNKNOWN false`` says so."""
+    if check.unknown_is_false:
+        return ()
+    nodes = check.scope.nodes
+    bound = {node for quantifier in check.quantifiers for node in quantifier.nodes}
+    spoken = [check.formula, *(q.where for q in check.quantifiers if q.where is not None)]
+    spoken += [check.reset] if check.reset is not None else []
+    egos = {Need(key, node.kinds, None) for key, node in nodes.items() if key not in bound}
+    return _ordered(egos | _all(spoken, nodes, strict=True))
+
+
+def of_query(query: b.Query) -> tuple[Need, ...]:
+    """What a trace must know so that a query can find something in it.
+
+    Where one of several conditions is enough (``OR``), and no time is looked at, what all of them need counts.
+    """
+    if query.unknown_is_false:
+        return ()
+    found: set[Need] = set()
+    steps = [(step.scope, step.when) for step in query.steps] or [(query.scope, ())]
+    for scope, when in steps:
+        found |= {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
+        found |= _all([*scope.where, *when], scope.nodes, strict=False)
+    # One ego is as good as another.
+    egos = {need.kinds: need for need in found if need.attribute is None}
+    return _ordered({need for need in found if need.attribute is not None} | {*egos.values()})
+
+
+def _ordered(needs: set[Need]) -> tuple[Need, ...]:
+    def rank(need: Need) -> tuple[bool, str, str]:
+        return need.attribute is not None, need.node, need.attribute.name if need.attribute else ""
+
+    return tuple(sorted(needs, key=rank))
+
+
+def _all(expressions: Iterable[b.Bound], nodes: Mapping[str, b.Node], *, strict: bool) -> set[Need]:
+    return {need for e in expressions for need in _needed(e, nodes, strict=strict)}
+
+
+def _needed(  # noqa: C901, PLR0911 - a case each
+    expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
+) -> set[Need]:
+    """What an expression needs; ``strict``: all that it speaks of, even if less were enough."""
+
+    def of_node(key: str, name: str) -> set[Need]:
+        attribute = NODE_ATTRIBUTES[normalize_name(name)]
+        own = key in nodes and name in MEASURED
+        return {Need(key, nodes[key].kinds, attribute)} if own else set()
+
+    match expression:
+        case b.Operation(word=word) if word in _TELLS:
+            return set()
+        case b.Operation("OR" | "IMPLIES", operands) if not strict:
+            return set.intersection(*(_needed(one, nodes, strict=False) for one in operands))
+        case b.Operation(operands=operands):
+            return _all(operands, nodes, strict=strict)
+        case b.Tense(operands=operands):
+            return _all(operands, nodes, strict=True)
+        case b.SignalCall(word="age" | "exists_now"):
+            return set()
+        case b.SignalCall(operand=operand):
+            return _needed(operand, nodes, strict=True)
+        case b.NodeAttribute(node=node, attribute=attribute):
+            return of_node(node, attribute.name)
+        case b.PairNumber(function=function, a=one, b=other):
+            parts = _OF_PAIRS.get(function, ())
+            return {need for node in (one, other) for name in parts for need in of_node(node, name)}
+        case b.FrameAttribute(attribute=attribute) if attribute.unit in {
+            DisplayUnit.weather,
+            DisplayUnit.clock,
+        }:
+            return {Need("", None, attribute)}
+        case b.BlockValue(scope=scope, value=value):
+            inner = [*scope.where, *([value] if value is not None else [])]
+            return _all(inner, {k: n for k, n in nodes.items() if k in scope.outer}, strict=True)
+        case _:
+            return set()

@@ -1,0 +1,528 @@
+"""The parser: an LALR(1) table parser and its tables.
+
+From ``grammar.lark`` to the tables that parse, once, so that a query does not pay for it.
+
+Lark needs about 200 ms to read the grammar and work out its LALR(1) tables. They are plain data, so they
+are kept beside the grammar in ``grammar.json`` with the digest of the text they were made from, and load in
+6 ms. If the file is missing or stale, the tables are made again in memory: slower, never wrong.
+
+Written by ``python -m sgstore.lang._parse``; a test says so when it is due.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QuerySyntaxError, TextSpan
+from sgstore.lang._hints import bracket_hint, places, slip_hint
+from sgstore.lang._syntax_builder import BUILDERS, BuildError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sgstore.lang.syntax import Statement
+
+
+GRAMMAR: Final = "grammar.lark"
+TABLES: Final = "grammar.json"
+_WORD: Final = re.compile(r"\w")
+
+
+@dataclass(frozen=True, slots=True)
+class Terminal:
+    """A terminal: what it looks like in a text.
+
+    Attributes
+    ----------
+    name : str
+    literal : str
+        In capitals; empty if it is a pattern.
+    pattern : re.Pattern or None
+    priority : int
+        Decides between terminals that match the same text.
+    """
+
+    name: str
+    literal: str
+    pattern: re.Pattern[str] | None
+    priority: int
+
+    def length_at(self, text: str, start: int) -> int:
+        """How many characters of the text from ``start`` it matches; 0: none. Words match as a whole."""
+        if self.pattern is None:
+            end = start + len(self.literal)
+            length = len(self.literal) if text[start:end].upper() == self.literal else 0
+        else:
+            found = self.pattern.match(text, start)
+            length = found.end() - start if found else 0
+        end = start + length
+        broken = length and _WORD.match(text, end) and _WORD.match(text, end - 1)
+        return 0 if broken else length
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A rule of the grammar, as it is reduced.
+
+    Attributes
+    ----------
+    origin, name : str
+        The symbol that it makes, and the name of what is built.
+    size : int
+        Number of symbols.
+    keep : tuple of bool
+        Whether each symbol is a child of what is built.
+    absent : tuple of int
+        How many absent children stand before each symbol and after the last; empty if none do.
+    inline : bool
+        Whether an only child stands for itself.
+    """
+
+    origin: str
+    name: str
+    size: int
+    keep: tuple[bool, ...]
+    absent: tuple[int, ...]
+    inline: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """An LALR(1) parser as data.
+
+    Attributes
+    ----------
+    terminals : dict of str to Terminal
+    rules : tuple of Rule
+    states : tuple of dict
+        For each state, symbol → action: ``n >= 0`` goes to state n, ``-1 - n`` reduces rule n.
+    start, end : int
+        The first state, and the one that has seen everything.
+    """
+
+    terminals: dict[str, Terminal]
+    rules: tuple[Rule, ...]
+    states: tuple[dict[str, int], ...]
+    start: int
+    end: int
+
+
+@cache
+def tables() -> Tables:
+    """The tables of the grammar that is shipped."""
+    folder = resources.files("sgstore.lang")
+    grammar = folder.joinpath(GRAMMAR).read_text(encoding="utf-8")
+    kept = folder.joinpath(TABLES)
+    plain = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
+    if plain.get("digest") != _digest(grammar):
+        plain = made_from(grammar)
+    return _read_tables(plain)
+
+
+def made_from(grammar: str) -> dict[str, Any]:
+    """The tables of a grammar as plain data, fit for JSON; the same text gives the same tables."""
+    from lark import Lark
+    from lark.grammar import Rule as LarkRule
+    from lark.lexer import TerminalDef
+
+    data, memo = Lark(grammar, parser="lalr", maybe_placeholders=True).memo_serialize(
+        [TerminalDef, LarkRule]
+    )
+    table: dict[str, Any] = data["parser"]["parser"]
+    rules = sorted(
+        {json.dumps(_rule(value)) for value in memo.values() if value["__type__"] == "Rule"}
+    )
+    number = {
+        key: rules.index(json.dumps(_rule(value)))
+        for key, value in memo.items()
+        if value["__type__"] == "Rule"
+    }
+    states = {
+        state: {
+            table["tokens"][symbol]: -1 - number[target["@"]] if reduces else target
+            for symbol, (reduces, target) in actions.items()
+        }
+        for state, actions in table["states"].items()
+    }
+    order = _walk(states, table["start_states"]["start"])
+    return {
+        "digest": _digest(grammar),
+        "start": 0,
+        "end": order[table["end_states"]["start"]],
+        "terminals": sorted(
+            _terminal(value) for value in memo.values() if value["__type__"] == "TerminalDef"
+        ),
+        "rules": [json.loads(rule) for rule in rules],
+        "states": [_numbered(states[state], order) for state in order],
+    }
+
+
+def _walk(states: dict[int, dict[str, int]], start: int) -> dict[int, int]:
+    """States in an order that depends on the grammar only; lark's own numbers change from run to run."""
+    order = {start: 0}
+    waiting = [start]
+    while waiting:
+        actions = states[waiting.pop(0)]
+        for _, target in sorted(actions.items()):
+            if target >= 0 and target not in order:
+                order[target] = len(order)
+                waiting.append(target)
+    return order
+
+
+def _numbered(actions: dict[str, int], order: dict[int, int]) -> dict[str, int]:
+    return {s: order[t] if t >= 0 else t for s, t in sorted(actions.items())}
+
+
+def _rule(rule: dict[str, Any]) -> list[Any]:
+    options = rule["options"]
+    origin, alias = rule["origin"]["name"], rule["alias"]
+    keep = [
+        options["keep_all_tokens"] or not symbol.get("filter_out", False)
+        for symbol in rule["expansion"]
+    ]
+    holes = "".join("1" if hole else "0" for hole in options["empty_indices"])
+    absent = [len(ones) for ones in holes.split("0")] if holes else []
+    names = [symbol["name"] for symbol in rule["expansion"]]
+    return [origin, alias or origin, keep, absent, bool(options["expand1"] and not alias), names]
+
+
+def _terminal(terminal: dict[str, Any]) -> list[Any]:
+    pattern = terminal["pattern"]
+    literal = pattern["__type__"] == "PatternStr"
+    value: str = pattern["value"]
+    return [
+        terminal["name"],
+        value.upper() if literal else "",
+        "" if literal else value,
+        terminal["priority"],
+    ]
+
+
+def _read_tables(plain: dict[str, Any]) -> Tables:
+    return Tables(
+        {
+            name: Terminal(
+                name, literal, re.compile(regex, re.IGNORECASE) if regex else None, priority
+            )
+            for name, literal, regex, priority in plain["terminals"]
+        },
+        tuple(
+            Rule(origin, name, len(keep), tuple(keep), tuple(absent), inline)
+            for origin, name, keep, absent, inline, _ in plain["rules"]
+        ),
+        tuple(plain["states"]),
+        plain["start"],
+        plain["end"],
+    )
+
+
+def _digest(grammar: str) -> str:
+    return hashlib.sha256(grammar.encode()).hexdigest()[:16]
+
+
+def text_of(plain: dict[str, Any]) -> str:
+    """The tables as JSON, one state a line."""
+    states = ",\n".join(json.dumps(state, separators=(",", ":")) for state in plain["states"])
+    rest = {key: value for key, value in plain.items() if key != "states"}
+    return f'{json.dumps(rest, separators=(",", ":"))[:-1]},\n"states":[\n{states}\n]}}\n'
+
+
+if __name__ == "__main__":
+    here = Path(__file__).parent
+    grammar_text = (here / GRAMMAR).read_text(encoding="utf-8")
+    (here / TABLES).write_text(text_of(made_from(grammar_text)), encoding="utf-8")
+
+
+# Text → syntax tree: an LALR(1) parser that runs the tables of ``grammar.lark`` -----------------
+# The lexer is led by the parser: of the terminals that may stand at a place it takes the longest, so that a
+# word is a keyword only where a keyword may stand. What may stand there is also what an error message says.
+
+MAX_LENGTH: Final = 100_000
+"""Longest text that is parsed; characters."""
+
+MAX_DEPTH: Final = 200
+"""Deepest stack of the parser, so that nesting is bounded before anything recurses."""
+
+_END: Final = "$END"
+_BLANK: Final = re.compile(r"\s+")
+_COMMENT: Final = re.compile(r"--[^\n]*|/\*.*?\*/", re.DOTALL)
+_NEXT: Final = re.compile(
+    r"""\w+|<?--+>?|&&|\|\||\]\s*>|-\(|'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|\S""", re.DOTALL
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """A terminal as it was read."""
+
+    name: str
+    text: str
+    span: TextSpan
+
+
+@dataclass(slots=True)
+class _StackEntry:
+    """What lies on the parser's stack: the state after a symbol, what was built of it, where it stands."""
+
+    state: int
+    value: Any
+    span: TextSpan
+
+
+def parse(text: str) -> tuple[Statement, ...]:
+    """The statements of a text.
+
+    Raises
+    ------
+    QuerySyntaxError
+        The text is not a sentence of the language.
+    """
+    if len(text) > MAX_LENGTH:
+        reason = f"the text has {len(text)} characters, more than {MAX_LENGTH}"
+        raise QuerySyntaxError(reason)
+    machine = tables()
+    stack = [_StackEntry(machine.start, None, TextSpan(0, 0))]
+    position = 0
+    while True:
+        token = _read(machine, stack, text, position)
+        _take(machine, stack, token, text)
+        if stack[-1].state == machine.end:
+            return stack[-1].value
+        position = token.span.end
+
+
+def joined(texts: Sequence[str]) -> str:
+    """The statements of several texts as one text, which one text alone is already.
+
+    Raises
+    ------
+    QuerySyntaxError
+        One of them is not a sentence of the language.
+    """
+    if len(texts) == 1:
+        return texts[0]
+    written = (text[s.span.start : s.span.end] for text in texts for s in parse(text))
+    return "\n;\n".join(written)  # on lines of their own, as a statement may end in a comment
+
+
+def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -> Token:
+    """The next token of those that may stand after the stack."""
+    actions = machine.states[stack[-1].state]
+    allowed = [machine.terminals[name] for name in actions if name in machine.terminals]
+    while True:
+        if blank := _BLANK.match(text, position):
+            position = blank.end()
+        best = max(allowed, key=partial(_rank, text, position), default=None)
+        edge = _reads_as_edge(text, position, actions)
+        comment = None if edge else _COMMENT.match(text, position)
+        # Between nodes two dashes are an edge; in an expression they begin a comment.
+        signs = comment is not None and best is not None and best.name == "SIGN"
+        if best and not signs and (length := best.length_at(text, position)):
+            span = TextSpan(position, position + length)
+            return Token(best.name, text[position : position + length], span)
+        if not comment:
+            break
+        position = comment.end()
+    if position == len(text) and _END in actions:
+        return Token(_END, "", TextSpan(position, position))
+    raise _unexpected(machine, stack, text, position)
+
+
+def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
+    """Whether two dashes are meant as an edge, so that what follows is not taken for a comment and dropped."""
+    if text.startswith("-->", position):
+        return True
+    behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
+    return behind and "BARE_ANY" in actions and text.startswith("--", position)
+
+
+def _rank(text: str, position: int, terminal: Terminal) -> tuple[int, int, bool]:
+    return terminal.length_at(text, position), terminal.priority, bool(terminal.literal)
+
+
+def _take(machine: Tables, stack: list[_StackEntry], token: Token, text: str) -> None:
+    """Reduce whatever ends before the token, then put it on the stack."""
+    while True:
+        action = machine.states[stack[-1].state].get(token.name)
+        if action is None:
+            raise _unexpected(machine, stack, text, token.span.start)
+        if action >= 0:
+            break
+        rule = machine.rules[-1 - action]
+        _reduce(machine, stack, rule, text)
+        if stack[-1].state == machine.end:
+            return
+    if len(stack) > MAX_DEPTH:
+        raise QuerySyntaxError("nested too deeply", text=text, span=token.span)
+    stack.append(_StackEntry(action, token, token.span))
+
+
+def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) -> None:
+    first = len(stack) - rule.size
+    parts = stack[first:]
+    del stack[first:]
+    end = stack[-1].span.end  # of what comes before, for a part that is empty
+    span = TextSpan(parts[0].span.start, parts[-1].span.end) if parts else TextSpan(end, end)
+    value = _built(rule, _children(rule, parts), span, text)
+    state = machine.states[stack[-1].state][rule.origin]
+    stack.append(_StackEntry(state, value, span))
+
+
+def _children(rule: Rule, parts: list[_StackEntry]) -> list[Any]:
+    """What a rule is built of: without mere signs, with repetitions spread out, absent parts as ``None``."""
+    children: list[Any] = []
+    for index, part in enumerate(parts):
+        if rule.absent:
+            children += [None] * rule.absent[index]
+        if isinstance(part.value, list):
+            children += part.value
+        elif rule.keep[index]:
+            children.append(part.value)
+    if rule.absent:
+        children += [None] * rule.absent[-1]
+    return children
+
+
+def _built(rule: Rule, children: list[Any], span: TextSpan, text: str) -> Any:
+    if rule.origin.startswith("_"):
+        return children
+    if rule.inline and len(children) == 1:
+        return children[0]
+    try:
+        return BUILDERS[rule.name](span, children)
+    except BuildError as error:
+        raise QuerySyntaxError(
+            error.reason, text=text, span=error.span or span, hint=error.hint
+        ) from None
+
+
+# Errors -------------------------------------------------------------------------------------------
+
+_OPERATORS: Final = frozenset(
+    {"COMPARE", "SIGN", "STAR", "SLASH", "PERCENT", "AND", "OR", "XOR", "IMPLIES", "IS", "IN"}
+    | {"STARTS", "ENDS", "CONTAINS", "EQUAL", "UNTIL_OP", "UNTIL_LINK", "NOT"}
+)
+_EDGES: Final = frozenset({"BARE_RIGHT", "BARE_LEFT", "BARE_ANY", "_OPEN", "_OPEN_LEFT"})
+_LATER: Final = frozenset(
+    {
+        "HOLDS",
+        "CHECK",
+        "FOR",
+        "THEN",
+        "UNTIL_LINK",
+        "WHILE",
+        "UNTIL_OP",
+        "TEMPORAL",
+        "RESET",
+        "SEMICOLON",
+    }
+    | {"_ARROW"}
+)
+"""What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
+
+_STARTS: Final = frozenset({"NUMBER", "STRING", "PARAM", "TRUTH", "NULL", "EXISTS"})
+_SAID: Final = {
+    "NAME": ("a name",),
+    "NUMBER": ("a number",),
+    "STRING": ("a text in quotes",),
+    "DURATION": ("a duration such as 2s",),
+    "PARAM": ("a parameter such as $x",),
+    "COMPARE": ("a comparison",),
+    "BARE_RIGHT": ("'-->'",),
+    "BARE_LEFT": ("'<--'",),
+    "BARE_ANY": ("'--'",),
+    "UPTO": ("'..'",),
+    "SIGN": ("'+'", "'-'"),
+    "TRUTH": ("TRUE", "FALSE"),
+    "DIRECTION": ("ASC", "DESC"),
+    "QUANTIFIER": ("FORALL", "FORSOME"),
+    "DEF_KIND": ("PREDICATE", "SCENARIO"),
+    "AGGREGATE": ("MIN", "MAX", "AVG", "SUM"),
+    "BOUND": ("a bound such as [0s, 2s]",),
+    _END: ("the end",),
+}
+"""Terminals in words."""
+
+_MANY: Final = 8
+_LONGEST: Final = 40
+
+
+def _unexpected(
+    machine: Tables, stack: list[_StackEntry], text: str, position: int
+) -> QuerySyntaxError:
+    if blank := _BLANK.match(text, position):
+        position = blank.end()
+    found = _NEXT.match(text, position)
+    span = TextSpan(position, found.end() if found else position)
+    names = [name for name in machine.states[stack[-1].state] if name.isupper() or name == _END]
+    names = [name for name in names if _leads_on(machine, stack, name)]
+    here = f"found {_shown(found[0])}" if found else "the text ends"
+    reason = f"expected {_listed(machine, names)}, but {here}"
+    return QuerySyntaxError(reason, text=text, span=span, hint=_hint(machine, names, text, span))
+
+
+def _shown(found: str) -> str:
+    """What was found, for a message: short, and so that it can be seen."""
+    if not found.isprintable():
+        return " ".join(f"U+{ord(character):04X}" for character in found[:8])
+    short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
+    return short if len(found) > 1 and found[0] in "'\"" else f"'{short}'"
+
+
+def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
+    """Whether the parser would accept the terminal after all reductions that it brings about."""
+    states = [entry.state for entry in stack]
+    while (action := machine.states[states[-1]].get(name)) is not None:
+        if action >= 0:
+            return True
+        rule = machine.rules[-1 - action]
+        del states[len(states) - rule.size :]
+        states.append(machine.states[states[-1]][rule.origin])
+        if states[-1] == machine.end:
+            return name == _END
+    return False
+
+
+def _listed(machine: Tables, names: list[str]) -> str:
+    """What was expected, in words; operators and beginnings of values are each one thing."""
+    left = set(names) - _LATER
+    said: list[str] = []
+    if left >= _EDGES:
+        said.append("an edge")
+        left -= _EDGES
+    if "MATCH" in left:
+        left -= {"NOT"}
+    if left >= _STARTS:
+        said += ["a value", "a condition"]
+        left -= _STARTS | {"NAME", "LPAR", "LSQB", "COUNT", "AGGREGATE", "DURATION", "TEMPORAL"}
+        left -= {"SIGN", "NOT"}
+    elif {"SIGN", "STAR"} <= left:
+        said.append("an operator")
+        left -= _OPERATORS | {"_RESEMBLES", "DOT"}
+    said += sorted(word for name in left for word in _said(machine, name))
+    if len(said) > _MANY:
+        said = [*said[:_MANY], "…"]
+    return " or ".join([", ".join(said[:-1]), said[-1]]) if len(said) > 1 else "".join(said)
+
+
+def _said(machine: Tables, name: str) -> tuple[str, ...]:
+    terminal = machine.terminals.get(name)
+    if name in _SAID or terminal is None or not terminal.literal:
+        return _SAID.get(name, (name,))
+    return (terminal.literal if terminal.literal.isalpha() else f"'{terminal.literal}'",)
+
+
+def _hint(machine: Tables, names: list[str], text: str, span: TextSpan) -> str | None:
+    bracket = bracket_hint(text, span.start, text[span.start : span.end])
+    if bracket:
+        return bracket
+    words = [machine.terminals[name].literal for name in names if name in machine.terminals]
+    return slip_hint(text, span.start, span.end, places(names), words)

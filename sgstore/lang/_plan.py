@@ -1,0 +1,308 @@
+"""The query plan: which condition is answered in which phase, and the order of rows.
+
+Which condition of a scope is answered in which phase, and which nodes wait for the second one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang._catalog import DisplayUnit
+from sgstore.lang._formulas import Leaf, leaves, nested
+from sgstore.lang._kinds import Profile
+from sgstore.lang._rewrite import counted_block
+from sgstore.lang.ir import (
+    BlockValue,
+    Bound,
+    EdgeAttribute,
+    EdgeRelation,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    Query,
+    Scope,
+    TraceAttribute,
+    blocks_of,
+    nodes_of,
+    walk,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from sgstore.lang._catalog import Catalog
+    from sgstore.lang._formulas import BoundValues, Select
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A range of buckets: ``low`` is in it, ``high`` is not; with ``traces``, only those of these traces."""
+
+    low: int
+    high: int
+    traces: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SharedRelation:
+    """A shared relation of the first phase that binds nodes for a block, and which; and edges."""
+
+    name: str
+    nodes: frozenset[str]
+    edges: frozenset[str]
+
+
+@dataclass(slots=True)
+class Phases:
+    """The conditions of a scope by how they are answered.
+
+    Attributes
+    ----------
+    blocks : list
+        ``EXISTS``, ``NOT EXISTS`` and comparisons of ``COUNT`` with a number: by masks.
+    single : dict
+        Node → conditions on its attributes alone: by masks.
+    lane : dict
+        Edge → conditions on its attributes alone: by masks.
+    direct : list
+        On node ids, relations and constants: where the edges are joined.
+    trace : list
+        On the trace alone: on the bucket.
+    rest : list
+        In the second phase.
+    late : set of str
+        Nodes that are bound in the second phase.
+    empty : bool
+        Whether the first phase has nothing to say.
+    """
+
+    blocks: list[Bound] = field(default_factory=list[Bound])
+    single: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    lane: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    direct: list[Bound] = field(default_factory=list[Bound])
+    trace: list[Bound] = field(default_factory=list[Bound])
+    rest: list[Bound] = field(default_factory=list[Bound])
+    late: set[str] = field(default_factory=set[str])
+    empty: bool = False
+
+
+def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
+    """The conditions of a scope, filed."""
+    parts = Phases()
+    for condition in scope.where:
+        _file(condition, parts)
+    parts.late = set(_late(scope, parts, query, catalog))
+    for key in parts.late & set(parts.single):
+        parts.rest += parts.single.pop(key)
+    parts.rest += [c for c in parts.direct if nodes_of(c) & parts.late]
+    parts.direct = [c for c in parts.direct if not nodes_of(c) & parts.late]
+    first = scope.outer or scope.edges or parts.blocks or set(scope.nodes) - parts.late
+    parts.empty = bool(parts.late) and not first
+    if parts.empty:
+        parts.rest += parts.trace + parts.direct
+        parts.trace, parts.direct = [], []
+    return parts
+
+
+def _file(condition: Bound, parts: Phases) -> None:
+    if is_masked(condition):
+        parts.blocks.append(condition)
+        return
+    found = set(leaves(condition))
+    if all(_is_direct(leaf) for leaf in found):
+        parts.direct.append(condition)
+    elif any(
+        isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.role
+        for leaf in found
+    ):
+        parts.rest.append(condition)
+    elif all(isinstance(leaf, NodeAttribute) for leaf in found) and len(nodes_of(condition)) == 1:
+        parts.single.setdefault(next(iter(nodes_of(condition))), []).append(condition)
+    elif all(isinstance(leaf, TraceAttribute) for leaf in found):
+        parts.trace.append(condition)
+    elif (edge := _edge_alone(found)) is not None and not _of_null(condition):
+        parts.lane.setdefault(edge, []).append(condition)
+    else:
+        parts.rest.append(condition)
+
+
+def is_masked(condition: Bound) -> bool:
+    """Whether a condition is a block, or the negation of one, or compares a count with a number."""
+    match condition:
+        case BlockValue(word="EXISTS") | Operation("NOT", (BlockValue(word="EXISTS"),)):
+            return True
+        case _:
+            return counted_block(condition) is not None
+
+
+def _is_direct(leaf: Leaf) -> bool:
+    match leaf:
+        case NodeValue() | EdgeRelation():
+            return True
+        case NodeAttribute(attribute=attribute):
+            return attribute.unit is DisplayUnit.binding
+        case _:
+            return False
+
+
+def _edge_alone(found: set[Leaf]) -> str | None:
+    edges = {leaf.edge if isinstance(leaf, EdgeAttribute) else None for leaf in found}
+    return edges.pop() if len(edges) == 1 else None
+
+
+def _of_null(condition: Bound) -> bool:
+    """Whether a condition may be true of what has no row: of an edge without attributes."""
+    return any(
+        isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce"}
+        for part in walk(condition)
+    )
+
+
+def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
+    """Nodes that no edge or block has a say in, but values have; and a node that is all there is.
+
+    To bind them by their presence would mean to group all states into masks, and to expand these again.
+    """
+    bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
+    compared = {key for condition in parts.rest for key in nodes_of(condition)}
+    alone = scope is query.scope and len(scope.nodes) == 1
+    spoken_of = blocked(query)
+    for key in scope.nodes:
+        profile = Profile.of(scope.kinds(key), catalog)
+        if profile.fixed or profile.mapped or key in bound_nodes or key in spoken_of:
+            continue
+        if alone or key in compared:
+            yield key
+
+
+def blocked(query: Query) -> frozenset[str]:
+    """Nodes that blocks speak of from inside, anywhere in a query."""
+    values = [column.value for column in query.result.columns]
+    values += [key.value for key in query.result.order if not isinstance(key.value, str)]
+    sample = query.result.sample
+    if sample and sample.per and not isinstance(sample.per, str):
+        values.append(sample.per)
+    return frozenset(_blocked([*query.scope.where, *values]))
+
+
+def _blocked(expressions: list[Bound]) -> Iterator[str]:
+    for expression in expressions:
+        for block in blocks_of(expression):
+            yield from block.scope.outer
+            yield from _blocked([*block.scope.where, *([block.value] if block.value else [])])
+
+
+def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:
+    """Ids of the traces that a query chooses (``None``: all), and of those that cannot answer it."""
+    chosen = None
+    if query.ego is not None:
+        chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
+    if catalog.only is not None:
+        chosen = set(catalog.only) if chosen is None else chosen & catalog.only
+    left: set[int] = set()
+    if not query.unknown_is_false:
+        left = {t.trace_id for t in catalog.traces if not query.relations <= t.answers}
+        left |= catalog.unknowing
+    return (None if chosen is None else chosen - left), left
+
+
+def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
+    """Pairs of nodes that must differ and could be the same, of those bound, one of which is newly bound.
+
+    Of two nodes whose kinds exclude one another nothing need be said.
+    """
+    for a, b in sorted(scope.distinct):
+        if {a, b} <= nodes and {a, b} & new:
+            one, other = scope.kinds(a), scope.kinds(b)
+            if (one & other).every:
+                yield a, b
+
+
+# The order in which traces come where nothing else is said: by name, ``run2`` before ``run10`` ----
+# Ids of traces are digests, so the order of ids is none that anybody knows. A catalog has its traces in order
+# (see :attr:`sgstore.lang.Catalog.traces`); rows are ordered by the places of their traces there, which are
+# numbers, and never by names.
+
+TRACE_OF_BUCKET: Final = 18
+"""``bucket >> 18`` is the trace of a bucket."""
+
+TRACE_OF_FRAME: Final = 24
+"""``frame_id >> 24`` is the trace of a frame; the bits below are its place in the trace."""
+
+
+def in_order(extents: Iterable[Sequence[int]], catalog: Catalog) -> list[tuple[int, int]]:
+    """First bucket and number of buckets of each trace, put in the order of the traces."""
+    place = {trace.trace_id: number for number, trace in enumerate(catalog.traces)}
+    found = [(first, buckets) for first, buckets in extents]
+    return sorted(found, key=lambda one: place.get(one[0] >> TRACE_OF_BUCKET, len(place)))
+
+
+def frame_key(
+    select: Select, frame: str, catalog: Catalog, window: Window | None, values: BoundValues
+) -> str:
+    """What rows are ordered by so that traces come in order, and the frames of each in theirs.
+
+    It is one number, for that is sorted fastest: the id of the frame, with the place of the trace instead of
+    its id. Where ids are in order already, it is the id.
+
+    Parameters
+    ----------
+    select : Select
+        The places of the traces are joined to it.
+    frame : str
+        The column of the frame's id.
+    catalog : Catalog
+    window : Window or None
+        What the statement looks at.
+    values : BoundValues
+        Of the statement.
+    """
+    order = [trace.trace_id for trace in catalog.traces]
+    if window is not None:
+        low, high = window.low >> TRACE_OF_BUCKET, (window.high - 1) >> TRACE_OF_BUCKET
+        chosen = range(low, high + 1) if window.traces is None else set(window.traces)
+        order = [trace for trace in order if trace in chosen]
+    if order == sorted(order):
+        return frame
+    firsts = [place << TRACE_OF_FRAME for place in range(len(order))]
+    _join(select, ":order", ("BIGINT", order), firsts, f"{frame} >> {TRACE_OF_FRAME}", values)
+    return f'":order".":first" + ({frame} & {(1 << TRACE_OF_FRAME) - 1})'
+
+
+def name_key(
+    select: Select, number: int, column: str, catalog: Catalog, values: BoundValues
+) -> str:
+    """What rows are ordered by instead of a column with names of traces.
+
+    Parameters
+    ----------
+    select : Select
+        The places of the traces are joined to it.
+    number : int
+        Tells this key from others of the statement.
+    column : str
+    catalog : Catalog
+    values : BoundValues
+        Of the statement.
+    """
+    names, alias = [trace.name for trace in catalog.traces], f":order {number}"
+    _join(select, alias, ("VARCHAR", names), list(range(len(names))), column, values)
+    return f'"{alias}".":first"'
+
+
+def _join(
+    select: Select,
+    alias: str,
+    known: tuple[str, Sequence[int | str]],
+    firsts: list[int],
+    column: str,
+    values: BoundValues,
+) -> None:
+    """Join a number to each row by a column: which numbers belong to which of its values."""
+    kind, keys = known
+    text = (
+        f'SELECT unnest(CAST({values.add(list(keys))} AS {kind}[])) AS ":trace",'
+        f' unnest(CAST({values.add(firsts)} AS BIGINT[])) AS ":first"'
+    )
+    select.join(nested(text, alias), [f'"{alias}".":trace" = {column}'], "LEFT JOIN")

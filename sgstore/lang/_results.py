@@ -1,0 +1,714 @@
+"""SQL of results: rows, frames, intervals, clips and counts.
+
+Which nodes of several frames are the same: what groups and counts of matches go by.
+
+A node id is a number within a trace, or, below 0, within a map. So an entity is a trace and a number, a part
+of a map is a map and a number, and traces may share that map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.lang._catalog import (
+    FRAME_ATTRIBUTES,
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Attribute,
+    Catalog,
+    DisplayUnit,
+    Type,
+)
+from sgstore.lang._formulas import (
+    Leaf,
+    Select,
+    columns_of,
+    expression_text,
+    frame_text,
+    leaves,
+    nested,
+    owner_text,
+)
+from sgstore.lang._kinds import Profile
+from sgstore.lang._plan import frame_key, name_key, traces_of
+from sgstore.lang._sql_frames import Frames, column_of
+from sgstore.lang.ir import (
+    CLIP_COLUMNS,
+    FRAME_COLUMNS,
+    INTERVAL_COLUMNS,
+    Aggregate,
+    Bound,
+    EdgeRelation,
+    FrameAttribute,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    Query,
+    Result,
+    ReturnColumn,
+    TraceAttribute,
+    Value,
+    walk,
+)
+from sgstore.quoting import quoted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.lang._plan import Window
+
+
+_TRACE_OF_NODE: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
+"""What tells the trace, and so whose numbers ids are."""
+
+
+OWNER: Final = Attribute("owner", Type.number, {}, "whose number the node id is", DisplayUnit.owner)
+"""What nodes of several traces are told apart by, beside their ids: of an entity the trace, of a part of a map
+the map, which traces may share. No query can name it."""
+
+
+def owner_of(node: str) -> NodeAttribute:
+    """Whose number the id of a node is."""
+    return NodeAttribute(node, OWNER, Type.number)
+
+
+def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
+    """What tells the nodes among some values apart, beside these values.
+
+    Nothing where only one trace is asked, or one of the values says which trace it is.
+    """
+    values = list(values)
+    if _tells_trace(values) or not _several(query, catalog):
+        return []
+    return list(dict.fromkeys(owner_of(v.node) for v in values if isinstance(v, NodeValue)))
+
+
+def counted_apart(query: Query, catalog: Catalog) -> Query:
+    """A query in which ``COUNT(DISTINCT v)`` of nodes counts those of each trace, or map, by themselves."""
+    keys = [column.value for column in query.result.columns]
+    if _tells_trace(keys) or not _several(query, catalog):
+        return query
+    return replace(query, result=query.result.changed(_apart))
+
+
+def _apart(value: Bound) -> Bound:
+    match value:
+        case Aggregate(distinct=True, operand=NodeValue(node=node) as operand):
+            whose = Operation("whose", (operand, owner_of(node)), Type.node)
+            return replace(value, operand=whose)
+        case Operation(operands=operands):
+            return replace(value, operands=tuple(_apart(operand) for operand in operands))
+        case _:
+            return value
+
+
+def _tells_trace(keys: Iterable[Bound]) -> bool:
+    return any(
+        isinstance(k, FrameAttribute | TraceAttribute) and k.attribute in _TRACE_OF_NODE
+        for k in keys
+    )
+
+
+def _several(query: Query, catalog: Catalog) -> bool:
+    chosen, _ = traces_of(query, catalog)
+    return len(catalog.traces if chosen is None else chosen) != 1
+
+
+# Masks → runs: from which frame to which something holds without a break ------------------------
+# A frame *goes on* with a run if the same holds in the frame before it and the recording has no gap between the
+# two (``bucket.joined``). Frames of a mask that do not go on are the first of a run; those with which none goes
+# on are the last. So runs are found a bucket at a time, and only their ends are looked at as frames.
+
+_LAST: Final = 59
+"""The bit of the last frame of a bucket."""
+
+_TRACE_OF_RUN: Final = '"bucket" >> 18'
+
+
+def runs(masks: str, keys: list[str], apart: list[str]) -> str:
+    """Maximal runs of consecutive frames of a trace in which the same keys hold.
+
+    Parameters
+    ----------
+    masks : str
+        A relation with the columns ``bucket`` and ``mask`` and those of the keys; each bucket and combination
+        of keys once.
+    keys : list of str
+        Columns, quoted.
+    apart : list of str
+        Those of them by which they differ within a trace.
+
+    Returns
+    -------
+    str
+        A relation with the columns of the keys, ``":from"`` and ``":to"``: ids of the first and the last frame.
+    """
+    same = f'PARTITION BY {", ".join([_TRACE_OF_RUN, *apart])} ORDER BY "bucket"'
+    joined = Select(['":masks".*', '":bucket"."joined"'])
+    joined.join(nested(masks, ":masks"), [])
+    joined.join('"bucket" AS ":bucket"', ['":bucket"."bucket" = ":masks"."bucket"'])
+
+    beside = Select(["*"], [nested(joined.text(), ":joined")])
+    beside.columns += [
+        f'CASE WHEN lag("bucket") OVER ({same}) = "bucket" - 1'
+        f' THEN lag("mask") OVER ({same}) >> {_LAST} ELSE 0 END AS "before"',
+        f'CASE WHEN lead("bucket") OVER ({same}) = "bucket" + 1'
+        f' THEN lead("mask" & "joined") OVER ({same}) & 1 ELSE 0 END AS "after"',
+    ]
+    going = Select(["*"], [nested(beside.text(), ":beside")])
+    going.columns.append('"mask" & "joined" & (("mask" << 1) | "before") AS "going"')
+
+    ends = Select(['"bucket"', *keys], [nested(going.text(), ":going")])
+    ends.columns.append('"mask" & ~"going" AS "firsts"')
+    ends.columns.append(f'"mask" & ~(("going" >> 1) | ("after" << {_LAST})) AS "lasts"')
+
+    last = f'CASE WHEN "lasts" <> 0 THEN {_first_of("lasts")} END'
+    following = f"OVER ({same} ROWS BETWEEN 1 FOLLOWING AND UNBOUNDED FOLLOWING)"
+    later = Select(["*", f'min({last}) {following} AS "later"'], [nested(ends.text(), ":ends")])
+
+    from_here = Select([*keys, '"later"', '"bucket" * 64 + ":bit"."bit" AS ":from"'])
+    from_here.columns += ['"bucket"', '"lasts" & ~(":bit"."m" - 1) AS "lasts"']
+    from_here.join(nested(later.text(), ":later"), [])
+    from_here.join('"bits" AS ":bit"', ['("firsts" & ":bit"."m") <> 0'])
+
+    to = f'CASE WHEN "lasts" <> 0 THEN {_first_of("lasts")} ELSE "later" END AS ":to"'
+    return Select([*keys, '":from"', to], [nested(from_here.text(), ":from here")]).text()
+
+
+def _first_of(mask: str) -> str:
+    """The id of the first frame of a mask: that of its lowest bit."""
+    return f'"bucket" * 64 + bit_count(("{mask}" & -"{mask}") - 1)'
+
+
+# Relations → statements: what a query returns of the frames and bindings that match -------------
+# Rows come in the order of traces, frames and bindings, unless the query orders them. An *interval* is a
+# maximal run of consecutive frames of one trace in which the same binding holds; a gap of more than 2.5
+# median periods ends it.
+
+EXTENTS: Final = """
+SELECT min(bucket) AS first, max(bucket) - min(bucket) + 1 AS buckets FROM bucket
+GROUP BY trace_id ORDER BY first
+"""
+"""First bucket and number of buckets of each trace, by its id."""
+
+CONSTANTS: Final = "SELECT node_id, ident, type_name, parked FROM entities WHERE trace_id = ?"
+"""What does not change about the entities of a trace, and stands in no frame."""
+
+LOG_TIME: Final = "log_time_ns"
+
+_NAME: Final = NODE_ATTRIBUTES["name"]
+_TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+_FRAME: Final = '":frame"'
+_TRACE: Final = '":trace"'
+_ROWS: Final = '":rows"'
+_T: Final = 'CAST({0} - ":trace"."start_ns" AS DOUBLE) / 1e9'
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """A table that a statement speaks of and the store has not: what was found otherwise.
+
+    Attributes
+    ----------
+    name : str
+    types : mapping of str to str
+        The type of each column in the database.
+    block : function
+        The columns of what is found in a window of whole traces.
+    """
+
+    name: str
+    types: Mapping[str, str]
+    block: Callable[[Window | None], list[list[Any]]]
+
+
+@dataclass(frozen=True, slots=True)
+class SqlStatement:
+    """SQL with the values that it binds, the names of its columns, and tables that are put together first."""
+
+    sql: str
+    values: tuple[Any, ...]
+    columns: tuple[str, ...]
+    gathered: tuple[Gathered, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ResultColumn:
+    """A column of a result: its name, and its text in terms of a relation's columns."""
+
+    name: str
+    text: str
+
+
+Span = tuple[Leaf, Leaf]
+"""Of a match over several frames: the values that are its first and its last ``frame_id``."""
+
+
+def rows(
+    query: Query,
+    catalog: Catalog,
+    window: Window | None = None,
+    writer: Frames | None = None,
+    span: Span | None = None,
+) -> SqlStatement:
+    """The statement for what a query returns, whatever its form.
+
+    Parameters
+    ----------
+    query : Query
+    catalog : Catalog
+    window : Window, optional
+    writer : Frames, optional
+        Says what matches; by default what the pattern finds.
+    span : Span, optional
+        Of a query whose matches are intervals themselves.
+    """
+    if query.result.form in {"intervals", "clips"}:
+        return intervals(query, catalog, window, writer, span)
+    query = counted_apart(_spelled(query, catalog), catalog)
+    return _RowStatement(query, writer or Frames(query, catalog, window)).statement()
+
+
+def frames(
+    query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
+) -> SqlStatement:
+    """The frames that match, each once, with their log times."""
+    writer = writer or Frames(query, catalog, window)
+    relation = writer.frames(query.scope, None, frozenset())
+    outputs = [*_frame_columns(), (LOG_TIME, f'{_FRAME}."{LOG_TIME}"')]
+    select = Select([_named(text, name) for name, text in outputs])
+    _from_frames(select, relation)
+    frame = f'{_ROWS}."frame_id"'
+    select.order = [frame_key(select, frame, catalog, window, writer.values)]
+    return _finished(writer, select.text(), [name for name, _ in outputs])
+
+
+def count(
+    query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
+) -> SqlStatement:
+    """How many frames match."""
+    told, writer = writer is not None, writer or Frames(query, catalog, window)
+    parts = writer.phases(query.scope)
+    if parts.rest or parts.late or told:
+        relation = writer.frames(query.scope, None, frozenset())
+        text = Select(['count(*) AS "frames"'], [nested(relation, ":rows")]).text()
+    else:
+        text = writer.number_of_frames(writer.masks(query.scope, parts, None, frozenset()))
+    return _finished(writer, text, ("frames",))
+
+
+def intervals(
+    query: Query,
+    catalog: Catalog,
+    window: Window | None = None,
+    writer: Frames | None = None,
+    span: Span | None = None,
+) -> SqlStatement:
+    """Intervals in which what is returned (nothing but a match, if nothing is) stays the same."""
+    query = _spelled(query, catalog)
+    return _IntervalStatement(query, writer or Frames(query, catalog, window), span).statement()
+
+
+def about_frame(attributes: Sequence[FrameAttribute]) -> str:
+    """The statement for what is told of one frame, given its id: one row, a column each."""
+    texts = [frame_text(one, _FRAME, _TRACE, '":map"') for one in attributes]
+    select = Select(
+        [f"{text} AS {quoted(column_of(a))}" for text, a in zip(texts, attributes, strict=True)]
+    )
+    select.join(f'"frame" AS {_FRAME}', [])
+    select.where.append(f'{_FRAME}."frame_id" = ?')
+    return select.text()
+
+
+def with_bindings(query: Query) -> Query:
+    """A query that returns its bindings and their names as columns: what intervals of a match keep."""
+    columns: list[ReturnColumn] = []
+    for node in query.scope.nodes.values():
+        if node.role == "named":
+            columns.append(ReturnColumn(node.key, NodeValue(node.key)))
+            columns.append(
+                ReturnColumn(f"{node.key}.name", NodeAttribute(node.key, _NAME, Type.text))
+            )
+    columns += [ReturnColumn(e.key, EdgeRelation(e.key)) for e in query.scope.edges if e.named]
+    return replace(query, result=Result(form="intervals", columns=tuple(columns), whole=False))
+
+
+class _RowStatement:
+    """Writes the statement of a query whose results are rows."""
+
+    def __init__(self, query: Query, writer: Frames) -> None:
+        self.query, self.result = query, query.result
+        self.writer = writer
+        scope = query.scope
+        counted = not self.result.distinct and not self.result.framed
+        roles = {"named", "unnamed"} if counted and not self.result.whole else {"named"}
+        self.nodes = frozenset(k for k, node in scope.nodes.items() if node.role in roles)
+        self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
+        if self.result.framed or self.result.distinct:
+            self.nodes, self.edges = frozenset(), frozenset()
+        if self.result.whole:
+            self.nodes = frozenset(k for k, n in scope.nodes.items() if n.role == "named")
+            self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
+
+    def statement(self) -> SqlStatement:
+        values = [column.value for column in self.result.columns]
+        keys = [c.value for c in self.result.columns if not _aggregates(c)]
+        apart: list[NodeAttribute] = []
+        if self.result.aggregated or (self.result.distinct and not self.result.framed):
+            apart = owners_of(keys, self.query, self.writer.catalog)
+        values += apart
+        values += [key.value for key in self.result.order if not isinstance(key.value, str)]
+        values += self._per_values()
+        values += [name for _, name in self._names()]
+        wanted = [leaf for value in values for leaf in leaves(value)]
+        relation = self.writer.frames(self.query.scope, None, self.nodes, self.edges, wanted)
+        outputs = self._outputs()
+        select = Select([_named(o.text, o.name) for o in outputs])
+        if self.result.whole or self.result.framed:
+            _from_frames(select, relation)
+        else:
+            select.join(nested(relation, ":rows"), [])
+        select.distinct = self.result.distinct or self.result.framed
+        if self.result.aggregated:
+            listed = enumerate(self.result.columns, start=1)
+            select.group = [str(place) for place, column in listed if not _aggregates(column)]
+            select.group += [_column(owner) for owner in apart]
+        elif apart:
+            select = _told_apart(select, [output.name for output in outputs], apart)
+        text = self._ordered(select, [quoted(output.name) for output in outputs])
+        return _finished(self.writer, text, tuple(output.name for output in outputs))
+
+    def _outputs(self) -> list[ResultColumn]:
+        outputs: list[ResultColumn] = []
+        if self.result.whole or self.result.framed:
+            outputs += [ResultColumn(name, text) for name, text in _frame_columns()]
+        if self.result.whole:
+            outputs += self._bindings({output.name for output in outputs})
+        outputs += [ResultColumn(c.name, self._text(c.value)) for c in self.result.columns]
+        return outputs
+
+    def _bindings(self, taken: set[str]) -> list[ResultColumn]:
+        """Ids and names of the nodes, and relations of the edges, that the query names, as it names them."""
+        outputs: list[ResultColumn] = []
+        for key, name in self._names():
+            outputs.append(
+                ResultColumn(f"{key}.id" if key in taken else key, f"{_ROWS}.{quoted(f'{key}.id')}")
+            )
+            outputs.append(ResultColumn(f"{key}.name", self._text(name)))
+        edges = [edge.key for edge in self.query.scope.edges if edge.key in self.edges]
+        return outputs + [ResultColumn(key, f"{_ROWS}.{quoted(f'{key}.type')}") for key in edges]
+
+    def _names(self) -> list[tuple[str, Bound]]:
+        if not self.result.whole:
+            return []
+        return [
+            (k, _name_of(k, self.query, self.writer.catalog))
+            for k in self.query.scope.nodes
+            if k in self.nodes
+        ]
+
+    def _text(self, value: Bound) -> str:
+        return expression_text(value, _column, self.writer.values)
+
+    def _ordered(self, select: Select, names: list[str]) -> str:
+        """The statement in the order of the query, or else of traces, frames, bindings; as many as wanted."""
+        keys = [_directed(self._key(k.value), k.descending) for k in self.result.order]
+        frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
+        framed, grouped = self.result.framed, self._grouped
+        if not grouped:
+            keys.append(frame_key(select, frame, writer.catalog, writer.window, writer.values))
+        if framed and keys[own] == frame:  # it is the first of the names
+            del keys[own]
+        moved = framed and len(keys) > own
+        bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
+        keys += names if framed or grouped else bindings
+        sample = self.result.sample
+        if sample is not None:
+            per = [] if sample.per is None else [self._key(sample.per)]
+            per += [self._text(owner) for owner in self._per_owners()]
+            text = _sampled(select, names, sample.number, per, frame, keys, first=own)
+            return _limited(text, self.result.limit)
+        named = self._named_traces(keys, own) if grouped else []
+        if moved or named:
+            order = _keyed(select, names, keys)
+            select = Select(names, [nested(select.text(), ":all")])
+            for place in named:
+                order[place] = name_key(select, place, keys[place], writer.catalog, writer.values)
+            keys = order
+        select.order, select.limit = keys, self.result.limit
+        return select.text()
+
+    @property
+    def _grouped(self) -> bool:
+        """Whether a row tells of several frames."""
+        result = self.result
+        return (result.distinct or result.aggregated) and not result.framed
+
+    def _named_traces(self, keys: list[str], own: int) -> list[int]:
+        """Which keys, behind the query's own, are names of traces whose characters give another order."""
+        known = [trace.name for trace in self.writer.catalog.traces]
+        if known == sorted(known):
+            return []
+        told = {quoted(c.name) for c in self.result.columns if c.value == _TRACE_NAME}
+        return [place for place in range(own, len(keys)) if keys[place] in told]
+
+    def _per_values(self) -> list[Bound]:
+        """What is asked of each match to take samples of each value of it."""
+        per = self.result.sample and self.result.sample.per
+        own = [] if per is None or isinstance(per, str) else [per]
+        return [*own, *self._per_owners()]
+
+    def _per_owners(self) -> list[NodeAttribute]:
+        per = _sampled_by(self.result)
+        return owners_of([per], self.query, self.writer.catalog) if per else []
+
+    def _key(self, value: Bound | str) -> str:
+        return quoted(value) if isinstance(value, str) else self._text(value)
+
+
+class _IntervalStatement:
+    """Writes the statement of a query whose results are intervals, or the clips around them.
+
+    What stays the same in an interval are its *keys*: the values that are returned, or, of a name that is put
+    together, its parts.
+    """
+
+    def __init__(self, query: Query, writer: Frames, span: Span | None) -> None:
+        self.query, self.result = query, query.result
+        self.writer, self.span = writer, span
+        kept = [value for column in self.result.columns for value in _kept(column.value)]
+        distinct = enumerate(dict.fromkeys(kept))
+        self.keys = {value: quoted(f"key {number}") for number, value in distinct}
+        # In a trace, what has one id has one kind.
+        implied = {kind for c in self.result.columns for kind in _kept(c.value)[:-1]}
+        self.apart = [key for value, key in self.keys.items() if value not in implied]
+
+    def statement(self) -> SqlStatement:
+        columns = self.result.columns
+        wanted = [leaf for column in columns for leaf in leaves(column.value)]
+        spans = self._spans(wanted)
+        clips = self.result.form == "clips"
+        own = self._clip_columns() if clips else self._interval_columns()
+        named = [f"{self._told(c.value)} AS {quoted(c.name)}" for c in columns]
+        select = Select([_named(text, name) for name, text in own] + named)
+        select.join(nested(self._between(spans), ":runs"), [])
+        select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = ":runs"."trace_id"'])
+        first = '":runs"."first"'
+        order = [_directed(_named_key(k.value), k.descending) for k in self.result.order]
+        writer = self.writer
+        order.append(frame_key(select, first, writer.catalog, writer.window, writer.values))
+        order += [self._told(column.value) for column in columns]
+        names = (*(name for name, _ in own), *(column.name for column in columns))
+        sample = self.result.sample
+        if sample is None:
+            select.order, select.limit = order, self.result.limit
+            return _finished(self.writer, select.text(), names)
+        per = [] if sample.per is None else [_named_key(sample.per)]
+        sampled = _sampled_by(self.result)
+        if isinstance(sampled, NodeValue):
+            profile = Profile.of(self.query.scope.kinds(sampled.node), self.writer.catalog)
+            per.append(owner_text(per[0], profile, f'{_TRACE}."trace_id"', f'{_TRACE}."map_id"'))
+        shown = [quoted(name) for name in names]
+        keys = len(self.result.order)
+        text = _sampled(select, shown, sample.number, per, first, order, first=keys)
+        return _finished(self.writer, _limited(text, self.result.limit), names)
+
+    def _told(self, value: Bound) -> str:
+        """A value that is returned, in terms of the keys."""
+        if value in self.keys and not isinstance(value, NodeAttribute):
+            return self.keys[value]
+        return expression_text(value, self.keys.__getitem__, self.writer.values)
+
+    def _keys(self) -> dict[str, str]:
+        """Key → the value that stays the same."""
+        # A word of the vocabulary is a number inside, as long as it is not told.
+        texts = [
+            _column(value)
+            if isinstance(value, NodeAttribute)
+            else expression_text(value, _column, self.writer.values)
+            for value in self.keys
+        ]
+        return dict(zip(self.keys.values(), texts, strict=True))
+
+    def _spans(self, wanted: list[Leaf]) -> str:
+        """The first and the last frame of each interval, with the keys."""
+        scope = self.query.scope
+        if self.span is not None:
+            wanted = [*wanted, *self.span]
+            relation = self.writer.frames(scope, None, frozenset(), frozenset(), wanted)
+            ends = [_column(leaf) for leaf in self.span]
+            select = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"'])
+            select.columns += [f"{text} AS {key}" for key, text in self._keys().items()]
+            select.join(nested(relation, ":rows"), [])
+            select.distinct = True
+            return select.text()
+        keys = list(self.keys.values())
+        return runs(self.writer.in_masks(scope, wanted, self._keys()), keys, self.apart)
+
+    def _between(self, spans: str) -> str:
+        """What is told of the frames at both ends."""
+        select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
+        select.columns += ['":from"."frame_id" AS "first"']
+        select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
+        for column, name in (("seq", "seq"), ("time_ns", "time"), ("log_time_ns", "log")):
+            select.columns += [f'":from".{quoted(column)} AS {quoted(f"min {name}")}']
+            select.columns += [f'":to".{quoted(column)} AS {quoted(f"max {name}")}']
+        select.join(nested(spans, ":spans"), [])
+        select.join('"frame" AS ":from"', ['":from"."frame_id" = ":spans".":from"'])
+        select.join('"frame" AS ":to"', ['":to"."frame_id" = ":spans".":to"'])
+        return select.text()
+
+    def _interval_columns(self) -> list[tuple[str, str]]:
+        since = [_T.format(quoted(f"{end} time")) for end in ("min", "max")]
+        texts = [f'{_TRACE}."name"', '"min seq"', '"max seq"', '"min time"', '"max time"', *since]
+        return list(zip(INTERVAL_COLUMNS, [*texts, '":runs"."frames"'], strict=True))
+
+    def _clip_columns(self) -> list[tuple[str, str]]:
+        start = f'"min log" + {self.result.before}'
+        end = f'"max log" + {self.result.after}'
+        return list(zip(CLIP_COLUMNS, [f'{_TRACE}."name"', start, end], strict=True))
+
+
+def _column(leaf: Leaf) -> str:
+    """Where a value stands in what matches."""
+    return f"{_ROWS}.{quoted(column_of(leaf))}"
+
+
+def _kept(value: Bound) -> tuple[Bound, ...]:
+    """What must stay the same for a value to do so."""
+    return (
+        tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
+    )
+
+
+def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
+    """The name of a node; that of an entity is put together late, for till then it is but two numbers."""
+    name = NodeAttribute(node, _NAME, Type.text)
+    profile = Profile.of(query.scope.kinds(node), catalog)
+    if query.steps or profile.mapped or profile.places != 1:
+        return name
+    kind: Bound = NodeAttribute(node, NODE_ATTRIBUTES["kind"], Type.text)
+    if len(profile.kinds) == 1:
+        kind = Value(next(iter(profile.kinds)), Type.text, closed=True)
+    return Operation("name", (kind, NodeValue(node)), Type.text)
+
+
+def _spelled(query: Query, catalog: Catalog) -> Query:
+    """A query in whose results names are put together late, where they can be."""
+
+    def spelled(value: Bound) -> Bound:
+        match value:
+            case NodeAttribute(node=node, attribute=attribute) if (
+                attribute.unit is DisplayUnit.label
+            ):
+                return _name_of(node, query, catalog)
+            case Operation(operands=operands):
+                return replace(value, operands=tuple(spelled(operand) for operand in operands))
+            case _:
+                return value
+
+    return replace(query, result=query.result.changed(spelled))
+
+
+def _frame_columns() -> list[tuple[str, str]]:
+    time = f'{_FRAME}."time_ns"'
+    texts = [f'{_FRAME}."frame_id"', f'{_TRACE}."name"', f'{_FRAME}."seq"', time, _T.format(time)]
+    return list(zip(FRAME_COLUMNS, texts, strict=True))
+
+
+def _from_frames(select: Select, relation: str) -> None:
+    """A relation with the rows of its frames and of their traces."""
+    select.join(nested(relation, ":rows"), [])
+    select.join(f'"frame" AS {_FRAME}', [f'{_FRAME}."frame_id" = {_ROWS}."frame_id"'])
+    select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = {_FRAME}."trace_id"'])
+
+
+def _named(text: str, name: str) -> str:
+    return f"{text} AS {quoted(name)}"
+
+
+def _named_key(value: Bound | str) -> str:
+    assert isinstance(value, str), value  # noqa: S101 - the binder knows the names of intervals only
+    return quoted(value)
+
+
+def _directed(text: str, descending: bool) -> str:  # noqa: FBT001
+    return f"{text} {'DESC' if descending else 'ASC'} NULLS LAST"
+
+
+def _sampled_by(result: Result) -> Bound | None:
+    """The value of each of which samples are taken; ``None`` if of none, or of what tells the frame."""
+    per = result.sample and result.sample.per
+    if isinstance(per, str):
+        return next((column.value for column in result.columns if column.name == per), None)
+    return per
+
+
+def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) -> Select:
+    """Rows that differ, or whose nodes do: nodes of several traces may have the same number."""
+    select.columns += [f'{_column(one)} AS ":owner {i}"' for i, one in enumerate(apart)]
+    return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
+
+
+def _sampled(
+    select: Select,
+    names: list[str],
+    number: int,
+    per: list[str],
+    frame: str,
+    keys: list[str],
+    *,
+    first: int,
+) -> str:
+    """At most ``number`` rows of each combination of ``per``.
+
+    The first ones by the order, if ``first`` of the keys are those of one; else they are chosen by a number
+    that depends on the frame alone.
+    """
+    mixed = f"{frame} % 1000003 * 48271 % 2147483647"
+    partition = [f'":per {place}"' for place in range(len(per))]
+    select.columns += [f'{mixed} AS ":mixed"']
+    select.columns += [f"{text} AS {name}" for text, name in zip(per, partition, strict=True)]
+    order = _keyed(select, names, keys)
+    over = ", ".join(order if first else ['":mixed"', *order])
+    by = f"PARTITION BY {', '.join(partition)} " if partition else ""
+    ranked = Select(["*", f'row_number() OVER ({by}ORDER BY {over}) AS ":rank"'])
+    ranked.join(nested(select.text(), ":all"), [])
+    outer = Select(names, [nested(ranked.text(), ":ranked")], [f'":rank" <= {number}'])
+    outer.order = order
+    return outer.text()
+
+
+def _keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
+    """Add keys to a statement as columns, where they are none; what a statement around it is ordered by."""
+    ordered = [key.removesuffix(" NULLS LAST") for key in keys]
+    plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
+    inner = [key if key in names else f'":key {i}"' for i, key in enumerate(plain)]
+    select.columns += [
+        f"{key} AS {name}" for key, name in zip(plain, inner, strict=True) if key != name
+    ]
+    down = [key.endswith(" DESC") for key in ordered]
+    return [_directed(name, descending) for name, descending in zip(inner, down, strict=True)]
+
+
+def _limited(text: str, limit: int | None) -> str:
+    return text if limit is None else f"{text}\nLIMIT {limit}"
+
+
+def _aggregates(column: ReturnColumn) -> bool:
+    return any(isinstance(part, Aggregate) for part in walk(column.value))
+
+
+def _finished(writer: Frames, text: str, columns: Iterable[str]) -> SqlStatement:
+    """A statement with the shared relations before it."""
+    before = [
+        (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
+    ]
+    before += [(f"{quoted(name)} AS", body) for name, body in writer.shared]
+    shared = ",\n".join(
+        f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
+        for head, body in before
+    )
+    sql = f"WITH {shared}\n{text}" if shared else text
+    return SqlStatement(sql, tuple(writer.values.items), tuple(columns), writer.gathered)

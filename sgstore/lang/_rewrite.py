@@ -1,0 +1,456 @@
+"""Bound query → bound query of the same meaning that is cheaper to answer: an ordered tuple of rules.
+
+Each rule says what it does and why the meaning stays. None can fail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations, count, pairwise
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang._catalog import NODE_ATTRIBUTES, Catalog, Triple, Type
+from sgstore.lang._formulas import leaves
+from sgstore.lang._invariants import INVARIANT, is_lasting
+from sgstore.lang._kinds import entities_of_pairs
+from sgstore.lang.ir import (
+    ANY,
+    EGO,
+    Aggregate,
+    BlockValue,
+    Bound,
+    Choices,
+    Edge,
+    Kinds,
+    LabelTest,
+    Node,
+    NodeAttribute,
+    Operation,
+    Query,
+    Scope,
+    Value,
+    walk,
+)
+from sgstore.vocabulary import KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+
+FALSE: Final = Value(value=False, type=Type.boolean)
+_OPPOSITE: Final = {"=": "<>", "<>": "=", "<": ">=", ">=": "<", ">": "<=", "<=": ">"} | {
+    "IS NULL": "IS NOT NULL",
+    "IS NOT NULL": "IS NULL",
+}
+_MIRRORED: Final = {"=": "=", "<>": "<>", "<": ">", ">=": "<=", ">": "<", "<=": ">="}
+
+
+def rewritten(query: Query, catalog: Catalog) -> Query:
+    """The query after all rules."""
+    for rule in RULES:
+        query = rule(query, catalog)
+    return query
+
+
+def _scopes(change: Callable[[Scope], Scope], query: Query) -> Query:
+    """A query with a change made to every scope, the inner ones first."""
+
+    def inside(expression: Bound) -> Bound:
+        match expression:
+            case Operation(word, operands, kind):
+                return Operation(word, tuple(inside(operand) for operand in operands), kind)
+            case BlockValue(scope=scope, value=value):
+                return replace(expression, scope=deep(scope), value=value and inside(value))
+            case _:
+                return expression
+
+    def deep(scope: Scope) -> Scope:
+        return change(replace(scope, where=tuple(inside(condition) for condition in scope.where)))
+
+    return replace(query, scope=deep(query.scope), result=query.result.changed(inside))
+
+
+# Conditions ----------------------------------------------------------------------------------------
+
+
+def push_negations(query: Query, _: Catalog) -> Query:
+    """``NOT`` moves inwards to what cannot be split, so that more conditions stand alone.
+
+    De Morgan's laws and ``NOT a < b`` = ``a >= b`` hold in three-valued logic too.
+    """
+    return _scopes(
+        lambda scope: replace(scope, where=tuple(_flat(_positive(c) for c in scope.where))), query
+    )
+
+
+def _flat(conditions: Iterator[Bound]) -> Iterator[Bound]:
+    for condition in conditions:
+        if isinstance(condition, Operation) and condition.word == "AND":
+            yield from _flat(iter(condition.operands))
+        else:
+            yield condition
+
+
+def _positive(condition: Bound) -> Bound:
+    match condition:
+        case Operation("NOT", (operand,)):
+            return _negated(operand)
+        case Operation("IMPLIES", (left, right)):
+            return Operation("OR", (_negated(left), _positive(right)), Type.boolean)
+        case Operation(word="AND" | "OR" as word, operands=operands):
+            return Operation(word, tuple(_positive(o) for o in operands), Type.boolean)
+        case _:
+            return condition
+
+
+def _negated(condition: Bound) -> Bound:
+    match condition:
+        case Operation(word=word, operands=operands):
+            return _negated_operation(word, operands)
+        case Value(value=bool(value)):
+            return Value(not value, Type.boolean)
+        case LabelTest(node, kinds):
+            return LabelTest(node, ~kinds)
+        case _:
+            return Operation("NOT", (condition,), Type.boolean)
+
+
+def _negated_operation(word: str, operands: tuple[Bound, ...]) -> Bound:
+    if word == "NOT":
+        return _positive(operands[0])
+    if word == "IMPLIES":
+        operands = (_positive(operands[0]), _negated(operands[1]))
+        return Operation("AND", operands, Type.boolean)
+    if word in {"AND", "OR"}:
+        other = "OR" if word == "AND" else "AND"
+        return Operation(other, tuple(_negated(o) for o in operands), Type.boolean)
+    if word in _OPPOSITE:
+        return Operation(_OPPOSITE[word], operands, Type.boolean)
+    return Operation("NOT", (Operation(word, operands, Type.boolean),), Type.boolean)
+
+
+def counts_to_existence(query: Query, _: Catalog) -> Query:
+    """``COUNT {…} > 0`` is ``EXISTS {…}``, which need not count; ``COUNT {…} = 0`` is its negation."""
+    return _scopes(
+        lambda scope: replace(scope, where=tuple(_existence(c) for c in scope.where)), query
+    )
+
+
+def _existence(condition: Bound) -> Bound:
+    counted = counted_block(condition)
+    if counted is None:
+        if isinstance(condition, Operation) and condition.word in {"AND", "OR", "NOT", "XOR"}:
+            return replace(condition, operands=tuple(_existence(o) for o in condition.operands))
+        return condition
+    block, sign, number = counted
+    exists = replace(block, word="EXISTS", type=Type.boolean)
+    if (sign, number) in {(">", 0), (">=", 1), ("<>", 0)}:
+        return exists
+    if (sign, number) in {("=", 0), ("<", 1), ("<=", 0)}:
+        return Operation("NOT", (exists,), Type.boolean)
+    return condition
+
+
+def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
+    """The parts of ``COUNT {…} sign number``, the block on the left; ``None`` if it is something else."""
+    match condition:
+        case Operation(
+            word, (BlockValue(word="COUNT") as block, Value(value=int() | float() as n))
+        ):
+            return (block, word, n) if word in _OPPOSITE else None
+        case Operation(
+            word, (Value(value=int() | float() as n), BlockValue(word="COUNT") as block)
+        ):
+            return (block, _MIRRORED[word], n) if word in _OPPOSITE else None
+        case _:
+            return None
+
+
+def complement(sign: str) -> str:
+    """The comparison that is true where another is false."""
+    return _OPPOSITE[sign]
+
+
+# Patterns ------------------------------------------------------------------------------------------
+
+
+def unfold_paths(query: Query, _: Catalog) -> Query:
+    """A path of exactly n edges becomes n edges with hidden nodes between them.
+
+    As in a path of m to n edges, these nodes differ from one another and from both ends, if nodes must
+    differ at all; with the other nodes of the pattern they may coincide.
+    """
+    numbers = count(1)
+
+    def unfold(scope: Scope) -> Scope:
+        for edge in scope.edges:
+            if edge.low == edge.high > 1:
+                scope = chain(scope, edge, edge.low, numbers, injective=query.injective)
+        return scope
+
+    return _scopes(unfold, query)
+
+
+def chain(
+    scope: Scope, edge: Edge, length: int, numbers: Iterator[int], *, injective: bool
+) -> Scope:
+    """A scope in which a path has become ``length`` edges with hidden nodes between them."""
+    between = [f"#{edge.key}.{next(numbers)}" for _ in range(length - 1)]
+    stops = [edge.src, *between, edge.dst]
+    hidden = {key: Node(key, ANY, "hidden", edge.span) for key in between}
+    links = tuple(
+        replace(edge, key=f"{edge.key}.{i + 1}", src=src, dst=dst, low=1, high=1)
+        for i, (src, dst) in enumerate(pairwise(stops))
+    )
+    differ = {(a, b) for a, b in combinations(stops, 2) if a in hidden or b in hidden}
+    return replace(
+        scope,
+        nodes={**scope.nodes, **hidden},
+        edges=tuple(e for old in scope.edges for e in (links if old.key == edge.key else (old,))),
+        distinct=scope.distinct | differ if injective else scope.distinct,
+    )
+
+
+def labels_from_conditions(query: Query, _: Catalog) -> Query:
+    """``v.kind = 'car'``, ``v.is_ego`` and the like say what a node may be, which the edges know too."""
+
+    def narrow(scope: Scope) -> Scope:
+        nodes, rest = dict(scope.nodes), list[Bound]()
+        for condition in scope.where:
+            key, kinds = _label(condition)
+            if key in nodes:
+                nodes[key] = replace(nodes[key], kinds=nodes[key].kinds & kinds)
+            else:
+                rest.append(condition)
+        return replace(scope, nodes=nodes, where=tuple(rest))
+
+    return _scopes(narrow, query)
+
+
+def _label(condition: Bound) -> tuple[str, Kinds]:
+    match condition:
+        case LabelTest(node, kinds):
+            return node, kinds
+        case NodeAttribute(node=node, attribute=attribute) if attribute.name == "is_ego":
+            return node, EGO
+        case Operation("NOT", (NodeAttribute(node=node, attribute=attribute),)) if (
+            attribute.name == "is_ego"
+        ):
+            return node, ~EGO
+        case Operation(
+            "=", (NodeAttribute(node=node, attribute=attribute), Value(value=str(kind)))
+        ) if attribute.name == "kind":
+            return node, ANY.only(frozenset({kind}))
+        case _:
+            return "", ANY
+
+
+def open_exists(query: Query, _: Catalog) -> Query:
+    """An ``EXISTS {…}`` that must be true joins the pattern around it, its nodes hidden, if that binds a node.
+
+    A node that no edge of the pattern binds would otherwise be tried with every entity of the frame.
+    """
+    return _scopes(_opened, query)
+
+
+def _opened(scope: Scope) -> Scope:
+    while True:
+        bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
+        free = set(scope.nodes) - bound_nodes
+        for condition in scope.where:
+            if isinstance(condition, BlockValue) and condition.word == "EXISTS":
+                inner = condition.scope
+                ends = {key for edge in inner.edges for key in (edge.src, edge.dst)}
+                if ends & free:
+                    scope = _merged(scope, condition)
+                    break
+        else:
+            return scope
+
+
+def _merged(scope: Scope, block: BlockValue) -> Scope:
+    inner = block.scope
+    hidden = {key: replace(node, role="hidden") for key, node in inner.nodes.items()}
+    unnamed = tuple(replace(edge, named=False) for edge in inner.edges)
+    where = tuple(condition for condition in scope.where if condition is not block)
+    return Scope(
+        {**scope.nodes, **hidden},
+        scope.outer,
+        scope.edges + unnamed,
+        where + inner.where,
+        scope.distinct | inner.distinct,
+    )
+
+
+def pairs_of_entities(query: Query, _: Catalog) -> Query:
+    """Nodes whose pair is compared are entities; see :mod:`sgstore.lang._kinds`."""
+    return _scopes(entities_of_pairs, query)
+
+
+# What the store holds ------------------------------------------------------------------------------
+
+
+def narrow_kinds(query: Query, catalog: Catalog) -> Query:
+    """Nodes are narrowed to the kinds that occur at the ends of such edges in the store.
+
+    A pattern whose edges do not occur at all has no match: its condition becomes false.
+    """
+    return _scopes(lambda scope: narrowed(scope, catalog), query)
+
+
+def narrowed(scope: Scope, catalog: Catalog) -> Scope:
+    """A scope whose nodes are narrowed to what its edges have at their ends in the store."""
+    triples = tuple({**catalog.map_edges, **catalog.edges})
+    held = catalog.moving | catalog.fixed | catalog.mapped
+    kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
+    single = [edge for edge in scope.edges if edge.high == 1]
+    while _pass(kinds, single, triples):
+        pass
+    if not all(kinds.values()):
+        return replace(scope, where=(FALSE,))
+    nodes = {key: replace(node, kinds=kinds[key]) for key, node in scope.nodes.items()}
+    return replace(scope, nodes=nodes, outer={key: kinds[key] for key in scope.outer})
+
+
+def _pass(kinds: dict[str, Kinds], edges: list[Edge], triples: tuple[Triple, ...]) -> bool:
+    """Narrow the ends of each edge once; whether that changed anything."""
+    changed = False
+    for edge in edges:
+        found = list(possible(edge, kinds[edge.src], kinds[edge.dst], triples))
+        for key, side in ((edge.src, 1), (edge.dst, 2)):
+            narrower = kinds[key].only(frozenset(triple[side] for triple in found))
+            changed |= narrower != kinds[key]
+            kinds[key] = narrower
+    return changed
+
+
+def possible(
+    edge: Edge, src: Kinds, dst: Kinds, triples: tuple[Triple, ...] | Mapping[Triple, int]
+) -> Iterator[Triple]:
+    """The triples that an edge may be, as seen from its ends: the second is what ``src`` is."""
+    for triple in triples:
+        relation, one, other = triple
+        if relation not in edge.relations:
+            continue
+        if one in src.every and other in dst.every:
+            yield triple
+        if edge.both and other in src.every and one in dst.every:
+            yield relation, other, one
+
+
+def order_edges(query: Query, catalog: Catalog) -> Query:
+    """Edges in an order that starts with the rarest and goes on with the rarest that is connected."""
+    return _scopes(lambda scope: ordered(scope, catalog), query)
+
+
+def ordered(scope: Scope, catalog: Catalog) -> Scope:
+    """A scope with its edges in that order."""
+    counts = {**catalog.map_edges, **catalog.edges}
+
+    def rows(edge: Edge) -> int:
+        found = possible(edge, scope.kinds(edge.src), scope.kinds(edge.dst), counts)
+        return sum(counts.get(triple, 0) for triple in set(found))
+
+    waiting, result = list(scope.edges), list[Edge]()
+    seen = set(scope.outer)
+    while waiting:
+        connected = [e for e in waiting if {e.src, e.dst} & seen] or waiting
+        rarest = min(connected, key=rows)
+        waiting.remove(rarest)
+        result.append(rarest)
+        seen |= {rarest.src, rarest.dst}
+    return replace(scope, edges=tuple(result))
+
+
+def labels_to_conditions(query: Query, _: Catalog) -> Query:
+    """A label that a block asks of a node outside it is a condition on that node's attributes.
+
+    So is one that a value which is returned is made of.
+    """
+    query = _scopes(
+        lambda scope: replace(scope, where=tuple(_attributes(c) for c in scope.where)), query
+    )
+    return replace(query, result=query.result.changed(_attributes))
+
+
+def _attributes(condition: Bound) -> Bound:
+    if isinstance(condition, Operation):
+        return replace(condition, operands=tuple(_attributes(o) for o in condition.operands))
+    if isinstance(condition, Aggregate) and condition.operand is not None:
+        return replace(condition, operand=_attributes(condition.operand))
+    if not isinstance(condition, LabelTest):
+        return condition
+    kind = NodeAttribute(condition.node, NODE_ATTRIBUTES["kind"], Type.text)
+    ego = NodeAttribute(condition.node, NODE_ATTRIBUTES["isego"], Type.boolean)
+    other = Operation("NOT", (ego,), Type.boolean)
+    either = tuple(
+        Operation("AND", (mark, Operation("IN", (kind, _words(kinds)), Type.boolean)), Type.boolean)
+        for mark, kinds in ((ego, condition.kinds.ego), (other, condition.kinds.other))
+    )
+    return Operation("OR", either, Type.boolean)
+
+
+def _words(kinds: frozenset[str]) -> Choices:
+    return Choices(tuple(Value(kind, Type.text, closed=True) for kind in KINDS if kind in kinds))
+
+
+# Results -------------------------------------------------------------------------------------------
+
+
+def count_by_buckets(query: Query, catalog: Catalog) -> Query:
+    """``COUNT(*)`` of what is the same in all frames of a bucket adds up how many frames each row holds in.
+
+    Nothing else of the result may need single frames: values are constants, and of the other aggregates there
+    are only those to which it is all the same how often a value comes.
+    """
+    result = query.result
+    values = [column.value for column in result.columns]
+    values += [key.value for key in result.order if not isinstance(key.value, str)]
+    parts = [part for value in values for part in walk(value)]
+    counts = [part for part in parts if isinstance(part, Aggregate)]
+    listed = result.form != "rows" or result.whole or result.framed or result.sample is not None
+    if listed or not any(_counts_all(part) for part in counts):
+        return query
+    if not all(
+        _counts_all(part) or part.distinct or part.word in {"min", "max"} for part in counts
+    ):
+        return query
+    if not all(
+        is_lasting(leaf, query.scope, catalog) for value in values for leaf in leaves(value)
+    ):
+        return query
+    columns = tuple(replace(column, value=_weighed(column.value)) for column in result.columns)
+    order = tuple(
+        key if isinstance(key.value, str) else replace(key, value=_weighed(key.value))
+        for key in result.order
+    )
+    return replace(query, result=replace(result, columns=columns, order=order))
+
+
+def _counts_all(part: Aggregate) -> bool:
+    return part.word == "count" and part.operand is None
+
+
+def _weighed(value: Bound) -> Bound:
+    match value:
+        case Aggregate() if _counts_all(value):
+            return replace(value, operand=INVARIANT)
+        case Operation(operands=operands):
+            return replace(value, operands=tuple(_weighed(operand) for operand in operands))
+        case _:
+            return value
+
+
+RULES: Final[tuple[Callable[[Query, Catalog], Query], ...]] = (
+    push_negations,
+    counts_to_existence,
+    unfold_paths,
+    labels_from_conditions,
+    open_exists,
+    labels_from_conditions,
+    labels_to_conditions,
+    pairs_of_entities,
+    narrow_kinds,
+    order_edges,
+    count_by_buckets,
+)

@@ -1,0 +1,736 @@
+"""SQL of the second phase: conditions and values of single frames.
+
+Numbers of pairs and conditions on values of frames: statements around the join that brings the values.
+
+Each number is computed in terms of others, in layers, one statement within the other, so that each part has a
+name and is computed once; a condition stands in the first layer that has all its parts. Of ``gap``,
+``ttc`` and ``closing_time``, which are dear, a cheap lower bound is compared before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, TypeGuard
+
+from sgstore.lang._catalog import DisplayUnit, Home, Type
+from sgstore.lang._formulas import (
+    PLACES,
+    WAY,
+    Aliases,
+    Leaf,
+    Select,
+    attribute_text,
+    columns_of,
+    edge_table,
+    expression_text,
+    frame_text,
+    is_position,
+    lane_text,
+    leaves,
+    needed_for,
+    nested,
+    owner_text,
+    pair_column,
+    pair_text,
+    parts_of,
+    role_text,
+    stage_of,
+    way_text,
+)
+from sgstore.lang._invariants import INVARIANT, is_lasting, join_lasting
+from sgstore.lang._kinds import Profile, homes_of, kind_conditions
+from sgstore.lang._plan import Phases, SharedRelation, apart
+from sgstore.lang._sql_masks import Masks, folded, merged
+from sgstore.lang.ir import (
+    BlockValue,
+    Bound,
+    EdgeAttribute,
+    EdgeRelation,
+    FrameAttribute,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    PairNumber,
+    Scope,
+    TraceAttribute,
+    nodes_of,
+)
+from sgstore.quoting import quoted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.lang._catalog import Attribute
+    from sgstore.lang._formulas import BoundValues
+    from sgstore.lang._results import Gathered
+
+
+_DEAR: Final = {"gap", "ttc", "closing_time"}
+_LESS: Final = {"<", "<=", "="}
+_MORE: Final = {">", ">=", "="}
+
+Part = tuple[str, str, str]
+"""A number of a pair: its name, and the nodes."""
+
+
+def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
+    """The numbers of pairs among values that are computed in layers."""
+    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function != WAY]
+
+
+@dataclass(slots=True)
+class Join:
+    """The join of the second phase in the making.
+
+    Attributes
+    ----------
+    select : Select
+    frame : str
+        The column of the frame; empty as long as there is none.
+    trace : str
+        The id of the trace; empty: that of the frame's.
+    nodes, edges : dict of str to str
+        Node → the column of its id, edge → the column of its relation.
+    at : dict of str to Aliases
+        Tables of a node's values that are joined.
+    texts : dict of Leaf to str
+        Values that are there, as they are computed.
+    lanes : set of str
+        Aliases of the rows that are joined for attributes of edges.
+    """
+
+    select: Select = field(default_factory=Select)
+    frame: str = ""
+    trace: str = ""
+    nodes: dict[str, str] = field(default_factory=dict[str, str])
+    edges: dict[str, str] = field(default_factory=dict[str, str])
+    at: dict[str, Aliases] = field(default_factory=dict[str, Aliases])
+    texts: dict[Leaf, str] = field(default_factory=dict[Leaf, str])
+    lanes: set[str] = field(default_factory=set[str])
+
+
+@dataclass(slots=True)
+class Layers:
+    """The statements around a join that compute numbers of pairs and test conditions.
+
+    What no cheap condition needs is computed after these have been tested.
+
+    Attributes
+    ----------
+    join : Join
+    needed : list of Leaf
+        Values that conditions or results are made of.
+    conditions : list of Bound
+    early : set of Part
+        What the conditions are made of that no dear number is in.
+    tested : int
+        The layer after which these are tested.
+    """
+
+    join: Join
+    needed: list[Leaf]
+    conditions: list[Bound]
+    early: set[Part] = field(default_factory=set["Part"])
+    tested: int = 0
+
+    def __post_init__(self) -> None:
+        cheap = [c for c in self.conditions if not any(_dear(leaf) for leaf in leaves(c))]
+        pairs = [pair for c in cheap for pair in _pairs(leaves(c))]
+        self.early = {
+            (name, p.a, p.b) for p in pairs for name in needed_for(p.function) if stage_of(name)
+        }
+        self.tested = max((stage_of(name) for name, _, _ in self.early), default=0)
+
+    def stage(self, name: str, a: str, b: str) -> int:
+        """The layer in which a number of a pair is computed; 0 for a raw column."""
+        if not stage_of(name):
+            return 0
+        found = 1 + max(self.stage(part, a, b) for part in parts_of(name))
+        return found if (name, a, b) in self.early else max(found, self.tested + 1)
+
+    def stage_of_test(self, condition: Bound) -> int:
+        """The layer after which a condition can be tested."""
+        pairs = _pairs(leaves(condition))
+        return max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
+
+    def text(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
+        """The whole: frame, keys and the values that are wanted."""
+        pairs = _pairs(self.needed)
+        last = max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
+        innermost = self.join.select
+        innermost.where += [
+            expression_text(c, self.join.texts.__getitem__, values)
+            for c in self.conditions
+            if self.stage_of_test(c) == 0
+        ]
+        ids = {quoted(f"{k}.id"): v for k, v in self.join.nodes.items()}
+        ids |= {quoted(f"{k}.type"): v for k, v in self.join.edges.items()}
+        names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
+        texts = {quoted(column_of(leaf)): text for leaf, text in self.join.texts.items()}
+        known = {'"frame_id"': self.join.frame, **ids, **texts}
+        if last == 0:
+            innermost.columns = [named(known[n], n) for n in dict.fromkeys(names)]
+            return innermost.text()
+        carried = dict.fromkeys([*names, *texts])
+        innermost.columns = [named(known[n], n) for n in carried if n in known]
+        innermost.columns += [named(text, n) for n, text in self._raw(pairs).items()]
+        text = innermost.text()
+        for stage in range(1, last + 1):
+            text = self._layer(values, text, stage, pairs)
+        final = Select(list(dict.fromkeys(names)), [nested(text, f":layer {last}")])
+        final.where = self._tests(values, last)
+        return final.text()
+
+    def _layer(self, values: BoundValues, text: str, stage: int, pairs: list[PairNumber]) -> str:
+        select = Select(["*"], [nested(text, f":layer {stage - 1}")])
+        parts = dict.fromkeys(
+            (name, pair.a, pair.b)
+            for pair in pairs
+            for name in sorted(needed_for(pair.function))
+            if self.stage(name, pair.a, pair.b) == stage
+        )
+        select.columns += [named(pair_text(*part), pair_column(*part)) for part in parts]
+        select.where = self._tests(values, stage - 1) if stage > 1 else []
+        return select.text()
+
+    def _tests(self, values: BoundValues, stage: int) -> list[str]:
+        return [
+            expression_text(c, lambda leaf: quoted(column_of(leaf)), values)
+            for c in self.conditions
+            if self.stage_of_test(c) == stage
+        ]
+
+    def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
+        """The raw columns that numbers of pairs are made of."""
+        columns: dict[str, str] = {}
+        for pair in pairs:
+            for name in sorted(needed_for(pair.function)):
+                if stage_of(name) == 0:
+                    key = pair.a if name[0] == "a" else pair.b
+                    columns[pair_column(name, pair.a, pair.b)] = _raw_text(
+                        name[1:], self.join.at[key]
+                    )
+        return columns
+
+
+def _raw_text(name: str, at: Aliases) -> str:
+    """A raw column of a node, wherever it lives; positions about the trace's origin.
+
+    What stands for ever has no states, and velocity 0.
+    """
+    still = name in {"vx", "vy"}
+    parts: list[str] = []
+    if at.state:
+        parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")
+    if at.entity:
+        value = f"CAST({at.entity}.{quoted(name)} AS DOUBLE)"
+        parts.append(f'CASE WHEN {at.entity}."is_static" THEN 0e0 END' if still else value)
+    if at.map:
+        value = "0e0" if still else f"{at.map}.{quoted(name)}"
+        value = f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value
+        # Signs and lights of a map are entities; of lanes and roads there are no numbers of pairs.
+        parts.append(f'CASE WHEN {at.map}."kind" NOT IN ({PLACES}) THEN {value} END')
+    if not parts:
+        return "CAST(NULL AS DOUBLE)"
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def named(text: str, name: str) -> str:
+    """A column under its name, which need not be said if it is called so anyway."""
+    return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
+
+
+def column_of(leaf: Leaf) -> str:
+    """The name of the column of a value."""
+    match leaf:
+        case NodeValue(node=owner):
+            name = "id"
+        case NodeAttribute(node=owner, attribute=attribute):
+            name = attribute.name
+        case EdgeRelation(edge=owner):
+            name = "type"
+        case EdgeAttribute(edge=owner, attribute=attribute):
+            name = attribute.name
+        case FrameAttribute(attribute=attribute):
+            owner, name = "frame", attribute.name
+        case TraceAttribute(attribute=attribute):
+            owner, name = "trace", attribute.name
+        case PairNumber(function=function, a=a, b=b):
+            return f"{function}({a}, {b})"
+        case BlockValue(number=number):
+            return f"block {number}"
+    return f"{owner}.{name}"
+
+
+def bounds(conditions: list[Bound]) -> list[Bound]:
+    """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
+    found: list[Bound] = []
+    for condition in conditions:
+        match condition:
+            case Operation(word, (PairNumber() as pair, limit)) if word in _LESS:
+                found += _bound(pair, limit)
+            case Operation(word, (limit, PairNumber() as pair)) if word in _MORE:
+                found += _bound(pair, limit)
+            case _:
+                pass
+    return found
+
+
+def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
+    if pair.function not in _DEAR or any(_dear(leaf) for leaf in leaves(limit)):
+        return []
+    least = PairNumber("at_least", pair.a, pair.b)
+    if pair.function != "gap":
+        approach = PairNumber("approach", pair.a, pair.b)
+        limit = Operation("*", (limit, approach), Type.number)
+    return [Operation("<=", (least, limit), Type.boolean)]
+
+
+def _dear(leaf: Leaf) -> bool:
+    return isinstance(leaf, PairNumber) and leaf.function in _DEAR
+
+
+# Bound patterns → SQL, second phase: conditions and results that need values of single frames ----
+# The frames that the first phase leaves are joined with ``state`` (and the tables of constants) for each node
+# whose values are asked for; numbers of pairs are computed around that join (:mod:`sgstore.lang._sql_frames`).
+
+PATTERN: Final = '":pattern"'
+FRAME: Final = '":frame"'
+TRACE: Final = '":trace"'
+MAP: Final = '":map"'
+
+
+class Frames(Masks):
+    """Writes relations of both phases for one query.
+
+    Attributes
+    ----------
+    gathered : tuple of Gathered
+        Tables that they speak of and the store has not.
+    """
+
+    gathered: tuple[Gathered, ...] = ()
+
+    def frames(
+        self,
+        scope: Scope,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+        columns: Iterable[Leaf] = (),
+    ) -> str:
+        """The relation of the second phase: one row a frame and binding of some nodes and edges.
+
+        Parameters
+        ----------
+        scope : Scope
+        given : SharedRelation or None
+            What binds the outer nodes.
+        nodes, edges : frozenset of str
+            What is to be bound; every binding comes once for each frame.
+        columns : iterable of Leaf
+            Values wanted beside them, each a column named by :func:`column_of`.
+        """
+        parts = self.phases(scope)
+        wanted = list(dict.fromkeys(columns))
+        if INVARIANT in wanted and not (parts.rest or parts.late):
+            return self._by_buckets(scope, parts, given, nodes, edges, wanted)
+        conditions = [*parts.rest, *bounds(parts.rest)]
+        needed = list(dict.fromkeys([*(leaf for c in conditions for leaf in leaves(c)), *wanted]))
+        join = Join()
+        bound = nodes | {key for leaf in needed for key in nodes_of(leaf)}
+        bound |= self._ends(scope, needed)
+        every = {*scope.nodes, *scope.outer}
+        bound |= {key for pair in apart(scope, every, parts.late) for key in pair}
+        ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation)}
+        given = self._first_phase(join, scope, parts, given, bound, ties, needed)
+        self._second_phase(join, scope, parts, given, needed)
+        layers = Layers(join, needed, conditions)
+        text = layers.text(self.values, columns_of(nodes, edges), wanted)
+        told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
+        told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
+        told |= {leaf.node for leaf in wanted if _is_id(leaf)}
+        hidden = (bound | parts.late | ties) - nodes - edges - told
+        hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
+        return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
+
+    def _by_buckets(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+        wanted: list[Leaf],
+    ) -> str:
+        """One row a bucket and binding, with the number of frames that it stands for."""
+        select, texts = self._of_buckets(scope, parts, given, nodes, edges, wanted)
+        texts[INVARIANT] = self.held(PATTERN)
+        columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
+        columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
+        select.columns = [named(text, name) for name, text in columns.items()]
+        return select.text()
+
+    def _of_buckets(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+        wanted: Iterable[Leaf],
+    ) -> tuple[Select, dict[Leaf, str]]:
+        """What the first phase leaves, joined with what lasting values come from; how each is computed."""
+        select = Select()
+        select.join(nested(self.masks(scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
+        bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
+        bucket = f'{PATTERN}."bucket"'
+        texts = join_lasting(select, bucket, bound, scope, self.catalog, wanted)
+        for leaf in wanted:
+            if isinstance(leaf, EdgeRelation):
+                texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
+        return select, texts
+
+    def in_masks(self, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]) -> str:
+        """In which frames some match has which values: one row a bucket and combination of them.
+
+        Parameters
+        ----------
+        scope : Scope
+        wanted : iterable of Leaf
+            What the values are made of.
+        values : mapping of str to str
+            Column, quoted → its text in terms of a relation ``":rows"`` that has the columns ``wanted``.
+        """
+        rows = self._lasting(scope, wanted)
+        if rows is not None:
+            return merged(rows, values)
+        rows = self.frames(scope, None, frozenset(), frozenset(), wanted)
+        select = Select(['"frame_id"'], [nested(rows, ":rows")])
+        select.columns += [f"{text} AS {column}" for column, text in values.items()]
+        return folded(select.text(), list(values))
+
+    def _lasting(self, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
+        """One row a bucket and match, with values that last as long; ``None`` if frames must be looked at."""
+        parts, wanted = self.phases(scope), list(dict.fromkeys(wanted))
+        if parts.rest or parts.late or not all(is_lasting(v, scope, self.catalog) for v in wanted):
+            return None
+        nodes = frozenset(key for leaf in wanted for key in nodes_of(leaf))
+        edges = frozenset(leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation))
+        select, texts = self._of_buckets(scope, parts, None, nodes, edges, wanted)
+        select.columns = self.in_which(PATTERN)
+        select.columns += [named(texts[leaf], quoted(column_of(leaf))) for leaf in wanted]
+        return select.text()
+
+    def _ends(self, scope: Scope, needed: list[Leaf]) -> set[str]:
+        """Nodes at the ends of edges whose attributes are needed."""
+        keys = {leaf.edge for leaf in needed if isinstance(leaf, EdgeAttribute)}
+        return {end for e in scope.edges if e.key in keys for end in (e.src, e.dst)}
+
+    def _first_phase(
+        self,
+        join: Join,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        bound: frozenset[str],
+        ties: frozenset[str],
+        needed: list[Leaf],
+    ) -> SharedRelation | None:
+        """What the first phase leaves, and its frames; what it gives to the blocks of the second."""
+        if parts.empty:
+            return None
+        nodes = bound - parts.late
+        text = self.masks(scope, parts, given, nodes, ties)
+        blocks = [leaf for leaf in needed if isinstance(leaf, BlockValue)]
+        if blocks:
+            given = SharedRelation(self.share(text, "pattern"), nodes, ties)
+            text = Select(["*"], [quoted(given.name)]).text()
+        join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
+        join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
+        leader = self._leader(scope, parts, nodes, needed)
+        if leader is None:
+            join.select.join(nested(self.expanded(text, nodes, ties), PATTERN[1:-1]), [])
+            join.frame = f'{PATTERN}."frame_id"'
+        else:
+            join.select.join(nested(text, PATTERN[1:-1]), [])
+            self._join_leader(join, scope, leader)
+        return given
+
+    def _leader(
+        self, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
+    ) -> str | None:
+        """The node whose states bring the frames with them, so that masks need not be expanded.
+
+        The many states are then looked up in the few rows of the first phase, rather than these, one row a
+        frame, among the states. Only where a query chooses traces it is better to say which frames are asked.
+        """
+        if parts.trace or (scope is self.query.scope and self.chooses_traces):
+            return None
+        moving = [
+            key
+            for key in sorted({key for leaf in needed for key in _valued(leaf)} & nodes)
+            if Profile.of(scope.kinds(key), self.catalog).places == 1
+            and Home.state in self._homes(scope, key, needed)
+        ]
+        others = [key for key in moving if scope.kinds(key).other]
+        return next(iter(others or moving), None)
+
+    def _join_leader(self, join: Join, scope: Scope, key: str) -> None:
+        alias = quoted(key)
+        frame = f'{alias}."frame_id"'
+        on = [f'{frame} >> 6 = {PATTERN}."bucket"', f'{alias}."node_id" = {join.nodes[key]}']
+        on += self._of_kinds(scope, key, alias)
+        join.select.join(f'"state" AS {alias}', [*on, self.in_mask(PATTERN, frame)])
+        join.select.where += self.within(frame, 64)
+        join.frame = frame
+        # Said of the bucket, so that constants are looked up for the rows of masks, and not for all states.
+        join.trace = f'{PATTERN}."bucket" >> 18'
+        join.at[key] = Aliases(state=alias)
+
+    def _of_kinds(self, scope: Scope, key: str, state: str) -> list[str]:
+        """Conditions that keep states to what a node may be; of the ego's states it is enough that they are."""
+        if scope.kinds(key).one_a_frame and key not in self.phases(scope).late:
+            return [f'{state}."is_ego"']
+        return kind_conditions(
+            scope.kinds(key), f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
+        )
+
+    def _homes(
+        self, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
+    ) -> set[Home]:
+        """Where the values of a node that are needed live; ``stated``: its state is joined anyway."""
+        profile = Profile.of(scope.kinds(key), self.catalog)
+        of_it = [leaf for leaf in needed if key in _valued(leaf)]
+        homes = _homes(of_it, profile)
+        if profile.places == 1 and profile.moving and (stated or Home.state in homes):
+            # Its state says its kind as well, and so its name.
+            homes = {Home.state} | _homes([leaf for leaf in of_it if not _of_kind(leaf)], profile)
+        return homes
+
+    def _second_phase(
+        self,
+        join: Join,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        needed: list[Leaf],
+    ) -> None:
+        """Join whatever the values come from, and say how each is computed."""
+        for key in sorted(parts.late):
+            self._bind_late(join, scope, key)
+        join.select.where += [
+            f"{join.nodes[a]} <> {join.nodes[b]}"
+            for a, b in apart(scope, set(join.nodes), parts.late)
+        ]
+        if parts.empty:
+            join.select.where += self.of_traces(f"{join.frame} >> 24", scope)
+        self._join_rows(join, scope, parts, needed)
+        for key in sorted({key for leaf in needed for key in _valued(leaf)}):
+            stated = key in join.at and join.at[key].state is not None
+            homes = self._homes(scope, key, needed, stated=stated)
+            self._join_values(join, scope, key, homes)
+        for leaf in needed:
+            self._say(join, scope, given, leaf)
+
+    def _bind_late(self, join: Join, scope: Scope, key: str) -> None:
+        """A node that is bound by its state in the frame."""
+        alias = quoted(key)
+        on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
+        on += self._of_kinds(scope, key, alias)
+        join.select.join(f'"state" AS {alias}', on)
+        join.select.where += self.within(f'{alias}."frame_id"', 64)
+        join.frame = join.frame or f'{alias}."frame_id"'
+        join.nodes[key] = f'{alias}."node_id"'
+        join.at[key] = Aliases(state=alias)
+
+    def _join_rows(self, join: Join, scope: Scope, parts: Phases, needed: list[Leaf]) -> None:
+        """The rows of the frame, of its trace and of the map, where they are needed."""
+        kinds = {type(leaf) for leaf in needed}
+        on_map = any(
+            Profile.of(scope.kinds(key), self.catalog).mapped
+            for leaf in needed
+            for key in (_valued(leaf) or _owned(leaf))
+        )
+        position = any(is_position(leaf) for leaf in needed)
+        pairs_on_map = on_map and PairNumber in kinds
+        trace = TraceAttribute in kinds or position or pairs_on_map
+        since = any(_since_start(leaf) for leaf in needed)
+        if on_map or trace or since or any(_of_frame(leaf) for leaf in needed):
+            join.select.join(f'"frame" AS {FRAME}', [f'{FRAME}."frame_id" = {join.frame}'])
+        if trace or since:
+            on = [f'{TRACE}."trace_id" = {FRAME}."trace_id"']
+            join.select.join(f'"trace" AS {TRACE}', on)
+        if any(
+            isinstance(leaf, TraceAttribute) and Home.map in leaf.attribute.columns
+            for leaf in needed
+        ):
+            on = [f'{MAP}."map_id" = {TRACE}."map_id"']
+            join.select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
+
+    def _join_values(self, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
+        """The tables that some values of a node come from."""
+        profile = Profile.of(scope.kinds(key), self.catalog)
+        at, node = join.at.get(key, Aliases()), join.nodes[key]
+        state, entity, part = at.state, None, None
+        if Home.state in homes and state is None:
+            state = quoted(key)
+            on = [f'{state}."frame_id" = {join.frame}']
+            if not scope.kinds(key).one_a_frame:  # one column filters the scan as it reads
+                on.append(f'{state}."node_id" = {node}')
+            on += self._of_kinds(scope, key, state) + self.within(f'{state}."frame_id"', 64)
+            alone = profile.places == 1
+            join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
+        if homes & {Home.entity, Home.scenery}:
+            entity = quoted(f"{key}.entity")
+            trace = join.trace or f"{join.frame} >> 24"
+            on = [f'{entity}."trace_id" = {trace}', f'{entity}."node_id" = {node}']
+            how = "LEFT JOIN" if profile.mapped else "JOIN"
+            join.select.join(f'"entity" AS {entity}', on, how)
+        if Home.map in homes:
+            part = quoted(f"{key}.map")
+            on = [f'{part}."map_id" = {FRAME}."map_id"', f'{part}."node_id" = {node}']
+            how = "JOIN" if profile.places == 1 else "LEFT JOIN"
+            join.select.join(f'"map_node" AS {part}', on, how)
+        join.at[key] = Aliases(state, entity, part, TRACE)
+
+    def _say(self, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf) -> None:
+        """How a value is computed; a block or the attributes of an edge are joined for it."""
+        match leaf:
+            case NodeValue(node=node):
+                join.texts[leaf] = join.nodes[node]
+            case NodeAttribute(node=node, attribute=attribute):
+                join.texts[leaf] = self._of_node(join, scope, node, attribute)
+            case EdgeRelation(edge=edge):
+                join.texts[leaf] = f"CAST({join.edges[edge]} AS VARCHAR)"
+            case EdgeAttribute(edge=edge):
+                join.texts[leaf] = self._of_lane(join, scope, edge, leaf)
+            case FrameAttribute() if leaf is INVARIANT:
+                join.texts[leaf] = "1"
+            case FrameAttribute() | TraceAttribute():
+                join.texts[leaf] = frame_text(leaf, FRAME, TRACE, MAP)
+            case BlockValue():
+                join.texts[leaf] = self._of_block(join, given, leaf)
+            case PairNumber(function=function, a=a, b=b):
+                if function == WAY:  # the others are computed in layers
+                    join.texts[leaf] = self._of_ways(join, scope, a, b)
+
+    def _of_node(self, join: Join, scope: Scope, node: str, attribute: Attribute) -> str:
+        if attribute.unit is DisplayUnit.binding:
+            return join.nodes[node]
+        if attribute.unit is DisplayUnit.owner:
+            profile = Profile.of(scope.kinds(node), self.catalog)
+            return owner_text(join.nodes[node], profile, f"{join.frame} >> 24", f'{FRAME}."map_id"')
+        if attribute.unit is DisplayUnit.role:
+            return role_text(join.frame, join.nodes[node])
+        return attribute_text(attribute, join.at[node])
+
+    def _of_lane(self, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
+        alias = quoted(f"{key}:in")
+        if alias not in join.lanes:
+            join.lanes.add(alias)
+            edge = next(edge for edge in scope.edges if edge.key == key)
+            table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
+            on = [f'{alias}."frame_id" = {join.frame}']
+            on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
+            join.select.join(f"{quoted(table)} AS {alias}", on, "LEFT JOIN")
+        return lane_text(leaf, alias)
+
+    def _of_ways(self, join: Join, scope: Scope, a: str, b: str) -> str:
+        every = self.catalog.moving | self.catalog.fixed
+        conditions = [
+            condition
+            for alias, key in (('"a"', a), ('"b"', b))
+            for condition in kind_conditions(
+                scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', every
+            )
+        ]
+        return way_text(join.frame, join.nodes[a], join.nodes[b], conditions)
+
+    def _of_block(self, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
+        """The value of a block for each frame and binding of the nodes outside."""
+        keys = frozenset(leaf.scope.outer)
+        alias = f":block {leaf.number}"
+        rows = self._block_rows(leaf, given, keys)
+        on = [f'{quoted(alias)}."frame_id" = {join.frame}']
+        on += [
+            f"{quoted(alias)}.{column} = {join.nodes[key]}"
+            for key, column in zip(sorted(keys), columns_of(keys), strict=True)
+        ]
+        join.select.join(nested(rows, alias), on, "LEFT JOIN")
+        value = f'{quoted(alias)}."value"'
+        if leaf.word == "EXISTS":
+            return f"coalesce({value}, FALSE)"
+        return f"coalesce({value}, 0)" if leaf.word in {"COUNT", "SUM"} else value
+
+    def _block_rows(
+        self, leaf: BlockValue, given: SharedRelation | None, keys: frozenset[str]
+    ) -> str:
+        if (
+            leaf.word == "EXISTS"
+        ):  # a column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL
+            rows = self.frames(leaf.scope, given, keys)
+            return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
+        parts = list(leaves(leaf.value)) if leaf.value is not None else []
+        select = Select(['"frame_id"', *columns_of(keys)])
+        select.join(nested(self.counted(leaf, given, parts), ":counted"), [])
+        select.group = list(select.columns)
+        if leaf.value is None:
+            select.columns.append('count(*) AS "value"')
+        else:
+            value = expression_text(leaf.value, lambda part: quoted(column_of(part)), self.values)
+            select.columns.append(f'{leaf.word.lower()}({value}) AS "value"')
+        return select.text()
+
+
+def _is_id(leaf: Leaf) -> TypeGuard[NodeAttribute]:
+    return isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.binding
+
+
+_BARE: Final = frozenset({DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role})
+"""What is told of a node without its tables."""
+
+
+def _owned(leaf: Leaf) -> frozenset[str]:
+    """Nodes of which it is asked whose numbers their ids are."""
+    if isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.owner:
+        return frozenset({leaf.node})
+    return frozenset()
+
+
+def _valued(leaf: Leaf) -> frozenset[str]:
+    """Nodes whose tables a value needs."""
+    match leaf:
+        case NodeAttribute(node=node, attribute=attribute):
+            return frozenset() if attribute.unit in _BARE else frozenset({node})
+        case PairNumber(function=function, a=a, b=b):
+            return frozenset() if function == WAY else frozenset({a, b})
+        case _:
+            return frozenset()
+
+
+def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
+    """Where values of a node live, of the places where the node may live."""
+    homes: set[Home] = set()
+    for leaf in needed:
+        if isinstance(leaf, PairNumber):
+            homes |= {Home.state, Home.scenery, Home.map}
+        elif isinstance(leaf, NodeAttribute):
+            homes |= homes_of(leaf.attribute, profile)
+    return {home for home in homes if profile.has(home)}
+
+
+def _of_kind(leaf: Leaf) -> bool:
+    """Whether a value is made of the kind, and the id, of a node."""
+    attribute = leaf.attribute if isinstance(leaf, NodeAttribute) else None
+    return attribute is not None and (
+        attribute.unit is DisplayUnit.label or attribute.name == "kind"
+    )
+
+
+def _of_frame(leaf: Leaf) -> bool:
+    return isinstance(leaf, FrameAttribute) and leaf is not INVARIANT
+
+
+def _since_start(leaf: Leaf) -> bool:
+    return isinstance(leaf, FrameAttribute) and leaf.attribute.unit is DisplayUnit.seconds

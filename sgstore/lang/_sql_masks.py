@@ -1,0 +1,841 @@
+"""SQL of the first phase: presence and relations as bit masks.
+
+Where nodes are present and what is asked of them alone: as masks, a relation for each place they live in.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from itertools import combinations, count, product
+from operator import eq, ge, gt, le, lt, ne
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang._catalog import Home
+from sgstore.lang._formulas import (
+    Aliases,
+    BoundValues,
+    Leaf,
+    Select,
+    among,
+    bound_text,
+    columns_of,
+    edge_table,
+    expression_text,
+    is_constant,
+    is_position,
+    lane_text,
+    leaves,
+    nested,
+    node_text,
+    trace_text,
+)
+from sgstore.lang._kinds import Profile, alias_of, edge_conditions, homes_of, kind_conditions
+from sgstore.lang._plan import (
+    TRACE_OF_BUCKET,
+    TRACE_OF_FRAME,
+    Phases,
+    SharedRelation,
+    apart,
+    phases_of,
+    traces_of,
+)
+from sgstore.lang._rewrite import (
+    FALSE,
+    chain,
+    complement,
+    counted_block,
+    narrowed,
+    ordered,
+    possible,
+)
+from sgstore.lang.ir import (
+    BlockValue,
+    Bound,
+    Edge,
+    Node,
+    NodeAttribute,
+    Operation,
+    Scope,
+    blocks_of,
+)
+from sgstore.quoting import quoted
+from sgstore.vocabulary import ENTITY_KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.lang._catalog import Catalog
+    from sgstore.lang._plan import Window
+    from sgstore.lang.ir import Kinds, Query
+
+
+_ENTITIES: Final = frozenset(ENTITY_KINDS)
+_BIT: Final = '"bit"'
+
+
+class PresenceSql:
+    """Writes relations of nodes, with the columns ``bucket``, ``node_id`` and ``mask``.
+
+    Parameters
+    ----------
+    catalog : Catalog
+    window : Window or None
+        The buckets to look at; ``None``: all.
+    """
+
+    def __init__(self, catalog: Catalog, window: Window | None = None) -> None:
+        self.catalog = catalog
+        self.window = window
+        self.values = BoundValues()
+
+    @property
+    def standing(self) -> frozenset[str]:
+        """Kinds of what is present by masks: static entities and parts of the map."""
+        return self.catalog.fixed | self.catalog.mapped
+
+    def within(self, column: str, per: int = 1) -> list[str]:
+        """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window."""
+        if self.window is None:
+            return []
+        low, high = self.window.low * per, self.window.high * per
+        found = [f"{column} >= {low}", f"{column} < {high}"]
+        if self.window.traces is not None:
+            shift = TRACE_OF_FRAME if per > 1 else TRACE_OF_BUCKET
+            found.append(among(f"{column} >> {shift}", list(self.window.traces)))
+        return found
+
+    def present(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
+        """Frames in which nodes are present and meet conditions, for each place where they may live."""
+        branches: list[str] = []
+        if (
+            profile.moving
+            and not conditions
+            and not kinds.other
+            and profile.moving >= (self.catalog.moving & _ENTITIES)
+        ):
+            branches.append(self._ego())
+        elif profile.moving:
+            branches.append(self._moving(kinds, profile, conditions))
+        if profile.fixed:
+            branches.append(self._standing(kinds.only(profile.fixed), conditions, "fixed"))
+        if profile.mapped:
+            branches.append(self._standing(kinds.only(profile.mapped), conditions, "mapped"))
+        return "\nUNION ALL\n".join(branches)
+
+    def _ego(self) -> str:
+        select = Select(['"bucket"', '"ego" AS "node_id"', f'bit_or({bit_of(_BIT)}) AS "mask"'])
+        select.join('"frame"', ['"ego" IS NOT NULL', *self.within('"bucket"')])
+        select.group = ['"bucket"', '"ego"']
+        return select.text()
+
+    def _moving(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
+        frame, node = '"s"."frame_id"', '"s"."node_id"'
+        select = Select(
+            [f'{frame} >> 6 AS "bucket"', node, f'bit_or({bit_of(frame)}) AS "mask"'],
+            group=[f"{frame} >> 6", node],
+        )
+        select.join(
+            '"state" AS "s"',
+            kind_conditions(kinds, '"s"."kind"', '"s"."is_ego"', self.catalog.moving),
+        )
+        select.where += self.within(frame, 64)
+        found = [leaf for c in conditions for leaf in leaves(c) if isinstance(leaf, NodeAttribute)]
+        homes = {home for leaf in found for home in homes_of(leaf.attribute, profile)}
+        entity = '"n"' if Home.entity in homes else None
+        if entity:
+            on = [f'"n"."trace_id" = {frame} >> 24', f'"n"."node_id" = {node}']
+            select.join('"entity" AS "n"', on)
+        at = Aliases('"s"', entity, None, self._join_trace(select, f"{frame} >> 24", conditions))
+        select.where += [node_text(c, node, at, self.values) for c in conditions]
+        return select.text()
+
+    def _standing(self, kinds: Kinds, conditions: list[Bound], place: str) -> str:
+        bucket, node = '"p"."bucket"', '"p"."node_id"'
+        select = Select([bucket, node, '"p"."mask"'])
+        select.join('"node" AS "p"', kind_conditions(kinds, '"p"."kind"', None, self.standing))
+        select.where += [f"{node} {'>=' if place == 'fixed' else '<'} 0", *self.within(bucket)]
+        at = Aliases()
+        if conditions and place == "fixed":
+            on = [f'"n"."trace_id" = {bucket} >> 18', f'"n"."node_id" = {node}']
+            select.join('"entity" AS "n"', on)
+            trace = self._join_trace(select, f"{bucket} >> 18", conditions)
+            at = Aliases(entity='"n"', trace=trace)
+        elif conditions:
+            select.join('"bucket" AS "b"', [f'"b"."bucket" = {bucket}'])
+            on = ['"n"."map_id" = "b"."map_id"', f'"n"."node_id" = {node}']
+            select.join('"map_node" AS "n"', on)
+            at = Aliases(map='"n"')
+        select.where += [node_text(c, node, at, self.values) for c in conditions]
+        return select.text()
+
+    def _join_trace(self, select: Select, trace: str, conditions: list[Bound]) -> str | None:
+        """The row of the trace, if a condition is on a position, which is stored about the trace's origin."""
+        if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
+            return None
+        select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
+        return '"t"'
+
+
+def bit_of(frame: str) -> str:
+    """The mask of a single frame, given its id or its number in the bucket."""
+    number = frame if frame == _BIT else f"{frame} & 63"
+    return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
+
+
+# In which frames how many rows hold, told by adding up their masks rather than by looking at single frames
+# ------------------------------------------------------------------------------------------------
+# A mask is spread over twelve numbers, each with every twelfth bit of it, so that a bit has twelve to itself.
+# The sums of these numbers over many rows are then the counts of all frames of a bucket, five to a number. To
+# see which counts reach a bound, the top bit of each is set and the bound is taken from it: where that bit
+# stays, the count was large enough.
+#
+# A count must stay below the top bit, so this is right for up to :data:`MOST` rows. Where a bucket has more,
+# its frames are counted one by one.
+
+WIDTH: Final = 12
+"""Bits that a count has to itself; 60 frames are five counts in each of twelve numbers."""
+
+MOST: Final = (1 << (WIDTH - 1)) - 1
+"""So many rows can be added up."""
+
+_ONES: Final = sum(1 << place for place in range(0, 60, WIDTH))
+_TOPS: Final = _ONES << (WIDTH - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class CountRange:
+    """The counts that a comparison wants, none of them 0: ``least`` and more, but less than ``end``."""
+
+    least: int
+    end: int | None
+
+    @classmethod
+    def of(cls, sign: str, number: float) -> CountRange:
+        """The counts from 1 on for which ``count sign number`` is true; it must be false for 0."""
+        up, past = math.ceil(number), math.floor(number) + 1
+        match sign:
+            case "=":
+                found = (up, past)
+            case "<":
+                found = (1, up)
+            case "<=":
+                found = (1, past)
+            case ">":
+                found = (past, None)
+            case ">=":
+                found = (up, None)
+            case _:  # <>: as it is false for 0, the number is 0
+                found = (1, None)
+        least, end = found
+        return cls(max(least, 1), end if end is None else max(end, 1))
+
+    @property
+    def empty(self) -> bool:
+        """Whether no count is wanted."""
+        return self.end is not None and self.least >= self.end
+
+    def condition(self, count: str) -> str:
+        """Whether a count is wanted."""
+        least = f"{count} >= {self.least}"
+        return least if self.end is None else f"{least} AND {count} < {self.end}"
+
+
+def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
+    """In which frames as many rows hold as are wanted: one row a bucket and keys.
+
+    Parameters
+    ----------
+    rows : str
+        Name of a relation with the columns ``bucket``, ``mask`` and those of the keys. A frame counts once for
+        each row in whose mask it is.
+    keys : list of str
+        Columns, quoted.
+    wanted : CountRange
+    """
+    if wanted.empty:
+        return Select(['"bucket"', *keys, '"mask"'], [quoted(rows)], ["FALSE"]).text()
+    many = _one_by_one(rows, keys, wanted)
+    return f"{_summed(rows, keys, wanted)}\nUNION ALL\n{many}" if wanted.least <= MOST else many
+
+
+def _summed(rows: str, keys: list[str], wanted: CountRange) -> str:
+    """For buckets with few rows: by sums of masks."""
+    sums = [
+        f'CAST(sum(("mask" >> {shift}) & {_ONES}) AS BIGINT) AS {_sum(shift)}'
+        for shift in range(WIDTH)
+    ]
+    inner = Select(
+        ['"bucket"', *keys, *sums],
+        [quoted(rows)],
+        group=['"bucket"', *keys],
+        having=[f"count(*) <= {MOST}"],
+    )
+    mask = _reached(wanted.least)
+    if wanted.end is not None and wanted.end <= MOST:
+        mask = f"({mask})\n    & ~({_reached(wanted.end)})"
+    outer = Select(['"bucket"', *keys, f'{mask} AS "mask"'])
+    outer.join(nested(inner.text(), ":sums"), [])
+    return outer.text()
+
+
+def _sum(shift: int) -> str:
+    return quoted(f"sum {shift}")
+
+
+def _reached(bound: int) -> str:
+    """The mask of the frames whose counts reach a bound."""
+    less = bound * _ONES
+    parts = [
+        f"((({_sum(shift)} | {_TOPS}) - {less}) & {_TOPS}) >> {WIDTH - 1 - shift}"
+        for shift in range(WIDTH)
+    ]
+    return "\n    | ".join(f"({part})" for part in parts)
+
+
+def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
+    """For buckets with many rows, or a bound beyond what sums can say: frame by frame."""
+    group = ['"bucket"', *keys]
+    crowded = Select(group, [quoted(rows)], group=group)
+    if wanted.least <= MOST:
+        crowded.having.append(f"count(*) > {MOST}")
+    frame = '":row"."bucket" * 64 + ":bit"."bit"'
+    counted = Select([f'{frame} AS "frame_id"', *(f'":row".{key}' for key in keys)])
+    counted.join(f'{quoted(rows)} AS ":row"', [])
+    on = [f'":crowded".{column} = ":row".{column}' for column in group]
+    counted.join(nested(crowded.text(), ":crowded"), on)
+    counted.join('"bits" AS ":bit"', ['(":row"."mask" & ":bit"."m") <> 0'])
+    counted.group = [frame, *(f'":row".{key}' for key in keys)]
+    counted.having = [wanted.condition("count(*)")]
+    return folded(counted.text(), keys)
+
+
+def folded(text: str, keys: list[str]) -> str:
+    """A relation of frames and keys as one of buckets, masks and keys."""
+    bit = bit_of('"frame_id"')
+    select = Select(['"frame_id" >> 6 AS "bucket"', *keys, f'bit_or({bit}) AS "mask"'])
+    select.join(nested(text, ":frames"), [])
+    select.group = ['"frame_id" >> 6', *keys]
+    return select.text()
+
+
+def merged(text: str, values: Mapping[str, str]) -> str:
+    """A relation of buckets and masks as one with each bucket and combination of values once.
+
+    Parameters
+    ----------
+    text : str
+    values : mapping of str to str
+        Column, quoted → its text in terms of the relation as ``":rows"``.
+    """
+    columns = [f"{value} AS {column}" for column, value in values.items()]
+    select = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
+    select.join(nested(text, ":rows"), [])
+    select.group = ['"bucket"', *values.values()]
+    return select.text()
+
+
+# Bound patterns → SQL, first phase: what can be answered on masks, 60 frames at a time ----------
+# A row of ``edge`` or ``node`` says with the bits of a mask in which frames of a bucket it holds. So edges join
+# on bucket and node ids, and the frames of a match are the bits that all masks have in common. Conditions on
+# the attributes of one node become masks too, and so do blocks (``EXISTS``, ``COUNT``), which are answered
+# once for all bindings of the nodes outside that they speak of.
+#
+# What needs values of single frames is left to the second phase (:mod:`sgstore.lang._sql_frames`). Masks are
+# known here and in the store, and nowhere else.
+#
+# A relation of this phase has the columns ``bucket``, ``mask``, ``"x.id"`` for each node x and ``"d.type"`` for
+# each edge d; one of the second phase has ``frame_id`` in place of the first two.
+
+OUTSIDE: Final = '":outside"'
+BUCKET: Final = '":bucket"'
+_MANY: Final = 5
+"""Up to so many masks are compared in pairs, so that each join sheds what it can."""
+
+_BRANCHES: Final = 8
+"""A pattern with paths is joined so many times at most, once for each length of its paths."""
+
+_COMPARED: Final = {"=": eq, "<>": ne, "<": lt, "<=": le, ">": gt, ">=": ge}
+
+
+@dataclass(slots=True)
+class Base:
+    """The join of the first phase in the making.
+
+    Attributes
+    ----------
+    select : Select
+    nodes : dict of str to str
+        Node → the column that binds it.
+    edges : dict of str to str
+        Edge → the column of its relation.
+    bucket : str
+        The column of the bucket; empty as long as there is none.
+    masks : list of str
+        Columns, or other terms.
+    present : set of str
+        Nodes that a mask of their own edges makes present.
+    repeats : bool
+        Whether a binding may come in several rows whose masks overlap.
+    knows_map : bool
+        Whether the row of the bucket is joined, which knows the map.
+    """
+
+    select: Select = field(default_factory=Select)
+    nodes: dict[str, str] = field(default_factory=dict[str, str])
+    edges: dict[str, str] = field(default_factory=dict[str, str])
+    bucket: str = ""
+    masks: list[str] = field(default_factory=list[str])
+    present: set[str] = field(default_factory=set[str])
+    repeats: bool = False
+    knows_map: bool = False
+
+    def join(
+        self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
+    ) -> None:
+        """Join a table with masks on the bucket and on the nodes that are bound; bind the others."""
+        on = [f'{alias}."bucket" = {self.bucket}'] if self.bucket else []
+        self.bucket = self.bucket or f'{alias}."bucket"'
+        self.masks.append(f'{alias}."mask"')
+        self.present |= set(ends)
+        self.tie(table, ends, [*conditions, *on])
+
+    def tie(self, table: str, ends: Mapping[str, str], conditions: Iterable[str]) -> None:
+        """Join a table on the nodes that are bound; bind the others."""
+        on = list(conditions)
+        for key, column in ends.items():
+            if key in self.nodes:
+                on.append(f"{column} = {self.nodes[key]}")
+            else:
+                self.nodes[key] = column
+        self.select.join(table, on)
+
+    def need_bucket(self) -> None:
+        """Join the row of the bucket, if it is not yet."""
+        if not self.knows_map:
+            self.knows_map = True
+            on = [f'{BUCKET}."bucket" = {self.bucket}'] if self.bucket else []
+            self.select.join(f'"bucket" AS {BUCKET}', on)
+            self.bucket = self.bucket or f'{BUCKET}."bucket"'
+
+
+class Masks(PresenceSql, ABC):
+    """Writes relations of the first phase for one query.
+
+    Parameters
+    ----------
+    query : Query
+        Rewritten.
+    catalog : Catalog
+    window : Window or None
+        The buckets to look at; ``None``: all.
+    """
+
+    def __init__(self, query: Query, catalog: Catalog, window: Window | None = None) -> None:
+        super().__init__(catalog, window)
+        self.query = query
+        self.shared: list[tuple[str, str]] = []
+        self._numbers = count(1)
+
+    @abstractmethod
+    def frames(
+        self,
+        scope: Scope,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+        columns: Iterable[Leaf] = (),
+    ) -> str:
+        """The relation of the second phase: one row a frame and binding of some nodes and edges."""
+
+    def phases(self, scope: Scope) -> Phases:
+        """The conditions of a scope by phase."""
+        return phases_of(scope, self.query, self.catalog)
+
+    def share(self, text: str, name: str) -> str:
+        """The name under which a relation stands before the statement, to be used more than once."""
+        full = f"{name} {next(self._numbers)}"
+        self.shared.append((full, text))
+        return full
+
+    def masks(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str] = frozenset(),
+    ) -> str:
+        """The relation of the first phase: one row a bucket and binding of some nodes and edges."""
+        if not parts.blocks:
+            return self._base(scope, parts, given, nodes, edges)
+        outside = {key for c in parts.blocks for block in blocks_of(c) for key in block.scope.outer}
+        wide = nodes | frozenset(outside)
+        name = self.share(self._base(scope, parts, given, wide, edges), "pattern")
+        return self._with_blocks(parts.blocks, SharedRelation(name, wide, edges), nodes, edges)
+
+    def expanded(self, text: str, nodes: frozenset[str], edges: frozenset[str]) -> str:
+        """A relation of the first phase, one row a frame."""
+        keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+        select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
+        select.join(nested(text, ":pattern"), [])
+        select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
+        return select.text()
+
+    def in_mask(self, alias: str, frame: str) -> str:
+        """Whether a frame of the same bucket is one of those in which a row of the first phase holds."""
+        return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
+
+    def number_of_frames(self, text: str) -> str:
+        """How many frames a relation of the first phase that binds nothing speaks of, as ``frames``."""
+        total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
+        return Select([total], [nested(text, ":pattern")]).text()
+
+    def in_which(self, alias: str) -> list[str]:
+        """The columns that say in which frames a row of a relation of the first phase holds."""
+        return [f'{alias}."bucket"', f'{alias}."mask"']
+
+    def held(self, alias: str) -> str:
+        """In how many frames a row of a relation of the first phase holds."""
+        return f'bit_count({alias}."mask")'
+
+    def existence(self, scope: Scope, given: SharedRelation | None) -> str:
+        """In which frames a block has a match: one row a bucket and binding of the nodes outside."""
+        keys = frozenset(scope.outer)
+        parts = self.phases(scope)
+        if parts.rest or parts.late:
+            return folded(self.frames(scope, given, keys), columns_of(keys))
+        text = self.masks(scope, parts, given, keys)
+        if set(scope.nodes) and not parts.blocks:
+            return text  # grouped already, for the nodes inside are dropped
+        return merged(text, {column: column for column in columns_of(keys)})
+
+    @property
+    def chooses_traces(self) -> bool:
+        """Whether the query chooses some of the traces, by their ego or by a dataset."""
+        return self.query.ego is not None or self.catalog.only is not None
+
+    def of_traces(self, trace: str, scope: Scope) -> list[str]:
+        """Conditions on a trace id that keep the traces that are asked, in the outermost scope."""
+        if scope is not self.query.scope:
+            return []
+        chosen, left = traces_of(self.query, self.catalog)
+        if chosen is not None:
+            return [among(trace, sorted(chosen))]
+        return ["NOT " + among(trace, sorted(left))] if left else []
+
+    # The join of edges and nodes
+
+    def _base(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+    ) -> str:
+        unfolded = self._unfolded(scope, parts, given, nodes, edges)
+        if unfolded:
+            return unfolded
+        base = Base()
+        if given is not None and scope.outer:
+            self._join_given(base, scope, given)
+        for edge in scope.edges:
+            self._join_edge(base, scope, edge)
+        single = dict(parts.single)
+        for key in scope.nodes:
+            if key not in parts.late and key not in base.present:
+                self._join_presence(base, key, scope.kinds(key), single.pop(key, []))
+        for key, conditions in single.items():
+            self._join_conditions(base, key, scope.kinds(key), conditions)
+        for key, conditions in parts.lane.items():
+            self._join_lane(base, next(e for e in scope.edges if e.key == key), conditions)
+        if not base.masks:  # all nodes wait for the second phase
+            base.need_bucket()
+            base.masks.append(f'{BUCKET}."valid"')
+        where, bound = base.select.where, set(base.nodes)
+        where += [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in apart(scope, bound, bound)]
+        where += [bound_text(c, base.nodes, base.edges, self.values) for c in parts.direct]
+        where += self.within(base.bucket)
+        where += self.of_traces(f"{base.bucket} >> 18", scope)
+        where += [trace_text(c, f"{base.bucket} >> 18", self.values) for c in parts.trace]
+        return _masked(base, nodes, edges)
+
+    def _join_given(self, base: Base, scope: Scope, given: SharedRelation) -> None:
+        """The bindings of the nodes outside that a block speaks of."""
+        columns = columns_of(frozenset(scope.outer))
+        table = f"{quoted(given.name)} AS {OUTSIDE}"
+        if given.edges or given.nodes != frozenset(scope.outer):
+            reduced = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
+            reduced.join(quoted(given.name), [])
+            reduced.group = ['"bucket"', *columns]
+            table = nested(reduced.text(), ":outside")
+        ends = zip(sorted(scope.outer), columns, strict=True)
+        base.join(table, OUTSIDE, {key: f"{OUTSIDE}.{column}" for key, column in ends})
+
+    def _join_edge(self, base: Base, scope: Scope, edge: Edge) -> None:
+        ends = scope.kinds(edge.src), scope.kinds(edge.dst)
+        moving = any(possible(edge, *ends, self.catalog.edges))
+        lasting = any(possible(edge, *ends, self.catalog.map_edges))
+        alias = quoted(alias_of(edge))
+        ends = {edge.src: f'{alias}."src"', edge.dst: f'{alias}."dst"'}
+        base.edges[edge.key] = f'{alias}."relation"'
+        if edge.src == edge.dst:
+            base.select.where.append(f'{alias}."src" = {alias}."dst"')
+        if edge.high > 1:
+            base.repeats = True
+            base.join(nested(self._paths(scope, edge), alias[1:-1]), alias, ends)
+        elif edge.both or (moving and lasting):
+            base.repeats = True
+            rows = self._rows(scope, edge, moving=moving, lasting=lasting)
+            base.join(nested(rows, alias[1:-1]), alias, ends)
+        elif lasting:
+            base.need_bucket()
+            on = edge_conditions(self.catalog, scope, edge, alias, moving=False)
+            on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
+            base.repeats |= len(edge.relations) > 1
+            base.tie(f'"map_edge" AS {alias}', ends, on)
+        else:
+            base.repeats |= len(edge.relations) > 1
+            base.join(
+                f'"edge" AS {alias}',
+                alias,
+                ends,
+                edge_conditions(self.catalog, scope, edge, alias, moving=True),
+            )
+
+    def _rows(self, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
+        """Rows of an edge that may run either way, or hold in frames as well as on the map."""
+        directions = (False, True) if edge.both else (False,)
+        branches: list[str] = []
+        for swapped in directions:
+            if moving or not lasting:
+                select = Select(_row_columns('"e"', '"e"."mask"', swapped=swapped))
+                select.join('"edge" AS "e"', [])
+                select.where = edge_conditions(
+                    self.catalog, scope, edge, '"e"', moving=True, swapped=swapped
+                )
+                select.where += self.within('"e"."bucket"')
+                branches.append(select.text())
+            if lasting:
+                branches.append(self._lasting_rows(scope, edge, swapped=swapped))
+        return "\nUNION ALL\n".join(branches)
+
+    def _lasting_rows(self, scope: Scope, edge: Edge, *, swapped: bool) -> str:
+        """Rows of a map's edges with the frames in which both ends are present."""
+        mask = '"p"."mask" & "q"."mask"'
+        select = Select(_row_columns('"m"', mask, swapped=swapped))
+        select.columns[0] = '"p"."bucket" AS "bucket"'
+        select.join('"map_edge" AS "m"', [])
+        select.join('"bucket" AS "b"', ['"b"."map_id" = "m"."map_id"'])
+        for alias, end in (("p", "src"), ("q", "dst")):
+            select.join(
+                f'"node" AS "{alias}"',
+                [f'"{alias}"."bucket" = "b"."bucket"', f'"{alias}"."node_id" = "m"."{end}"'],
+            )
+        select.where = edge_conditions(
+            self.catalog, scope, edge, '"m"', moving=False, swapped=swapped
+        )
+        select.where += [f"({mask}) <> 0", *self.within('"b"."bucket"')]
+        return select.text()
+
+    def _unfolded(
+        self,
+        scope: Scope,
+        parts: Phases,
+        given: SharedRelation | None,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+    ) -> str:
+        """The join, once for each length that its paths may have; empty if that is no use, or too often.
+
+        So a path begins where other edges lead, rather than anywhere.
+        """
+        paths = [edge for edge in scope.edges if edge.high > 1]
+        lengths = list(product(*(range(path.low, path.high + 1) for path in paths)))
+        wanted = any(path.key in edges for path in paths)
+        if not paths or wanted or len(paths) == len(scope.edges) or len(lengths) > _BRANCHES:
+            return ""
+        branches: list[str] = []
+        for chosen in lengths:
+            inner = scope
+            for path, length in zip(paths, chosen, strict=True):
+                inner = chain(inner, path, length, self._numbers, injective=self.query.injective)
+            inner = ordered(narrowed(inner, self.catalog), self.catalog)
+            if inner.where != (FALSE,):
+                branches.append(self._base(inner, parts, given, nodes, edges))
+        if not branches:
+            return ""
+        columns = ['"bucket"', *columns_of(nodes, edges)]
+        select = Select([*columns, 'bit_or("mask") AS "mask"'], group=columns)
+        select.join(nested("\nUNION ALL\n".join(branches), ":lengths"), [])
+        select.where = self.of_traces('"bucket" >> 18', scope)
+        return select.text()
+
+    def _paths(self, scope: Scope, edge: Edge) -> str:
+        """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
+        nodes = {
+            key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)
+        }
+        single = replace(edge, low=1, high=1)
+        branches: list[str] = []
+        for length in range(edge.low, edge.high + 1):
+            inner = Scope(nodes, {}, (single,), (), frozenset())
+            inner = chain(inner, single, length, self._numbers, injective=self.query.injective)
+            inner = ordered(narrowed(inner, self.catalog), self.catalog)
+            if inner.where != (FALSE,):
+                rows = self._base(inner, Phases(), None, frozenset(nodes), frozenset())
+                ends = ((edge.src, "src"), (edge.dst, "dst"))
+                columns = [f'{quoted(f"{key}.id")} AS "{end}"' for key, end in ends]
+                select = Select(['"bucket"', *columns, '"mask"'], [nested(rows, ":path")])
+                branches.append(select.text())
+        if not branches:
+            columns = ['"bucket"', '"src"', '"dst"', '"mask"']
+            branches.append(Select(columns, ['"edge"'], ["FALSE"]).text())
+        return "\nUNION ALL\n".join(branches)
+
+    # Presence and conditions
+
+    def _join_presence(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
+        """The frames in which a node is present and meets conditions on its attributes."""
+        alias = quoted(f"{key}:")
+        profile = Profile.of(kinds, self.catalog)
+        if profile.moving or conditions:
+            rows = self.present(kinds, profile, conditions)
+            base.join(nested(rows, f"{key}:"), alias, {key: f'{alias}."node_id"'})
+        else:
+            on = kind_conditions(kinds, f'{alias}."kind"', None, self.standing)
+            base.join(f'"node" AS {alias}', alias, {key: f'{alias}."node_id"'}, on)
+
+    def _join_conditions(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
+        """The frames in which a node that is present meets conditions on its attributes."""
+        profile, alias = Profile.of(kinds, self.catalog), quoted(f"{key}:")
+        constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
+        if profile.mapped and profile.places == 1:
+            base.need_bucket()
+            table, at = "map_node", Aliases(map=alias)
+            on = [f'{alias}."map_id" = {BUCKET}."map_id"']
+        elif constant and not profile.mapped:
+            table, at = "entity", Aliases(entity=alias)
+            on = [f'{alias}."trace_id" = {base.bucket} >> 18']
+        else:
+            self._join_presence(base, key, kinds, conditions)
+            return
+        node = f'{alias}."node_id"'
+        base.tie(f'"{table}" AS {alias}', {key: node}, on)
+        base.select.where += [node_text(c, node, at, self.values) for c in conditions]
+
+    def _join_lane(self, base: Base, edge: Edge, conditions: list[Bound]) -> None:
+        """The frames in which an edge meets conditions on its attributes."""
+        frame = '"l"."frame_id"'
+        table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
+        ends = [f'"l".{quoted(column)}' for column in nodes]
+        select = Select(
+            [f'{frame} >> 6 AS "bucket"', *ends, f'bit_or({bit_of(frame)}) AS "mask"'],
+            [f'{quoted(table)} AS "l"'],
+            self.within(frame, 64),
+            [f"{frame} >> 6", *ends],
+        )
+        select.where += [
+            expression_text(c, lambda leaf: lane_text(leaf, '"l"'), self.values) for c in conditions
+        ]
+        name = f"{edge.key}:in"
+        alias = quoted(name)
+        on = [f"{alias}.{quoted(column)} = {node}" for column, node in nodes.items()]
+        base.join(nested(select.text(), name), alias, {}, on)
+
+    # Blocks
+
+    def _with_blocks(
+        self,
+        blocks: list[Bound],
+        given: SharedRelation,
+        nodes: frozenset[str],
+        edges: frozenset[str],
+    ) -> str:
+        """A relation of the first phase with the frames in which blocks are true."""
+        select = Select()
+        select.join(f'{quoted(given.name)} AS ":pattern"', [])
+        mask = '":pattern"."mask"'
+        for number, condition in enumerate(blocks, start=1):
+            text, keys, wanted = self._block(condition, given)
+            alias = f":block {number}"
+            on = [f'":pattern".{c} = {quoted(alias)}.{c}' for c in ('"bucket"', *columns_of(keys))]
+            select.join(nested(text, alias), on, "JOIN" if wanted else "LEFT JOIN")
+            theirs = f'{quoted(alias)}."mask"'
+            mask += f" & {theirs}" if wanted else f" & ~coalesce({theirs}, 0)"
+        select.where.append(f"({mask}) <> 0")
+        keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+        select.columns = ['":pattern"."bucket"', *keep, f'{mask} AS "mask"']
+        if nodes != given.nodes:
+            select.columns[-1] = f'bit_or({mask}) AS "mask"'
+            select.group = ['":pattern"."bucket"', *keep]
+        return select.text()
+
+    def _block(self, condition: Bound, given: SharedRelation) -> tuple[str, frozenset[str], bool]:
+        """Where a block is true (or, if the last is false, where it is not), and the nodes it speaks of."""
+        match condition:
+            case BlockValue(scope=scope):
+                return self.existence(scope, given), frozenset(scope.outer), True
+            case Operation("NOT", (BlockValue(scope=scope),)):
+                return self.existence(scope, given), frozenset(scope.outer), False
+            case _:
+                return self._block_counted(condition, given)
+
+    def _block_counted(
+        self, condition: Bound, given: SharedRelation
+    ) -> tuple[str, frozenset[str], bool]:
+        counted = counted_block(condition)
+        assert counted is not None, condition  # noqa: S101 - it was filed so
+        block, sign, number = counted
+        wanted = not _COMPARED[sign](0, number)
+        sign = sign if wanted else complement(sign)
+        keys = frozenset(block.scope.outer)
+        parts = self.phases(block.scope)
+        if not (parts.rest or parts.late):
+            rows = self.masks(block.scope, parts, given, *_told_apart(block.scope))
+            name = self.share(rows, "counted")
+            return frames_with(name, columns_of(keys), CountRange.of(sign, number)), keys, wanted
+        select = Select(['"frame_id"', *columns_of(keys)])
+        select.join(nested(self.counted(block, given), ":counted"), [])
+        select.group = ['"frame_id"', *columns_of(keys)]
+        select.having = [f"count(*) {sign} {self.values.add(number)}"]
+        return folded(select.text(), columns_of(keys)), keys, wanted
+
+    def counted(
+        self, block: BlockValue, given: SharedRelation | None, columns: Iterable[Leaf] = ()
+    ) -> str:
+        """The matches of a block, one row each and frame."""
+        nodes, edges = _told_apart(block.scope)
+        return self.frames(block.scope, given, nodes, edges, columns)
+
+
+def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
+    """Nodes and edges by which the matches of a block differ, and the nodes outside that it speaks of."""
+    nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
+    edges = frozenset(edge.key for edge in scope.edges if edge.named)
+    return frozenset(nodes) | frozenset(scope.outer), edges
+
+
+def _masked(base: Base, nodes: frozenset[str], edges: frozenset[str]) -> str:
+    """The join as a relation of some nodes and edges, each binding once."""
+    select, masks = base.select, base.masks
+    mask = " & ".join(masks)
+    keep = [base.nodes[key] for key in sorted(nodes)] + [base.edges[key] for key in sorted(edges)]
+    named = [f"{c} AS {name}" for c, name in zip(keep, columns_of(nodes, edges), strict=True)]
+    if len(masks) <= _MANY:
+        select.where += [f"({a} & {b}) <> 0" for a, b in combinations(masks, 2)]
+    if len(masks) > 2:
+        select.where.append(f"({mask}) <> 0")
+    select.columns = [f'{base.bucket} AS "bucket"', *named, f'{mask} AS "mask"']
+    if base.repeats or set(base.nodes) > nodes:
+        select.columns[-1] = f'bit_or({mask}) AS "mask"'
+        select.group = [base.bucket, *keep]
+    return select.text()
+
+
+def _row_columns(alias: str, mask: str, *, swapped: bool) -> list[str]:
+    src, dst = ("dst", "src") if swapped else ("src", "dst")
+    ends = [f'{alias}."{src}" AS "src"', f'{alias}."{dst}" AS "dst"']
+    return [f'{alias}."bucket"', *ends, f'{alias}."relation"', f'{mask} AS "mask"']

@@ -1,0 +1,606 @@
+"""What the parser builds of each rule of the grammar.
+
+A builder is named for its rule (or for the alias of its alternative), takes the span and the children, and
+returns a part of the syntax tree. Signs and keywords are no children; an absent optional part is ``None``.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from sgstore.errors import TextSpan
+from sgstore.lang import syntax as s
+from sgstore.lang._hints import METHODS, TOLD
+from sgstore.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+Children = list[Any]
+
+_ESCAPES: Final = {"n": "\n", "t": "\t", "r": "\r", "\\": "\\", "'": "'", '"': '"'}
+_ESCAPED: Final = re.compile(r"\\(.)", re.DOTALL)
+_DURATION: Final = re.compile(r"([\d.]+)\s*(\w+)")
+
+
+class BuildError(Exception):
+    """A sentence of the grammar that the language refuses all the same."""
+
+    def __init__(self, reason: str, span: TextSpan | None = None, hint: str | None = None) -> None:
+        self.reason = reason
+        self.span = span
+        self.hint = hint
+        super().__init__(reason)
+
+
+# Values -------------------------------------------------------------------------------------------
+
+
+def _number(span: TextSpan, children: Children) -> s.Constant:
+    text: str = children[0].text
+    value = int(text) if text.isdigit() else float(text)
+    if abs(value) > 1e300:
+        raise BuildError("too large a number")
+    if isinstance(value, int) and value >= 2**63:
+        value = float(value)
+    return s.Constant(value, span)
+
+
+def _whole(token: Any) -> int:
+    if not token.text.isdigit():
+        raise BuildError("expected a whole number", token.span)
+    if len(token.text) > 9:
+        raise BuildError("too large a number", token.span, "at most 9 digits")
+    return int(token.text)
+
+
+def _string(span: TextSpan, children: Children) -> s.Constant:
+    return s.Constant(_unquoted(children[0].text), span)
+
+
+def _unquoted(text: str) -> str:
+    r"""What stands between the quotes; a backslash that escapes nothing stays, as ``\d`` needs."""
+    return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
+
+
+def _truth(span: TextSpan, children: Children) -> s.Constant:
+    return s.Constant(children[0].text.upper() == "TRUE", span)
+
+
+def _duration(span: TextSpan, children: Children) -> s.Duration | s.Parameter:
+    token = children[0]
+    if token.name == "PARAM":
+        return s.Parameter(token.text[1:], span)
+    found = _DURATION.fullmatch(token.text)
+    assert found is not None, token.text  # noqa: S101 - the lexer's pattern is narrower
+    return s.Duration(float(found[1]), found[2].lower(), span)
+
+
+def _parameter(span: TextSpan, children: Children) -> s.Parameter:
+    return s.Parameter(children[0].text[1:], span)
+
+
+def _variable(span: TextSpan, children: Children) -> s.Variable:
+    return s.Variable(children[0].text, span)
+
+
+def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
+    owner, name = children
+    if not isinstance(owner, s.Variable):
+        inner = owner.name if isinstance(owner, s.AttributeOf) else ""
+        hint = (
+            TOLD.get(normalize_name(inner)) or "what is of a value is a function: abs(x), lower(x)"
+        )
+        if isinstance(owner, s.Call):
+            hint = f"the attribute stands in the brackets: {owner.name}(x.{name.text})"
+        raise BuildError(
+            f"only variables have attributes, so '.{name.text}' has no meaning here", hint=hint
+        )
+    return s.AttributeOf(owner, name.text, span)
+
+
+def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
+    """``frame.class('E')``: another way to write ``frame.class_E``."""
+    owner, name, value = children
+    if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
+        hint = METHODS.get(
+            normalize_name(name.text), f"what is called stands first: {name.text}(x)"
+        )
+        raise BuildError(
+            f"'.{name.text}' takes nothing in parentheses; only frame.class does", hint=hint
+        )
+    return s.AttributeOf(owner, f"class_{_unquoted(value.text)}", span)
+
+
+def _arguments(_: TextSpan, children: Children) -> tuple[s.Expression, ...]:
+    return tuple(children)
+
+
+def _list(span: TextSpan, children: Children) -> s.ListOf:
+    return s.ListOf(children[0] or (), span)
+
+
+def _call(span: TextSpan, children: Children) -> s.Call:
+    name, arguments = children
+    return s.Call(name.text, arguments or (), distinct=False, name_span=name.span, span=span)
+
+
+def _count_all(span: TextSpan, _: Children) -> s.CountAll:
+    return s.CountAll(span)
+
+
+def _count_values(span: TextSpan, children: Children) -> s.Call:
+    distinct, value = children
+    return s.Call(
+        "count", (value,), distinct is not None, TextSpan(span.start, span.start + 5), span
+    )
+
+
+# Conditions ---------------------------------------------------------------------------------------
+
+
+def _logic(
+    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"],
+) -> Callable[[TextSpan, Children], s.Logic]:
+    return lambda span, children: s.Logic(word, tuple(children), span)
+
+
+def _compare(span: TextSpan, children: Children) -> s.Comparison:
+    left, sign, right = children
+    return s.Comparison("<>" if sign.text == "!=" else sign.text, left, right, span)
+
+
+def _comparison(word: str) -> Callable[[TextSpan, Children], s.Comparison]:
+    return lambda span, children: s.Comparison(word, children[0], children[1], span)
+
+
+def _null_test(*, negated: bool) -> Callable[[TextSpan, Children], s.NullTest]:
+    return lambda span, children: s.NullTest(children[0], negated, span)
+
+
+def _membership(*, negated: bool) -> Callable[[TextSpan, Children], s.Membership]:
+    return lambda span, children: s.Membership(children[0], children[1], negated, span)
+
+
+def _arithmetic(span: TextSpan, children: Children) -> s.Arithmetic:
+    pairs = zip(children[1::2], children[2::2], strict=True)
+    return s.Arithmetic(children[0], tuple((sign.text, term) for sign, term in pairs), span)
+
+
+def _times(_: TextSpan, children: Children) -> Any:
+    return children[0]
+
+
+def _sign(span: TextSpan, children: Children) -> s.Expression:
+    sign, operand = children
+    return s.Negative(operand, span) if sign.text == "-" else operand
+
+
+def _temporal(span: TextSpan, children: Children) -> s.Temporal:
+    word, bound, operand = children
+    return s.Temporal(word.text.upper(), (operand,), TextSpan(span.start, word.span.end), bound)
+
+
+def _temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
+    left, word, bound, right = children
+    return s.Temporal(word.text.upper(), (left, right), word.span, bound)
+
+
+def _bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
+    """``[0s, 2s]``, or ``WITHIN 2s``, which begins at once."""
+    (found,) = children
+    if isinstance(found, s.Duration | s.Parameter):
+        return s.Duration(0, "s", span), found
+    low, high = (part.strip() for part in found.text[1:-1].split(","))
+    return _end(low, span), None if high.upper() == "INF" else _end(high, span)
+
+
+def _end(text: str, span: TextSpan) -> s.Duration | s.Parameter:
+    if text.startswith("$"):
+        return s.Parameter(text[1:], span)
+    found = _DURATION.fullmatch(text)
+    assert found is not None, text  # noqa: S101 - the lexer's pattern is narrower
+    return s.Duration(float(found[1]), found[2].lower(), span)
+
+
+def _block_expression(word: str) -> Callable[[TextSpan, Children], s.BlockExpression]:
+    return lambda span, children: s.BlockExpression(word, children[0], None, span)
+
+
+def _aggregate_block(span: TextSpan, children: Children) -> s.BlockExpression:
+    word, block, value = children
+    return s.BlockExpression(word.text.upper(), block, value, span)
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+def _label(span: TextSpan, children: Children) -> s.Label:
+    return s.Label(children[0].text, span)
+
+
+def _label_any(span: TextSpan, _: Children) -> s.Label:
+    return s.Label("%", span)
+
+
+def _label_logic(word: Literal["!", "&", "|"]) -> Callable[[TextSpan, Children], s.LabelLogic]:
+    return lambda span, children: s.LabelLogic(word, tuple(children), span)
+
+
+def _props(_: TextSpan, children: Children) -> tuple[s.Property, ...]:
+    return tuple(children)
+
+
+def _prop(_: TextSpan, children: Children) -> s.Property:
+    name, value = children
+    return s.Property(name.text, value, name.span)
+
+
+def _only(_: TextSpan, children: Children) -> Any:
+    return children[0]
+
+
+def _node(span: TextSpan, children: Children) -> s.NodePattern:
+    name, label, props, where = children
+    name_span = name.span if name else span
+    return s.NodePattern(name and name.text, label, props or (), where, name_span, span)
+
+
+def _edge_body(span: TextSpan, children: Children) -> tuple[Any, ...]:
+    name, label, star, props, where = children
+    return name and name.text, label, star, props or (), where, span
+
+
+def _edge(
+    direction: Literal["right", "left", "any"],
+) -> Callable[[TextSpan, Children], s.EdgePattern]:
+    def build(span: TextSpan, children: Children) -> s.EdgePattern:
+        (name, label, star, props, where, _), repeat = children
+        if star and repeat:
+            raise BuildError("an edge is repeated twice, by '*' and by '{…}'")
+        low, high = star or repeat or (None, None)
+        return s.EdgePattern(name, label, low, high, props, where, direction, span)
+
+    return build
+
+
+def _bare(
+    direction: Literal["right", "left", "any"],
+) -> Callable[[TextSpan, Children], s.EdgePattern]:
+    return lambda span, _: s.EdgePattern(None, None, None, None, (), None, direction, span)
+
+
+def _star(span: TextSpan, children: Children) -> tuple[int, int]:
+    number, upto = children
+    digits = upto.text[2:].strip() if upto else ""
+    if not number and not upto:
+        raise _unbounded(span)
+    if upto and not digits:
+        raise _unbounded(span)
+    low = _whole(number) if number else 1
+    return _range(low, int(digits[:9]) if upto else low, span)
+
+
+def _repeat(span: TextSpan, children: Children) -> tuple[int, int]:
+    low, high = children
+    if high is None:
+        raise _unbounded(span)
+    return _range(_whole(low), _whole(high), span)
+
+
+def _repeat_exactly(span: TextSpan, children: Children) -> tuple[int, int]:
+    return _range(_whole(children[0]), _whole(children[0]), span)
+
+
+MAX_EDGES: Final = 10
+"""Longest path that one edge pattern may stand for."""
+
+
+def _unbounded(span: TextSpan) -> BuildError:
+    return BuildError(
+        "a repeated edge needs an upper bound", span, f"write *1..{MAX_EDGES} for 1 to {MAX_EDGES}"
+    )
+
+
+def _range(low: int, high: int, span: TextSpan) -> tuple[int, int]:
+    if not 1 <= low <= high:
+        raise BuildError(f"an edge cannot be repeated {low} to {high} times", span, "write *1..3")
+    if high > MAX_EDGES:
+        raise BuildError(f"a repeated edge stands for at most {MAX_EDGES} edges", span)
+    return low, high
+
+
+def _path(_: TextSpan, children: Children) -> s.Path:
+    return s.Path(tuple(children[::2]), tuple(children[1::2]))
+
+
+def _patterns(_: TextSpan, children: Children) -> tuple[s.Path, ...]:
+    return tuple(children)
+
+
+def _block_body(span: TextSpan, children: Children) -> s.Block:
+    paths, where = children
+    return s.Block(paths, where, span)
+
+
+# Statements ---------------------------------------------------------------------------------------
+
+
+def _match_step(span: TextSpan, children: Children) -> s.StepClause:
+    paths, where, hold, name = children
+    end = where.span.end if where else span.end
+    block = s.Block(paths, where, TextSpan(span.start, end))
+    return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
+
+
+def _holds_step(span: TextSpan, children: Children) -> s.StepClause:
+    condition, hold, name = children
+    block = s.Block((), condition, condition.span)
+    return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
+
+
+def _absent_step(span: TextSpan, children: Children) -> s.StepClause:
+    (step,) = children
+    if step.hold or step.name:
+        raise BuildError("what must not happen has no duration and no name", step.span)
+    return s.StepClause(step.block, absent=True, hold=None, name=None, span=span)
+
+
+def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
+    name, *given = children
+    values = tuple(value for value in given if value is not None)
+    named = [normalize_name(value.name) for value in values]
+    if len(set(named)) < len(named):
+        raise BuildError("a parameter is given twice", span)
+    return s.ScenarioStep(name.text, values, name.span, span)
+
+
+def _given(span: TextSpan, children: Children) -> s.Argument:
+    name, value = children
+    if not isinstance(value, s.Constant | s.Duration):
+        value = s.Parameter(value.text[1:], value.span)
+    return s.Argument(name.text, value, span)
+
+
+def _hold(span: TextSpan, children: Children) -> s.HoldClause:
+    *comparison, duration, inclusive = children
+    word = comparison[0].text if comparison else "="
+    if word in {"<>", "!="}:
+        raise BuildError("a step lasts for >=, >, =, < or <= a time", span)
+    return s.HoldClause(word, duration, inclusive is not None, span)
+
+
+def _step_name(_: TextSpan, children: Children) -> str:
+    return children[0].text
+
+
+def _link(span: TextSpan, children: Children) -> s.LinkClause:
+    kind, after, within = children[0] or ("then", None, None)
+    return s.LinkClause(kind, after, within, span)
+
+
+def _immediately(_: TextSpan, __: Children) -> tuple[str, None, None]:
+    return "immediately", None, None
+
+
+def _other_link(kind: Literal["until", "while"]) -> Callable[[TextSpan, Children], s.LinkClause]:
+    return lambda span, _: s.LinkClause(kind, None, None, span)
+
+
+def _sequence(span: TextSpan, children: Children) -> s.SequenceClause:
+    return s.SequenceClause(tuple(children[::2]), tuple(children[1::2]), span)
+
+
+def _match(span: TextSpan, children: Children) -> s.MatchClause:
+    settings, sequence, returns, order, sample, limit = children
+    if returns or order or sample or limit is not None:
+        distinct, items, at = returns or (False, (s.Item("all", None, None, 0, 0, span),), span)
+        returns = s.Returns(distinct, items, order or (), sample, limit, at)
+    return s.MatchClause(settings or (), sequence, returns, span)
+
+
+def _check(span: TextSpan, children: Children) -> s.CheckClause:
+    settings, name, *quantifiers, formula, reset = children
+    return s.CheckClause(
+        settings or (), name and name.text, tuple(quantifiers), formula, reset, span
+    )
+
+
+def _quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:
+    word, *nodes, where, absent = children
+    return s.QuantifierClause(word.text.upper(), tuple(nodes), where, bool(absent), span)
+
+
+def _quantified(span: TextSpan, children: Children) -> s.QuantifiedNode:
+    name, label = children
+    return s.QuantifiedNode(name.text, label, span)
+
+
+def _absent(_: TextSpan, children: Children) -> bool:
+    return children[0].text.upper() == "TRUE"
+
+
+def _using(_: TextSpan, children: Children) -> tuple[s.Setting, ...]:
+    return tuple(children)
+
+
+def _setting(span: TextSpan, children: Children) -> s.Setting:
+    name, value = children
+    if value.name == "PARAM":
+        return s.Setting(name.text, s.Parameter(value.text[1:], value.span), span)
+    text = _unquoted(value.text) if value.name == "STRING" else value.text
+    return s.Setting(name.text, text, span)
+
+
+def _define(span: TextSpan, children: Children) -> s.Define:
+    _, name, parameters, body = children
+    formals: tuple[s.Formal, ...] = parameters or ()
+    named = [normalize_name(formal.name) for formal in formals]
+    if len(set(named)) < len(named):
+        raise BuildError("two parameters have one name", span)
+    if not isinstance(body, s.SequenceClause) and any(formal.default for formal in formals):
+        raise BuildError("the parameters of a predicate are names, without a value", span)
+    return s.Define(name.text, formals, body, name.span, span)
+
+
+def _param(span: TextSpan, children: Children) -> s.Formal:
+    name, label, default = children
+    if label:
+        raise BuildError("the parameters of a definition are names, without a label")
+    return s.Formal(name.text, default, span)
+
+
+def _statements(_: TextSpan, children: Children) -> tuple[Any, ...]:
+    return tuple(child for child in children if child is not None)
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+def _item(span: TextSpan, children: Children) -> s.Item:
+    value, name = children
+    return s.Item("value", value, name and name.text, 0, 0, span)
+
+
+def _form(
+    form: Literal["all", "frames", "intervals", "subgraphs"],
+) -> Callable[[TextSpan, Children], s.Item]:
+    return lambda span, _: s.Item(form, None, None, 0, 0, span)
+
+
+def _clips(span: TextSpan, children: Children) -> s.Item:
+    return s.Item("clips", None, None, children[0], children[1], span)
+
+
+def _offset(span: TextSpan, children: Children) -> int:
+    sign, duration = children
+    if not isinstance(duration, s.Duration) or duration.unit == "frames":
+        raise BuildError("the ends of clips are times such as -3s and +5s", span)
+    return -duration.ns if sign and sign.text == "-" else duration.ns
+
+
+def _sort(_: TextSpan, children: Children) -> s.Sort:
+    value, direction = children
+    return s.Sort(value, bool(direction and direction.text.upper() == "DESC"))
+
+
+def _sample(span: TextSpan, children: Children) -> s.Sample:
+    return s.Sample(_whole(children[0]), children[1], span)
+
+
+def _limit(_: TextSpan, children: Children) -> int:
+    return _whole(children[0])
+
+
+def _returns(span: TextSpan, children: Children) -> tuple[bool, tuple[s.Item, ...], TextSpan]:
+    distinct, items = children
+    return distinct is not None, items, span
+
+
+BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
+    "start": _statements,
+    "define": _define,
+    "params": _arguments,
+    "param": _param,
+    "match": _match,
+    "check": _check,
+    "quantifier": _quantifier,
+    "qvar": _quantified,
+    "absent": _absent,
+    "reset": _only,
+    "using": _using,
+    "setting": _setting,
+    "sequence": _sequence,
+    "absent_step": _absent_step,
+    "match_step": _match_step,
+    "holds_step": _holds_step,
+    "scenario_step": _scenario_step,
+    "given": _given,
+    "hold": _hold,
+    "step_name": _step_name,
+    "link": _link,
+    "until_link": _other_link("until"),
+    "while_link": _other_link("while"),
+    "within": lambda _, children: ("then", None, children[0]),
+    "after": lambda _, children: ("then", *children),
+    "immediately": _immediately,
+    "where": _only,
+    "patterns": _patterns,
+    "path": _path,
+    "node": _node,
+    "edge_right": _edge("right"),
+    "edge_left": _edge("left"),
+    "edge_any": _edge("any"),
+    "bare_right": _bare("right"),
+    "bare_left": _bare("left"),
+    "bare_any": _bare("any"),
+    "edge_body": _edge_body,
+    "star": _star,
+    "repeat": _repeat,
+    "repeat_exactly": _repeat_exactly,
+    "label_expr": _only,
+    "label_or": _label_logic("|"),
+    "label_and": _label_logic("&"),
+    "label_neg": _label_logic("!"),
+    "label": _label,
+    "label_any": _label_any,
+    "props": _props,
+    "prop": _prop,
+    "implies": _logic("IMPLIES"),
+    "disjunction": _logic("OR"),
+    "exclusion": _logic("XOR"),
+    "conjunction": _logic("AND"),
+    "negation": _logic("NOT"),
+    "temporal": _temporal,
+    "temporal_pair": _temporal_pair,
+    "bound": _bound,
+    "compare": _compare,
+    "equal": _comparison("="),
+    "is_null": _null_test(negated=False),
+    "is_known": _null_test(negated=True),
+    "is_in": _membership(negated=False),
+    "is_not_in": _membership(negated=True),
+    "starts_with": _comparison("STARTS WITH"),
+    "ends_with": _comparison("ENDS WITH"),
+    "contains": _comparison("CONTAINS"),
+    "resembles": _comparison("=~"),
+    "sum": _arithmetic,
+    "product": _arithmetic,
+    "times": _times,
+    "sign": _sign,
+    "attribute": _attribute,
+    "attribute_in": _attribute_in,
+    "timespan": _duration,
+    "parameter": _parameter,
+    "variable": _variable,
+    "call": _call,
+    "count_all": _count_all,
+    "count_values": _count_values,
+    "exists": _block_expression("EXISTS"),
+    "count_block": _block_expression("COUNT"),
+    "aggregate_block": _aggregate_block,
+    "arguments": _arguments,
+    "list": _list,
+    "block": _only,
+    "block_body": _block_body,
+    "number": _number,
+    "string": _string,
+    "truth": _truth,
+    "null": lambda span, _: s.Constant(None, span),
+    "duration": _duration,
+    "returns": _returns,
+    "items": _arguments,
+    "item": _item,
+    "item_all": _form("all"),
+    "item_frames": _form("frames"),
+    "item_intervals": _form("intervals"),
+    "item_subgraphs": _form("subgraphs"),
+    "item_clips": _clips,
+    "offset": _offset,
+    "order": _arguments,
+    "sort": _sort,
+    "sample": _sample,
+    "limit": _limit,
+}

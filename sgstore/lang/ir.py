@@ -1,0 +1,702 @@
+"""The IR: bound patterns, sequences and checks.
+
+Bound patterns: every name resolved, every value typed; what the stages after the binder share.
+
+A *scope* is what stands in one ``MATCH`` or one pair of braces: nodes, edges, conditions that all must be true,
+and which nodes must differ. Nodes have keys that are unique in the query whatever the case of letters; those of
+unnamed nodes begin with ``#``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from sgstore.lang._catalog import Attribute, Type
+from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from sgstore.errors import TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Kinds:
+    """What a node may be: its kinds if it is the ego, and its kinds if it is not."""
+
+    ego: frozenset[str]
+    other: frozenset[str]
+
+    def __and__(self, more: Kinds) -> Kinds:
+        return Kinds(self.ego & more.ego, self.other & more.other)
+
+    def __or__(self, more: Kinds) -> Kinds:
+        return Kinds(self.ego | more.ego, self.other | more.other)
+
+    def __invert__(self) -> Kinds:
+        return Kinds(ANY.ego - self.ego, ANY.other - self.other)
+
+    def __bool__(self) -> bool:
+        return bool(self.ego or self.other)
+
+    def only(self, kinds: frozenset[str]) -> Kinds:
+        """Those of some kinds."""
+        return Kinds(self.ego & kinds, self.other & kinds)
+
+    @property
+    def every(self) -> frozenset[str]:
+        """All kinds, whether ego or not."""
+        return self.ego | self.other
+
+    @property
+    def one_a_frame(self) -> bool:
+        """Whether there is no more than one such node in a frame, for it must be the ego."""
+        return not self.other
+
+
+ANY: Final = Kinds(frozenset(ENTITY_KINDS), frozenset(KINDS))
+EGO: Final = Kinds(frozenset(ENTITY_KINDS), frozenset())
+ANY_RELATION: Final = frozenset(RELATIONS)
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of a pattern.
+
+    Attributes
+    ----------
+    key : str
+    kinds : Kinds
+    role : str
+        ``named`` in the query and part of what is found; ``unnamed``, but counted; or ``hidden``: made by a
+        rewriting, only asked to exist.
+    span : TextSpan
+    """
+
+    key: str
+    kinds: Kinds
+    role: Literal["named", "unnamed", "hidden"]
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """An edge of a pattern, or a path of ``low`` to ``high`` edges.
+
+    Attributes
+    ----------
+    key : str
+        Its name in the query, or a number.
+    src, dst : str
+        Keys of its nodes.
+    relations : frozenset of str
+    both : bool
+        Whether it may also run from ``dst`` to ``src``.
+    low, high : int
+    named : bool
+        Whether its relation is part of a match.
+    span : TextSpan
+    """
+
+    key: str
+    src: str
+    dst: str
+    relations: frozenset[str]
+    both: bool
+    low: int
+    high: int
+    named: bool
+    span: TextSpan
+
+
+# Expressions --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A constant.
+
+    Attributes
+    ----------
+    value, type
+    closed : bool
+        Whether it is a canonical word of the vocabulary, not a text of the user's.
+    unit : str
+        ``s`` or ``frames`` if it was written as a length of time, such as ``2s``; no part of what it is.
+    span : TextSpan or None
+        Where a length of time was written.
+    """
+
+    value: int | float | str | bool | None
+    type: Type
+    closed: bool = False
+    unit: str = field(default="", compare=False)
+    span: TextSpan | None = field(default=None, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """A list of constants, after ``IN``."""
+
+    items: tuple[Value, ...]
+    type: Type = Type.list
+
+
+@dataclass(frozen=True, slots=True)
+class NodeValue:
+    """A node itself."""
+
+    node: str
+    type: Type = Type.node
+
+
+@dataclass(frozen=True, slots=True)
+class NodeAttribute:
+    """An attribute of a node."""
+
+    node: str
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTest:
+    """Whether a node, bound outside, has a label."""
+
+    node: str
+    kinds: Kinds
+    type: Type = Type.boolean
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeRelation:
+    """The relation that an edge variable is bound to."""
+
+    edge: str
+    type: Type = Type.text
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeAttribute:
+    """An attribute of an edge from an entity to a lane."""
+
+    edge: str
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAttribute:
+    """``frame.name``."""
+
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class TraceAttribute:
+    """``trace.name``."""
+
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class PairNumber:
+    """A number of an ordered pair of entities."""
+
+    function: str
+    a: str
+    b: str
+    type: Type = Type.number
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """Anything that is computed of its operands: ``AND``, ``<``, ``+``, ``abs``, ``IN``, ``IS NULL``."""
+
+    word: str
+    operands: tuple[Bound, ...]
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class BlockValue:
+    """``EXISTS {…}``, ``COUNT {…}``, ``MIN {… | value}``; ``number`` tells the blocks of a query apart."""
+
+    word: str
+    scope: Scope
+    value: Bound | None
+    type: Type
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Aggregate:
+    """``COUNT(*)``, ``AVG(x)``, … over the matches of a query; ``COUNT(*)`` has no operand."""
+
+    word: str
+    operand: Bound | None
+    distinct: bool
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class Tense:
+    """An operator of time: its operands at other frames than this one.
+
+    Attributes
+    ----------
+    word : str
+        ``ALWAYS``, ``UNTIL``, ``PREVIOUS``, … as written.
+    operands : tuple of Bound
+        One or two conditions.
+    low, high : int
+        From when to when it looks, away from this frame; ns, or frames. ``high`` is ``None`` if it looks as far
+        as the trace goes.
+    frames : bool
+        Whether the bound counts frames.
+    """
+
+    word: str
+    operands: tuple[Bound, ...]
+    low: int = 0
+    high: int | None = None
+    frames: bool = False
+    type: Type = Type.boolean
+
+
+@dataclass(frozen=True, slots=True)
+class SignalCall:
+    """A function of how something went.
+
+    Attributes
+    ----------
+    word : str
+        ``prev``, ``delta``, ``run_length``, ``since_true``, ``age`` or ``exists_now``.
+    operand : Bound
+        A value, a condition (``run_length``, ``since_true``), or a node (``age``, ``exists_now``).
+    by : int
+        How far ``delta`` looks back; ns, or frames.
+    frames : bool
+        Whether ``by``, or the number that it gives, counts frames; else time.
+    type : Type
+    """
+
+    word: str
+    operand: Bound
+    by: int = 0
+    frames: bool = False
+    type: Type = Type.number
+
+
+@dataclass(frozen=True, slots=True)
+class StepTime:
+    """The time of a step of a sequence; s since the trace began. ``step`` is its number."""
+
+    step: int
+    type: Type = Type.number
+
+
+Bound = (
+    Value
+    | Choices
+    | NodeValue
+    | NodeAttribute
+    | LabelTest
+    | EdgeRelation
+    | EdgeAttribute
+    | FrameAttribute
+    | TraceAttribute
+    | PairNumber
+    | Operation
+    | BlockValue
+    | Aggregate
+    | Tense
+    | SignalCall
+    | StepTime
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scope:
+    """What one ``MATCH`` or one block asks for. Two scopes are equal only if they are the same.
+
+    Attributes
+    ----------
+    nodes : mapping of str to Node
+        Its own nodes by key.
+    outer : mapping of str to Kinds
+        Nodes of scopes around it that it, or a block in it, speaks of; with what they may be here.
+    edges : tuple of Edge
+    where : tuple of Bound
+        Conditions; each must be true.
+    distinct : frozenset of pairs
+        Keys of nodes that must not be bound to the same node.
+    """
+
+    nodes: Mapping[str, Node]
+    outer: Mapping[str, Kinds]
+    edges: tuple[Edge, ...]
+    where: tuple[Bound, ...]
+    distinct: frozenset[tuple[str, str]]
+
+    def kinds(self, key: str) -> Kinds:
+        """What a node of this scope, or one that it speaks of, may be."""
+        return self.nodes[key].kinds if key in self.nodes else self.outer[key]
+
+
+# Queries ------------------------------------------------------------------------------------------
+
+FRAME_COLUMNS: Final = ("frame_id", "trace", "seq", "time_ns", "t")
+"""Columns that say which frame a row is of: ``t`` is seconds since the trace began."""
+
+INTERVAL_COLUMNS: Final = (
+    "trace",
+    "start_seq",
+    "end_seq",
+    "start_ns",
+    "end_ns",
+    "start",
+    "end",
+    "frames",
+)
+"""Columns of an interval: its ends by number, simulation time, and seconds since the trace began."""
+
+CLIP_COLUMNS: Final = ("trace", "start_ns", "end_ns")
+"""Columns of a clip: log times, offsets included."""
+
+Form = Literal["rows", "intervals", "clips", "subgraphs"]
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnColumn:
+    """A value to return, and what it is called."""
+
+    name: str
+    value: Bound
+
+
+@dataclass(frozen=True, slots=True)
+class SortKey:
+    """What to order by: a value, or the name of a result."""
+
+    value: Bound | str
+    descending: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """At most ``number`` results of each value of ``per`` (of all, if it is ``None``)."""
+
+    number: int
+    per: Bound | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What to return of the matches.
+
+    Attributes
+    ----------
+    form : str
+        ``rows``, ``intervals``, ``clips`` or ``subgraphs``.
+    columns : tuple of ReturnColumn
+        Values returned; empty without ``RETURN``.
+    whole : bool
+        Whether frame and variables are returned too: without ``RETURN``, or for ``*``.
+    framed : bool
+        Whether the frame is returned with the values.
+    distinct : bool
+    order : tuple of SortKey
+    sample : Sampling or None
+    limit : int or None
+    before, after : int
+        Offsets of clips; ns, negative is earlier.
+    """
+
+    form: Form = "rows"
+    columns: tuple[ReturnColumn, ...] = ()
+    whole: bool = True
+    framed: bool = False
+    distinct: bool = False
+    order: tuple[SortKey, ...] = ()
+    sample: Sampling | None = None
+    limit: int | None = None
+    before: int = 0
+    after: int = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns that are not values: those of frames, intervals or clips."""
+        if self.form == "subgraphs":
+            return FRAME_COLUMNS
+        if self.form != "rows":
+            return INTERVAL_COLUMNS if self.form == "intervals" else CLIP_COLUMNS
+        return FRAME_COLUMNS if self.whole or self.framed else ()
+
+    @property
+    def aggregated(self) -> bool:
+        """Whether it counts or sums over matches, rather than listing them."""
+        return any(isinstance(e, Aggregate) for c in self.columns for e in walk(c.value))
+
+    def changed(self, change: Callable[[Bound], Bound]) -> Result:
+        """The same with a change made to every value."""
+
+        def key(value: Bound | str) -> Bound | str:
+            return value if isinstance(value, str) else change(value)
+
+        sample = self.sample
+        return replace(
+            self,
+            columns=tuple(replace(column, value=change(column.value)) for column in self.columns),
+            order=tuple(replace(one, value=key(one.value)) for one in self.order),
+            sample=sample and replace(sample, per=sample.per and key(sample.per)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """A bound query.
+
+    Attributes
+    ----------
+    scope : Scope
+        What stands in ``MATCH``; of a query with steps, their nodes and the edges that have names, without
+        conditions.
+    result : Result
+    relations : frozenset of str
+        Relations that it names, anywhere: what a trace must be able to answer.
+    injective : bool
+        Whether different nodes of a pattern are bound to different nodes.
+    ego : str or None
+        The simulator's id of the ego that was chosen.
+    unknown_is_false : bool
+        Whether relations that a trace cannot answer count as absent.
+    steps : tuple of BoundStep
+        Of a query that looks at more than one frame at a time; else empty.
+    links : tuple of StepLink
+        Between the steps.
+    policy : str
+        Which matches of a sequence are told: ``all``, ``first``, ``longest``.
+    gaps : str
+        Whether a gap in the recording ends a run (``break``) or not (``bridge``).
+    """
+
+    scope: Scope
+    result: Result
+    relations: frozenset[str]
+    injective: bool = True
+    ego: str | None = None
+    unknown_is_false: bool = False
+    steps: tuple[BoundStep, ...] = ()
+    links: tuple[StepLink, ...] = ()
+    policy: str = "all"
+    gaps: str = "break"
+
+
+def walk(expression: Bound) -> Iterator[Bound]:
+    """An expression and all its parts, but not what stands in the blocks in it."""
+    yield expression
+    match expression:
+        case Operation(operands=operands):
+            for operand in operands:
+                yield from walk(operand)
+        case Aggregate(operand=operand) if operand is not None:
+            yield from walk(operand)
+        case Tense(operands=operands):
+            for operand in operands:
+                yield from walk(operand)
+        case SignalCall(operand=operand):
+            yield from walk(operand)
+        case _:
+            pass
+
+
+def is_temporal(expression: Bound) -> bool:
+    """Whether an expression looks at more than one frame."""
+    return any(isinstance(part, Tense | SignalCall | StepTime) for part in walk(expression))
+
+
+def nodes_of(expression: Bound) -> frozenset[str]:
+    """Keys of the nodes that an expression speaks of; of a block's, those outside it."""
+    found: set[str] = set()
+    for part in walk(expression):
+        match part:
+            case NodeValue(node=node) | NodeAttribute(node=node) | LabelTest(node=node):
+                found.add(node)
+            case PairNumber(a=a, b=b):
+                found |= {a, b}
+            case BlockValue(scope=scope):
+                found |= set(scope.outer)
+            case _:
+                pass
+    return frozenset(found)
+
+
+def edges_of(expression: Bound) -> frozenset[str]:
+    """Keys of the edges that an expression speaks of; what stands in blocks speaks of none outside."""
+    edges = (EdgeRelation, EdgeAttribute)
+    return frozenset(part.edge for part in walk(expression) if isinstance(part, edges))
+
+
+def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
+    """The blocks in an expression, not those within them."""
+    return tuple(part for part in walk(expression) if isinstance(part, BlockValue))
+
+
+# Bound forms of what happens over time: the steps and links of a sequence, and checks -----------
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """A length of time: ``amount`` nanoseconds, or frames."""
+
+    amount: int
+    frames: bool
+
+
+_COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
+    ">=": lambda length, amount, by: length >= amount - by,
+    ">": lambda length, amount, by: length > amount + by,
+    "<=": lambda length, amount, by: length <= amount + by,
+    "<": lambda length, amount, by: length < amount - by,
+    "=": lambda length, amount, by: abs(length - amount) <= by,
+}
+"""Comparisons, what differs by no more than a tolerance being the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundHold:
+    """How long a step must last: the first and the last frame of the run are so far apart.
+
+    Attributes
+    ----------
+    comparison : str
+    length : Length
+        In frames: how many there are.
+    inclusive : bool
+        Whether the time of one median period is added to that of the run.
+    """
+
+    comparison: str
+    length: Length
+    inclusive: bool
+
+    def fits(self, length: Any, tolerance: int) -> Any:
+        """Whether a run that is so long lasts as it must.
+
+        Parameters
+        ----------
+        length : int or (R,) int
+            Nanoseconds, or frames.
+        tolerance : int
+            Of times; ns.
+
+        Returns
+        -------
+        bool or (R,) bool
+        """
+        by = 0 if self.length.frames else tolerance
+        return _COMPARE[self.comparison](length, self.length.amount, by)
+
+
+@dataclass(frozen=True, slots=True)
+class BoundStep:
+    """A step of a sequence.
+
+    Attributes
+    ----------
+    scope : Scope
+        What one frame must show; nodes of other steps have the same keys here.
+    when : tuple of Bound
+        Further conditions, which look at other frames.
+    hold : BoundHold or None
+    absent : bool
+        Whether it must not happen between its neighbours.
+    span : TextSpan
+    """
+
+    scope: Scope
+    when: tuple[Bound, ...]
+    hold: BoundHold | None
+    absent: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class StepLink:
+    """When a step comes after the one before.
+
+    Attributes
+    ----------
+    kind : str
+        ``then``: from ``after`` on, up to ``within``, and in a later frame; ``immediately``: in the next frame;
+        ``until``: in the frame after a run of the step before; ``while``: in the same frame.
+    after, within : Length or None
+    """
+
+    kind: Literal["then", "immediately", "until", "while"]
+    after: Length | None
+    within: Length | None
+
+
+@dataclass(frozen=True, slots=True)
+class BoundQuantifier:
+    """``FORALL`` or ``FORSOME``: over the entities of a trace.
+
+    Attributes
+    ----------
+    word : str
+    nodes : tuple of str
+        Keys of its variables.
+    where : Bound or None
+        What must be true of them in some frame, so that they count.
+    absent : bool
+        What a condition on them is where one of them is absent.
+    """
+
+    word: str
+    nodes: tuple[str, ...]
+    where: Bound | None
+    absent: bool
+
+
+@dataclass(frozen=True, slots=True)
+class BoundCheck:
+    """A bound check: what is to be true from the first frame of a trace on.
+
+    Attributes
+    ----------
+    name : str
+    scope : Scope
+        The nodes that it speaks of: its variables, and the ego; without conditions.
+    quantifiers : tuple of BoundQuantifier
+    formula : Bound
+    reset : Bound or None
+        After a violation, the check begins anew in the frame after that in which this holds.
+    relations : frozenset of str
+    injective : bool
+    ego : str or None
+    unknown_is_false : bool
+        As in :class:`Query`.
+    end : str
+        How the end of a trace is taken: ``strong`` (what is still due is missed), ``weak`` (it is forgiven),
+        ``pending`` (the verdict says that it was due).
+    gaps : str
+        Whether a gap in the recording ends a run (``break``) or not (``bridge``); with ``unknown`` nothing is
+        known of what happened in it.
+    """
+
+    name: str
+    scope: Scope
+    quantifiers: tuple[BoundQuantifier, ...]
+    formula: Bound
+    reset: Bound | None
+    relations: frozenset[str]
+    injective: bool = True
+    ego: str | None = None
+    unknown_is_false: bool = False
+    end: str = "strong"
+    gaps: str = "break"

@@ -1,0 +1,359 @@
+"""The library: predicates, concepts, scenarios and properties that have names.
+
+They lie in ``library/*.sgql``. An entry is a head, which is comments, and the text under it::
+
+    -- concept low_ttc: The ego and another would meet soon, if both went on as they do.
+    -- param limit = 1.5s: the longest time to collision
+    -- source: Hayward 1972, Near-Miss Determination Through Use of a Scale of Danger
+    MATCH (e:Ego), (v:Vehicle|Person) WHERE ttc(e, v) < $limit
+
+A line that begins with ``--`` and three blanks goes on with the one before; comments behind a text are about
+the file. ``$limit`` stands for the value of the parameter, which has the type of its default: a number, a
+duration, a text, true or false. Predicates have no such parameters, and every query may use them by name.
+
+Files are read when a name is first asked for, and a text is parsed when a query uses it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
+from importlib import resources
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import QueryError, QueryNameError
+from sgstore.lang._parse import parse
+from sgstore.lang.syntax import Define
+from sgstore.vocabulary import normalize_name, suggestion
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+KINDS_OF_PATTERNS: Final = ("predicate", "concept", "scenario", "property")
+"""Conditions with names; patterns that practitioners ask for; scenarios of a benchmark; rules of traffic."""
+
+LIBRARY: Final = ("std", "concepts", "nuplan", "leaderboard", "sgsm", "sceneflow")
+"""Names of the files, in the order in which they are listed."""
+
+_HEAD: Final = re.compile(rf"-- ({'|'.join(KINDS_OF_PATTERNS)}) (\w+): (\S.*)")
+_PARAMETER: Final = re.compile(r"-- param (\w+) = ('[^']*'|[^\s:]+): (\S.*)")
+_SOURCE: Final = re.compile(r"-- source: (\S.*)")
+_MORE: Final = re.compile(r"--   \s*(\S.*)")
+_DURATION: Final = re.compile(r"\d+(\.\d+)?(ms|s|min|frames)")
+_NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
+_PLACE: Final = re.compile(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"|--[^\n]*|\$(\w+)")
+"""Texts in quotes and comments, which stay as they are; and the places of parameters."""
+_DRAWING: Final = re.compile(r"^==== (\w+)\n(.*?)(?=^==== |\Z)", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class PatternParameter:
+    """A value of a named pattern that can be chosen.
+
+    Attributes
+    ----------
+    name : str
+    type : str
+        ``number``, ``duration``, ``text`` or ``truth``.
+    default : str
+        As it stands in a query: ``1.5s``.
+    meaning : str
+        With its unit.
+    """
+
+    name: str
+    type: str
+    default: str
+    meaning: str
+
+    def written(self, value: object) -> str:
+        """A value as it stands in a query.
+
+        Raises
+        ------
+        QueryError
+            It is of another type.
+        """
+        text = _WRITTEN[self.type](value)
+        if text is None:
+            expected = f"expected a {self.type} such as {self.default}"
+            raise QueryError(f"parameter '{self.name}' cannot be {value!r}", hint=expected)
+        return text
+
+
+@dataclass(frozen=True, slots=True)
+class NamedPattern:
+    """An entry of the library.
+
+    Attributes
+    ----------
+    name, kind : str
+        The kind is one of :data:`KINDS_OF_PATTERNS`.
+    query : str
+        The text as it stands in the library: parameters are ``$name``.
+    parameters : mapping of str to PatternParameter
+        By name, in order.
+    sentence : str
+        What it finds, or what has to hold.
+    source : str
+        Where it comes from.
+    library : str
+        The file that it stands in, one of :data:`LIBRARY`.
+    """
+
+    name: str
+    kind: str
+    query: str
+    parameters: Mapping[str, PatternParameter]
+    sentence: str
+    source: str
+    library: str
+
+    @property
+    def text(self) -> str:
+        """The query, its parameters being what they are by default: what a store can be asked."""
+        return self.written()
+
+    @property
+    def example(self) -> str:
+        """A scene that it holds in, drawn with letters; empty for a predicate."""
+        return _drawings().get(self.name, "")
+
+    @property
+    def is_check(self) -> bool:
+        """Whether it is a ``CHECK``, which has a verdict, and not a ``MATCH``, which has matches."""
+        return self.kind == "property"
+
+    def written(self, **values: object) -> str:
+        """The query with parameters chosen.
+
+        Parameters
+        ----------
+        **values : number, str or bool
+            Of some of the parameters; a duration is a text such as ``"1.5s"``, or a number of seconds.
+
+        Raises
+        ------
+        QueryNameError
+            It has no parameter of that name.
+        QueryError
+            A value is of another type than its parameter.
+        """
+        for name in values:
+            if name not in self.parameters:
+                known = ", ".join(self.parameters) or "none"
+                reason = f"{self.name} has no parameter '{name}'"
+                raise QueryNameError(reason, hint=f"it has: {known}")
+        chosen = {
+            name: parameter.written(values[name]) if name in values else parameter.default
+            for name, parameter in self.parameters.items()
+        }
+        return _PLACE.sub(lambda found: chosen[found[1]] if found[1] else found[0], self.query)
+
+
+def _number(value: object) -> str | None:
+    if isinstance(value, str) and _NUMBER.fullmatch(value):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, int) else f"{value:.12f}".rstrip("0").rstrip(".")
+
+
+def _duration(value: object) -> str | None:
+    if isinstance(value, str) and _DURATION.fullmatch(value):
+        return value
+    number = _number(value)
+    return None if number is None or number.startswith("-") else f"{number}s"
+
+
+def _text(value: object) -> str | None:
+    if not isinstance(value, str):
+        return None
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
+
+
+def _truth(value: object) -> str | None:
+    return str(value).upper() if str(value).lower() in {"true", "false"} else None
+
+
+_WRITTEN: Final = {"number": _number, "duration": _duration, "text": _text, "truth": _truth}
+
+
+# What is asked for ------------------------------------------------------------------------------------------
+
+
+@cache
+def patterns() -> Mapping[str, NamedPattern]:
+    """Everything in the library by name, in its order."""
+    folder = resources.files("sgstore.lang").joinpath("library")
+    found: dict[str, NamedPattern] = {}
+    for library in LIBRARY:
+        text = folder.joinpath(f"{library}.sgql").read_text(encoding="utf-8")
+        for entry in entries(text, library):
+            if entry.name in found:
+                raise QueryError(f"{library}.sgql: a second '{entry.name}'")
+            found[entry.name] = entry
+    return MappingProxyType(found)
+
+
+def pattern_named(name: str) -> NamedPattern:
+    """A pattern by its name; how it is written matters only where two differ in nothing else.
+
+    Raises
+    ------
+    QueryNameError
+        There is none of that name, or there are two.
+    """
+    found = patterns()
+    if name in found:
+        return found[name]
+    like = [known for known in found if normalize_name(known) == normalize_name(name)]
+    if len(like) == 1:
+        return found[like[0]]
+    if like:
+        raise QueryNameError(f"'{name}' may be {' or '.join(like)}", hint="write one of them")
+    near = next(iter(get_close_matches(name, found, 1)), suggestion(name, found))
+    hint = f"did you mean '{near}'?" if near else "'sgstore patterns list' names them all"
+    raise QueryNameError(f"no pattern is called '{name}'", hint=hint)
+
+
+@cache
+def predicates() -> Mapping[str, Define]:
+    """The predicates of the library by folded name; each is parsed when it is first looked up."""
+    return _Predicates(
+        {normalize_name(p.name): p for p in patterns().values() if p.kind == "predicate"}
+    )
+
+
+class _Predicates(Mapping[str, Define]):
+    def __init__(self, entries: Mapping[str, NamedPattern]) -> None:
+        self._entries = entries
+        self._parsed: dict[str, Define] = {}
+
+    def __getitem__(self, name: str) -> Define:
+        if name not in self._parsed:
+            entry = self._entries[name]
+            (statement,) = parse(entry.query)
+            if not isinstance(statement, Define) or statement.name != entry.name:
+                raise QueryError(f"{entry.library}.sgql: expected DEFINE PREDICATE {entry.name}")
+            self._parsed[name] = statement
+        return self._parsed[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+
+@cache
+def _drawings() -> Mapping[str, str]:
+    folder = resources.files("sgstore.lang").joinpath("library")
+    text = folder.joinpath("drawings.txt").read_text(encoding="utf-8")
+    return {found[1]: found[2].rstrip("\n") for found in _DRAWING.finditer(text)}
+
+
+# Files ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _LibraryEntry:
+    """An entry while it is read."""
+
+    kind: str
+    name: str
+    head: dict[str, str] = field(default_factory=dict[str, str])
+    parameters: dict[str, PatternParameter] = field(default_factory=dict[str, PatternParameter])
+    lines: list[str] = field(default_factory=list[str])
+    last: str = "sentence"
+
+    def read(self, line: str) -> bool:
+        """Take a line; whether it is one that may stand there."""
+        if not line.startswith("--") or self.lines:
+            self.lines.append(line)
+            return True
+        if found := _MORE.fullmatch(line):
+            self._go_on(found[1])
+        elif found := _PARAMETER.fullmatch(line):
+            name, default, self.last = found[1], found[2], found[1]
+            if name in self.parameters or (kind := _type_of(default)) is None:
+                return False
+            self.parameters[name] = PatternParameter(name, kind, default, found[3])
+        elif (found := _SOURCE.fullmatch(line)) and "source" not in self.head:
+            self.head["source"], self.last = found[1], "source"
+        else:
+            return False
+        return True
+
+    def _go_on(self, text: str) -> None:
+        if self.last in self.head:
+            self.head[self.last] += f" {text}"
+        else:
+            known = self.parameters[self.last]
+            meaning = f"{known.meaning} {text}"
+            self.parameters[self.last] = PatternParameter(
+                known.name, known.type, known.default, meaning
+            )
+
+    def finished(self, library: str) -> NamedPattern:
+        lines = list(self.lines)
+        while lines and (not lines[-1].strip() or lines[-1].startswith("--")):
+            lines.pop()
+        query = "\n".join(lines).removesuffix(";")
+        places = {found[1] for found in _PLACE.finditer(query) if found[1]}
+        strange = places ^ set(self.parameters)
+        if not query or strange or "source" not in self.head:
+            wrong = f"parameter '{min(strange)}' is not both told and used" if strange else ""
+            wrong = wrong or ("it has no text" if not query else "it has no source")
+            raise QueryError(f"{library}.sgql: '{self.name}': {wrong}")
+        parameters = MappingProxyType(self.parameters)
+        sentence, source = self.head["sentence"], self.head["source"]
+        return NamedPattern(self.name, self.kind, query, parameters, sentence, source, library)
+
+
+def entries(text: str, library: str) -> Iterator[NamedPattern]:
+    """The entries of a file.
+
+    Parameters
+    ----------
+    text : str
+        Of the file; what comes before the first head is about the file, and lines of ``--`` alone divide.
+    library : str
+        Its name, for messages.
+
+    Raises
+    ------
+    QueryError
+        A line of a head cannot be read, or something is missing; it says where.
+    """
+    entry: _LibraryEntry | None = None
+    for number, line in enumerate(text.splitlines(), start=1):
+        if found := _HEAD.fullmatch(line):
+            if entry is not None:
+                yield entry.finished(library)
+            entry = _LibraryEntry(found[1], found[2], {"sentence": found[3]})
+        elif entry is None:
+            if line.startswith("--") or not line.strip():
+                continue
+            raise QueryError(f"{library}.sgql, line {number}: expected '-- KIND NAME: sentence'")
+        elif not entry.read(line):
+            expected = "expected '-- param NAME = DEFAULT: meaning' or '-- source: …'"
+            raise QueryError(f"{library}.sgql, line {number}: {expected}, found {line!r}")
+    if entry is not None:
+        yield entry.finished(library)
+
+
+def _type_of(default: str) -> str | None:
+    """The type of a value as it stands in a query."""
+    if default.startswith("'"):
+        return "text"
+    if default in {"TRUE", "FALSE"}:
+        return "truth"
+    return "duration" if _duration(default) == default else _number(default) and "number"

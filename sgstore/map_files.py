@@ -1,0 +1,151 @@
+"""The road maps of recordings: their own, the one that is given, or one of a folder by its name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import MapError
+from sgstore.opendrive import SIGNS, read_map
+from sgstore.roads import OF_LANES
+from sgstore.world import Loss
+
+if TYPE_CHECKING:
+    from sgstore.config import Signs
+    from sgstore.roads import RoadMap
+    from sgstore.world import TraceInfo
+
+
+MAX_MAP_BYTES: Final = 1 << 28
+"""Largest file that is read as a road map."""
+
+NO_MAP: Final = "no road map: without road nodes and without relations that need them"
+
+_SHOWN_WARNINGS: Final = 5
+"""Defects of a road map that are named; the others are counted."""
+
+_ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-9._-]{1,40})["']""")
+
+
+def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
+    """The road map in an OpenDRIVE file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
+
+    Raises
+    ------
+    MapError
+        There is no such file, or it is no OpenDRIVE map.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_MAP_BYTES:
+            raise MapError(f"{path}: larger than {MAX_MAP_BYTES} bytes, which no road map is")
+        text = _decoded(path.read_bytes())
+    except (OSError, UnicodeDecodeError, LookupError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise MapError(f"{path}: cannot be read as an OpenDRIVE map: {reason}") from error
+    try:
+        return read_map(text, path.name, signs)
+    except MapError as error:
+        raise MapError(f"{path}: {error}") from error
+
+
+def _decoded(content: bytes) -> str:
+    """The text of an XML file in the encoding that it names, else UTF-8."""
+    named = _ENCODING.match(content)
+    if named and content[:2] not in {b"\xff\xfe", b"\xfe\xff"}:
+        return content.decode(named[1].decode())
+    return content.decode("utf-16" if content[:1] in {b"\xff", b"\xfe"} else "utf-8-sig")
+
+
+class Maps:
+    """The road maps of the recordings of a run; each is read once.
+
+    Parameters
+    ----------
+    given : Path or None
+        A file, for the recordings that carry no OpenDRIVE of their own; or a folder of files ``NAME.xodr``,
+        for those that name their map.
+    signs : Signs
+        How their signals are read.
+
+    Raises
+    ------
+    MapError
+        The file cannot be read, or there is nothing.
+    """
+
+    def __init__(self, given: Path | None, signs: Signs = SIGNS) -> None:
+        self._signs = signs
+        self._read: dict[str, RoadMap | MapError] = {}
+        self._folder = given if given is not None and given.is_dir() else None
+        one_file = given is not None and not self._folder
+        self._given = read_map_file(given, signs) if given is not None and one_file else None
+
+    def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
+        """The map of a recording, and what is odd about it.
+
+        Its own OpenDRIVE comes first, then what is given, then lanes that the recording tells without one.
+        """
+        warnings: list[str] = []
+        own = self._own(info.map_text, info.map_name) if info.map_text else None
+        if isinstance(own, MapError):
+            warnings.append(f"its road map cannot be read: {own}")
+            own = None
+        road_map = own
+        if own is None or not _is_opendrive(info.map_text):
+            road_map = self._given or self._named(info.map_name, warnings) or own
+        if road_map is None:
+            return None, [*warnings, NO_MAP]
+        told = [one for one in road_map.warnings if one not in info.lost_lanes]
+        shown = told[:_SHOWN_WARNINGS]
+        warnings += [f"road map {road_map.name}: {warning}" for warning in shown]
+        more = len(told) - len(shown)
+        if more:
+            warnings.append(f"road map {road_map.name}: {more} more defects")
+        return road_map, warnings
+
+    def _own(self, text: str, name: str) -> RoadMap | MapError:
+        if text not in self._read:
+            try:
+                self._read[text] = read_map(text, name, self._signs)
+            except MapError as error:
+                self._read[text] = error
+        return self._read[text]
+
+    def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
+        """The map of that name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
+        if self._folder is None:
+            return None
+        stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
+        stem = stem.removesuffix(".xodr")
+        path = self._folder / f"{stem}.xodr"
+        if not stem or not path.is_file():
+            wanted = (
+                f"no map {stem!r} in {self._folder}" if stem else "it does not name its road map"
+            )
+            warnings.append(wanted)
+            return None
+        key = str(path)
+        if key not in self._read:
+            try:
+                self._read[key] = read_map_file(path, self._signs)
+            except MapError as error:
+                self._read[key] = error
+        found = self._read[key]
+        if isinstance(found, MapError):
+            warnings.append(str(found))
+            return None
+        return found
+
+
+def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
+    """Lanes that a recording tells and that are of no use, unless it has another map."""
+    if road_map is not None and road_map.text != info.map_text:
+        return []
+    return [Loss(reason, 0, 0) for reason in info.lost_lanes]
+
+
+def _is_opendrive(text: str) -> bool:
+    """Whether a text is XML. Lanes that a recording tells otherwise are another text."""
+    return text[:100].lstrip("\ufeff \t\r\n").startswith("<")

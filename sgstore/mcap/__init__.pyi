@@ -1,0 +1,59 @@
+# The face of this package: what others may import from it.
+
+from ._chunks import HEAD as HEAD
+from ._chunks import IDS as IDS
+from ._chunks import MAX_LOSSES as MAX_LOSSES
+from ._chunks import MESSAGE_HEAD as MESSAGE_HEAD
+from ._chunks import READ_ERRORS as READ_ERRORS
+from ._chunks import Messages as Messages
+from ._chunks import Recording as Recording
+from ._chunks import RecordPlace as RecordPlace
+from ._chunks import Records as Records
+from ._chunks import parse_records as parse_records
+from ._chunks import read_chunk_head as read_chunk_head
+from ._chunks import read_records as read_records
+from ._fetch import METADATA as METADATA
+from ._fetch import BagPart as BagPart
+from ._fetch import bag_folder as bag_folder
+from ._fetch import check_name as check_name
+from ._fetch import digest_of as digest_of
+from ._fetch import mark_of as mark_of
+from ._fetch import message_at as message_at
+from ._fetch import open_regular as open_regular
+from ._fetch import part_at as part_at
+from ._fetch import parts_of as parts_of
+from ._read_ahead import MAGIC as MAGIC
+from ._read_ahead import read_summary as read_summary
+from ._reader import CLIP as CLIP
+from ._reader import RUN_MESSAGES as RUN_MESSAGES
+from ._reader import McapFile as McapFile
+
+__all__ = [
+    "BagPart",
+    "CLIP",
+    "HEAD",
+    "IDS",
+    "MAGIC",
+    "MAX_LOSSES",
+    "MESSAGE_HEAD",
+    "METADATA",
+    "McapFile",
+    "Messages",
+    "READ_ERRORS",
+    "RUN_MESSAGES",
+    "RecordPlace",
+    "Recording",
+    "Records",
+    "bag_folder",
+    "check_name",
+    "digest_of",
+    "mark_of",
+    "message_at",
+    "open_regular",
+    "parse_records",
+    "part_at",
+    "parts_of",
+    "read_chunk_head",
+    "read_records",
+    "read_summary",
+]

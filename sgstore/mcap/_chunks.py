@@ -1,0 +1,618 @@
+"""Chunks of MCAP files, decompressed under guard, and reports of losses.
+
+What every container of messages offers to the readers of flavours: channels, and a walk over messages.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TYPE_CHECKING, Final, Protocol
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+
+from sgstore.errors import TraceError
+from sgstore.world import Loss
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from io import BufferedReader
+    from pathlib import Path
+
+    from mcap.records import Channel, Schema
+    from numpy.typing import NDArray
+
+    from sgstore.world import Ints, TraceReport
+
+    Memory = Callable[[int], memoryview]
+
+
+class Recording(Protocol):
+    """A file of messages that is open: an MCAP file, or another container in the same words."""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Its size in bytes."""
+        ...
+
+    @property
+    def mtime_ns(self) -> int:
+        """Its time of change."""
+        ...
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Schemas by their id."""
+        ...
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Channels by their id."""
+        ...
+
+    @property
+    def counts(self) -> Mapping[int, int] | None:
+        """Channel id → messages as the file itself says."""
+        ...
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Log times, both included, between which messages are frames."""
+        ...
+
+    def walk(
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
+    ) -> Iterator[Messages]:
+        """All messages in file order; what cannot be read goes to ``report``.
+
+        ``wanted``: whether the chunk at an offset is wanted. ``keep``: whether the messages of a channel will
+        be asked for again, so that a later walk finds them sooner.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+
+# What of a file could not be read, as its report lists it ---------------------------------------
+
+MAX_LOSSES: Final = 1000
+"""Losses that are listed one by one; the last of them stands for all that follow."""
+_LAST_LOSS_NS: Final = (1 << 63) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class RecordPlace:
+    """A record of the file: where it begins, and its length with its head; bytes."""
+
+    offset: int
+    length: int
+
+
+def lose(report: TraceReport, loss: Loss) -> None:
+    """Report a loss; when there are very many, the last one stands for the rest."""
+    if len(report.losses) < MAX_LOSSES:
+        report.losses.append(loss)
+        return
+    last = report.losses[-1]
+    many = last.messages >= 0 and loss.messages >= 0
+    report.losses[-1] = Loss(
+        "further damage of the same kinds",
+        messages=last.messages + loss.messages if many else -1,
+        bytes=max(last.bytes, 0) + max(loss.bytes, 0),
+        start_ns=last.start_ns,
+        end_ns=max(last.end_ns, loss.end_ns),
+        offset=last.offset,
+    )
+
+
+def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Loss:
+    """The loss of a chunk, with the time span that its head tells, if it can be."""
+    known = head is not None and head.start_ns <= head.end_ns <= _LAST_LOSS_NS
+    return Loss(
+        reason,
+        bytes=place.length,
+        start_ns=head.start_ns if head and known else -1,
+        end_ns=head.end_ns if head and known else -1,
+        offset=place.offset,
+    )
+
+
+def name_of(opcode: int) -> str:
+    """What a record is, in words."""
+    try:
+        return Opcode(opcode).name.lower().replace("_", " ")
+    except ValueError:
+        return f"opcode {opcode}"
+
+
+# Chunks of an MCAP file, decompressed under guard, and the messages in them as columns ----------
+# A chunk comes from a stranger. Its header says how large it is and how large it becomes; either may
+# be a lie, and 65 kB can become 2 GB. So what a chunk declares is held against a limit before a byte
+# is decompressed, what comes out is held against what was declared, a dictionary window larger than
+# the chunk could need is refused, and a record must end where the chunk does. What fails is refused
+# as a whole with a :class:`TraceError` that names the offset; the walk over the file
+# (:mod:`sgstore.mcap._reader`) makes a loss of it and goes on.
+#
+# Source: MCAP specification, format version 0 (mcap.dev/spec).
+
+try:
+    from isal.isal_zlib import crc32
+except ImportError:  # the extra [fast], whose checksums are the same, ten times sooner
+    from zlib import crc32
+
+
+MAX_CHUNK: Final = 256 << 20
+"""Greatest size of a chunk, stored or decompressed, and of a message outside chunks; bytes."""
+
+MAX_RECORDS: Final = 2_000_000
+"""Greatest number of records in a chunk: more than 60 MB of the smallest messages."""
+
+IDS: Final = 1 << 16
+"""Ids of channels, and of schemas, that a file may have: they have 16 bits."""
+
+MIN_WINDOW: Final = 32 << 20
+"""Window that a zstd frame may always ask for; bytes. Larger ones only as large as the chunk itself."""
+
+READ_ERRORS: Final = (
+    McapError,
+    struct.error,
+    zstandard.ZstdError,
+    RuntimeError,  # what lz4.frame raises
+    ValueError,  # among them UnicodeDecodeError
+    KeyError,
+    IndexError,
+    OverflowError,
+    EOFError,
+    MemoryError,
+    OSError,
+)
+"""Whatever the parsers and decompressors below are known to raise on bytes that are not what they seem."""
+
+Records = bytes | bytearray | memoryview
+"""The records of a chunk, uncompressed."""
+
+HEAD: Final = struct.Struct("<BQ")
+"""Head of every record: opcode, length of what follows."""
+
+MESSAGE_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""Head of a message record, packed: 31 bytes, then the data."""
+
+CHUNK_FIELDS: Final = struct.Struct("<QQQI")
+_PIECE: Final = 1 << 20
+_LZ4_PIECE: Final = 16 << 20  # its decompressor copies what is left of the input for every piece
+_LAST_NS: Final = (1 << 63) - 1
+_MESSAGE: Final = int(Opcode.MESSAGE)
+_MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
+_DEFINITIONS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
+
+
+class StrictStream(ReadDataStream):
+    """The parser's stream, but a text or number that ends early is an error instead of a shorter one."""
+
+    def __init__(self, record: bytes | memoryview) -> None:
+        super().__init__(BytesIO(record))
+
+    def read(self, length: int) -> bytes:
+        """Exactly ``length`` bytes."""
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """Messages that stand together in a file: those of a chunk, or a run outside chunks; shape (n,).
+
+    Attributes
+    ----------
+    chunk_offset : int
+        Byte offset of the chunk record in the file, -1 outside chunks.
+    channel, sequence : int64
+        Channel id in the file; sequence number.
+    log_time_ns : int64
+    publish_time_ns : uint64
+    offset : int64
+        Byte offset of the record in the chunk, uncompressed, or in the file.
+    length : int64
+        Bytes of the message's data.
+    read : callable
+        ``read(position, length)``: bytes at a position counted as ``offset`` is.
+    """
+
+    chunk_offset: int
+    channel: Ints
+    sequence: Ints
+    log_time_ns: Ints
+    publish_time_ns: np.ndarray[tuple[int], np.dtype[np.uint64]]
+    offset: Ints
+    length: Ints
+    read: Callable[[int, int], memoryview]
+
+    def __len__(self) -> int:
+        return len(self.channel)
+
+    def data(self, row: int) -> memoryview:
+        """The data of one message."""
+        return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
+
+    def span(self, start: int, stop: int) -> Messages:
+        """The messages from one row up to another."""
+        return self.take(slice(start, stop))
+
+    def take(self, rows: NDArray[np.bool_] | slice) -> Messages:
+        """Some of the messages."""
+        return Messages(
+            self.chunk_offset,
+            self.channel[rows],
+            self.sequence[rows],
+            self.log_time_ns[rows],
+            self.publish_time_ns[rows],
+            self.offset[rows],
+            self.length[rows],
+            self.read,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """What a chunk record says before its records come.
+
+    Attributes
+    ----------
+    offset : int
+        Byte offset of the record in the file.
+    start_ns, end_ns : int
+        Least and greatest log time of its messages.
+    size, crc : int
+        Size and CRC-32 of the records, uncompressed; a CRC of 0 stands for none.
+    compression : str
+        ``zstd``, ``lz4``, or empty.
+    data_offset, data_length : int
+        Where the records begin in the file, and how many bytes they take there.
+    """
+
+    offset: int
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    data_offset: int
+    data_length: int
+
+
+def read_chunk_head(file: BufferedReader, offset: int) -> ChunkHead:
+    """The head of the chunk record at an offset, the offset of its data with it.
+
+    Raises
+    ------
+    TraceError
+        There is no chunk record, or its head contradicts itself.
+    """
+    file.seek(offset)
+    try:
+        opcode, length = HEAD.unpack(file.read(HEAD.size))
+        start, end, size, crc = CHUNK_FIELDS.unpack(file.read(CHUNK_FIELDS.size))
+        (name_length,) = struct.unpack("<I", file.read(4))
+        if opcode != Opcode.CHUNK or name_length > 64:
+            raise TraceError("expected a chunk record", offset=offset)
+        compression = file.read(name_length).decode()
+        (data_length,) = struct.unpack("<Q", file.read(8))
+    except (struct.error, UnicodeDecodeError) as error:
+        raise TraceError("the head of this chunk is cut or malformed", offset=offset) from error
+    head_length = CHUNK_FIELDS.size + 4 + name_length + 8
+    if head_length + data_length != length:
+        reason = f"the chunk record is {length} bytes long but its parts take {head_length + data_length}"
+        raise TraceError(reason, offset=offset)
+    data_offset = offset + HEAD.size + head_length
+    return ChunkHead(offset, start, end, size, crc, compression, data_offset, data_length)
+
+
+def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | None:
+    """The head of a chunk record at an offset whose end is missing, and what there is of its data.
+
+    ``rest``: the bytes from there on. ``None`` where not even the head is whole.
+    """
+    try:
+        begin, end, size, crc = CHUNK_FIELDS.unpack_from(rest, HEAD.size)
+        at = HEAD.size + CHUNK_FIELDS.size
+        (length,) = struct.unpack_from("<I", rest, at)
+        compression = rest[at + 4 : at + 4 + length].decode()
+        at += 4 + length + 8
+    except (struct.error, UnicodeDecodeError):
+        return None
+    return ChunkHead(offset, begin, end, size, crc, compression, offset + at, 0), rest[at:]
+
+
+def read_records(
+    file: BufferedReader, head: ChunkHead, *, verify: bool = True, memory: Memory | None = None
+) -> Records:
+    """The records of a chunk, decompressed and, if the chunk has a checksum, verified.
+
+    Parameters
+    ----------
+    file : file
+    head : ChunkHead
+    verify : bool
+        Whether to look at the checksum.
+    memory : callable, optional
+        Gives memory of some size, for what is read and what it becomes.
+
+    Raises
+    ------
+    TraceError
+        The chunk is too large, cut, not what it declares, or damaged.
+    """
+    stored = read_stored(file, head, memory)
+    into = memory(head.size) if memory and head.compression else None
+    return records_of(stored, head, verify=verify, into=into)
+
+
+def read_stored(file: BufferedReader, head: ChunkHead, memory: Memory | None = None) -> Records:
+    """The records of a chunk as they stand in the file.
+
+    Raises
+    ------
+    TraceError
+        The chunk is too large, or cut.
+    """
+    if head.size > MAX_CHUNK or head.data_length > MAX_CHUNK:
+        largest = max(head.size, head.data_length)
+        reason = f"the chunk declares {largest} bytes; at most {MAX_CHUNK} are read"
+        raise TraceError(reason, offset=head.offset)
+    file.seek(head.data_offset)
+    if memory is None:
+        stored = file.read(head.data_length)
+    else:
+        whole = memory(head.data_length)
+        stored = whole[: file.readinto(whole)]
+    if len(stored) != head.data_length:
+        raise TraceError("the file ends inside this chunk", offset=head.offset)
+    return stored
+
+
+def records_of(
+    stored: Records, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
+) -> Records:
+    """The records of a chunk from what :func:`read_stored` gives.
+
+    ``into``: memory of the chunk's size that may be used for them.
+
+    Raises
+    ------
+    TraceError
+        The chunk is not what it declares, or damaged.
+    """
+    try:
+        records = decompress(stored, head.compression, head.size, into)
+    except TraceError as error:
+        raise TraceError(error.reason, offset=head.offset) from error
+    if verify and head.crc and crc32(records) != head.crc:
+        reason = "the chunk does not match its checksum"
+        raise TraceError(reason, offset=head.offset)
+    return records
+
+
+def decompress(
+    stored: Records, compression: str, size: int, into: memoryview | None = None
+) -> Records:
+    """What a chunk's bytes become: exactly ``size`` bytes, and never more of them in memory.
+
+    ``into``: memory of that size that may be used for them.
+
+    Raises
+    ------
+    TraceError
+        They become more or fewer, cannot be decompressed, or the compression is not known.
+    """
+    if compression not in _DECOMPRESS:
+        raise TraceError(f"the compression {compression!r} is not known; known: zstd, lz4, none")
+    try:
+        records = _DECOMPRESS[compression](stored, size, into)
+    except READ_ERRORS as error:
+        reason = f"the chunk cannot be decompressed ({compression}): {error}"
+        raise TraceError(reason) from error
+    if len(records) != size:
+        many = "more" if len(records) > size else f"only {len(records)}"
+        raise TraceError(f"the chunk declares {size} bytes but holds {many}")
+    return records
+
+
+def decompress_head(stored: bytes, compression: str, size: int) -> bytes:
+    """As much as a chunk gives whose end is missing: at most ``size`` bytes, none if nothing can be had."""
+    pieces: list[bytes] = []
+    left = size
+    with suppress(*READ_ERRORS):  # the missing end, met at last: what came before it stands
+        if compression == "zstd":
+            reader = _zstd(size).stream_reader(stored, read_across_frames=True)
+            while left > 0 and (piece := reader.read(min(left, 1 << 16))):
+                pieces.append(piece)
+                left -= len(piece)
+        elif compression == "lz4":
+            decompressor = lz4.frame.LZ4FrameDecompressor()
+            for start in range(0, len(stored), 1 << 12):
+                piece = decompressor.decompress(stored[start : start + (1 << 12)], max_length=left)
+                pieces.append(piece)
+                left -= len(piece)
+        elif not compression:
+            pieces.append(stored)
+    return b"".join(pieces)[:size]
+
+
+def _zstd(size: int) -> zstandard.ZstdDecompressor:
+    return zstandard.ZstdDecompressor(max_window_size=max(size, MIN_WINDOW))
+
+
+def _from_zstd(stored: Records, size: int, into: memoryview | None) -> Records:
+    declared = zstandard.get_frame_parameters(stored).content_size
+    if declared == size and into is not None:
+        with _zstd(size).stream_reader(stored) as reader:
+            return into[: reader.readinto(into)]
+    if declared == size:
+        return _zstd(size).decompress(stored)
+    if declared != zstandard.CONTENTSIZE_UNKNOWN and declared > size:
+        # A one-shot decompressor would allocate what the frame declares before it looks further.
+        raise TraceError(f"the chunk declares {size} bytes, the zstd frame in it {declared}")
+    records = bytearray()
+    with _zstd(size).stream_reader(stored, read_across_frames=True) as reader:
+        while piece := reader.read(min(_PIECE, size + 1 - len(records))):
+            records += piece
+    return records
+
+
+def _from_lz4(stored: Records, size: int, _into: memoryview | None) -> Records:
+    records = bytearray()
+    while stored and len(records) <= size:
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        piece = decompressor.decompress(stored, max_length=_lz4_piece(records, size))
+        while piece:
+            records += piece
+            if decompressor.eof or len(records) > size:
+                break
+            piece = decompressor.decompress(b"", max_length=_lz4_piece(records, size))
+        if not decompressor.eof:
+            break  # too much, or the input ends before the frame does
+        stored = bytes(decompressor.unused_data or b"")
+    return records
+
+
+def _lz4_piece(records: bytearray, size: int) -> int:
+    return min(_LZ4_PIECE, size + 1 - len(records))
+
+
+_DECOMPRESS: Final[dict[str, Callable[[Records, int, memoryview | None], Records]]] = {
+    "zstd": _from_zstd,
+    "lz4": _from_lz4,
+    "": lambda stored, _size, _into: stored,
+}
+
+
+def parse_records(
+    records: Records, chunk_offset: int, *, whole: bool = True
+) -> tuple[Messages, list[tuple[int, memoryview]]]:
+    """The records of a chunk: its messages as columns, and the definitions among them.
+
+    Parameters
+    ----------
+    records : bytes-like
+    chunk_offset : int
+        Byte offset of the chunk in the file.
+    whole : bool
+        Whether the records must end where the bytes do. Otherwise what is left at the end is passed over.
+
+    Returns
+    -------
+    messages : Messages
+    definitions : list of tuple
+        Opcode and content of every schema and channel record, in order.
+
+    Raises
+    ------
+    TraceError
+        A record does not fit, or there are too many.
+    """
+    offsets, definitions, end = _frame_records(records)
+    if whole and end != len(records):
+        reason = (
+            f"the records of this chunk break off at byte {end} of {len(records)},"
+            f" or are more than {MAX_RECORDS}"
+        )
+        raise TraceError(reason, offset=chunk_offset)
+    view = memoryview(records)
+    heads = _message_heads(view, offsets)
+    messages = message_columns(
+        heads, offsets, chunk_offset, lambda at, length: view[at : at + length]
+    )
+    return messages, [(opcode, view[start:stop]) for opcode, start, stop in definitions]
+
+
+def message_columns(
+    heads: NDArray[np.void],
+    offsets: Ints,
+    chunk_offset: int,
+    read: Callable[[int, int], memoryview],
+) -> Messages:
+    """Message records as columns.
+
+    Parameters
+    ----------
+    heads : (n,) of :data:`MESSAGE_HEAD`
+    offsets : (n,) int64
+        Where each record begins.
+    chunk_offset, read
+        As :class:`Messages` has them.
+
+    Raises
+    ------
+    TraceError
+        A log time lies beyond what 64 bits with a sign can hold: the year 2262.
+    """
+    if len(heads) and int(heads["log_time"].max()) > _LAST_NS:
+        reason = f"a message bears the log time {int(heads['log_time'].max())} ns"
+        raise TraceError(reason, offset=max(chunk_offset, 0))
+    return Messages(
+        chunk_offset=chunk_offset,
+        channel=heads["channel"].astype(np.int64),
+        sequence=heads["sequence"].astype(np.int64),
+        log_time_ns=heads["log_time"].astype(np.int64),
+        publish_time_ns=heads["publish_time"].astype(np.uint64),
+        offset=offsets,
+        length=heads["length"].astype(np.int64) - (MESSAGE_HEAD.itemsize - HEAD.size),
+        read=read,
+    )
+
+
+def _frame_records(records: Records) -> tuple[Ints, list[tuple[int, int, int]], int]:
+    """Offsets of the messages, spans of the definitions, and where the last whole record ends."""
+    offsets = array("q")
+    definitions: list[tuple[int, int, int]] = []
+    position, total, head_at = 0, len(records), HEAD.unpack_from
+    for _ in range(MAX_RECORDS):
+        start = position + HEAD.size
+        if start > total:
+            break
+        opcode, length = head_at(records, position)
+        stop = start + length
+        if opcode == _MESSAGE and length >= _MESSAGE_FIELDS and stop <= total:
+            offsets.append(position)
+        elif opcode in {0, _MESSAGE} or stop > total:
+            break
+        elif opcode in _DEFINITIONS:
+            definitions.append((opcode, start, stop))
+        position = stop
+    return np.frombuffer(offsets, np.int64), definitions, position
+
+
+def _message_heads(view: memoryview, offsets: Ints) -> NDArray[np.void]:
+    if not len(offsets):
+        return np.empty(0, MESSAGE_HEAD)
+    rows = np.frombuffer(view, np.uint8)[offsets[:, None] + np.arange(MESSAGE_HEAD.itemsize)]
+    return np.ascontiguousarray(rows).view(MESSAGE_HEAD)[:, 0]

@@ -1,0 +1,327 @@
+"""Access to single messages, and folders of split recordings.
+
+Bags of rosbag2: a folder whose ``metadata.yaml`` lists the MCAP files that one recording was split into.
+
+A bag is its files one after another: a place in it counts from the beginning of its first file, as if they
+were one. Only the list of files is taken from ``metadata.yaml``, so a few words of YAML suffice to read it: a
+key, and behind it a list of plain or quoted texts, as rosbag2 writes it. What it lists lies in the folder.
+
+Source: rosbag2, ``rosbag2_storage/yaml.hpp``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import stat
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Final
+
+from mcap.opcode import Opcode
+
+from sgstore.errors import TraceError
+from sgstore.mcap._chunks import (
+    HEAD,
+    MAX_CHUNK,
+    MESSAGE_HEAD,
+    READ_ERRORS,
+    read_chunk_head,
+    read_records,
+)
+
+if TYPE_CHECKING:
+    from io import BufferedReader
+
+
+METADATA: Final = "metadata.yaml"
+MAX_METADATA: Final = 16 << 20
+"""Greatest ``metadata.yaml`` that is read; bytes. It repeats the settings of every channel."""
+MAX_PARTS: Final = 10_000
+"""Most files of a bag."""
+
+_MARK: Final = b"rosbag2_bagfile_information"
+_BEGINNING: Final = 4096
+_ENTRY: Final = re.compile(r"(?P<indent> *)(?P<dash>- +)?(?P<rest>\S.*?)\s*")
+_KEY: Final = re.compile(r"(relative_file_paths|storage_identifier|compression_mode)\s*:\s*(.*)")
+
+
+@dataclass(frozen=True, slots=True)
+class BagPart:
+    """A file of a bag.
+
+    Attributes
+    ----------
+    path : Path
+    base : int
+        Where it begins in the bag: the size of all files before it; bytes.
+    size : int
+        -1: there is no such file.
+    """
+
+    path: Path
+    base: int
+    size: int
+
+
+def bag_folder(path: Path) -> Path | None:
+    """The folder of the bag that a path means: itself, or that of a ``metadata.yaml``; ``None``: no bag.
+
+    A folder is a bag if its ``metadata.yaml`` begins as rosbag2 writes it; other tools write such files, too.
+    """
+    if path.name == METADATA:
+        return path.parent
+    try:
+        if not path.is_dir():
+            return None
+        with (path / METADATA).open("rb") as file:
+            return path if _MARK in file.read(_BEGINNING) else None
+    except (OSError, ValueError):
+        return None
+
+
+def parts_of(folder: Path) -> tuple[BagPart, ...]:
+    """The files of a bag, in the order in which its metadata list them.
+
+    Raises
+    ------
+    TraceError
+        The metadata cannot be read, list no file, or are of a bag that is not MCAP; or no file of it is there.
+    """
+    parts: list[BagPart] = []
+    base = 0
+    for name in _listed(folder / METADATA):
+        path = _inside(folder, name)
+        size = _size(path)
+        parts.append(BagPart(path, base, size))
+        base += max(size, 0)
+    if all(part.size < 0 for part in parts):
+        reason = f"none of the {len(parts)} files that its {METADATA} lists is there"
+        raise TraceError(reason, path=folder)
+    return tuple(parts)
+
+
+def part_at(parts: tuple[BagPart, ...], place: int) -> BagPart | None:
+    """The file in which a place of the bag lies, if there is one."""
+    there = (part for part in parts if part.base <= place < part.base + part.size)
+    return next(there, None)
+
+
+def _listed(path: Path) -> list[str]:
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_METADATA + 1)
+        text = content.decode()
+    except (OSError, ValueError) as error:
+        raise TraceError(f"cannot be read: {error}", path=path) from error
+    if len(content) > MAX_METADATA:
+        raise TraceError(f"more than {MAX_METADATA} bytes, which no bag needs", path=path)
+    found = read_metadata(text)
+    (stored,) = found["storage_identifier"][:1] or ("mcap",)
+    if stored != "mcap":
+        raise TraceError(f"a bag of {stored!r}; expected 'mcap' (ros2 bag convert)", path=path)
+    if "".join(found["compression_mode"]).upper() == "FILE":
+        raise TraceError("its files are compressed as a whole; expected MCAP files", path=path)
+    files = found["relative_file_paths"]
+    if not files or len(files) > MAX_PARTS:
+        reason = f"it lists {len(files)} files; expected 1 to {MAX_PARTS} in relative_file_paths"
+        raise TraceError(reason, path=path)
+    return files
+
+
+def read_metadata(text: str) -> dict[str, list[str]]:
+    """What the metadata of a bag say of its files and how these are stored; an absent key has no values.
+
+    Other keys are passed over, and so is what is nested in them.
+    """
+    found: dict[str, list[str]] = {
+        "relative_file_paths": [],
+        "storage_identifier": [],
+        "compression_mode": [],
+    }
+    open_key, open_indent = "", -1
+    for line in text.splitlines():
+        entry = _ENTRY.fullmatch(line)
+        if entry is None or entry["rest"].startswith("#"):
+            continue
+        indent = len(entry["indent"])
+        if open_key and entry["dash"] and indent >= open_indent:
+            found[open_key].append(_plain(entry["rest"]))
+            continue
+        open_key = ""
+        key = None if entry["dash"] else _KEY.fullmatch(entry["rest"])
+        if key is None or found[key[1]]:
+            continue
+        if key[2] and not key[2].startswith("#"):
+            found[key[1]] = [_plain(value) for value in _values(key[2])]
+        elif key[1] == "relative_file_paths":
+            open_key, open_indent = key[1], indent
+    return found
+
+
+def _values(text: str) -> list[str]:
+    """The texts in ``[a, b]``, or the only one."""
+    if text.startswith("[") and text.endswith("]"):
+        return [part.strip() for part in text[1:-1].split(",") if part.strip()]
+    return [text]
+
+
+def _plain(text: str) -> str:
+    """A scalar without its quotes, or without the comment behind it."""
+    quoted = re.match(r"""'((?:[^']|'')*)'|"((?:[^"\\]|\\.)*)\"""", text)
+    if quoted is None:
+        return re.sub(r"\s+#.*", "", text)
+    if quoted[1] is not None:
+        return quoted[1].replace("''", "'")
+    return re.sub(r"\\(.)", r"\1", quoted[2])
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """The file that is meant. Early versions wrote the name of the folder before it."""
+    parts = PurePosixPath(name).parts
+    if not parts or PurePosixPath(name).is_absolute() or ".." in parts or "\0" in name:
+        raise TraceError(f"it lists {name!r}, which is not in its folder", path=folder / METADATA)
+    path = folder.joinpath(*parts)
+    return folder / parts[-1] if len(parts) > 1 and _size(path) < 0 else path
+
+
+def _size(path: Path) -> int:
+    """Size of a regular file; -1 if there is none."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return -1
+    return status.st_size if stat.S_ISREG(status.st_mode) else -1
+
+
+# Files of recordings: opened with care, hashed, and asked for one message by its place ----------
+
+
+def message_at(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
+    """The data of one message, by its place; see :class:`sgstore.world.MessageRefs`.
+
+    In a bag, places count from the beginning of its first file.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened, the chunk is damaged, or there is no message of that length: the file
+        was replaced.
+    """
+    record = b""
+    path, base = _file_at(path, offset if chunk_offset < 0 else chunk_offset)
+    chunk_offset, offset = (
+        (-1, offset - base) if chunk_offset < 0 else (chunk_offset - base, offset)
+    )
+    with open_regular(path) as file:
+        try:
+            if chunk_offset < 0:
+                file.seek(offset)
+                record = file.read(min(MESSAGE_HEAD.itemsize + length, MAX_CHUNK))
+            else:
+                records = read_records(file, read_chunk_head(file, chunk_offset))
+                record = bytes(records[offset : offset + MESSAGE_HEAD.itemsize + length])
+            opcode, found = HEAD.unpack_from(record)
+        except TraceError as error:
+            raise TraceError(error.reason, path=path, offset=chunk_offset) from error
+        except READ_ERRORS:  # an offset outside the file or the chunk
+            opcode, found = 0, 0
+    fields = MESSAGE_HEAD.itemsize - HEAD.size
+    if (opcode, found, len(record)) != (
+        Opcode.MESSAGE,
+        fields + length,
+        HEAD.size + fields + length,
+    ):
+        reason = f"no message of {length} bytes at {offset} there: the file was replaced"
+        raise TraceError(reason, path=path, offset=max(chunk_offset, 0))
+    return record[MESSAGE_HEAD.itemsize :]
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a whole file, or of the files of a bag one after another, in hexadecimal digits.
+
+    Raises
+    ------
+    TraceError
+        A file cannot be read.
+    """
+    folder = bag_folder(path)
+    files = [path] if folder is None else [p.path for p in parts_of(folder) if p.size >= 0]
+    digest = hashlib.sha256()
+    for one in files:
+        with open_regular(one) as file:
+            try:
+                hashlib.file_digest(file, lambda: digest)
+            except OSError as error:
+                raise TraceError(f"cannot be read: {error.strerror}", path=one) from error
+    return digest.hexdigest()
+
+
+def check_name(path: Path) -> None:
+    """Refuse a recording of which a store could not say where it is.
+
+    Raises
+    ------
+    TraceError
+        Its name, or that of a folder above it, is no UTF-8.
+    """
+    for name in reversed(path.absolute().parts):
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            shown = repr(os.fsencode(name))[2:-1]
+            reason = f"a store keeps names as UTF-8, and '{shown}' is none: rename it"
+            raise TraceError(reason, path=path) from None
+
+
+def mark_of(path: Path) -> tuple[int, int]:
+    """Size and time of change of a recording, which tell whether it was replaced; bytes, ns.
+
+    Of a bag: the size of its files together, and the latest time of change among them.
+
+    Raises
+    ------
+    OSError
+        There is no such file.
+    TraceError
+        The metadata of the bag cannot be read, or none of its files is there.
+    """
+    folder = bag_folder(path)
+    if folder is None:
+        status = path.stat()
+        return status.st_size, status.st_mtime_ns
+    files = [part for part in parts_of(folder) if part.size >= 0]
+    return sum(part.size for part in files), max(part.path.stat().st_mtime_ns for part in files)
+
+
+def _file_at(path: Path, place: int) -> tuple[Path, int]:
+    """The file in which a place of a recording lies, and the place at which that file begins."""
+    folder = bag_folder(path)
+    if folder is None:
+        return path, 0
+    part = part_at(parts_of(folder), place)
+    if part is None:
+        raise TraceError("no file of the bag is there: it was replaced", path=path, offset=place)
+    return part.path, part.base
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """A regular file, opened for reading. Pipes and devices, which one would wait for, are refused.
+
+    Raises
+    ------
+    TraceError
+        There is no such file, it is a folder or a device, or it may not be read.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise TraceError("a folder; expected an MCAP recording", path=path)
+        if not stat.S_ISREG(mode):
+            raise TraceError("not a regular file; expected an MCAP recording", path=path)
+        return path.open("rb")
+    except FileNotFoundError as error:
+        raise TraceError("no such file", path=path) from error
+    except (OSError, ValueError) as error:
+        raise TraceError(f"cannot be opened: {error}", path=path) from error

@@ -1,0 +1,601 @@
+"""The guarded reader of MCAP files: everything that can be had, and the name of what cannot.
+
+A file is walked record by record in the order in which it was written, one chunk in memory at a
+time. The summary at its end, where there is one, is a help and not an authority: it gives the
+definitions of channels early, and the places of chunks, so that the walk finds its way again behind
+a record that is damaged. Without a summary the walk is all there is, and enough.
+
+What can be wrong, and what comes of it:
+
+* A chunk is damaged, lies about its size, or is too large: it is passed over and reported as a
+  :class:`~sgstore.world.Loss` (bytes, time span, messages where message indexes tell), and the walk
+  goes on behind it.
+* The file ends early: every whole record is kept, and of a chunk that is cut the whole messages.
+* A record's length leads astray: the walk goes on at the next chunk that the summary names.
+* It is no MCAP file at all: a :class:`TraceError`.
+
+Nothing else escapes: whatever the parsers below raise becomes one or the other.
+
+Source: MCAP specification, format version 0 (mcap.dev/spec).
+"""
+
+from __future__ import annotations
+
+import os
+from array import array
+from bisect import bisect_right
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, Self, cast
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Header, Metadata, Schema
+
+from sgstore.errors import TraceError
+from sgstore.mcap._chunks import (
+    HEAD,
+    IDS,
+    MAX_CHUNK,
+    MESSAGE_HEAD,
+    READ_ERRORS,
+    ChunkHead,
+    Messages,
+    RecordPlace,
+    StrictStream,
+    decompress_head,
+    head_of_cut_chunk,
+    lose,
+    loss_of_chunk,
+    message_columns,
+    name_of,
+    parse_records,
+    read_chunk_head,
+)
+from sgstore.mcap._fetch import bag_folder, open_regular
+from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, Summary, chunks_in, read_summary
+from sgstore.world import Loss, TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+
+CLIP: Final = "sgstore.clip"
+"""Name of the metadata record that makes a file a clip of another: ``start_ns``, ``end_ns`` of its interval."""
+MAX_DEFINITION: Final = 16 << 20
+"""Greatest size of a schema, channel or metadata record; bytes."""
+MAX_DEFINITIONS: Final = 64 << 20
+"""Greatest size of all schemas, channels and metadata of a file together; bytes."""
+SMALL: Final = 4 << 20
+"""Files up to this size are read chunk by chunk, without threads; bytes."""
+RUN_MESSAGES: Final = 1024
+"""Messages outside chunks that are handed on together."""
+
+_PIECE: Final = 1 << 20
+_MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
+_LAST_NS: Final = (1 << 63) - 1
+_HOLDS_CONTENT: Final = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.MESSAGE,
+        Opcode.CHUNK,
+        Opcode.ATTACHMENT,
+        Opcode.METADATA,
+    }
+)
+
+
+@dataclass(slots=True)
+class _FileWalk:
+    """Where a walk is, and what it has found.
+
+    ``pending`` is a chunk that was lost: the message indexes behind it tell what was in it.
+    """
+
+    report: TraceReport
+    ahead: ReadAhead
+    wanted: Callable[[int], bool] | None = None
+    keep: Callable[[int], bool] | None = None
+    position: int = len(MAGIC)
+    run: array[int] = field(default_factory=lambda: array("q"))
+    pending: Loss | None = None
+    messages: int = 0
+    chunks: int = 0
+    unverified: int = 0
+    closed: bool = False
+
+
+class McapFile:
+    """An MCAP file that is read once or more often, from its beginning.
+
+    Parameters
+    ----------
+    path : Path
+        The file. The folder of a bag, or its ``metadata.yaml``, opens all files of it as one
+        (:class:`~sgstore.mcap._bag.McapBag`).
+    spool : Spool, optional
+        Where messages are kept between readings; of several files one, which somebody else closes.
+
+    Attributes
+    ----------
+    path, size, mtime_ns
+        The file, its size in bytes, its time of change.
+    profile, library : str
+        As the header has them.
+    schemas, channels : dict
+        Records by their id. Filled from the summary, and while the file is walked.
+    metadata : dict
+        Metadata records by their place; filled while the file is walked.
+    attachments : list of RecordPlace
+        Attachments are not read; filled while the file is walked.
+    counts : dict or None
+        Channel id → messages as the file's statistics say.
+    compression : str
+        That of the first chunk; ``zstd`` before a chunk was met.
+    chunk_offsets : (n,) int64
+        Where chunks begin as the summary has it, ascending.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened or is no MCAP file.
+    """
+
+    def __new__(cls, path: Path, spool: Spool | None = None) -> Self:
+        """A file, or all files of a bag."""
+        del spool
+        if cls is McapFile and bag_folder(path) is not None:
+            from sgstore.mcap._bag import McapBag
+
+            return object.__new__(cast("type[Self]", McapBag))
+        return object.__new__(cls)
+
+    def __init__(self, path: Path, spool: Spool | None = None) -> None:
+        self.path = path
+        self._spool, self._own_spool = spool or Spool(), spool is None
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.metadata: dict[RecordPlace, Metadata] = {}
+        self.attachments: list[RecordPlace] = []
+        self.counts: dict[int, int] | None
+        self.compression = "zstd"
+        self._verified: set[int] = set()
+        self._aheads: list[ReadAhead] = []
+        self._known_channels = np.zeros(IDS, np.bool_)
+        self._definition_bytes = 0
+        self._file = open_regular(path)
+        try:
+            status = os.fstat(self._file.fileno())
+            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            self.profile, self.library = self._header()
+            self._use(read_summary(self._file, self.size))
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        for ahead in self._aheads:
+            ahead.close()
+        self._file.close()
+        if self._own_spool:
+            self._spool.close()
+
+    def reopen(self) -> None:
+        """Open the file again after it was closed.
+
+        Raises
+        ------
+        TraceError
+            It cannot be opened any more.
+        """
+        if self._file.closed:
+            self._file = open_regular(self.path)
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Log times, both included, that a clip is of; of any other file all there are.
+
+        What a clip holds from outside them was carried in because later messages depend on it.
+        """
+        window = (0, _LAST_NS)
+        for place in sorted(self.metadata, key=lambda place: place.offset):
+            record = self.metadata[place]
+            start, end = record.metadata.get("start_ns", ""), record.metadata.get("end_ns", "")
+            if record.name == CLIP and start.isdecimal() and end.isdecimal():
+                window = (int(start), int(end))
+        return window
+
+    def walk(
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
+    ) -> Iterator[Messages]:
+        """All messages in file order, chunk by chunk; what cannot be read goes to ``report``.
+
+        Parameters
+        ----------
+        report : TraceReport
+        wanted : callable, optional
+            Whether the chunk at an offset is wanted; others are passed over.
+        keep : callable, optional
+            Whether the messages of the channel with an id will be asked for again: then a later walk need not
+            decompress them. It is asked after the messages were handed out.
+
+        Raises
+        ------
+        TraceError
+            The definitions of channels exceed all measure, or the file cannot be read any more.
+        """
+        walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep)
+        self._aheads.append(walk.ahead)
+        try:
+            while not walk.closed:
+                head = self._head(walk.position)
+                if head is None:
+                    break
+                if head[0] == Opcode.MESSAGE_INDEX and self._passes(walk, head[1]):
+                    continue
+                yield from self._step(walk, *head)
+            yield from self._flush(walk)
+        except READ_ERRORS as error:
+            raise TraceError(f"cannot be read: {error}", path=self.path) from error
+        finally:
+            self._aheads.remove(walk.ahead)
+            walk.ahead.close()
+        self._settle(walk)
+        self._closing_words(walk)
+
+    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
+        """The bytes of a record, with its head, piece by piece.
+
+        Raises
+        ------
+        TraceError
+            The file has become shorter.
+        """
+        for start in range(0, place.length, _PIECE):
+            yield self._at(place.offset + start, min(_PIECE, place.length - start))
+
+    def _header(self) -> tuple[str, str]:
+        start = self._file.read(len(MAGIC))
+        if not start:
+            raise TraceError("the file is empty; expected an MCAP recording", path=self.path)
+        if start != MAGIC:
+            reason = f"not an MCAP file: it begins with {start!r}, expected {MAGIC!r}"
+            raise TraceError(reason, path=self.path)
+        try:
+            opcode, length = HEAD.unpack(self._file.read(HEAD.size))
+            if opcode != Opcode.HEADER or length > MAX_DEFINITION:
+                raise TraceError("expected the header of an MCAP file", path=self.path, offset=8)
+            header = Header.read(StrictStream(self._file.read(length)))
+        except READ_ERRORS as error:
+            reason = "the header of this MCAP file is cut or malformed"
+            raise TraceError(reason, path=self.path, offset=len(MAGIC)) from error
+        return header.profile, header.library
+
+    def _use(self, summary: Summary) -> None:
+        self.schemas.update(summary.schemas)
+        self.channels.update(summary.channels)
+        self.counts = summary.counts
+        self.chunk_offsets = summary.chunk_offsets
+        self._chunk_starts = array("q", summary.chunk_offsets.tobytes())
+        self._summary_fault = summary.fault
+        self._known_channels[[*self.channels]] = True
+
+    def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
+        """What begins the chunks of a walk before their turn, where they are many and all wanted."""
+        if wanted is not None or self.size <= SMALL:
+            return ReadAhead(self._file)
+        offsets = self._chunk_starts or chunks_in(self._file)
+        offsets = (at for at in offsets if not self._spool.has(self.path, at))
+        return ReadAhead(self._file, offsets, self._verified)
+
+    # The walk ------------------------------------------------------------------------------------------------
+
+    def _head(self, position: int) -> tuple[int, int] | None:
+        """Opcode and length of the record at a position; ``None`` where no whole head is left."""
+        self._file.seek(position)
+        head = self._file.read(HEAD.size)
+        return HEAD.unpack(head) if len(head) == HEAD.size else None
+
+    def _passes(self, walk: _FileWalk, length: int) -> bool:
+        """Pass over a record that tells nothing, the most frequent one; whether it is as it should be."""
+        stop = walk.position + HEAD.size + length
+        sound = walk.pending is None and stop <= self.size
+        sound = sound and self._chunk_behind(walk.position, stop) is None
+        if sound:
+            walk.position = stop
+        return sound
+
+    def _step(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
+        """What one record gives; the walk stands behind it afterwards."""
+        start = walk.position
+        stop = start + HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX:
+            self._settle(walk)
+        astray = self._chunk_behind(start, min(stop, self.size))
+        if opcode == 0 or stop > self.size or (astray is not None and opcode != Opcode.CHUNK):
+            yield from self._flush(walk)
+            yield from self._broken(walk, opcode, length)
+            return
+        walk.position = stop
+        match opcode:
+            case Opcode.MESSAGE:
+                yield from self._single(walk, start, length)
+            case Opcode.CHUNK:
+                yield from self._flush(walk)
+                yield from self._chunk(walk, RecordPlace(start, stop - start), astray)
+            case Opcode.MESSAGE_INDEX:
+                self._count(walk, length)
+            case Opcode.DATA_END | Opcode.FOOTER:
+                yield from self._end(walk, start)
+            case _:
+                self._define_at(walk, opcode, RecordPlace(start, stop - start))
+
+    def _single(self, walk: _FileWalk, start: int, length: int) -> Iterator[Messages]:
+        if length < MESSAGE_HEAD.itemsize - HEAD.size or length > MAX_CHUNK:
+            reason = f"a message of {length} bytes"
+            lose(walk.report, Loss(reason, 1, length + HEAD.size, offset=start))
+            return
+        walk.run.append(start)
+        if len(walk.run) >= RUN_MESSAGES:
+            yield from self._flush(walk)
+
+    def _flush(self, walk: _FileWalk) -> Iterator[Messages]:
+        """The messages outside chunks that were met since the last time."""
+        if not walk.run:
+            return
+        offsets = np.frombuffer(walk.run, np.int64)
+        walk.run = array("q")
+        walk.messages += len(offsets)
+        heads = b"".join(self._at(int(at), MESSAGE_HEAD.itemsize) for at in offsets)
+        try:
+            messages = message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
+        except TraceError as error:
+            loss = Loss(error.reason, len(offsets), offset=int(offsets[0]))
+            lose(walk.report, loss)
+            return
+        yield from self._known(walk, messages)
+
+    def _end(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
+        """The end of the data; not believed where the summary names chunks behind it."""
+        yield from self._flush(walk)
+        resume = self._chunk_behind(start, self.size)
+        walk.closed = resume is None
+        if resume is not None:
+            reason = "damage: the data seem to end here, but the summary names chunks behind"
+            lose(walk.report, Loss(reason, bytes=resume - start, offset=start))
+            walk.position = resume
+
+    def _chunk(self, walk: _FileWalk, place: RecordPlace, astray: int | None) -> Iterator[Messages]:
+        """The messages of a chunk. ``astray``: a chunk that the summary says begins within it."""
+        if walk.wanted is not None and not walk.wanted(place.offset):
+            return
+        walk.chunks += 1
+        head = None
+        try:
+            head = read_chunk_head(self._file, place.offset)
+            if walk.chunks == 1:
+                self.compression = head.compression
+            walk.unverified += head.crc == 0
+            messages, definitions = self._records(walk, head)
+        except TraceError as error:
+            if astray is not None:
+                walk.position = astray
+                place = RecordPlace(place.offset, astray - place.offset)
+            walk.pending = loss_of_chunk(error.reason, place, head)
+            return
+        walk.messages += len(messages)
+        for opcode, content in definitions:
+            self._define(walk, opcode, content, place.offset)
+        yield from self._known(walk, messages)
+        if walk.keep is not None and head.compression and not definitions:
+            kept = np.bincount(messages.channel) > 0
+            for number in np.flatnonzero(kept).tolist():
+                kept[number] = number in self.channels and walk.keep(number)
+            self._spool.put(self.path, messages, kept[messages.channel])
+
+    def _records(
+        self, walk: _FileWalk, head: ChunkHead
+    ) -> tuple[Messages, list[tuple[int, memoryview]]]:
+        """Messages and definitions of a chunk, kept ones or from the file."""
+
+        def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
+            return parse_records(walk.ahead.records(head), head.offset)
+
+        kept = self._spool.get(self.path, head.offset, lambda: read()[0].read)
+        if kept is not None:
+            return kept, []
+        found = read()
+        self._verified.add(head.offset)
+        return found
+
+    def _known(self, walk: _FileWalk, messages: Messages) -> Iterator[Messages]:
+        """The messages, without those of channels that were never defined."""
+        lost = ~self._known_channels[messages.channel]
+        if lost.any():
+            unknown: list[int] = np.unique(messages.channel[lost]).tolist()
+            times = messages.log_time_ns[lost]
+            loss = Loss(
+                f"messages of channels that the file does not define: {unknown[:10]}",
+                messages=int(lost.sum()),
+                bytes=int(messages.length[lost].sum()),
+                start_ns=int(times.min()),
+                end_ns=int(times.max()),
+                offset=max(messages.chunk_offset, -1),
+            )
+            lose(walk.report, loss)
+            messages = messages.take(~lost)
+        if len(messages):
+            yield messages
+
+    # What went wrong -----------------------------------------------------------------------------------------
+
+    def _chunk_behind(self, start: int, stop: int) -> int | None:
+        """Offset of the first chunk that begins behind ``start`` and before ``stop``, as the summary has it.
+
+        The summary is believed where there is the head of a chunk indeed.
+        """
+        starts = self._chunk_starts
+        for at in range(bisect_right(starts, start), len(starts)):
+            if starts[at] >= stop:
+                break
+            with suppress(TraceError):
+                return read_chunk_head(self._file, starts[at]).offset
+        return None
+
+    def _broken(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
+        """A record whose length cannot be: go on behind it where the summary says, or end here."""
+        resume = self._chunk_behind(walk.position, self.size)
+        start = walk.position
+        stop = self.size if resume is None else resume
+        walk.position = stop
+        name = name_of(opcode)
+        if resume is not None:
+            reason = (
+                f"damage: a record ({name}) of {length} bytes where at most {stop - start} are left"
+            )
+            lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+        elif opcode == Opcode.CHUNK:
+            yield from self._cut_chunk(walk, start)
+        elif opcode in _HOLDS_CONTENT:
+            reason = f"the file ends inside a record ({name}): {stop - start} of {length + HEAD.size} bytes"
+            messages = 1 if opcode == Opcode.MESSAGE else 0
+            lose(walk.report, Loss(reason, messages, stop - start, offset=start))
+        elif opcode == 0 or opcode > Opcode.DATA_END:
+            reason = f"the bytes from here to the end are no MCAP records (opcode {opcode})"
+            lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+
+    def _cut_chunk(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
+        """The whole messages of a chunk whose end is missing."""
+        kept = None
+        found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
+        if found is not None:
+            head, stored = found
+            records = decompress_head(stored, head.compression, min(head.size, MAX_CHUNK))
+            try:
+                kept, definitions = parse_records(records, start, whole=False)
+                for opcode, content in definitions:
+                    self._define(walk, opcode, content, start)
+            except TraceError:
+                kept = None
+        count = 0 if kept is None else len(kept)
+        walk.messages += count
+        reason = f"the file ends inside a chunk; its first {count} messages were kept"
+        place = RecordPlace(start, self.size - start)
+        lose(walk.report, loss_of_chunk(reason, place, found[0] if found else None))
+        if kept is not None:
+            yield from self._known(walk, kept)
+
+    def _count(self, walk: _FileWalk, length: int) -> None:
+        """Add the messages that a message index names to those that were lost with its chunk."""
+        if walk.pending is None:
+            return
+        entries = max(length - 6, 0) // 16
+        walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
+
+    def _settle(self, walk: _FileWalk) -> None:
+        """Report a chunk that was lost, now that its message indexes are read."""
+        if walk.pending is not None:
+            lose(walk.report, walk.pending)
+            walk.pending = None
+
+    def _closing_words(self, walk: _FileWalk) -> None:
+        """Report what is odd about the file as a whole but lost nothing."""
+        warn = walk.report.warnings.append
+        left = self.size - walk.position
+        if not walk.closed:
+            if 0 < left < HEAD.size:
+                lose(walk.report, Loss("the file ends inside the head of a record", bytes=left))
+            warn("the recording was not closed: it has no end of data")
+        elif self._summary_fault:
+            warn(self._summary_fault)
+        told = sum(self.counts.values()) if self.counts else 0
+        if told > walk.messages and not walk.report.losses and walk.wanted is None:
+            reason = f"the file's statistics tell of {told} messages, {walk.messages} were found"
+            lose(walk.report, Loss(reason, told - walk.messages))
+        if walk.chunks and walk.unverified == walk.chunks:
+            warn("no chunk has a checksum: damage that leaves a chunk readable cannot be noticed")
+
+    # Definitions -----------------------------------------------------------------------------
+
+    def _define_at(self, walk: _FileWalk, opcode: int, place: RecordPlace) -> None:
+        if opcode == Opcode.ATTACHMENT:
+            if place not in self.attachments[-1:]:
+                self.attachments.append(place)
+        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
+            if place.length > MAX_DEFINITION:
+                reason = f"a definition ({name_of(opcode)}) of {place.length} bytes"
+                lose(walk.report, Loss(reason, 0, place.length, offset=place.offset))
+                return
+            content = self._at(place.offset + HEAD.size, place.length - HEAD.size)
+            self._define(walk, opcode, content, place.offset, place)
+
+    def _define(
+        self,
+        walk: _FileWalk,
+        opcode: int,
+        content: memoryview,
+        offset: int,
+        place: RecordPlace | None = None,
+    ) -> None:
+        """Take up a schema, a channel or a metadata record; the first one of an id stands."""
+        try:
+            odd = self._take_up(opcode, content, place)
+        except READ_ERRORS as error:
+            reason = f"a definition ({name_of(opcode)}) is malformed: {error!r}"
+            lose(walk.report, Loss(reason, 0, len(content), offset=offset))
+            return
+        if odd and odd not in walk.report.warnings:
+            walk.report.warnings.append(odd)
+
+    def _take_up(self, opcode: int, content: memoryview, place: RecordPlace | None = None) -> str:
+        """Take up a definition; returns what is odd about it, or an empty text."""
+        stream = StrictStream(content)
+        if opcode == Opcode.METADATA and place is not None:
+            if place not in self.metadata:
+                self._weigh(len(content))
+                self.metadata[place] = Metadata.read(stream)
+            return ""
+        record = Schema.read(stream) if opcode == Opcode.SCHEMA else Channel.read(stream)
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if record.id not in known:
+            self._weigh(len(content))
+            known[record.id] = record
+            if isinstance(record, Channel):
+                self._known_channels[record.id] = True
+        elif known[record.id] != record:
+            return (
+                f"{name_of(opcode)} {record.id} is defined twice, differently; the first one counts"
+            )
+        return ""
+
+    def _weigh(self, length: int) -> None:
+        self._definition_bytes += length
+        if self._definition_bytes > MAX_DEFINITIONS:
+            reason = f"more than {MAX_DEFINITIONS} bytes of schemas, channels and metadata"
+            raise TraceError(reason, path=self.path)
+
+    def _at(self, position: int, length: int) -> memoryview:
+        """Bytes of the file.
+
+        Raises
+        ------
+        TraceError
+            The file has become shorter since it was opened.
+        """
+        self._file.seek(position)
+        data = self._file.read(length)
+        if len(data) != length:
+            raise TraceError("the file became shorter while it was read", path=self.path)
+        return memoryview(data)

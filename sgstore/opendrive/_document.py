@@ -1,0 +1,444 @@
+"""OpenDRIVE text to tables of elements, in bounded time and memory.
+
+OpenDRIVE text → tables of elements, in bounded time and memory.
+
+The parser is the standard library's expat, fed once, without a tree: each element that a map reader can
+use becomes a row in the table of its kind, with the row of its parent; everything else is passed over.
+Document type declarations, and with them entities, are refused, so that nothing can expand; depth, size,
+number of elements and of attributes are bounded. What an attribute *means* is decided later, by
+:class:`ElementTable`, which turns a whole column into numbers and blames the road of each one that is none.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+from xml.parsers import expat
+
+import numpy as np
+
+from sgstore.errors import MapError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from sgstore.world import Bools, Floats, Ints
+
+
+MAX_CHARACTERS: Final = 256 << 20
+MAX_ELEMENTS: Final = 3_000_000
+MAX_DEPTH: Final = 64
+MAX_ATTRIBUTES: Final = 64
+MAX_MAGNITUDE: Final = 1e12
+"""Greatest absolute value of a number; what is larger is taken for a defect."""
+
+_Shape = dict[str, Any]
+
+_LINKS: Final[_Shape] = {"predecessor": {}, "successor": {}}
+_VALID: Final[_Shape] = {"validity": {}}
+_OUTLINE: Final[_Shape] = {"outline": {"cornerLocal": {}, "cornerRoad": {}}}
+_LANE: Final[_Shape] = {
+    "lane": {"link": _LINKS, "width": {}, "border": {}, "roadMark": {}, "speed": {}}
+}
+_SHAPE: Final[_Shape] = {
+    "OpenDRIVE": {
+        "header": {},
+        "road": {
+            "link": _LINKS,
+            "type": {"speed": {}},
+            "planView": {
+                "geometry": {"line": {}, "arc": {}, "spiral": {}, "poly3": {}, "paramPoly3": {}}
+            },
+            "elevationProfile": {"elevation": {}},
+            "lanes": {
+                "laneOffset": {},
+                "laneSection": {"left": _LANE, "center": _LANE, "right": _LANE},
+            },
+            "objects": {
+                "object": {**_OUTLINE, "outlines": _OUTLINE, "repeat": {}},
+            },
+            "signals": {"signal": _VALID, "signalReference": _VALID},
+        },
+        "controller": {"control": {}},
+        "junction": {"connection": {"laneLink": {}}},
+    }
+}
+_TRANSPARENT: Final = {
+    *("link", "planView", "elevationProfile", "lanes", "left", "center", "right"),
+    *("objects", "signals", "outlines"),
+}
+"""Elements that only group others: their children are rows of the element around them."""
+
+
+RECORDS: Final = frozenset(
+    {
+        "road/elevation",
+        "road/laneOffset",
+        "road/laneSection/lane/width",
+        "road/laneSection/lane/border",
+    }
+)
+"""Kinds of elements of which one that is broken costs only itself: the one before it holds on."""
+
+Record = tuple[str, int, int]
+"""One of these: its kind, the number of its road in the text, and its own number in this road."""
+
+
+class Spoiled(Exception):  # noqa: N818 (control flow inside the package; a road is spoiled, not the map)
+    """Some roads or records cannot be used: rows of roads, and records → what is wrong."""
+
+    def __init__(self, roads: dict[int, MapError], records: dict[Record, MapError]) -> None:
+        self.roads = roads
+        self.records = records
+        super().__init__(str(next(iter((*roads.values(), *records.values())))))
+
+
+@dataclass(slots=True)
+class ElementTable:
+    """All elements of one kind, in the order of the text.
+
+    Attributes
+    ----------
+    element : str
+        Path of tags: ``road/lanes/laneSection``.
+    parent : list of int
+        Row of the element around it, in that element's table.
+    attributes : list of dict
+    road : (n,) int64
+        Row of the road it belongs to; -1 outside roads.
+    """
+
+    element: str
+    parent: list[int] = field(default_factory=list[int])
+    attributes: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
+    road: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.parent)
+
+    @property
+    def of(self) -> Ints:
+        """(n,) int64: the parents as an array."""
+        return np.asarray(self.parent, np.int64)
+
+    def texts(self, name: str, default: str = "") -> list[str]:
+        """A column of texts; ``default`` where the attribute is absent."""
+        return [attributes.get(name, default) for attributes in self.attributes]
+
+
+class Document:
+    """An OpenDRIVE text as tables.
+
+    Attributes
+    ----------
+    tables : dict
+        Kind of element → :class:`ElementTable`. Kinds are tags without those that only group others, from the
+        road on: ``road``, ``road/geometry/arc``, ``road/laneSection/lane/width``.
+    ordinals : list of int
+        Row of the table of roads → the road's number in the text.
+    blame : dict
+        Row of a road → the first thing that was found wrong with it.
+    odd : dict
+        Record → the first thing that was found wrong with it.
+    """
+
+    def __init__(self, tables: dict[str, ElementTable], ordinals: list[int]) -> None:
+        self.tables = tables
+        self.ordinals = ordinals
+        self.blame: dict[int, MapError] = {}
+        self.odd: dict[Record, MapError] = {}
+        self.road_ids = tables["road"].texts("id")
+        for kind, table in tables.items():
+            above = kind.rpartition("/")[0]
+            if kind == "road":
+                table.road = np.arange(len(table))
+            elif above in tables and len(table):
+                table.road = tables[above].road[table.of]
+            else:
+                table.road = np.full(len(table), -1, np.int64)
+
+    def __getitem__(self, kind: str) -> ElementTable:
+        return self.tables[kind]
+
+    def numbers(self, kind: str, name: str, default: float | None = None) -> Floats:
+        """A column of finite numbers.
+
+        Where one is absent and there is no default, or is no finite number of reasonable size, its road
+        gets the blame and the value is 0; outside roads, the value is the default.
+        """
+        table = self.tables[kind]
+        missing = "0" if default is None else repr(default)
+        values = _floats(table.texts(name, missing))
+        # A missing number may be meant by NaN, but only where the reader asked for it.
+        wild = ~(np.abs(values) <= MAX_MAGNITUDE)
+        if default is not None and math.isnan(default):
+            wild &= np.array([name in a for a in table.attributes], bool)
+        self.accuse(kind, wild, f"attribute {name!r} is no finite number")
+        values[wild] = 0.0 if default is None else default
+        if default is None:
+            absent = np.array([name not in a for a in table.attributes], bool)
+            self.accuse(kind, absent, f"attribute {name!r} is missing")
+        return values
+
+    def integers(self, kind: str, name: str, default: int | None = None) -> Ints:
+        """A column of whole numbers, under the same terms."""
+        values = self.numbers(kind, name, default)
+        broken = (values != np.floor(values)) | (np.abs(values) > 1e9)
+        self.accuse(kind, broken, f"attribute {name!r} is no whole number")
+        values[broken] = 0 if default is None else default
+        return values.astype(np.int64)
+
+    def rough_numbers(self, kind: str, name: str, default: float = 0.0) -> Floats:
+        """A column of numbers of which a broken one costs no road: it is NaN, an absent one ``default``."""
+        values = _floats(self.tables[kind].texts(name, repr(default)))
+        values[~(np.abs(values) <= MAX_MAGNITUDE)] = np.nan
+        return values
+
+    def accuse(self, kind: str, wrong: Bools, reason: str) -> None:
+        """Blame the roads of the rows where something is ``wrong``; of :data:`RECORDS` the rows alone."""
+        table = self.tables[kind]
+        rows = np.flatnonzero(wrong)
+        if kind in RECORDS and len(rows):
+            for row, record in zip(rows.tolist(), self._records(kind, rows), strict=True):
+                name = self.road_ids[int(table.road[row])]
+                found = MapError(reason, road=name, element=table.element)
+                self.odd.setdefault(record, found)
+            return
+        for row in rows:
+            road = int(table.road[row])
+            if road >= 0 and road not in self.blame:
+                self.blame[road] = MapError(reason, road=self.road_ids[road], element=table.element)
+
+    def settle(self) -> None:
+        """Raise :class:`Spoiled` if any road or record got the blame so far."""
+        if self.blame or self.odd:
+            raise Spoiled(self.blame, self.odd)
+
+    def leave_out(self, records: Collection[Record]) -> None:
+        """Go on without some records."""
+        for kind in {kind for kind, _, _ in records}:
+            table = self.tables[kind]
+            every = self._records(kind, np.arange(len(table)))
+            kept = [row for row, record in enumerate(every) if record not in records]
+            table.parent = [table.parent[row] for row in kept]
+            table.attributes = [table.attributes[row] for row in kept]
+            table.road = table.road[kept]
+
+    def _records(self, kind: str, rows: Ints) -> list[Record]:
+        """Rows of a kind as records. The rows of a road follow one another."""
+        road = self.tables[kind].road
+        within = rows - np.searchsorted(road, road[rows])
+        numbers = [self.ordinals[row] for row in road[rows].tolist()]
+        return [(kind, road, row) for road, row in zip(numbers, within.tolist(), strict=True)]
+
+
+def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
+    """The tables of an OpenDRIVE text, without the roads of the numbers in ``skip``.
+
+    Raises
+    ------
+    MapError
+        The text is no XML, no OpenDRIVE, has a document type declaration, or exceeds a bound.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
+    tables, ordinals = _parse(text, skip)
+    return Document(tables, ordinals)
+
+
+_Node = tuple["ElementTable | None", dict[str, "_Node"]]
+
+
+def _grammar() -> tuple[dict[str, ElementTable], dict[str, _Node]]:
+    """Empty tables, and the tree of tags that leads to them."""
+    tables: dict[str, ElementTable] = {}
+
+    def branch(shape: Mapping[str, Any], kind: str, element: str) -> dict[str, _Node]:
+        nodes: dict[str, _Node] = {}
+        for tag, below in shape.items():
+            path = f"{element}/{tag}" if element else tag
+            if tag == "OpenDRIVE" or tag in _TRANSPARENT:
+                within = "" if tag == "OpenDRIVE" else path
+                nodes[tag] = (None, branch(below, kind, within))
+                continue
+            name = f"{kind}/{tag}" if kind else tag
+            table = tables.setdefault(name, ElementTable(path))
+            nodes[tag] = (table, branch(below, name, path))
+        return nodes
+
+    return tables, branch(_SHAPE, "", "")
+
+
+class _Builder:
+    """What expat calls: rows are added to tables as elements start."""
+
+    def __init__(self, skip: frozenset[int]) -> None:
+        self.tables, root = _grammar()
+        self.ordinals: list[int] = []
+        self._skip = skip
+        self._levels: list[dict[str, _Node]] = [root]
+        self._rows: list[int] = [-1]
+        self._elements = 0
+        self._roads = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        """An element starts: it becomes a row, stands for the one around it, or is passed over."""
+        levels, rows = self._levels, self._rows
+        self._elements += 1
+        if (
+            len(levels) > MAX_DEPTH
+            or len(attributes) > MAX_ATTRIBUTES
+            or self._elements > MAX_ELEMENTS
+        ):
+            raise MapError(_bound_passed(len(levels), len(attributes)), element=tag[:80])
+        node = levels[-1].get(tag)
+        if node is None:
+            if len(levels) == 1:
+                raise MapError(f"the root element is <{tag[:80]}>, expected <OpenDRIVE>")
+            levels.append({})
+            rows.append(-1)
+            return
+        table, below = node
+        if table is None:
+            rows.append(rows[-1])
+        elif tag == "road" and not self._next_road_is_wanted():
+            below = {}
+            rows.append(-1)
+        else:
+            table.parent.append(rows[-1])
+            table.attributes.append(attributes)
+            rows.append(len(table.parent) - 1)
+        levels.append(below)
+
+    def end(self, _tag: str) -> None:
+        """An element ends."""
+        self._levels.pop()
+        self._rows.pop()
+
+    def doctype(self, *_: object) -> None:
+        """A document type declaration starts."""
+        raise MapError("a document type declaration is refused: maps need none")
+
+    def _next_road_is_wanted(self) -> bool:
+        number = self._roads
+        self._roads += 1
+        if number in self._skip:
+            return False
+        self.ordinals.append(number)
+        return True
+
+
+def _parse(text: str, skip: frozenset[int]) -> tuple[dict[str, ElementTable], list[int]]:
+    builder = _Builder(skip)
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.StartDoctypeDeclHandler = builder.doctype
+    try:
+        parser.Parse(text, True)  # noqa: FBT003 (expat takes no keywords)
+    except expat.ExpatError as error:
+        where = f"line {error.lineno}, column {error.offset + 1}"
+        raise MapError(f"not XML: {expat.ErrorString(error.code)} at {where}") from error
+    except UnicodeEncodeError as error:
+        raise MapError(f"not text: lone surrogate at character {error.start}") from error
+    return builder.tables, builder.ordinals
+
+
+def _bound_passed(depth: int, attributes: int) -> str:
+    if depth > MAX_DEPTH:
+        return f"nested more than {MAX_DEPTH} levels deep"
+    if attributes > MAX_ATTRIBUTES:
+        return f"{attributes} attributes; an element may have {MAX_ATTRIBUTES}"
+    return f"more than {MAX_ELEMENTS:,} elements"
+
+
+def _floats(texts: list[str]) -> Floats:
+    """Texts as numbers; NaN for what is none."""
+    try:
+        return np.fromiter(map(float, texts), np.float64, len(texts))
+    except ValueError:
+        return np.array([_number(text) for text in texts], np.float64)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+# Columns in groups: what many records along many roads have in common ---------------------------
+
+
+def starts_of(counts: Ints) -> Ints:
+    """(n + 1,) int64: where groups of these sizes start when they follow one another, and the end."""
+    return np.concatenate((np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)))
+
+
+def ragged(counts: Ints) -> tuple[Ints, Ints]:
+    """Groups of these sizes spelled out: the group of each row, and the row's number in its group.
+
+    >>> ragged(np.array([2, 0, 3]))
+    (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
+    """
+    group = np.repeat(np.arange(len(counts)), counts)
+    return group, np.arange(len(group)) - starts_of(counts)[group]
+
+
+def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) -> Ints:
+    """The record that holds at each place: the last of its group that starts at or before it.
+
+    Parameters
+    ----------
+    group, at : (n,)
+        Group and start of each record, in any order; of records that start together the later holds.
+    asked_group, asked_at : (m,)
+        Places.
+
+    Returns
+    -------
+    (m,) int64
+        Rows of the records. Before the first record of a group the first holds; -1: the group is empty.
+    """
+    n, m = len(group), len(asked_group)
+    if n == 0:
+        return np.full(m, -1, np.int64)
+    order = np.lexsort((at, group))
+    groups, starts = group[order], at[order]
+    # One sort of records and places together: a place comes after the records that start with it.
+    both_group = np.concatenate((groups, asked_group))
+    both_at = np.concatenate((starts, asked_at))
+    is_place = np.arange(n + m) >= n
+    merged = np.lexsort((is_place, both_at, both_group))
+    seen = np.cumsum(~is_place[merged]) - 1
+    found = np.empty(m, np.int64)
+    places = merged[is_place[merged]] - n
+    found[places] = seen[is_place[merged]]
+    first = np.searchsorted(groups, asked_group, side="left")
+    found = np.maximum(found, first)
+    exists = (first < n) & (groups[np.minimum(first, n - 1)] == asked_group)
+    return np.where(exists, order[np.minimum(found, n - 1)], -1)
+
+
+def cubic(coefficients: Floats, at: Floats) -> Floats:
+    """Values of cubics ``(..., 4)``, constant first, at ``at``."""
+    c = coefficients
+    return c[..., 0] + at * (c[..., 1] + at * (c[..., 2] + at * c[..., 3]))
+
+
+def cubic_slope(coefficients: Floats, at: Floats) -> Floats:
+    """First derivatives of cubics ``(..., 4)`` at ``at``."""
+    c = coefficients
+    return c[..., 1] + at * (2 * c[..., 2] + at * 3 * c[..., 3])
+
+
+def cubic_bend(coefficients: Floats, at: Floats) -> Floats:
+    """Second derivatives of cubics ``(..., 4)`` at ``at``."""
+    c = coefficients
+    return 2 * c[..., 2] + at * 6 * c[..., 3]
+
+
+def coefficients_of(document: Document, kind: str) -> Floats:
+    """(n, 4): ``a``, ``b``, ``c``, ``d`` of all elements of a kind; those that are absent are 0."""
+    return np.stack([document.numbers(kind, letter, 0.0) for letter in "abcd"], axis=1)

@@ -1,0 +1,498 @@
+"""Lane sections and lanes, and the surface of lanes as cross sections.
+
+Along a lane section every lateral position (the centre lane's offset, the outer border of each lane) is a
+cubic of s between *cuts*: places where a record of any kind starts. Between cuts cubics add up, so lanes
+are stacked once per cut, as coefficients, and evaluated afterwards at as many *stations* as it takes for
+straight pieces to follow the curves within :data:`SAGITTA`. At a cut where something jumps there are two
+stations in one place, one for each side of the jump.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.errors import MapError
+from sgstore.opendrive._document import (
+    coefficients_of,
+    cubic,
+    cubic_bend,
+    cubic_slope,
+    last_before,
+    ragged,
+    starts_of,
+)
+from sgstore.opendrive._reference_lines import PlanView, Poses, poses
+from sgstore.roads import Ribbons
+
+if TYPE_CHECKING:
+    from sgstore.opendrive._document import Document
+    from sgstore.world import Bools, Floats, Ints
+
+
+SAGITTA: Final = 2e-3
+"""Greatest distance between a border and the straight pieces that stand for it; m.
+
+Half the tolerance would cost half as many pieces more, in every look-up. Centre lines are smoother: between
+cross sections their headings tell how they bend.
+"""
+RISE: Final = 2e-2
+"""The same for heights; m."""
+MAX_STEP: Final = 10.0
+"""Greatest length of a piece, so that its bounding box stays small; m."""
+MAX_STATIONS: Final = 1_000_000
+"""Greatest number of cross sections of the lanes of one road."""
+MAX_TOTAL: Final = 4_000_000
+"""Greatest number of cross sections of all lanes of a map."""
+MAX_LANES: Final = 1_000
+"""Greatest number of lanes of a section."""
+MAX_COORDINATE: Final = 1e8
+JUMP: Final = 2e-4
+"""Least distance by which something jumps at a cut; m."""
+CORNER: Final = 2e-4
+"""Least change of direction at a cut that makes a corner; rad."""
+_SAME_PLACE: Final = 1e-6
+_SAMPLES: Final = 5
+"""Places between two cuts at which curvature is looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaneSections:
+    """Lane sections, ordered by road and s; shape (n,).
+
+    Attributes
+    ----------
+    road : int64
+        Row of the road.
+    number : int64
+        From 0 in its road.
+    start, end : float64
+        Along the road; m.
+    """
+
+    road: Ints
+    number: Ints
+    start: Floats
+    end: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class LaneTable:
+    """All lanes but centre lanes, ordered by section and from left to right; shape (L,).
+
+    Attributes
+    ----------
+    sections : LaneSections
+    section, road, ident : int64
+        Rows of section and road; the lane's number in its section.
+    type : list of str
+    forward : bool
+        Whether traffic runs along s.
+    both : bool
+        Whether traffic runs both ways.
+    inner : int64
+        The lane between it and the centre lane, -1: the centre lane itself.
+    rank : int64
+        How many lanes there are between it and the centre lane.
+    row : (raw,) int64
+        Row of each element of the document, -1 for centre lanes.
+    centre : (raw,) int64
+        Section of each element that is a centre lane, else -1.
+    """
+
+    sections: LaneSections
+    section: Ints
+    road: Ints
+    ident: Ints
+    type: list[str]
+    forward: Bools
+    both: Bools
+    inner: Ints
+    rank: Ints
+    row: Ints
+    centre: Ints
+
+    def __len__(self) -> int:
+        return len(self.section)
+
+
+def read_lanes(document: Document) -> LaneTable:
+    """All lane sections and lanes; what is wrong is blamed on its road."""
+    sections, section_row = _read_sections(document)
+    table = document["road/laneSection/lane"]
+    ident = document.integers("road/laneSection/lane", "id")
+    section = section_row[table.of]
+    order = np.lexsort((-ident, section))
+    twice = order[1:][(np.diff(section[order]) == 0) & (np.diff(ident[order]) == 0)]
+    document.accuse("road/laneSection/lane", _marked(twice, len(table)), "two lanes of one id")
+    crowd = np.bincount(section, minlength=len(sections.start))[section] > MAX_LANES
+    document.accuse("road/laneSection/lane", crowd, f"more than {MAX_LANES:,} lanes in a section")
+    row = np.full(len(table), -1, np.int64)
+    order = order[ident[order] != 0]
+    row[order] = np.arange(len(order))
+    centre = np.where(ident == 0, section, -1)
+    section, ident = section[order], ident[order]
+    road = sections.road[section]
+    types = [table.attributes[i].get("type", "none").strip() for i in order]
+    left_hand = np.array([t.upper() == "LHT" for t in document["road"].texts("rule")], bool)
+    direction = np.array([table.attributes[i].get("direction", "standard") for i in order], object)
+    forward = (ident < 0) ^ left_hand[road] ^ (direction == "reversed")
+    both = (direction == "both") | (np.array(types, object) == "bidirectional")
+    inner, rank = _stack(section, ident)
+    return LaneTable(
+        sections, section, road, ident, types, forward, both, inner, rank, row, centre
+    )  # fmt: skip
+
+
+def odd_sections(document: Document) -> list[str]:
+    """Warnings of sections that are for one side of the road only: they are read as if they were for both."""
+    table = document["road/laneSection"]
+    roads = {
+        document.road_ids[road]
+        for road, one_sided in zip(table.road.tolist(), table.texts("singleSide"), strict=True)
+        if one_sided.lower() in {"true", "1"}
+    }
+    return [
+        f"road {name!r}: a laneSection is for one side only; lanes of the other side end there"
+        for name in sorted(roads)
+    ]
+
+
+def _marked(rows: Ints, n: int) -> Bools:
+    mask = np.zeros(n, bool)
+    mask[rows] = True
+    return mask
+
+
+def _read_sections(document: Document) -> tuple[LaneSections, Ints]:
+    table = document["road/laneSection"]
+    start = document.numbers("road/laneSection", "s")
+    length = document.numbers("road", "length")
+    document.accuse("road", length < 0, "attribute 'length' is negative")
+    document.accuse("road", np.bincount(table.road, minlength=len(length)) == 0, "no laneSection")
+    geometries = np.bincount(document["road/geometry"].road, minlength=len(length))
+    document.accuse("road", geometries == 0, "no geometry in its planView")
+    order = np.lexsort((start, table.road))
+    road, start = table.road[order], start[order]
+    last = np.append(road[1:] != road[:-1], True)
+    end = np.where(last, length[road], np.append(start[1:], 0.0))
+    number = np.arange(len(road)) - np.searchsorted(road, road)
+    row = np.empty(len(order), np.int64)
+    row[order] = np.arange(len(order))
+    # A road may end a little before its last section starts, as numbers were rounded.
+    return LaneSections(road, number, start, np.maximum(end, start)), row
+
+
+def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
+    """The next lane towards the centre, and the number of lanes that lie between."""
+    n = len(ident)
+    order = np.lexsort((np.abs(ident), ident > 0, section))
+    same = (np.diff(section[order]) == 0) & (np.diff((ident > 0)[order].astype(np.int8)) == 0)
+    follows = np.concatenate((np.zeros(min(n, 1), bool), same))
+    inner = np.full(n, -1, np.int64)
+    inner[order[1:][same]] = order[:-1][same]
+    position = np.arange(n)
+    first = np.maximum.accumulate(np.where(follows, 0, position))
+    rank = np.empty(n, np.int64)
+    rank[order] = position - first
+    return inner, rank
+
+
+@dataclass(frozen=True, slots=True)
+class _LaneIntervals:
+    """Stretches between cuts, ordered by section and s; shape (n,)."""
+
+    section: Ints
+    start: Floats
+    end: Floats
+    first: Ints  # (sections + 1,): where the intervals of each section start
+
+
+def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneIntervals:
+    sections = lanes.sections
+    kinds = ("road/elevation", "road/laneOffset")
+    road = np.concatenate([plan.road, *(document[kind].road for kind in kinds)])
+    s = np.concatenate([plan.s, *(document.numbers(kind, "s") for kind in kinds)])
+    section = last_before(sections.road, sections.start, road, s)
+    cuts = [(section, s)]
+    for kind in ("road/laneSection/lane/width", "road/laneSection/lane/border"):
+        lane = lanes.row[document[kind].of]
+        offset = document.numbers(kind, "sOffset", 0.0)[lane >= 0]
+        of = lanes.section[lane[lane >= 0]]
+        cuts.append((of, sections.start[of] + offset))
+    section = np.concatenate([c for c, _ in cuts])
+    s = np.concatenate([at for _, at in cuts])
+    inside = (section >= 0) & (s > sections.start[section] + _SAME_PLACE)
+    inside &= s < sections.end[section] - _SAME_PLACE
+    section, s = section[inside], s[inside]
+    every = np.arange(len(sections.start))
+    section = np.concatenate((every, section))
+    s = np.concatenate((sections.start, s))
+    order = np.lexsort((s, section))
+    section, s = section[order], s[order]
+    new = np.concatenate(
+        (np.ones(min(len(s), 1), bool), (np.diff(section) > 0) | (np.diff(s) > _SAME_PLACE))
+    )
+    section, s = section[new], s[new]
+    first = starts_of(np.bincount(section, minlength=len(every)))
+    end = np.append(s[1:], 0.0)
+    last = first[1:] - 1
+    end[last] = sections.end
+    return _LaneIntervals(section, s, end, first)
+
+
+def _shifted(coefficients: Floats, by: Floats) -> Floats:
+    """Cubics over ``x`` as cubics over ``x - by``."""
+    return np.stack(
+        (
+            cubic(coefficients, by),
+            cubic_slope(coefficients, by),
+            cubic_bend(coefficients, by) / 2,
+            coefficients[:, 3],
+        ),
+        axis=1,
+    )
+
+
+def _along_road(
+    document: Document, kind: str, lanes: LaneTable, intervals: _LaneIntervals
+) -> Floats:
+    """(intervals, 4): the cubics of a record of roads over the distance from the interval's start."""
+    middle = (intervals.start + intervals.end) / 2
+    at = document.numbers(kind, "s")
+    record = last_before(document[kind].road, at, lanes.sections.road[intervals.section], middle)
+    found = np.flatnonzero(record >= 0)
+    result = np.zeros((len(middle), 4))
+    by = np.maximum(intervals.start[found] - at[record[found]], 0.0)
+    result[found] = _shifted(coefficients_of(document, kind)[record[found]], by)
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class _LaneBorders:
+    """Outer and inner borders of lanes on intervals, as cubics over the distance from the interval's start."""
+
+    first: Ints  # (L + 1,): where the rows of each lane start, one row an interval of its section
+    interval: Ints
+    inner: Floats
+    outer: Floats
+
+
+def _borders(
+    document: Document, lanes: LaneTable, intervals: _LaneIntervals, centre: Floats
+) -> _LaneBorders:
+    counts = np.diff(intervals.first)[lanes.section]
+    lane, number = ragged(counts)
+    first = starts_of(counts)
+    interval = intervals.first[lanes.section[lane]] + number
+    middle = (intervals.start[interval] + intervals.end[interval]) / 2
+    within = middle - lanes.sections.start[lanes.section[lane]]
+    start = intervals.start[interval] - lanes.sections.start[lanes.section[lane]]
+    width, has_width = _of_lanes(document, "width", lanes, (lane, within, start))
+    border, has_border = _of_lanes(document, "border", lanes, (lane, within, start))
+    width *= np.sign(lanes.ident)[lane][:, None]
+    by_border = has_border & ~has_width
+    inner, outer = np.empty_like(width), np.empty_like(width)
+    rank = lanes.rank[lane]
+    by_rank = np.argsort(rank, kind="stable")
+    ends = np.searchsorted(rank[by_rank], np.arange(rank.max(initial=-1) + 2))
+    for begin, end in pairwise(ends):
+        rows = by_rank[begin:end]
+        below = lanes.inner[lane[rows]]
+        inner[rows] = outer[first[below] + number[rows]] if begin else centre[interval[rows]]
+        outer[rows] = np.where(by_border[rows][:, None], border[rows], inner[rows] + width[rows])
+    return _LaneBorders(first, interval, inner, outer)
+
+
+def _of_lanes(
+    document: Document, tag: str, lanes: LaneTable, at: tuple[Ints, Floats, Floats]
+) -> tuple[Floats, Bools]:
+    """Cubics of the records of lanes that hold at places (lane, middle, start), and where there are any."""
+    kind = f"road/laneSection/lane/{tag}"
+    lane, middle, start = at
+    of = lanes.row[document[kind].of]
+    offset = document.numbers(kind, "sOffset", 0.0)
+    record = last_before(of, offset, lane, middle)
+    has = record >= 0
+    result = np.zeros((len(lane), 4))
+    coefficients = coefficients_of(document, kind)[record[has]]
+    result[has] = _shifted(coefficients, np.maximum(start[has] - offset[record[has]], 0.0))
+    return result, has
+
+
+def _pieces(
+    document: Document,
+    lanes: LaneTable,
+    plan: PlanView,
+    parts: tuple[_LaneIntervals, _LaneBorders, Floats],
+) -> tuple[Ints, Ints]:
+    """Into how many pieces each interval is cut, and the record of the plan view that holds in it."""
+    intervals, borders, heights = parts
+    length = intervals.end - intervals.start
+    road = lanes.sections.road[intervals.section]
+    record = last_before(plan.road, plan.s, road, (intervals.start + intervals.end) / 2)
+    share = np.linspace(0.0, 1.0, _SAMPLES)
+    places = (intervals.start[:, None] + length[:, None] * share).ravel()
+    curvature = poses(plan, np.repeat(record, _SAMPLES), places).curvature.reshape(-1, _SAMPLES)
+    rate = np.ptp(curvature, axis=1) / np.maximum(length, _SAME_PLACE)
+    at = length[borders.interval][:, None] * np.array([0.0, 0.5, 1.0])
+    kappa = curvature[borders.interval][:, [0, _SAMPLES // 2, -1]]
+    sharpest = np.abs(curvature).max(axis=1)[borders.interval][:, None]
+    bend = np.zeros(len(length))
+    for side in (borders.inner, borders.outer):
+        cubics = side[:, None, :]
+        t, slope = cubic(cubics, at), np.abs(cubic_slope(cubics, at))
+        # |p''| of p = r + t n, with r'' = κ n and n' = -κ r', is at most
+        # |κ (1 - κ t)| + 2 |κ t'| + |κ' t| + |t''|.
+        bound = sharpest * np.abs(1 - kappa * t) + 2 * sharpest * slope
+        bound += rate[borders.interval][:, None] * np.abs(t) + np.abs(cubic_bend(cubics, at))
+        np.maximum.at(bend, borders.interval, bound.max(axis=1))
+    rise = np.abs(cubic_bend(heights[:, None, :], length[:, None] * np.array([0.0, 1.0])))
+    steepest = np.maximum(bend / (8 * SAGITTA), rise.max(axis=1) / (8 * RISE))
+    steepest = np.maximum(steepest, 1 / MAX_STEP**2)
+    wanted = np.ceil(length * np.sqrt(steepest))
+    wanted = np.where(np.isfinite(wanted), np.clip(wanted, 1, MAX_STATIONS), MAX_STATIONS)
+    _bound(document, lanes, intervals, wanted)
+    return wanted.astype(np.int64), record
+
+
+def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, pieces: Floats) -> None:
+    """Refuse roads, or the map, whose intervals would be cut into too many pieces."""
+    road = lanes.sections.road[intervals.section]
+    lanes_here = np.bincount(lanes.section, minlength=len(lanes.sections.start)) + 1.0
+    points = (pieces + 1) * lanes_here[intervals.section]
+    total = np.bincount(road, points, minlength=len(document["road"]))
+    many = f"so bent, long or finely recorded that it takes over {MAX_STATIONS:,} points"
+    document.accuse("road", total > MAX_STATIONS, many)
+    document.settle()
+    if points.sum() > MAX_TOTAL:
+        raise MapError(f"takes over {MAX_TOTAL:,} points", element="OpenDRIVE")
+
+
+@dataclass(frozen=True, slots=True)
+class _Stations:
+    """Places along sections where cross sections are taken, ordered by section and s; shape (n,)."""
+
+    first: Ints  # (sections + 1,)
+    interval: Ints
+    s: Floats
+    pose: Poses
+    z: Floats
+
+
+def _stations(
+    plan: PlanView, parts: tuple[_LaneIntervals, _LaneBorders, Floats], pieces: Ints, record: Ints
+) -> _Stations:
+    intervals, borders, heights = parts
+    interval, number = ragged(pieces + 1)
+    length = (intervals.end - intervals.start)[interval]
+    into = length * number / pieces[interval]
+    s = intervals.start[interval] + into
+    pose = poses(plan, record[interval], s)
+    # The last station before a cut goes, unless something jumps or has a corner there.
+    ends = np.cumsum(pieces + 1) - 1
+    inner_cut = np.flatnonzero(np.diff(intervals.section) == 0)
+    before, after = ends[inner_cut], ends[inner_cut] + 1
+    jump = np.hypot(pose.x[after] - pose.x[before], pose.y[after] - pose.y[before])
+    reach, step, corner = _lateral_jumps(intervals, borders)
+    turn = 2 * np.abs(np.sin((pose.heading[after] - pose.heading[before]) / 2))
+    jump += turn * reach[inner_cut] + step[inner_cut]
+    keep = np.ones(len(s), bool)
+    keep[before[(jump < JUMP) & (turn + corner[inner_cut] < CORNER)]] = False
+    z = cubic(heights[interval], into)
+    kept = Poses(pose.x[keep], pose.y[keep], pose.heading[keep], pose.curvature[keep])
+    counts = np.bincount(intervals.section[interval[keep]], minlength=len(intervals.first) - 1)
+    return _Stations(starts_of(counts), interval[keep], s[keep], kept, z[keep])
+
+
+def _lateral_jumps(
+    intervals: _LaneIntervals, borders: _LaneBorders
+) -> tuple[Floats, Floats, Floats]:
+    """How far borders reach from the reference line at the end of each interval, jump, and turn there."""
+    n = len(intervals.section)
+    length = (intervals.end - intervals.start)[borders.interval]
+    reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)
+    for side in (borders.inner, borders.outer):
+        at_end = cubic(side, length)
+        np.maximum.at(reach, borders.interval, np.abs(at_end))
+        rows = np.flatnonzero(np.diff(borders.interval) == 1)
+        np.maximum.at(step, borders.interval[rows], np.abs(side[rows + 1, 0] - at_end[rows]))
+        slope = cubic_slope(side, length)
+        np.maximum.at(corner, borders.interval[rows], np.abs(side[rows + 1, 1] - slope[rows]))
+    return reach, step, corner
+
+
+def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
+    """The surface of all lanes.
+
+    Raises
+    ------
+    Spoiled
+        Some roads are too bent, too long, or too far away.
+    MapError
+        All roads together are.
+    """
+    intervals = _intervals(document, lanes, plan)
+    _bound(document, lanes, intervals, np.ones(len(intervals.section)))
+    centre = _along_road(document, "road/laneOffset", lanes, intervals)
+    heights = _along_road(document, "road/elevation", lanes, intervals)
+    borders = _borders(document, lanes, intervals, centre)
+    document.settle()
+    parts = (intervals, borders, heights)
+    pieces, record = _pieces(document, lanes, plan, parts)
+    stations = _stations(plan, parts, pieces, record)
+    ribbons = _cross_sections(lanes, intervals, borders, stations)
+    _check_places(document, lanes, ribbons)
+    return ribbons
+
+
+def _cross_sections(
+    lanes: LaneTable, intervals: _LaneIntervals, borders: _LaneBorders, stations: _Stations
+) -> Ribbons:
+    counts = np.diff(stations.first)[lanes.section]
+    lane, number = ragged(counts)
+    offsets = starts_of(counts)
+    forward = lanes.forward[lane]
+    number = np.where(forward, number, counts[lane] - 1 - number)
+    at = stations.first[lanes.section[lane]] + number
+    interval = stations.interval[at]
+    row = borders.first[lane] + interval - intervals.first[intervals.section[interval]]
+    into = stations.s[at] - intervals.start[interval]
+    inner, outer = cubic(borders.inner[row], into), cubic(borders.outer[row], into)
+    middle = (inner + outer) / 2
+    slope = (cubic_slope(borders.inner[row], into) + cubic_slope(borders.outer[row], into)) / 2
+    x, y = stations.pose.x[at], stations.pose.y[at]
+    direction, bend = stations.pose.heading[at], stations.pose.curvature[at]
+    turned = np.arctan2(slope, 1 - bend * middle) + np.where(forward, 0.0, np.pi)
+    to_left_x, to_left_y = -np.sin(direction), np.cos(direction)
+    inner_is_left = (lanes.ident[lane] < 0) == forward
+    left, right = np.where(inner_is_left, (inner, outer), (outer, inner))
+    centre_x, centre_y = x + middle * to_left_x, y + middle * to_left_y
+    step = np.hypot(np.diff(centre_x, prepend=0.0), np.diff(centre_y, prepend=0.0))
+    step[offsets[:-1]] = 0.0
+    run = np.cumsum(step)
+    return Ribbons(
+        offsets=offsets,
+        left_x=x + left * to_left_x,
+        left_y=y + left * to_left_y,
+        right_x=x + right * to_left_x,
+        right_y=y + right * to_left_y,
+        z=stations.z[at],
+        heading=direction + turned,
+        s=stations.s[at],
+        along=run - run[offsets[:-1]][lane],
+    )
+
+
+def _check_places(document: Document, lanes: LaneTable, ribbons: Ribbons) -> None:
+    columns = (ribbons.left_x, ribbons.left_y, ribbons.right_x, ribbons.right_y, ribbons.z)
+    wild = np.zeros(len(ribbons.z), bool)
+    for column in columns:
+        wild |= ~(np.abs(column) < MAX_COORDINATE)
+    lane = np.searchsorted(ribbons.offsets, np.flatnonzero(wild), side="right") - 1
+    roads = _marked(lanes.road[lane], len(document["road"]))
+    document.accuse("road", roads, f"reaches farther than {MAX_COORDINATE:.0e} m from the origin")
+    document.settle()

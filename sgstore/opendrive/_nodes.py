@@ -1,0 +1,339 @@
+"""Lanes, roads and junctions as nodes with relations, and lane changes from road marks.
+
+Lanes, roads and junctions as nodes, and the relations that hold among them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.opendrive._document import last_before
+from sgstore.roads import STOREY, LaneChanges, MapNodes, conflicts, mean_widths, turn_words, turned
+from sgstore.vocabulary import DRIVING, TRAFFIC
+
+if TYPE_CHECKING:
+    from sgstore.opendrive._document import Document
+    from sgstore.opendrive._lanes import LaneTable
+    from sgstore.opendrive._links import Flow
+    from sgstore.roads import Edge, Ribbons
+    from sgstore.world import Bools, Floats, Ints
+
+
+NARROW: Final = 1e-2
+"""A lane that is nowhere wider has no neighbours: those on both sides of it are neighbours; m."""
+
+SPEED_UNITS: Final = {"": 1.0, "m/s": 1.0, "mph": 0.44704, "km/h": 1 / 3.6, "kmh": 1 / 3.6}
+"""Units of speed → m/s. (ASAM OpenDRIVE 1.8, ``e_unitSpeed``.)"""
+
+FIRST_LANE: Final = 1
+"""Row of the first lane: ``off_road`` comes before it."""
+
+
+def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNodes:
+    """The lanes, in their order."""
+    road_names = document.road_ids
+    sections = lanes.sections
+    number = sections.number[lanes.section]
+    roads = [road_names[r] for r in lanes.road.tolist()]
+    names = [
+        f"{road}/{section}/{ident}"
+        for road, section, ident in zip(roads, number.tolist(), lanes.ident.tolist(), strict=True)
+    ]
+    length = ribbons.lengths
+    middle = ribbons.at(np.arange(len(lanes)), length / 2)
+    return MapNodes.of(
+        "lane",
+        names,
+        x=middle.x,
+        y=middle.y,
+        z=middle.z,
+        heading=middle.heading,
+        lane_type=tuple(lanes.type),
+        road=tuple(roads),
+        junction=tuple(junction_of(document, road) for road in lanes.road.tolist()),
+        turn=_turns(document, lanes, ribbons),
+        section=number,
+        lane=lanes.ident,
+        length=length,
+        width=mean_widths(ribbons),
+        speed_limit=_speed_limits(document, lanes),
+    )
+
+
+def junction_of(document: Document, road: int) -> str:
+    """Id of the junction that a road lies in, empty if it lies in none."""
+    junction = document["road"].attributes[road].get("junction", "-1")
+    return "" if junction == "-1" else junction
+
+
+def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str, ...]:
+    """How lanes turn on their way through a junction; a road that turns in several sections turns once."""
+    sign = np.where(lanes.forward, 1.0, -1.0)
+    _, one = np.unique(lanes.section, return_index=True)
+    of_road = np.zeros(len(document["road"]))
+    np.add.at(of_road, lanes.road[one], (turned(ribbons) * sign)[one])
+    turn = of_road[lanes.road] * sign
+    return tuple(
+        word if junction_of(document, road) else ""
+        for word, road in zip(turn_words(turn), lanes.road.tolist(), strict=True)
+    )
+
+
+def _speed_limits(document: Document, lanes: LaneTable) -> Floats:
+    """Limits at the middle of each lane: the lane's own record, else that of its road; m/s."""
+    sections = lanes.sections
+    start, end = sections.start[lanes.section], sections.end[lanes.section]
+    middle = (start + end) / 2
+    kind = "road/laneSection/lane/speed"
+    record = last_before(
+        lanes.row[document[kind].of],
+        document.numbers(kind, "sOffset", 0.0),
+        np.arange(len(lanes)),
+        middle - start,
+    )
+    own = np.append(_speeds(document, kind), np.nan)[record]
+    of_type = document["road/type"]
+    kind = "road/type/speed"
+    limit = np.full(len(of_type) + 1, np.nan)
+    limit[document[kind].of] = _speeds(document, kind)
+    at = document.numbers("road/type", "s", 0.0)
+    of_road = limit[last_before(of_type.road, at, lanes.road, middle)]
+    return np.where(np.isnan(own), of_road, own)
+
+
+def _speeds(document: Document, kind: str) -> Floats:
+    table = document[kind]
+    texts = zip(table.texts("max"), table.texts("unit"), strict=True)
+    return np.array([speed(value, unit) for value, unit in texts], np.float64)
+
+
+def speed(value: str, unit: str) -> float:
+    """A speed in m/s; NaN for ``no limit``, ``undefined`` and what is no speed."""
+    try:
+        metres = float(value) * SPEED_UNITS[unit.strip().lower()]
+    except (ValueError, KeyError):
+        return np.nan
+    return metres if 0 < metres < 1000 else np.nan
+
+
+def wide_pairs(lanes: LaneTable, ribbons: Ribbons) -> Ints:
+    """(2, n): lanes that share a border, the left one first."""
+    return _pairs(lanes, np.flatnonzero(mean_widths(ribbons) > NARROW))
+
+
+def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
+    """``toLeftOf``, ``toRightOf`` and ``opposes`` among lanes.
+
+    Neighbours share a border. Lanes of traffic that only lanes without traffic part (a median, a strip of
+    grass) are neighbours as well: they are what a driver looks at across it.
+    """
+    wide = np.flatnonzero(mean_widths(ribbons) > NARROW)
+    traffic = _pairs(lanes, wide[[lanes.type[lane] in TRAFFIC for lane in wide.tolist()]])
+    forward, both = lanes.forward, lanes.both
+    left, right = np.concatenate((wide_pairs(lanes, ribbons), traffic), axis=1)
+    from_left, from_right = forward[left], forward[right]
+    against = (forward[traffic[0]] != forward[traffic[1]]) | both[traffic].any(axis=0)
+    opposing = traffic[:, against] + FIRST_LANE
+    left, right = left + FIRST_LANE, right + FIRST_LANE
+    return [
+        ("toRightOf", right[from_left], left[from_left]),
+        ("toLeftOf", right[~from_left], left[~from_left]),
+        ("toLeftOf", left[from_right], right[from_right]),
+        ("toRightOf", left[~from_right], right[~from_right]),
+        ("opposes", np.concatenate(opposing), np.concatenate(opposing[::-1])),
+    ]
+
+
+def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
+    """(2, n): lanes of a section that follow one another among ``rows``, from left to right."""
+    same: Bools = np.diff(lanes.section[rows]) == 0
+    return np.stack((rows[:-1][same], rows[1:][same]))
+
+
+def flow_edges(lanes: LaneTable, nodes: MapNodes, ribbons: Ribbons, flow: Flow) -> list[Edge]:
+    """``travelsTo`` and ``conflictsWith`` among lanes; ``nodes`` are theirs."""
+    crossing = [
+        lane
+        for lane, (kind, junction) in enumerate(zip(lanes.type, nodes.junction, strict=True))
+        if junction and kind in DRIVING
+    ]
+    pair = (flow.src, flow.dst)
+    one, other = conflicts(ribbons, np.array(crossing, np.int64), nodes.junction, pair, STOREY)
+    both = np.concatenate((one, other)), np.concatenate((other, one))
+    return [
+        ("travelsTo", flow.src + FIRST_LANE, flow.dst + FIRST_LANE),
+        ("conflictsWith", both[0] + FIRST_LANE, both[1] + FIRST_LANE),
+    ]
+
+
+def road_nodes(document: Document) -> list[MapNodes]:
+    """The roads, and the junctions, in their order."""
+    every = range(len(document["road"]))
+    road = MapNodes.of(
+        "road",
+        document.road_ids,
+        length=document.numbers("road", "length"),
+        road=tuple(document.road_ids),
+        junction=tuple(junction_of(document, row) for row in every),
+    )
+    names = document["junction"].texts("id")
+    return [road, MapNodes.of("junction", names, junction=tuple(names))]
+
+
+def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
+    """Id of each road that has a type → where along it which type begins."""
+    table = document["road/type"]
+    found: dict[str, list[tuple[float, str]]] = {}
+    places = document.rough_numbers("road/type", "s").tolist()
+    for road, s, name in zip(table.road.tolist(), places, table.texts("type"), strict=True):
+        found.setdefault(document.road_ids[road], []).append((s, name))
+    return {road: tuple(sorted(types)) for road, types in found.items()}
+
+
+def junction_types(document: Document) -> dict[str, str]:
+    """Id of each junction → its type (ASAM OpenDRIVE 1.8, 12: one that does not say is ``default``)."""
+    table = document["junction"]
+    pairs = zip(table.texts("id"), table.texts("type", "default"), strict=True)
+    return {name: kind.strip() or "default" for name, kind in pairs}
+
+
+def containment(document: Document, road: Ints) -> list[Edge]:
+    """``isIn``: lanes in their roads, roads in their junctions. They stand in the order of their nodes.
+
+    ``road``: rows of the roads of all lanes.
+    """
+    first_road = FIRST_LANE + len(road)
+    first_junction = first_road + len(document["road"])
+    junctions: dict[str, int] = {}
+    for row, name in enumerate(document["junction"].texts("id")):
+        junctions.setdefault(name, row)
+    pairs = [
+        (row, junctions[name])
+        for row in range(len(document["road"]))
+        if (name := junction_of(document, row)) in junctions
+    ]
+    roads, within = np.array(pairs, np.int64).reshape(-1, 2).T
+    every = np.arange(len(road))
+    return [
+        ("isIn", FIRST_LANE + every, first_road + road),
+        ("isIn", first_road + roads, first_junction + within),
+    ]
+
+
+# Road marks → where traffic may change lanes ----------------------------------------------------
+# The mark of a lane is on its outer border, that of the centre lane on the line between left and right. What
+# ``laneChange`` says holds; where it says nothing the type of the mark does: broken lines may be crossed, and
+# of a double line the one on one's own side counts. A border without any mark forbids nothing. (ASAM OpenDRIVE
+# 1.8, 11.9.)
+
+_ATTRIBUTE: Final = {
+    "both": (True, True),
+    "none": (False, False),
+    "increase": (True, False),
+    "decrease": (False, True),
+}
+"""``laneChange`` → whether lanes may be changed towards higher ids (to the left along s), towards lower ids."""
+
+_CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
+"""Types of marks that may be crossed from either side."""
+
+
+def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
+    """Whether a mark lets traffic change towards higher lane ids, and towards lower ids.
+
+    Parameters
+    ----------
+    kind, attribute : str
+        ``type`` and ``laneChange`` of the mark.
+    owner : int
+        Id of the lane whose mark it is. Double lines are named from the inside out, that of the centre lane
+        from left to right.
+    """
+    if attribute in _ATTRIBUTE:
+        return _ATTRIBUTE[attribute]
+    if kind in _CROSSED:
+        return True, True
+    if kind not in {"solid broken", "broken solid"}:
+        return False, False
+    # To the right of the centre, inside is to the left. From the side with the broken line one may cross.
+    left_is_broken = (kind == "broken solid") == (owner <= 0)
+    return not left_is_broken, left_is_broken
+
+
+def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
+    """Where traffic may change from lane to lane: driving lanes side by side with traffic in one direction."""
+    left, right = wide_pairs(lanes, ribbons)
+    driving = np.array([kind in DRIVING for kind in lanes.type], bool)
+    one_way = lanes.forward[left] == lanes.forward[right]
+    one_way |= lanes.both[left] | lanes.both[right]
+    kept = driving[left] & driving[right] & one_way
+    left, right = left[kept], right[kept]
+    marks = _Marks(document, lanes)
+    rows: list[tuple[int, int, float, float]] = []
+    for a, b in zip(left.tolist(), right.tolist(), strict=True):
+        for start, end, to_left, to_right in marks.between(a, b):
+            rows += [(b, a, start, end)] * to_left + [(a, b, start, end)] * to_right
+    table = np.array(rows, np.float64).reshape(-1, 4)
+    lane, to = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    return _along(ribbons, lane, to, table[:, 2:])
+
+
+class _Marks:
+    """The marks of borders."""
+
+    def __init__(self, document: Document, lanes: LaneTable) -> None:
+        self._lanes = lanes
+        kind = "road/laneSection/lane/roadMark"
+        table = document[kind]
+        offsets = document.rough_numbers(kind, "sOffset")
+        records: dict[int, list[tuple[float, str, str]]] = {}
+        rows = zip(
+            table.parent,
+            offsets.tolist(),
+            table.texts("type", "none"),
+            table.texts("laneChange"),
+            strict=True,
+        )
+        for raw, offset, mark, attribute in rows:
+            if np.isfinite(offset):
+                record = (offset, mark.strip().lower(), attribute.strip().lower())
+                records.setdefault(raw, []).append(record)
+        self._of_lane = {int(lanes.row[raw]): marks for raw, marks in records.items()}
+        self._of_centre = {
+            int(lanes.centre[raw]): marks
+            for raw, marks in records.items()
+            if lanes.centre[raw] >= 0
+        }
+
+    def between(self, left: int, right: int) -> list[tuple[float, float, bool, bool]]:
+        """Stretches (start, end, to the left permitted, to the right permitted) of a border, along s."""
+        lanes = self._lanes
+        section = int(lanes.section[left])
+        idents = int(lanes.ident[left]), int(lanes.ident[right])
+        owner = right if idents[1] > 0 else left
+        if idents[0] > 0 > idents[1]:
+            records, ident = self._of_centre.get(section, []), 0
+        else:
+            records, ident = self._of_lane.get(owner, []), int(lanes.ident[owner])
+        start, end = float(lanes.sections.start[section]), float(lanes.sections.end[section])
+        records = sorted([(-np.inf, "none", ""), *records], key=lambda record: record[0])
+        cuts = [min(max(start + offset, start), end) for offset, _, _ in records] + [end]
+        return [
+            (cuts[i], cuts[i + 1], *permitted(kind, attribute, ident))
+            for i, (_, kind, attribute) in enumerate(records)
+            if cuts[i + 1] > cuts[i]
+        ]
+
+
+def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
+    """Stretches from s to lengths of the centre line, in order, those that follow on one another as one."""
+    one, other = ribbons.along_at(lane, ends[:, 0]), ribbons.along_at(lane, ends[:, 1])
+    start, end = np.minimum(one, other), np.maximum(one, other)
+    order = np.lexsort((start, to, lane))
+    lane, to, start, end = lane[order], to[order], start[order], end[order]
+    follows = (np.diff(lane) == 0) & (np.diff(to) == 0) & (np.abs(start[1:] - end[:-1]) < 1e-6)
+    begins = np.concatenate((np.ones(min(len(lane), 1), bool), ~follows))
+    ends_here = np.concatenate((~follows, np.ones(min(len(lane), 1), bool)))
+    return LaneChanges(lane[begins], to[begins], start[begins], end[ends_here])

@@ -1,0 +1,192 @@
+"""Text of a road map → RoadMap: OpenDRIVE, and the plain lanes of recordings that carry none.
+
+``document`` reads the text into tables · ``planview`` evaluates reference lines · ``lanes`` stacks lanes on
+them · ``links`` finds where traffic flows on · ``nodes`` and its kin make nodes and relations of it all.
+A road with a defect is left out and named in the map's warnings: the text is then read once more
+without it, so that no later step has to know. Of a width, a border, a height or a lane offset that is no
+number only that record is left out. Only a map without any usable road is an error.
+
+OpenDRIVE 1.4 to 1.8 (ASAM) are read alike. Superelevation, crossfall and the height of kerbs are not: a lane
+lies at the elevation of its reference line, which is what storeys are told apart by.
+
+A map that was read is kept by its content, so that the traces of a store, or pictures one after another, read
+it once a process, with the indices that it made. It is not kept on disk: a town is read in a tenth of a second,
+less than starting takes, and what is read from a file has to be checked again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import shapely
+
+from sgstore.config import Signs
+from sgstore.errors import MapError
+from sgstore.opendrive._document import Document, Record, Spoiled, read_document
+from sgstore.opendrive._lanes import odd_sections, read_lanes, surface
+from sgstore.opendrive._links import Network, flows
+from sgstore.opendrive._nodes import (
+    FIRST_LANE,
+    containment,
+    flow_edges,
+    junction_types,
+    lane_nodes,
+    neighbours,
+    read_lane_changes,
+    road_nodes,
+    road_types,
+)
+from sgstore.opendrive._objects import read_objects
+from sgstore.opendrive._reference_lines import read_plan_view
+from sgstore.opendrive._signals import read_controllers, read_signals
+from sgstore.roads import (
+    MapNodes,
+    RoadMap,
+    edges_of,
+    is_lane_text,
+    plain_nodes,
+    read_lane_text,
+    ribbons_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Mapping
+
+
+__all__ = ["parse_map", "read_map"]
+
+SIGNS: Final = Signs()
+"""How signals are read if nobody says otherwise."""
+_ROUNDS: Final = 8
+"""Readings of a text: each leaves out the roads that the one before found defects in."""
+
+
+_KEPT: Final = 4
+"""Maps that are kept: one of 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth of it."""
+
+
+@lru_cache(maxsize=_KEPT)
+def read_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
+    """The road map that a text describes; the same one again if it was asked for lately.
+
+    Parameters
+    ----------
+    text : str
+        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads._lanes`). Untrusted: time and
+        memory are bounded by its length.
+    name : str
+        What people call it; empty: the name in its header, or the first digits of its digest.
+    signs : Signs
+        How signals are read: kinds that the client says they are, and what their orientation means. A map for
+        which that matters is another map: it has another digest.
+
+    Returns
+    -------
+    RoadMap
+        Roads with a defect are left out; its ``warnings`` say which, and why.
+
+    Raises
+    ------
+    MapError
+        The text is no XML or no OpenDRIVE, exceeds a bound, or has no road that can be used.
+    """
+    return parse_map(text, name, signs)
+
+
+def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
+    """The same, read anew."""
+    if is_lane_text(text):
+        return read_lane_text(text, name or _short_digest(text))
+    skip: dict[int, MapError] = {}
+    odd: dict[Record, MapError] = {}
+    for _ in range(_ROUNDS):
+        document = read_document(text, frozenset(skip))
+        if not len(document["road"]):
+            break
+        document.leave_out(odd)
+        try:
+            road_map = _build(document, text, name, signs)
+            left_out = [*map(str, skip.values()), *_without(odd, skip)]
+            road_map.warnings = (*left_out, *road_map.warnings)
+            return road_map
+        except Spoiled as spoiled:
+            found = {document.ordinals[row]: error for row, error in spoiled.roads.items()}
+            skip |= found
+            odd |= spoiled.records
+    if skip:
+        first = next(iter(skip.values()))
+        more = f" (and {len(skip) - 1} more such roads)" if len(skip) > 1 else ""
+        raise MapError(f"{first.reason}{more}", road=first.road, element=first.element) from first
+    raise MapError("has no road", element="OpenDRIVE")
+
+
+def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
+    """What is said of records that were left out of roads that are there: a line for each road and kind."""
+    groups: dict[tuple[str, int], list[MapError]] = {}
+    for (kind, road, _), error in odd.items():
+        if road not in skip:
+            groups.setdefault((kind, road), []).append(error)
+    return [
+        f"{errors[0]}: "
+        + ("it is left out" if len(errors) == 1 else f"it and {len(errors) - 1} more are left out")
+        for errors in groups.values()
+    ]
+
+
+def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
+    plan = read_plan_view(document)
+    lanes = read_lanes(document)
+    document.settle()
+    ribbons = surface(document, lanes, plan)
+    network = Network.of(document, lanes)
+    surfaces = lane_nodes(document, lanes, ribbons)
+    signals = read_signals(document, plan, network, signs)
+    furniture = read_objects(document, plan, network.warnings)
+    spaces = ribbons_of(furniture.parking)
+    before = [
+        MapNodes.of("off_road", ["off_road"]),
+        surfaces,
+        plain_nodes(furniture.parking, spaces),
+        *road_nodes(document),
+        furniture.crosswalks.nodes,
+    ]
+    nodes = MapNodes.joined([*before, signals.nodes, furniture.scenery.nodes])
+    first_signal = sum(map(len, before))
+    lane_changes = read_lane_changes(document, lanes, ribbons)
+    edges = [
+        *neighbours(lanes, ribbons),
+        *flow_edges(lanes, surfaces, ribbons, flows(document, network)),
+        *containment(document, np.append(lanes.road, furniture.parking_road)),
+        ("laneChange", FIRST_LANE + lane_changes.lane, FIRST_LANE + lane_changes.to),
+        signals.edges(first_signal),
+    ]
+    shapes = np.full(len(nodes), None, object)
+    poles: Any = shapely.points(signals.nodes.x, signals.nodes.y)
+    beside = [*furniture.crosswalks.shapes, *poles, *furniture.scenery.shapes]
+    shapes[len(nodes) - len(beside) :] = beside
+    document.settle()
+    return RoadMap(
+        name=name or _header_name(document) or _short_digest(text),
+        text=text,
+        nodes=nodes,
+        edges=edges_of(edges),
+        ribbons=ribbons.followed_by(spaces),
+        shapes=shapes,
+        lane_changes=lane_changes,
+        road_types=road_types(document),
+        junction_types=junction_types(document),
+        controllers=read_controllers(document),
+        warnings=[*odd_sections(document), *network.warnings],
+        variant=signals.told,
+    )
+
+
+def _header_name(document: Document) -> str:
+    return next(iter(document["header"].texts("name")), "").strip()
+
+
+def _short_digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:12]

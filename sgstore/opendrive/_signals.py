@@ -1,0 +1,456 @@
+"""Signals: type, place and controlled lanes, with warnings where these disagree.
+
+Signals whose place contradicts the lanes that their orientation names.
+
+Only what has no validity is looked at. Its place contradicts if nobody drives in the direction that is named
+although there is traffic; and a light, a stop or a yield sign that stands before a junction contradicts if all
+that is named comes out of the junction there while other traffic comes towards it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.opendrive._document import coefficients_of, cubic, last_before
+from sgstore.opendrive._links import END, START
+from sgstore.opendrive._nodes import FIRST_LANE, junction_of, speed
+from sgstore.opendrive._reference_lines import PlanView, poses
+from sgstore.roads import MapNodes
+from sgstore.vocabulary import DRIVING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.config import Signs
+    from sgstore.opendrive._document import Document
+    from sgstore.opendrive._links import Network
+    from sgstore.roads import Edge
+    from sgstore.world import Floats, Ints
+
+
+NEAR: Final = 50.0
+"""What stands farther from a junction than this is not taken to stand before it; m along the road."""
+LISTED: Final = 8
+"""Signals that a warning names."""
+_BEFORE_JUNCTIONS: Final = frozenset({"traffic_light", "stop_sign", "yield_sign"})
+_READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA reads it"}
+
+
+@dataclass(slots=True)
+class Doubts:
+    """What is found of the signals of a map.
+
+    Parameters
+    ----------
+    document : Document
+    network : Network
+    reading : str
+        ``asam`` or ``carla``: how orientations are read.
+
+    Attributes
+    ----------
+    kinds : dict
+        Signal -> its kind.
+    asked : int
+        How many elements there are that have an orientation and no validity.
+    """
+
+    document: Document
+    network: Network
+    reading: str
+    kinds: dict[str, str] = field(default_factory=dict[str, str])
+    asked: int = 0
+    _odd: dict[str, bool] = field(default_factory=dict[str, bool])
+    _lengths: list[float] = field(default_factory=list[float])
+    _junctions: dict[str, frozenset[int]] = field(default_factory=dict[str, frozenset[int]])
+
+    def ask(
+        self,
+        signal: str,
+        place: tuple[int, float],
+        there: frozenset[int],
+        readings: tuple[frozenset[int], frozenset[int]],
+    ) -> None:
+        """Look at an element of a signal at a place (road, s).
+
+        ``there``: the driving lanes at this place; ``readings``: those of them that it names, and those that
+        it would name as others read it.
+        """
+        self.asked += 1
+        ours, theirs = (self._fits(self.kinds.get(signal, ""), place, there, r) for r in readings)
+        if not ours:
+            self._odd[signal] = self._odd.get(signal, True) and theirs
+
+    def warnings(self) -> list[str]:
+        """What is to be said, in a line or none."""
+        if not self._odd:
+            return []
+        names = ", ".join(map(repr, list(self._odd)[:LISTED]))
+        more = f" and {len(self._odd) - LISTED} more" if len(self._odd) > LISTED else ""
+        other = "carla" if self.reading == "asam" else "asam"
+        better = sum(self._odd.values())
+        help_ = f'; {better} of {len(self._odd)} would fit with the setting orientation = "{other}"'
+        return [
+            f"signals without <validity> {names}{more}: their orientation, {_READERS[self.reading]}, names no"
+            f" traffic, or what comes out of the junction before which they stand{help_ if better else ''}"
+        ]
+
+    def _fits(
+        self, kind: str, place: tuple[int, float], there: frozenset[int], named: frozenset[int]
+    ) -> bool:
+        if not there:
+            return True
+        if not named:
+            return False
+        end = self._before(*place) if kind in _BEFORE_JUNCTIONS else ""
+        if not end:
+            return True
+        towards = {lane for lane in there if self._leads_to(lane, end)}
+        return not towards or not named.isdisjoint(towards)
+
+    def _leads_to(self, lane: int, end: str) -> bool:
+        lanes = self.network.lanes
+        return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
+
+    def _before(self, road: int, s: float) -> str:
+        """The end of its road at which there is a junction before which a place lies; empty: there is none."""
+        if not self._junctions:
+            self._lengths = self.document.rough_numbers("road", "length").tolist()
+            self._junctions = {
+                contact: frozenset(
+                    table.parent[row]
+                    for row, attributes in enumerate(table.attributes)
+                    if attributes.get("elementType") == "junction"
+                )
+                for contact, table in (
+                    (START, self.document["road/predecessor"]),
+                    (END, self.document["road/successor"]),
+                )
+            }
+        length = self._lengths[road]
+        end, away = (START, s) if s < length / 2 else (END, length - s)
+        return end if away <= NEAR and road in self._junctions[end] else ""
+
+
+# Places along roads: (road, s, t) → position, for signals and objects ---------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RoadPoses:
+    """Positions, shape (N,): map axes, and the heading of the road there."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+
+
+def places(document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats) -> RoadPoses:
+    """Where ``s`` along roads and ``t`` to their left is; before or beyond a road, its end is taken."""
+    length = document.numbers("road", "length")[road]
+    s = np.clip(s, 0.0, length)
+    pose = poses(plan, last_before(plan.road, plan.s, road, s), s)
+    at = document.numbers("road/elevation", "s")
+    record = last_before(document["road/elevation"].road, at, road, s)
+    level = np.zeros((len(at) + 1, 4))
+    level[:-1] = coefficients_of(document, "road/elevation")
+    into = np.maximum(s - np.append(at, 0.0)[record], 0.0)
+    return RoadPoses(
+        pose.x - t * np.sin(pose.heading),
+        pose.y + t * np.cos(pose.heading),
+        cubic(level[record], into),
+        pose.heading,
+    )
+
+
+def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
+    """Those ``rows`` of signals or objects whose place is known; a warning for each of the others."""
+    table = document[kind]
+    placed = np.ones(len(table), bool)
+    for name in ("s", "t", "zOffset", "hdg", "hOffset"):
+        placed &= np.isfinite(document.rough_numbers(kind, name))
+    warnings.extend(
+        f"road {document.road_ids[table.road[row]]!r}, <{table.element}>"
+        f" {table.attributes[row].get('id', '')!r}: its place is no number, left out"
+        for row in rows[~placed[rows]].tolist()
+    )
+    return rows[placed[rows]]
+
+
+def node_columns(
+    document: Document,
+    plan: PlanView,
+    kind: str,
+    rows: Ints,
+    at: tuple[Floats, Floats, Floats] | None = None,
+) -> dict[str, Any]:
+    """Columns of :class:`~sgstore.roads.MapNodes` that say where signals or objects stand.
+
+    ``at`` is s, t and the height above the road, else the element's own. The heading is the road's plus the
+    element's own, as the file has it.
+    """
+    table = document[kind]
+    own = {
+        name: document.rough_numbers(kind, name)[rows]
+        for name in ("s", "t", "zOffset", "hdg", "hOffset")
+    }
+    s, t, up = at or (own["s"], own["t"], own["zOffset"])
+    road = table.road[rows]
+    where = places(document, plan, road, s, t)
+    heading = where.heading + own["hdg"] + own["hOffset"]
+    return {
+        "x": where.x,
+        "y": where.y,
+        "z": where.z + up,
+        "heading": np.pi - (np.pi - heading) % (2 * np.pi),
+        "road": tuple(document.road_ids[r] for r in road.tolist()),
+        "junction": tuple(junction_of(document, r) for r in road.tolist()),
+    }
+
+
+# Signals: what they are, where they stand, and which lanes they apply to ------------------------
+# A signal stands in one place and applies to lanes of the roads that name it: by its own validity, and by each
+# ``signalReference`` with its own. Without a validity it applies to whatever travels in the direction of its
+# orientation. (ASAM OpenDRIVE 1.8, 14.) LibCarla takes the lanes of a *side* for it: those to the left of the
+# road's line for ``+``. On a road for right-hand traffic these are opposites, and maps are written for either
+# reading, so a signal whose place contradicts the one that is taken is told of
+# (:mod:`sgstore.opendrive._signals`). The maps of CARLA keep speed limits and painted stop signs as
+# *objects* named ``Speed_30`` and ``Stencil_STOP``, which LibCarla reads as signals of type 274 and 206 (and
+# loses the painted ones on the way to its landmarks); their orientation is the sign of the lanes that they
+# apply to.
+
+KIND_OF_TYPE: Final = {
+    "206": "stop_sign",
+    "R1-1": "stop_sign",
+    "205": "yield_sign",
+    "R1-2": "yield_sign",
+    "274": "speed_limit",
+    "274.1": "speed_limit",
+    "R2-1": "speed_limit",
+}
+"""Codes of traffic signs → kinds: StVO (Germany), which CARLA and esmini use, and MUTCD (United States)."""
+
+_LIGHT: Final = re.compile(r"10000(0[1-9]|1\d|2\d)$")
+"""Codes of traffic lights in the catalogue that OpenDRIVE's country ``OpenDRIVE`` means."""
+_NOT_LIGHTS: Final = {"1000003", "1000004"}
+"""Crossings for people and bicycles, painted on the road."""
+_SPEED_OBJECT: Final = re.compile(r"speed_(\d+(?:\.\d+)?)", re.IGNORECASE)
+_STOP_STENCIL: Final = "stencil_stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """Signals and the lanes that they apply to.
+
+    Attributes
+    ----------
+    nodes : MapNodes
+    lanes : list of frozenset of int
+        Lanes, counted from 0, that each applies to.
+    told : str
+        Which kinds are what the client says that they are, and how orientations are read if that is not as
+        the standard says and matters; empty: none, and it is.
+    """
+
+    nodes: MapNodes
+    lanes: list[frozenset[int]]
+    told: str = ""
+
+    def edges(self, first: int) -> Edge:
+        """``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
+        pairs = [(first + row, lane) for row, lanes in enumerate(self.lanes) for lane in lanes]
+        signal, lane = np.array(pairs, np.int64).reshape(-1, 2).T
+        return ("controlsTrafficOf", signal, FIRST_LANE + lane)
+
+
+def read_signals(document: Document, plan: PlanView, network: Network, signs: Signs) -> Signals:
+    """The signals of a map; one whose place is broken is left out with a warning."""
+    reach = _Reach(document, network, signs.orientation)
+    kinds = dict(signs.kinds)
+    parts = (_elements(document, plan, reach, kinds), _signal_objects(document, plan, reach))
+    network.warnings.extend(reach.doubts.warnings())
+    other = "" if signs.orientation == "asam" or not reach.doubts.asked else signs.orientation
+    return Signals(
+        MapNodes.joined([part.nodes for part in parts]),
+        [s for p in parts for s in p.lanes],
+        " ".join(filter(None, (parts[0].told, other))),
+    )
+
+
+def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
+    """Id of each controller → ids of the signals that switch together."""
+    table = document["controller/control"]
+    names = document["controller"].texts("id")
+    members: dict[str, list[str]] = {}
+    for row, signal in zip(table.parent, table.texts("signalId"), strict=True):
+        members.setdefault(names[row], []).append(signal)
+    return {name: tuple(dict.fromkeys(signals)) for name, signals in members.items()}
+
+
+def is_signal_object(name: str) -> bool:
+    """Whether an object of this name is a signal in truth."""
+    return bool(_SPEED_OBJECT.match(name)) or _STOP_STENCIL in name.lower()
+
+
+def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
+    """The kind of a signal with this type code; ``sign`` for whatever is none of the others."""
+    if _LIGHT.match(code) and code not in _NOT_LIGHTS:
+        return "traffic_light"
+    if code in KIND_OF_TYPE:
+        return KIND_OF_TYPE[code]
+    if dynamic and "light" in name.lower():
+        return "traffic_light"
+    return "sign"
+
+
+class _Reach:
+    """Which driving lanes lie at a place of a road, by their ids or their direction."""
+
+    def __init__(self, document: Document, network: Network, orientation: str) -> None:
+        self.warnings = network.warnings
+        self.doubts = Doubts(document, network, orientation)
+        self._reading = orientation
+        self._network = network
+        lanes = network.lanes
+        self._driving: dict[int, list[tuple[int, int]]] = {}
+        for lane, (kind, section, ident) in enumerate(
+            zip(lanes.type, lanes.section.tolist(), lanes.ident.tolist(), strict=True)
+        ):
+            if kind in DRIVING:
+                self._driving.setdefault(section, []).append((lane, ident))
+        self._ranges = {
+            kind: _validities(document, kind) for kind in ("road/signal", "road/signalReference")
+        }
+        self._tables = {kind: document[kind] for kind in self._ranges}
+        # Many signals apply to the same lanes: what was found once is found again.
+        self._known: dict[tuple[int, object], frozenset[int]] = {}
+
+    def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
+        """The driving lanes at a place (road, s) that an element (its kind, row and signal) is valid for."""
+        kind, row, signal = element
+        ranges = self._ranges[kind].get(row)
+        orientation = self._tables[kind].attributes[row].get("orientation", "")
+        section = self._network.section_at(*place)
+        key = (section, orientation if ranges is None else tuple(ranges))
+        lanes = self._driving.get(section, [])
+        if key not in self._known:
+            self._known[key] = (
+                self._oriented(lanes, orientation, self._reading)
+                if ranges is None
+                else frozenset(
+                    lane
+                    for lane, ident in lanes
+                    if any(low <= ident <= high for low, high in ranges)
+                )
+            )
+        if ranges is None and orientation in {"+", "-"}:
+            there = frozenset(lane for lane, _ in lanes)
+            other = "carla" if self._reading == "asam" else "asam"
+            readings = self._known[key], self._oriented(lanes, orientation, other)
+            self.doubts.ask(signal, place, there, readings)
+        return self._known[key]
+
+    def on_side(self, place: tuple[int, float], *, left: bool) -> frozenset[int]:
+        """The driving lanes at a place (road, s) to the left or to the right of the centre lane."""
+        lanes = self._driving.get(self._network.section_at(*place), [])
+        return frozenset(lane for lane, ident in lanes if (ident > 0) == left)
+
+    def _oriented(
+        self, lanes: list[tuple[int, int]], orientation: str, reading: str
+    ) -> frozenset[int]:
+        """The lanes that an orientation means: of traffic in that direction, or of that side."""
+        if orientation not in {"+", "-"}:
+            return frozenset(lane for lane, _ in lanes)
+        plus, about = orientation == "+", self._network.lanes
+        if reading == "carla":
+            return frozenset(lane for lane, ident in lanes if (ident > 0) == plus)
+        return frozenset(
+            lane for lane, _ in lanes if about.both[lane] or about.forward[lane] == plus
+        )
+
+
+def _validities(document: Document, kind: str) -> dict[int, list[tuple[float, float]]]:
+    kind = f"{kind}/validity"
+    ends = (document.rough_numbers(kind, name).tolist() for name in ("fromLane", "toLane"))
+    ranges: dict[int, list[tuple[float, float]]] = {}
+    for row, one, other in zip(document[kind].parent, *ends, strict=True):
+        ranges.setdefault(row, []).append((min(one, other), max(one, other)))
+    return ranges
+
+
+def _elements(
+    document: Document, plan: PlanView, reach: _Reach, signs: Mapping[str, str]
+) -> Signals:
+    kind = "road/signal"
+    rows = standing(document, kind, np.arange(len(document[kind])), reach.warnings)
+    attributes = [document[kind].attributes[row] for row in rows.tolist()]
+    ids = [a.get("id", "") for a in attributes]
+    codes = [a.get("type", "") for a in attributes]
+    told = {code: signs[code.lower()] for code in sorted(set(codes)) if code.lower() in signs}
+    kinds = [
+        told.get(code)
+        or kind_of_signal(code, dynamic=a.get("dynamic") == "yes", name=a.get("name", ""))
+        for code, a in zip(codes, attributes, strict=True)
+    ]
+    limits = [
+        _limit(a) if kind == "speed_limit" else np.nan
+        for kind, a in zip(kinds, attributes, strict=True)
+    ]
+    road, s = document[kind].road, document.rough_numbers(kind, "s")
+    reach.doubts.kinds = dict(zip(ids, kinds, strict=True))
+    referred = _referred(document, reach)
+    lanes = [
+        reach.valid((kind, row, name), (int(road[row]), float(s[row])))
+        | referred.get(name, frozenset())
+        for row, name in zip(rows.tolist(), ids, strict=True)
+    ]
+    columns = node_columns(document, plan, kind, rows)
+    nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
+    return Signals(nodes, lanes, repr(told) if told else "")
+
+
+def _referred(document: Document, reach: _Reach) -> dict[str, frozenset[int]]:
+    """Id of a signal → lanes that references to it, anywhere in the map, make it apply to."""
+    kind = "road/signalReference"
+    table = document[kind]
+    s = document.rough_numbers(kind, "s")
+    found: dict[str, set[frozenset[int]]] = {}
+    for row in np.flatnonzero(np.isfinite(s)).tolist():
+        attributes = table.attributes[row]
+        place = (int(table.road[row]), float(s[row]))
+        name = attributes.get("id", "")
+        found.setdefault(name, set()).add(reach.valid((kind, row, name), place))
+    return {name: frozenset[int]().union(*parts) for name, parts in found.items()}
+
+
+def _limit(attributes: dict[str, str]) -> float:
+    """Speed limit of a sign; without a unit, km/h, or mph for the United States' own codes."""
+    american = attributes.get("type", "").startswith("R") or attributes.get("country") == "US"
+    unit = attributes.get("unit") or ("mph" if american else "km/h")
+    return speed(attributes.get("value", ""), unit)
+
+
+def _signal_objects(document: Document, plan: PlanView, reach: _Reach) -> Signals:
+    kind = "road/object"
+    table = document[kind]
+    named = np.array([is_signal_object(name) for name in table.texts("name")], bool)
+    rows = standing(document, kind, np.flatnonzero(named), reach.warnings)
+    kinds: list[str] = []
+    limits: list[float] = []
+    lanes: list[frozenset[int]] = []
+    s = document.rough_numbers(kind, "s")
+    for row in rows.tolist():
+        attributes = table.attributes[row]
+        limit = _SPEED_OBJECT.match(attributes.get("name", ""))
+        kinds.append("speed_limit" if limit else "stop_sign")
+        limits.append(speed(limit[1], "km/h") if limit else np.nan)
+        left = attributes.get("orientation", "") == "+"
+        place = (int(table.road[row]), float(s[row]))
+        lanes.append(reach.on_side(place, left=left))
+    ids = [table.attributes[row].get("id", "") for row in rows.tolist()]
+    columns = node_columns(document, plan, kind, rows)
+    return Signals(MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns), lanes)

@@ -1,0 +1,81 @@
+# The face of this package: what others may import from it.
+
+from ._media import Media as Media
+from ._media import read_carried as read_carried
+from ._media import read_messages as read_messages
+from ._registry import ENDINGS as ENDINGS
+from ._registry import READERS as READERS
+from ._registry import OpenTrace as OpenTrace
+from ._registry import RecordingReader as RecordingReader
+from ._registry import on_map as on_map
+from ._registry import open_recording as open_recording
+from ._registry import open_trace as open_trace
+from ._registry import read_message as read_message
+from ._registry import readers as readers
+from ._ros2 import decode as decode
+from ._ros2 import parse_definition as parse_definition
+from .carla._live import LiveWorld as LiveWorld
+from .carla._live import connect as connect
+from .carla._sensors import Sensor as Sensor
+from .carla._sensors import SensorCloud as SensorCloud
+from .carla._sensors import SensorPicture as SensorPicture
+from .carla._sensors import SensorReading as SensorReading
+from .carla._sensors import Sensors as Sensors
+from .carla._sensors import load_sensors as load_sensors
+from .foxglove._messages import DERIVED as DERIVED
+from .osi._camera import camera_of as camera_of
+from .osi._file import OsiFile as OsiFile
+from .osi._schema import DECODE_ERRORS as DECODE_ERRORS
+from .osi._schema import SENSOR_VIEW as SENSOR_VIEW
+from .osi._schema import descriptors as descriptors
+from .osi._schema import message_class as message_class
+from ._base import NAN as NAN
+from ._base import POSE as POSE
+from ._base import EntityTable as EntityTable
+from ._base import FrameRefs as FrameRefs
+from ._base import FrameRows as FrameRows
+from ._base import assemble as assemble
+from ._base import channels_of as channels_of
+from ._base import counted as counted
+from ._base import refs_of as refs_of
+
+__all__ = [
+    "DECODE_ERRORS",
+    "DERIVED",
+    "ENDINGS",
+    "EntityTable",
+    "FrameRefs",
+    "FrameRows",
+    "LiveWorld",
+    "Media",
+    "NAN",
+    "OpenTrace",
+    "OsiFile",
+    "POSE",
+    "READERS",
+    "RecordingReader",
+    "SENSOR_VIEW",
+    "Sensor",
+    "SensorCloud",
+    "SensorPicture",
+    "SensorReading",
+    "Sensors",
+    "assemble",
+    "camera_of",
+    "channels_of",
+    "connect",
+    "counted",
+    "decode",
+    "descriptors",
+    "load_sensors",
+    "message_class",
+    "on_map",
+    "open_recording",
+    "open_trace",
+    "parse_definition",
+    "read_carried",
+    "read_message",
+    "read_messages",
+    "readers",
+    "refs_of",
+]

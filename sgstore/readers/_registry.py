@@ -1,0 +1,228 @@
+"""Recordings → blocks of frames: one file for each flavour, and the guarded MCAP reader that all of them use.
+
+A flavour is a class like :class:`~sgstore.readers.osi._trace.OsiTrace` that is listed in :data:`READERS`, or
+that an installed package names as an entry point of the group ``sgstore.readers``: it recognises a recording
+by the schemas of its channels, and reads it. ``docs/flavours.md`` says how to add one.
+"""
+
+from __future__ import annotations
+
+import inspect
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
+
+from sgstore.errors import TraceError
+from sgstore.mcap import MAGIC, McapFile, check_name, digest_of, mark_of
+from sgstore.mcap import message_at as _read_message
+from sgstore.readers.carla._trace import CarlaTrace
+from sgstore.readers.foxglove._trace import FoxgloveTrace
+from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
+from sgstore.readers.osi._file import OsiFile
+from sgstore.readers.osi._file import read_message as _read_osi_message
+from sgstore.readers.osi._trace import OsiTrace
+from sgstore.world import TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.mcap import Recording
+    from sgstore.roads import RoadMap
+    from sgstore.world import FrameBlock, TraceInfo
+
+
+__all__ = [
+    "ENDINGS",
+    "READERS",
+    "OpenTrace",
+    "RecordingReader",
+    "check_name",
+    "digest_of",
+    "mark_of",
+    "on_map",
+    "open_recording",
+    "open_trace",
+    "read_message",
+    "readers",
+]
+
+ENDINGS: Final = (".mcap", *_OSI_ENDINGS)
+"""How the names of recordings end, where a folder is searched for them."""
+
+
+class OpenTrace(Protocol):
+    """A recording that is open.
+
+    Attributes
+    ----------
+    info : TraceInfo
+        What is known before frames are read.
+    report : TraceReport
+        What reading them brought to light; filled while blocks are read.
+    """
+
+    info: TraceInfo
+    report: TraceReport
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_exception: object) -> None: ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
+        """The frames, ``size`` at a time; block i begins at frame ``i * size``."""
+        ...
+
+
+class RecordingReader(Protocol):
+    """A flavour of recording: the class of its traces. One that takes ``mapping`` too is given it."""
+
+    name: str
+
+    def __call__(self, recording: Recording, *, ego: str, digest: str) -> OpenTrace:
+        """Open a recording of this flavour."""
+        ...
+
+    def recognises(self, recording: Recording) -> bool:
+        """Whether a recording is of this flavour, by the schemas of its channels."""
+        ...
+
+
+READERS: Final[tuple[RecordingReader, ...]] = (OsiTrace, CarlaTrace, FoxgloveTrace)
+"""The flavours of recordings, in the order in which they are asked."""
+
+
+GROUP: Final = "sgstore.readers"
+"""Group of entry points by which an installed package adds flavours."""
+
+
+def readers() -> Iterator[RecordingReader]:
+    """All flavours, in the order in which they are asked: :data:`READERS`, then those of other packages.
+
+    Raises
+    ------
+    TraceError
+        A package names a flavour that cannot be loaded.
+    """
+    yield from READERS
+    for entry in entry_points(group=GROUP):
+        try:
+            reader: RecordingReader = entry.load()
+        except Exception as error:  # whatever its import does
+            reason = f"the flavour {entry.name!r} ({entry.value}) cannot be loaded: {error!r}"
+            raise TraceError(reason) from error
+        yield reader
+
+
+def open_recording(path: str | Path) -> McapFile | OsiFile:
+    """A file of messages: MCAP by how it begins, a single-channel OSI file by how its name ends.
+
+    Raises
+    ------
+    TraceError
+        There is no such file, or it is neither.
+    """
+    path = Path(path)
+    if path.name.lower().endswith(_OSI_ENDINGS) and not _is_mcap(path):
+        return OsiFile(path)
+    return McapFile(path)
+
+
+def open_trace(
+    path: str | Path, *, ego: str = "", digest: str = "", mapping: str | Path = ""
+) -> OpenTrace:
+    """A recording, opened by the first reader that recognises it.
+
+    Parameters
+    ----------
+    path : str or Path
+    ego : str
+        The simulator's id or name of the ego; empty: as the recording says.
+    digest : str
+        SHA-256 of the file, if it is known already.
+    mapping : str or Path
+        How messages are to be understood that do not say it themselves (Foxglove): the name of a mapping that
+        is shipped, or the path of a TOML file; empty: the shipped one that fits. Other flavours need none.
+
+    Raises
+    ------
+    TraceError
+        There is no such file, it is no recording, holds no ground truth that a reader knows, holds no frame,
+        or nothing in it bears the name given for the ego.
+    """
+    path = Path(path)
+    recording = open_recording(path)
+    try:
+        if not recording.channels:
+            for _ in recording.walk(TraceReport()):  # no summary: channels come with their messages
+                pass
+        for reader in readers():
+            if reader.recognises(recording):
+                more = {"mapping": mapping} if _takes_mapping(reader) else {}
+                return reader(recording, ego=ego, digest=digest, **more)
+        raise TraceError(_no_reader(recording), path=path)
+    except TraceError as error:
+        recording.close()
+        if error.path is None:
+            raise TraceError(error.reason, path=path) from error
+        raise
+    except BaseException:
+        recording.close()
+        raise
+
+
+def on_map(trace: OpenTrace, road_map: RoadMap | None) -> None:
+    """Tell a trace which road map it is read with, if that matters to its flavour.
+
+    Then the flavour's class has a method ``on_map``; it is called before frames are read.
+    """
+    if isinstance(trace, _OnMap):
+        trace.on_map(road_map)
+
+
+@runtime_checkable
+class _OnMap(Protocol):
+    def on_map(self, road_map: RoadMap | None) -> None: ...
+
+
+def _takes_mapping(reader: RecordingReader) -> bool:
+    return "mapping" in inspect.signature(reader).parameters
+
+
+def _is_mcap(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
+    """The data of one message of a recording, by its place as :class:`~sgstore.world.MessageRefs` has it.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened, the chunk is damaged, or there is no message of that length there: the
+        file was replaced.
+    """
+    path = Path(path)
+    single = path.name.lower().endswith(_OSI_ENDINGS) and not _is_mcap(path)
+    read = _read_osi_message if single else _read_message
+    return read(path, chunk_offset=chunk_offset, offset=offset, length=length)
+
+
+def _no_reader(recording: Recording) -> str:
+    """Why nothing recognises a recording, and what is in it."""
+    listed: list[str] = []
+    for _, record in sorted(recording.channels.items()):
+        schema = recording.schemas.get(record.schema_id)
+        listed.append(f"{record.topic!r} ({schema.name if schema else 'no schema'})")
+    more = f" and {len(listed) - 12} more" if len(listed) > 12 else ""
+    known = ", ".join(reader.name for reader in READERS)
+    if not listed:
+        return f"no channel has any message; expected ground truth of a flavour known: {known}"
+    return f"no ground truth of a flavour known ({known}); its channels: {', '.join(listed[:12])}{more}"

@@ -1,0 +1,634 @@
+"""CARLA's traffic lights, and their signals in the road map.
+
+Which signal of the road map each traffic light of CARLA is.
+
+A light is at most one signal, and a signal at most one light. In turn
+
+1. *by place*: CARLA puts a light :data:`FORWARD` in front of the place that the map gives, in the signal's own
+   axes. Where the lights of a world stand elsewhere, but all alike, the offset is learnt: the median of those
+   lights and signals that have nothing else near them. The offset that most lights agree with goes first;
+2. *by what is left*: a light that stands within :data:`SAME_PLACE` of a signal that nobody has;
+3. *aside*: CARLA moves what would stand on the road sideways until it does not;
+4. *by lanes*: the signal that applies to the lanes of what triggers the light, or to those that they lead to.
+
+Distances are squared and summed over all lights at once. A common shift adds the same to every way of giving
+lights to signals, so twins a few centimetres apart keep their order, however far off both of them stand.
+
+Source: LibCarla ``road/MapBuilder.cpp`` (0.25 m forward, then aside by steps of a fifth of the lane's width,
+ten at most), CarlaUE4 ``Traffic/TrafficLightManager.cpp`` (actors are turned by 90° against their signals).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from sgstore.readers._base import FAR, NAN
+from sgstore.readers._ros2 import number, records
+from sgstore.readers.carla._actors import ident_of
+from sgstore.roads import lanes_ref
+from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
+from sgstore.world import POSE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from sgstore.readers._base import EntityTable
+    from sgstore.roads import RoadMap
+    from sgstore.world import Bools, Floats, Ints
+
+    Rows = NDArray[np.intp]
+
+
+FORWARD: Final = 0.25
+"""How far in front of a signal of the map CARLA puts its light; m."""
+SAME_SPOT: Final = 0.1
+"""How far from there it may stand; m."""
+SAME_PLACE: Final = 1.0
+"""How far a light may stand from a signal that no other light is; m."""
+ASIDE: Final = 10.0
+"""How far CARLA moves a light sideways at most: ten times a fifth of a lane 5 m wide; m."""
+SAME_WAY: Final = math.pi / 4
+"""By how much a light may face another way; rad."""
+TURNS: Final = (0.0, -math.pi / 2)
+"""How a light may be turned against its signal: as landmarks are, or as CARLA's actors are; rad."""
+LEARNT_FROM: Final = 3
+"""Lights from which an offset is learnt, at the least."""
+LEARNT_WITHIN: Final = 5.0
+"""How far from their signals these may stand; m."""
+
+MOST_NAMED: Final = 5
+"""Lights or lanes that a warning names."""
+
+_MOST_TOGETHER: Final = 300
+"""Lights that are given to signals by the least sum; more of them in one heap take the nearest in turn."""
+_AT_ONCE: Final = 1 << 20
+"""Lights times signals that are looked at in one go."""
+_OF_HEIGHT: Final = 1e-3
+"""What a difference of height counts beside one in the plane: it decides between what is in one place."""
+_DRIVING: Final = "driving"
+_RED, _GREEN = LIGHT_STATE_CODE["red"], LIGHT_STATE_CODE["green"]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """A traffic light.
+
+    Attributes
+    ----------
+    x, y, z, heading : float
+        Where it stands and faces; NaN: not known.
+    boxes : tuple of tuple of float
+        What triggers it, each with its centre ``x, y, z``, heading, length, width; as far as known.
+    """
+
+    x: float
+    y: float
+    z: float
+    heading: float
+    boxes: tuple[tuple[float, ...], ...] = ()
+
+
+def signals_of(
+    lights: Mapping[int, Light], road_map: RoadMap, told: Mapping[int, str] | None = None
+) -> dict[int, str]:
+    """Id of the signal of a road map that each light is, or else the lanes that it applies to by name.
+
+    Parameters
+    ----------
+    lights : mapping
+        Lights by id, in any order.
+    road_map : RoadMap
+    told : mapping, optional
+        Lights of which the signal is known; no other light is one of these signals.
+
+    Returns
+    -------
+    dict
+        Those that were told, and the others but for those that are no signal and whose boxes are on no lane.
+    """
+    found = dict(told or {})
+    nodes = road_map.nodes
+    taken = set(found.values())
+    columns = np.flatnonzero(nodes.kind == KIND_CODE["traffic_light"])
+    free = np.array([c for c in columns.tolist() if nodes.name[c] not in taken], np.intp)
+    idents = sorted(lights.keys() - found.keys())
+    places = [(of.x, of.y, of.z, of.heading) for of in (lights[ident] for ident in idents)]
+    signals = np.stack([nodes.x, nodes.y, nodes.z, nodes.heading], axis=1)[free]
+    matched = _matched(np.array(places, np.float64).reshape(-1, 4), signals)
+    for row, signal in matched.items():
+        found[idents[row]] = nodes.name[free[signal]]
+    left = np.delete(free, list(matched.values()))
+    others = {ident: lights[ident] for ident in idents if ident not in found}
+    return found | _by_boxes(others, road_map, left.tolist())
+
+
+# By place -----------------------------------------------------------------------------------------
+
+
+class _Rule(NamedTuple):
+    """How lights may stand to their signals: turned, and so far ahead and to the left in the signal's axes."""
+
+    turn: float
+    ahead: float
+    left: float
+
+
+class _Near(NamedTuple):
+    """Lights and signals that may be one another: rows of both, and how far apart they are.
+
+    ``ahead``, ``left``: in the signal's axes, less what the rule takes off; ``up``: less the usual height; m.
+    """
+
+    light: Rows
+    signal: Rows
+    ahead: Floats
+    left: Floats
+    up: Floats
+
+    def take(self, kept: Bools) -> _Near:
+        return _Near(
+            *(self.light[kept], self.signal[kept]),
+            *(self.ahead[kept], self.left[kept]),
+            self.up[kept],
+        )
+
+
+def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
+    """Row of the signal that each light is by where it stands; rows are ``x, y, z, heading``."""
+    found: dict[int, int] = {}
+    best = _Rule(TURNS[0], FORWARD, 0.0)
+    first = True
+    while True:
+        rules = [_Rule(turn, FORWARD, 0.0) for turn in TURNS]
+        rules += [rule for turn in TURNS if (rule := _learnt(lights, signals, turn, found))]
+        ranked = [
+            (_assigned(_near(lights, signals, rule, SAME_SPOT, found)), rule) for rule in rules
+        ]
+        matches, rule = max(ranked, key=lambda one: len(one[0]))  # of equals the first
+        if not matches:
+            break
+        best, first = (rule if first else best), False
+        found |= matches
+    rules = [best] if not first else [best, best._replace(turn=TURNS[1])]
+    left = [_assigned(_near(lights, signals, rule, SAME_PLACE, found)) for rule in rules]
+    found |= max(left, key=len)
+    for rule in rules:
+        aside = _near(lights, signals, rule, ASIDE, found)
+        found |= _alone(aside.take(np.abs(aside.ahead) <= SAME_SPOT))
+    return found
+
+
+def _near(
+    lights: Floats, signals: Floats, rule: _Rule, reach: float, found: Mapping[int, int]
+) -> _Near:
+    """The lights and signals that are still free, face one another's way and are so near each other."""
+    light = np.setdiff1d(np.arange(len(lights)), list(found))
+    signal = np.setdiff1d(np.arange(len(signals)), list(found.values()))
+    rows, columns = [light[:0]], [signal[:0]]
+    size = max(_AT_ONCE // max(len(signal), 1), 1)
+    for begin in range(0, len(light), size):
+        part = light[begin : begin + size]
+        apart = (lights[part, None, :2] - signals[None, signal, :2]).transpose(2, 0, 1)
+        row, column = np.nonzero(np.hypot(*apart) <= reach + math.hypot(rule.ahead, rule.left))
+        rows.append(part[row])
+        columns.append(signal[column])
+    one, other = np.concatenate(rows), np.concatenate(columns)
+    dx, dy, dz, turn = (lights[one] - signals[other]).T
+    heading = np.nan_to_num(signals[other, 3])
+    cos, sin = np.cos(heading), np.sin(heading)
+    ahead, left = dx * cos + dy * sin - rule.ahead, dy * cos - dx * sin - rule.left
+    away = np.abs(np.arctan2(np.sin(turn - rule.turn), np.cos(turn - rule.turn))) > SAME_WAY
+    near = _Near(one, other, ahead, left, np.nan_to_num(dz))
+    near = near.take((np.hypot(ahead, left) <= reach) & ~away)  # what faces nowhere faces any way
+    usual = float(np.median(near.up)) if len(near.up) else 0.0
+    return near._replace(up=near.up - usual)
+
+
+def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, int]) -> _Rule | None:
+    """The offset that most of those have that have nothing else near them; ``None`` if they do not agree."""
+    near = _near(lights, signals, _Rule(turn, 0.0, 0.0), LEARNT_WITHIN, found)
+    sure = near.take(_only(near.light) & _only(near.signal))
+    if len(sure.light) < LEARNT_FROM:
+        return None
+    ahead, left = float(np.median(sure.ahead)), float(np.median(sure.left))
+    agree = np.hypot(sure.ahead - ahead, sure.left - left) <= SAME_SPOT
+    return _Rule(turn, ahead, left) if agree.mean() >= 0.5 else None
+
+
+def _alone(near: _Near) -> dict[int, int]:
+    """Those of which neither may be any other."""
+    sure = near.take(_only(near.light) & _only(near.signal))
+    return dict(zip(sure.light.tolist(), sure.signal.tolist(), strict=True))
+
+
+def _only(rows: Rows) -> Bools:
+    """Whether each value comes once."""
+    return np.bincount(rows)[rows] == 1 if len(rows) else np.zeros(0, np.bool_)
+
+
+def _assigned(near: _Near) -> dict[int, int]:
+    """One signal for as many lights as possible, so that the sum of the squared distances is the least."""
+    cost = near.ahead**2 + near.left**2 + (_OF_HEIGHT * near.up) ** 2
+    found: dict[int, int] = {}
+    for rows in _heaps(near):
+        light, at_light = np.unique(near.light[rows], return_inverse=True)
+        signal, at_signal = np.unique(near.signal[rows], return_inverse=True)
+        if len(light) > _MOST_TOGETHER:
+            found |= _nearest_in_turn(near, rows[np.argsort(cost[rows], kind="stable")])
+            continue
+        # More lights than signals: some of them are none, at a price above all others.
+        none = float(cost[rows].sum()) + 1.0
+        table = np.full((len(light), len(signal) + len(light)), none)
+        table[:, : len(signal)] = 2 * none
+        table[at_light, at_signal] = cost[rows]
+        chosen = least_sum(table)
+        real = [
+            (row, column)
+            for row, column in enumerate(chosen.tolist())
+            if column < len(signal) and table[row, column] < none
+        ]
+        found |= {int(light[row]): int(signal[column]) for row, column in real}
+    return found
+
+
+def _heaps(near: _Near) -> Iterator[Rows]:
+    """The pairs by heaps that share neither a light nor a signal with one another."""
+    if not len(near.light):
+        return
+    light, signal = near.light, near.signal
+    label = np.arange(int(light.max()) + 1)
+    while True:  # a light has the least label of the lights that want what it wants
+        least = np.full(int(signal.max()) + 1, len(label))
+        np.minimum.at(least, signal, label[light])
+        after = label.copy()
+        np.minimum.at(after, light, least[signal])
+        if (after == label).all():
+            break
+        label = after
+    heap = label[light]
+    order = np.argsort(heap, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(heap[order])) + 1)
+
+
+def _nearest_in_turn(near: _Near, rows: Rows) -> dict[int, int]:
+    found: dict[int, int] = {}
+    taken: set[int] = set()
+    for light, signal in zip(near.light[rows].tolist(), near.signal[rows].tolist(), strict=True):
+        if light not in found and signal not in taken:
+            found[light] = signal
+            taken.add(signal)
+    return found
+
+
+def least_sum(cost: Floats) -> Rows:
+    """A column for each row, none of them twice, so that the sum is the least.
+
+    Parameters
+    ----------
+    cost : (n, m) float64
+        Finite, with m ≥ n.
+
+    Returns
+    -------
+    (n,) intp
+
+    Notes
+    -----
+    Row after row is brought in along the shortest path of exchanges, with prices that keep all costs above 0;
+    n² m steps, the m at once.
+
+    Source: R. Jonker, A. Volgenant, "A shortest augmenting path algorithm for dense and sparse linear
+    assignment problems", Computing 38 (1987).
+    """
+    rows, columns = cost.shape
+    row_price, column_price = np.zeros(rows), np.zeros(columns)
+    owner = np.full(columns, -1)
+    for row in range(rows):
+        length, came_from = np.full(columns, np.inf), np.full(columns, -1)
+        done = np.zeros(columns, np.bool_)
+        here, at, so_far = row, -1, 0.0
+        while True:
+            step = so_far + cost[here] - row_price[here] - column_price
+            shorter = ~done & (step < length)
+            length[shorter], came_from[shorter] = step[shorter], at
+            at = int(np.argmin(np.where(done, np.inf, length)))
+            so_far, done[at] = float(length[at]), True
+            if owner[at] < 0:
+                break
+            here = int(owner[at])
+        row_price[row] += so_far
+        passed = np.flatnonzero(done & (owner >= 0))
+        row_price[owner[passed]] += so_far - length[passed]
+        column_price[passed] -= so_far - length[passed]
+        while at >= 0:  # everybody on the path moves on by one
+            before = int(came_from[at])
+            owner[at] = row if before < 0 else owner[before]
+            at = before
+    found = np.full(rows, -1)
+    taken = np.flatnonzero(owner >= 0)
+    found[owner[taken]] = taken
+    return found
+
+
+# By lanes -----------------------------------------------------------------------------------------
+
+
+def _by_boxes(
+    lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
+) -> dict[int, str]:
+    """The free signals that apply to the lanes of the boxes of lights, or to those that they lead to.
+
+    Of several signals it is the one that has most of these lanes, then the nearest. Where nothing is left, the
+    lanes of the boxes are named.
+    """
+    nodes = road_map.nodes
+    own = _lanes_of_boxes(lights, road_map)
+    after = _lanes_after(road_map)
+    applying: dict[int, list[int]] = {}
+    for column in columns:
+        for lane in road_map.lanes_of_signal(nodes.name[column]).tolist():
+            applying.setdefault(lane, []).append(column)
+    ranked: list[tuple[int, float, str, int]] = []
+    for ident, lanes in own.items():
+        reached = lanes.union(*(after.get(lane, ()) for lane in lanes))
+        shared = Counter(column for lane in reached for column in applying.get(lane, ()))
+        for column, count in shared.items():
+            apart = math.hypot(nodes.x[column] - lights[ident].x, nodes.y[column] - lights[ident].y)
+            far = math.inf if math.isnan(apart) else apart
+            ranked.append((-count, far, nodes.name[column], ident))
+    found: dict[int, str] = {}
+    taken: set[str] = set()
+    for _, _, name, ident in sorted(ranked):
+        if ident not in found and name not in taken:
+            found[ident] = name
+            taken.add(name)
+    named = {
+        ident: lanes_ref(nodes.name[-1 - lane] for lane in sorted(lanes, reverse=True))
+        for ident, lanes in own.items()
+        if lanes
+    }
+    return named | found
+
+
+def _lanes_after(road_map: RoadMap) -> dict[int, set[int]]:
+    edges = road_map.edges
+    flow = edges.relation == RELATION_CODE["travelsTo"]
+    after: dict[int, set[int]] = {}
+    for lane, following in zip(edges.src[flow].tolist(), edges.dst[flow].tolist(), strict=True):
+        after.setdefault(lane, set()).add(following)
+    return after
+
+
+def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int, set[int]]:
+    """The lanes, by node id, that run through what triggers each light."""
+    told = [(ident, box) for ident, light in lights.items() for box in light.boxes]
+    boxes = np.array([box for _, box in told], np.float64).reshape(-1, 6)
+    hits = road_map.lanes_of(boxes[:, [0, 1, 3, 4, 5]], np.full(len(boxes), np.nan))
+    lane_type = road_map.nodes.lane_type
+    found: dict[int, set[int]] = {ident: set() for ident in lights}
+    for hit in np.flatnonzero(_through(hits, boxes)).tolist():
+        lane = int(hits.lane[hit])
+        if lane_type[-1 - lane] == _DRIVING:
+            found[told[int(hits.row[hit])][0]].add(lane)
+    return found
+
+
+def _through(hits: Any, boxes: Floats) -> Bools:
+    """Of which lanes the centre line runs through the box, not only its border."""
+    error, box = hits.heading_error, boxes[hits.row]
+    reach = (np.abs(np.sin(error)) * box[:, 4] + np.abs(np.cos(error)) * box[:, 5]) / 2
+    return np.abs(hits.offset) <= reach
+
+
+# What cannot be -----------------------------------------------------------------------------------
+
+
+def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
+    """A warning for each signal of the map that several lights are."""
+    if len(set(signals.values())) == len(signals):
+        return []
+    known = set(road_map.nodes.name)
+    by_name: dict[str, list[int]] = {}
+    for ident, name in signals.items():
+        if name in known:  # lanes that are named may well have several lights
+            by_name.setdefault(name, []).append(ident)
+    return [
+        f"traffic lights {_listed(sorted(idents))} are one signal of the road map: {name!r}"
+        for name, idents in by_name.items()
+        if len(idents) > 1
+    ]
+
+
+class AtOnce:
+    """Watches for lanes that are red and green at once: then lights are taken for the wrong signals.
+
+    Parameters
+    ----------
+    signals : mapping
+        Signals of the road map that lights are.
+    road_map : RoadMap or None
+    idents : iterable of int
+        Lights, in the order in which their states come.
+    before : AtOnce, optional
+        Who watched before other lights came; what it saw counts on.
+
+    Attributes
+    ----------
+    idents : list of int
+    who : dict
+        Lane by name → the lights that made it red and green.
+    frames : dict
+        Lane by name → frames in which it was so.
+    """
+
+    def __init__(
+        self,
+        signals: Mapping[int, str],
+        road_map: RoadMap | None,
+        idents: Iterable[int],
+        before: AtOnce | None = None,
+    ) -> None:
+        self.idents = list(idents)
+        named: list[tuple[str, int]] = []
+        if road_map is not None:
+            for row, ident in enumerate(self.idents):
+                lanes = road_map.lanes_of_signal(signals.get(ident, ""))
+                named += [(road_map.nodes.name[-1 - lane], row) for lane in lanes.tolist()]
+        self._lanes = sorted({lane for lane, _ in named})
+        place = {lane: i for i, lane in enumerate(self._lanes)}
+        self._lane: Ints = np.array([place[lane] for lane, _ in named], np.int64)
+        self._light: Ints = np.array([row for _, row in named], np.int64)
+        self._last: Ints | None = None
+        self._bad: list[str] = []
+        self.who: dict[str, tuple[int, int]] = {} if before is None else before.who
+        self.frames: dict[str, int] = {} if before is None else before.frames
+
+    def see(self, states: Ints) -> None:
+        """Take note of what the lights show in a frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`."""
+        if states is not self._last:
+            self._last = states
+            self._bad = self._contradicting(states)
+        for lane in self._bad:
+            self.frames[lane] = self.frames.get(lane, 0) + 1
+
+    def _contradicting(self, states: Ints) -> list[str]:
+        count, shown = len(self._lanes), states[self._light]
+        red, green = (
+            np.bincount(self._lane[shown == code], minlength=count) > 0 for code in (_RED, _GREEN)
+        )
+        bad = np.flatnonzero(red & green).tolist()
+        for lane in bad:
+            here = self._light[self._lane == lane]
+            one, other = (int(here[states[here] == code][0]) for code in (_RED, _GREEN))
+            self.who.setdefault(self._lanes[lane], (self.idents[one], self.idents[other]))
+        return [self._lanes[lane] for lane in bad]
+
+    @property
+    def warnings(self) -> list[str]:
+        """One for each two lights that contradicted one another."""
+        by_lights: dict[tuple[int, int], list[str]] = {}
+        for lane, who in sorted(self.who.items()):
+            by_lights.setdefault(who, []).append(lane)
+        told = [self._about(one, other, lanes) for (one, other), lanes in by_lights.items()]
+        more = len(told) - MOST_NAMED
+        if more > 0:
+            told[MOST_NAMED:] = [f"{more} more pairs of traffic lights contradict one another"]
+        return told
+
+    def _about(self, one: int, other: int, lanes: list[str]) -> str:
+        what = f"{'lanes' if len(lanes) > 1 else 'lane'} {_listed(lanes)}"
+        frames = max(self.frames[lane] for lane in lanes)
+        lights = f"red by traffic light '{one}' and green by '{other}'"
+        return f"{what}: {lights} at once, in {frames} frames"
+
+
+def _listed(names: list[Any]) -> str:
+    shown = ", ".join(repr(str(name)) for name in names[:MOST_NAMED])
+    more = len(names) - MOST_NAMED
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+# Traffic lights of CARLA's bridge: where they stand, and what they show -------------------------
+# The bridge tells the place of a light and the box on the road that triggers it, but no lane. The lanes are
+# those of the signal of the map that it is (:mod:`sgstore.readers.carla._signals`). A light that the map does
+# not have at all applies to the lanes of its box.
+
+TYPE_NAME: Final = "traffic.traffic_light"
+STATES: Final = ("red", "yellow", "green", "off", "unknown")
+"""``CarlaTrafficLightStatus.state`` → name in :data:`sgstore.vocabulary.LIGHT_STATES`."""
+
+
+def read_places(message: dict[str, Any]) -> dict[int, Light]:
+    """Lights by id, as a ``CarlaTrafficLightInfoList`` tells them, without those that have no usable place."""
+    lights: dict[int, Light] = {}
+    for told in records(message, "traffic_lights"):
+        x, y, z = (number(told, f"transform.position.{axis}") for axis in "xyz")
+        turn = [number(told, f"transform.orientation.{part}") for part in "xyzw"]
+        heading = heading_of(*turn)
+        ident = ident_of(told, "id")
+        if ident is None or not all(abs(value) < FAR for value in (x, y, z, heading)):
+            continue
+        dx, dy, dz = (number(told, f"trigger_volume.center.{axis}") for axis in "xyz")
+        length, width = (number(told, f"trigger_volume.size.{axis}") for axis in "xy")
+        cos, sin = math.cos(heading), math.sin(heading)
+        centre = (x + dx * cos - dy * sin, y + dx * sin + dy * cos, z + dz)
+        box = (*centre, heading, abs(length), abs(width))
+        known = all(abs(value) < FAR for value in box)
+        lights[ident] = Light(x, y, z, heading, (box,) if known else ())
+    return lights
+
+
+def heading_of(x: float, y: float, z: float, w: float) -> float:
+    """Heading of a quaternion of any length; rad. NaN for one that is none."""
+    norm = x * x + y * y + z * z + w * w
+    if not 0.25 < norm < 4:
+        return NAN
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+class Lights:
+    """The traffic lights of a trace, with a row in every frame.
+
+    Parameters
+    ----------
+    places : mapping
+        Lights by id.
+    signals : mapping
+        Ids of the signals of the road map that they are.
+    road_map : RoadMap or None
+        That map.
+    roster : EntityTable
+        Takes each of them up as an entity.
+    """
+
+    def __init__(
+        self,
+        places: Mapping[int, Light],
+        signals: Mapping[int, str],
+        road_map: RoadMap | None,
+        roster: EntityTable,
+    ) -> None:
+        self._roster = roster
+        self._row = {ident: row for row, ident in enumerate(sorted(places))}
+        self._signals = signals
+        self._unplaced: set[int] = set()
+        self.nodes: Ints = np.array([self._enter(ident) for ident in self._row], np.int64)
+        self.values: Floats = np.full((len(self._row), len(POSE)), np.nan)
+        for row, ident in enumerate(self._row):
+            light = places[ident]
+            self.values[row, :4] = light.x, light.y, light.z, light.heading
+        self._states: Ints = np.full(len(self._row), LIGHT_STATE_CODE["unknown"], np.int64)
+        self._at_once = AtOnce(signals, road_map, self._row)
+        self._shared = [] if road_map is None else shared_signals(signals, road_map)
+
+    @property
+    def unplaced(self) -> int:
+        """Lights that have a state but no place."""
+        return len(self._unplaced)
+
+    @property
+    def aimless(self) -> int:
+        """Lights of which it is not known for which lanes they are."""
+        return len(self._row.keys() - self._signals.keys())
+
+    @property
+    def warnings(self) -> list[str]:
+        """Lights that cannot be what they were taken for, as far as frames were made."""
+        return [*self._shared, *self._at_once.warnings]
+
+    def of_frame(self) -> Ints:
+        """What they show in the next frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`.
+
+        The array is kept by frames: it is not to be written to.
+        """
+        self._at_once.see(self._states)
+        return self._states
+
+    def update(self, message: dict[str, Any]) -> None:
+        """Take up a ``CarlaTrafficLightStatusList``; lights that it does not name stay as they are."""
+        states = self._states.copy()  # frames keep the array that they were given
+        for told in records(message, "traffic_lights"):
+            ident, state = ident_of(told, "id"), ident_of(told, "state")
+            if ident is None or state is None:
+                continue
+            row = self._row.get(ident)
+            if row is not None:
+                states[row] = LIGHT_STATE_CODE[
+                    STATES[state] if 0 <= state < len(STATES) else "unknown"
+                ]
+            elif ident not in self._unplaced:
+                self._unplaced.add(ident)
+                self._enter(ident)
+        if (states != self._states).any():
+            self._states = states
+
+    def _enter(self, ident: int) -> int:
+        meaning = TypeMeaning("traffic_light")
+        return self._roster.enter(str(ident), meaning, TYPE_NAME, self._signals.get(ident, ""))

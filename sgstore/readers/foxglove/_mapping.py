@@ -1,0 +1,288 @@
+"""How a Foxglove scene is to be understood: where kind, id, speed and ego stand, as a TOML file says.
+
+A ``foxglove.SceneUpdate`` is made to be drawn: it has boxes, but no word of what they are, how fast they
+move or which of them is the ego. Every producer has habits of its own for that, so they are data.
+``docs/flavours.md`` explains the file; ``foxglove_*.toml`` beside this module are those that are shipped.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import TraceError
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    SPECIALS,
+    TypeMeaning,
+    suggestion,
+    type_meanings,
+    vague_kind,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from collections.abc import Mapping as Map
+
+
+MAX_MAPPING_BYTES: Final = 1 << 20
+PREFIX: Final = "foxglove_"
+"""Before the names of the mappings that are shipped, in the names of their files."""
+METADATA: Final = "metadata."
+"""Before the key of an entity's metadata, where a mapping says where something stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recognise:
+    """By what a recording is known that a shipped mapping fits: it has all these topics."""
+
+    topics: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMapping:
+    """Which messages make the scene.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        Channels of ``foxglove.SceneUpdate``; empty: all there are.
+    axes : str
+        Name of the axes (``frame_id``) that stand still and that positions are given in; empty: those that no
+        transform leads away from, or else those of most entities.
+    snapshot : bool
+        Whether a message tells all that there is; otherwise what it does not tell stays, until it is deleted
+        or its lifetime ends, as Foxglove has it.
+    """
+
+    topics: tuple[str, ...] = ()
+    axes: str = ""
+    snapshot: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class EntityMapping:
+    """Where things stand in an entity: ``id``, or ``metadata.KEY``; empty: nowhere.
+
+    Attributes
+    ----------
+    id, type : str
+        What tells one entity from another, and what it is.
+    speed : str
+        m/s, along the heading.
+    velocity, acceleration : tuple of str
+        Three numbers, m/s and m/s², along the entity's own axes of reference (``frame_id``).
+    light_state : str
+        What a traffic light shows: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
+    """
+
+    id: str = "id"
+    type: str = ""
+    speed: str = ""
+    velocity: tuple[str, ...] = ()
+    acceleration: tuple[str, ...] = ()
+    light_state: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ego:
+    """Who the ego is: an entity, or axes that move with it.
+
+    Attributes
+    ----------
+    entity : str
+        Id of an entity, or its type.
+    axes : str
+        Name of axes (``child_frame_id``): the ego is a box in them.
+    type : str
+        Type of that box.
+    length, width, height : float
+        Its extents; m.
+    offset : tuple of float
+        Its centre in those axes; m.
+    """
+
+    entity: str = ""
+    axes: str = ""
+    type: str = "ego"
+    length: float = math.nan
+    width: float = math.nan
+    height: float = math.nan
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """All that a mapping file says.
+
+    Attributes
+    ----------
+    recognise, scene, entity, ego
+        See there.
+    types : dict
+        Type name in lower case → what it means; what stands nowhere is looked up in ``vocabulary.toml``, and
+        then among the names of kinds.
+    """
+
+    recognise: Recognise = field(default_factory=Recognise)
+    scene: SceneMapping = field(default_factory=SceneMapping)
+    entity: EntityMapping = field(default_factory=EntityMapping)
+    ego: Ego = field(default_factory=Ego)
+    types: Map[str, TypeMeaning] = field(default_factory=dict[str, TypeMeaning])
+
+    def meaning(self, type_name: str) -> TypeMeaning:
+        """What a type name means; kind ``unknown``, or ``vehicle``, if nobody knows more."""
+        name = type_name.lower()
+        if name in self.types:
+            return self.types[name]
+        known = type_meanings().get(name)
+        if known is not None:
+            return known
+        return TypeMeaning(name if name in ENTITY_KINDS else _ALIASES.get(name) or vague_kind(name))
+
+
+_ALIASES: Final = {
+    "pedestrian": "person",
+    "walker": "person",
+    "human": "person",
+    "cyclist": "bicycle",
+    "ego": "car",
+}
+"""Words that producers use for kinds; what is called nothing but the ego is a car."""
+_GENERAL: Final = Mapping(entity=EntityMapping(type="metadata.type"))
+_TYPE_KEYS: Final = ("type", "class", "category", "label", "kind", "classification")
+_SECTIONS: Final[dict[str, type[Any]]] = {
+    "recognise": Recognise,
+    "scene": SceneMapping,
+    "entity": EntityMapping,
+    "ego": Ego,
+}
+
+
+def type_keys() -> tuple[str, ...]:
+    """Keys of metadata that tell a type where no mapping says which one does."""
+    return _TYPE_KEYS
+
+
+@cache
+def shipped() -> Map[str, Mapping]:
+    """The mappings that come with sgstore, by name."""
+    return {
+        file.name.removeprefix(PREFIX).removesuffix(".toml"): _read(file.name, file.read_bytes())
+        for file in sorted(resources.files("sgstore.readers").iterdir(), key=lambda f: f.name)
+        if file.name.startswith(PREFIX) and file.name.endswith(".toml")
+    }
+
+
+def mapping_for(given: str | Path, topics: Iterable[str]) -> Mapping:
+    """The mapping that a user names, or the one that fits a recording.
+
+    Parameters
+    ----------
+    given : str or Path
+        Name of a mapping that is shipped, or the path of a file; empty: the shipped one whose topics the
+        recording has, or a general one, which takes the type from metadata of the usual names.
+    topics : iterable of str
+        Those of the recording.
+
+    Raises
+    ------
+    TraceError
+        There is no such mapping, or it is malformed.
+    """
+    if not str(given):
+        here = set(topics)
+        fitting = (m for m in shipped().values() if here >= set(m.recognise.topics or ("\0",)))
+        return next(fitting, _GENERAL)
+    if str(given) in shipped():
+        return shipped()[str(given)]
+    path = Path(given)
+    try:
+        if path.stat().st_size > MAX_MAPPING_BYTES:
+            raise TraceError(f"a mapping of more than {MAX_MAPPING_BYTES} bytes: {path}")
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:
+        names = ", ".join(shipped())
+        reason = f"no mapping {str(given)!r}: neither a file that can be read nor one of: {names}"
+        raise TraceError(reason) from error
+    return _read(str(path), content)
+
+
+def _read(name: str, content: bytes) -> Mapping:
+    try:
+        values = tomllib.loads(content.decode())
+        sections = {key: _section(key, values.pop(key, {})) for key in _SECTIONS}
+        types = _types(values.pop("types", {}))
+        if values:
+            raise ValueError(_unknown(next(iter(values)), [*_SECTIONS, "types"]))
+        return Mapping(**sections, types=types)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise TraceError(f"mapping {name}: {error}") from error
+
+
+def _section(name: str, values: Any) -> Any:
+    cls = _SECTIONS[name]
+    if not isinstance(values, dict):
+        raise TypeError(f"'{name}' is {values!r}; expected a table [{name}]")
+    known = {f.name: f.type for f in fields(cls)}
+    checked: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            raise ValueError(_unknown(f"{name}.{key}", [f"{name}.{k}" for k in known]))
+        checked[key] = _value(f"{name}.{key}", str(known[key]), value)
+    return cls(**checked)
+
+
+def _value(name: str, kind: str, value: Any) -> Any:
+    """A value of the type that a field has, which is told by its text."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    match kind:
+        case "str" if isinstance(value, str):
+            return value
+        case "bool" if isinstance(value, bool):
+            return value
+        case "float" if number and math.isfinite(value):
+            return float(value)
+        case "tuple[str, ...]" if isinstance(value, list) and all(
+            isinstance(v, str) for v in value
+        ):
+            if name.startswith("entity.") and len(value) != 3:
+                raise ValueError(f"'{name}' has {len(value)} parts; expected 3")
+            return tuple(value)
+        case "tuple[float, ...]" if isinstance(value, list) and len(value) == 3:
+            return tuple(_value(name, "float", v) for v in value)
+        case _:
+            words = {"str": "a text", "bool": "true or false", "float": "a number"}
+            expected = words.get(kind, "a list of texts" if "str" in kind else "three numbers")
+            raise ValueError(f"'{name}' is {value!r}; expected {expected}")
+
+
+def _types(values: Any) -> dict[str, TypeMeaning]:
+    if not isinstance(values, dict):
+        raise TypeError("'types' is no table")
+    meanings: dict[str, TypeMeaning] = {}
+    for name, told in values.items():
+        parts = {"kind": told} if isinstance(told, str) else told
+        if not isinstance(parts, dict) or not all(isinstance(v, str) for v in parts.values()):
+            raise ValueError(f'types."{name}" is {told!r}; expected {{ kind = "car" }}')
+        for key in parts:
+            if key not in {"kind", "special", "subkind"}:
+                raise ValueError(_unknown(f"types.{name}.{key}", ["kind", "special", "subkind"]))
+        kind, special = parts.get("kind", "unknown"), parts.get("special", "")
+        if kind not in ENTITY_KINDS:
+            raise ValueError(_unknown(f"kind {kind}", ENTITY_KINDS))
+        if special and special not in SPECIALS:
+            raise ValueError(_unknown(f"special {special}", SPECIALS))
+        meanings[name.lower()] = TypeMeaning(kind, special, parts.get("subkind", ""))
+    return meanings
+
+
+def _unknown(name: str, known: Iterable[str]) -> str:
+    like = suggestion(name.rpartition(" ")[2], known)
+    hint = f"did you mean '{like}'?" if like else f"known: {', '.join(known)}"
+    return f"'{name}' is not known; {hint}"

@@ -1,0 +1,441 @@
+"""Foxglove messages in protobuf and JSON, and the tree of coordinate frames.
+
+Axes that move in other axes: a tree of ``foxglove.FrameTransform``, asked for the pose of any at any time.
+
+Between two transforms a pose is interpolated: places along the line, turns along the shorter arc. Before the
+first and behind the last transform it is the nearest one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_left, bisect_right, insort
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.readers._base import FAR
+from sgstore.readers.osi._schema import DECODE_ERRORS, check_size, message_class
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from mcap.records import Schema
+
+    from sgstore.mcap import Recording
+    from sgstore.world import Floats
+
+
+MAX_AXES: Final = 10_000
+"""Axes of a recording; those of more are not taken up."""
+MAX_DEPTH: Final = 64
+"""Greatest number of transforms from any axes to those that stand still."""
+MAX_KEPT: Final = 4096
+"""Transforms of one pair of axes that are remembered at once."""
+
+Pose = tuple["Floats", "Floats"]
+"""Place (3,) and turn (4,), a quaternion x, y, z, w of length 1."""
+
+STILL: Final = np.array([0.0, 0.0, 0.0, 1.0])
+ORIGIN: Final = np.zeros(3)
+
+
+@dataclass(slots=True)
+class _Track:
+    """Where axes were in their parent: times, ascending, and poses."""
+
+    parent: str
+    times: list[int] = field(default_factory=list[int])
+    poses: list[Pose] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+
+    def at(self, time_ns: int) -> Pose:
+        behind = bisect_left(self.times, time_ns)
+        if behind == len(self.times):
+            return self.poses[-1]
+        if behind == 0 or self.times[behind] == time_ns:
+            return self.poses[behind]
+        start, stop = self.times[behind - 1], self.times[behind]
+        share = (time_ns - start) / (stop - start)
+        (p0, q0), (p1, q1) = self.poses[behind - 1], self.poses[behind]
+        q1 = -q1 if float(q0 @ q1) < 0 else q1
+        return p0 + share * (p1 - p0), normed(q0 + share * (q1 - q0))
+
+
+@dataclass(slots=True)
+class Axes:
+    """The axes of a recording.
+
+    Attributes
+    ----------
+    parents : dict
+        Axes → the axes that they move in, as was told first.
+    """
+
+    parents: dict[str, str] = field(default_factory=dict[str, str])
+    _tracks: dict[str, _Track] = field(default_factory=dict[str, _Track])
+
+    def tell(self, child: str, parent: str, time_ns: int, pose: Pose) -> bool:
+        """Take up where axes are in others; ``False`` if that contradicts what was told, or is too much."""
+        track = self._tracks.get(child)
+        if track is None:
+            if len(self._tracks) >= MAX_AXES or child == parent:
+                return False
+            track = self._tracks[child] = _Track(parent)
+            self.parents[child] = parent
+        if track.parent != parent:
+            return False
+        if not track.times or time_ns > track.times[-1]:
+            track.times.append(time_ns)
+            track.poses.append(pose)
+        else:
+            at = bisect_left(track.times, time_ns)
+            if at < len(track.times) and track.times[at] == time_ns:
+                track.poses[at] = pose
+            else:
+                insort(track.times, time_ns)
+                track.poses.insert(at, pose)
+        if len(track.times) > MAX_KEPT:
+            del track.times[: MAX_KEPT // 2], track.poses[: MAX_KEPT // 2]
+        return True
+
+    def pose(self, axes: str, root: str, time_ns: int) -> Pose | None:
+        """The pose of axes in others that they move in, directly or not; ``None`` if they do not."""
+        place, turn = ORIGIN, STILL
+        for _ in range(MAX_DEPTH):
+            if axes == root:
+                return place, turn
+            track = self._tracks.get(axes)
+            if track is None:
+                return None
+            outer_place, outer_turn = track.at(time_ns)
+            place = outer_place + rotated(outer_turn, place)
+            turn = product(outer_turn, turn)
+            axes = track.parent
+        return None
+
+    def root(self) -> str:
+        """The axes that move in no others, if there is one such; else the empty string."""
+        roots = set(self.parents.values()) - set(self.parents)
+        return roots.pop() if len(roots) == 1 else ""
+
+    def forget(self, before_ns: int) -> None:
+        """Forget what is not needed any more to know poses from a time on."""
+        for track in self._tracks.values():
+            keep = bisect_right(track.times, before_ns) - 1
+            if keep > 0:
+                del track.times[:keep], track.poses[:keep]
+
+
+def normed(turn: Floats) -> Floats:
+    """A quaternion of length 1; the one that turns nothing for one of no length."""
+    largest = float(np.abs(turn).max())
+    if not 0 < largest < np.inf:
+        return STILL
+    scaled = turn / largest  # the squares of very small numbers are 0
+    return scaled / np.sqrt(scaled @ scaled)
+
+
+def product(a: Floats, b: Floats) -> Floats:
+    """The turn b followed by the turn a."""
+    ax, ay, az, aw = a.tolist()
+    bx, by, bz, bw = b.tolist()
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def rotated(turn: Floats, vectors: Floats) -> Floats:
+    """Vectors (3,) or (n, 3), turned."""
+    x, y, z, w = turn.tolist()
+    matrix = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return vectors @ matrix.T
+
+
+def angles(turn: Floats) -> tuple[float, float, float]:
+    """Heading, pitch and roll of a quaternion; rad. Pitch is positive with the nose down, as in OSI."""
+    x, y, z, w = turn.tolist()
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
+    return (
+        float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
+        float(np.arcsin(sine)),
+        float(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+    )
+
+
+# ``foxglove.SceneUpdate`` and ``FrameTransform`` in protobuf and in JSON → the same plain values ----
+# Source: foxglove-sdk, schemas (SceneUpdate, SceneEntity, SceneEntityDeletion, CubePrimitive, FrameTransform).
+
+SCENE: Final = "foxglove.SceneUpdate"
+TRANSFORM: Final = "foxglove.FrameTransform"
+TRANSFORMS: Final = "foxglove.FrameTransforms"
+READ: Final = frozenset({SCENE, TRANSFORM, TRANSFORMS})
+
+MAX_BYTES: Final = 16 << 20
+"""Greatest size of a protobuf message that is read."""
+MAX_JSON: Final = 8 << 20
+"""Greatest size of a JSON message that is read; in memory it becomes up to thirty times as large."""
+MAX_ENTITIES: Final = 100_000
+"""Greatest number of entities of a message."""
+MAX_PARTS: Final = 10_000
+"""Greatest number of cubes, or of anything else, of an entity."""
+_PLACE: Final = dict.fromkeys(("x", "y", "z"))
+_TURN: Final = dict.fromkeys(("x", "y", "z", "w"))
+_SOLID: Final = {"pose": {"position": _PLACE, "orientation": _TURN}, "size": _PLACE}
+_SCENE_FIELDS: Final[dict[str, Any]] = {
+    "deletions": dict.fromkeys(("type", "id")),
+    "entities": {
+        **dict.fromkeys(("timestamp", "frame_id", "id", "lifetime", "frame_locked")),
+        "metadata": dict.fromkeys(("key", "value")),
+        **dict.fromkeys(("cubes", "cylinders", "spheres", "models"), _SOLID),
+    },
+}
+"""Fields that are read of a scene; lines, triangles and texts stay bytes."""
+ERRORS: Final = (*DECODE_ERRORS, RecursionError)
+"""What reading a message raises if it is not what it seems."""
+_LATEST: Final = 1 << 62
+_DELETE_ALL: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """An entity of a scene, as far as it has a body.
+
+    Attributes
+    ----------
+    id, axes : str
+        Its id, and the axes (``frame_id``) that its pose is given in.
+    time_ns, lifetime_ns : int
+        When it was so, and how long it stays; 0: not told, until it is replaced.
+    locked : bool
+        Whether it moves with its axes.
+    metadata : dict
+    pose : (place, turn), or None
+        ``None`` if that is unusable.
+    size : tuple of float
+        Length, width, height; m. NaN if it has no size.
+    """
+
+    id: str
+    axes: str
+    time_ns: int
+    lifetime_ns: int
+    locked: bool
+    metadata: dict[str, str]
+    pose: Pose | None
+    size: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneUpdate:
+    """A ``SceneUpdate``: what is there, and what is there no more.
+
+    ``deleted``: ids; ``cleared``: whether all that was there before is deleted. ``bodiless``: entities that are
+    lines, texts or arrows only.
+    """
+
+    boxes: list[Box]
+    deleted: list[str]
+    cleared: bool
+    bodiless: int
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """Where axes (``child``) are in others (``parent``)."""
+
+    parent: str
+    child: str
+    time_ns: int
+    pose: Pose | None
+
+
+DERIVED: Final = {"sgstore": "derived"}
+"""Metadata of channels that an export made of a recording, scene graphs to be drawn among them."""
+
+
+def encoding_of(recording: Recording, channel: int) -> str:
+    """``protobuf`` or ``json`` for a channel whose messages are read here, else the empty string."""
+    record = recording.channels[channel]
+    if DERIVED.items() <= record.metadata.items():
+        return ""
+    schema = recording.schemas.get(record.schema_id)
+    if schema is None or schema.name not in READ:
+        return ""
+    return record.message_encoding if record.message_encoding in {"protobuf", "json"} else ""
+
+
+class ChannelReader:
+    """Reads the messages of a channel.
+
+    Parameters
+    ----------
+    schema : Schema
+    encoding : str
+        ``protobuf`` or ``json``.
+
+    Raises
+    ------
+    TraceError
+        The protobuf descriptors are malformed.
+    """
+
+    def __init__(self, schema: Schema, encoding: str) -> None:
+        self.name = schema.name
+        fields = _SCENE_FIELDS if schema.name == SCENE else None
+        self._class = message_class(schema, fields) if encoding == "protobuf" else None
+
+    def scene(self, data: bytes) -> SceneUpdate:
+        """A ``SceneUpdate``.
+
+        Raises
+        ------
+        Exception
+            One of :data:`ERRORS`.
+        """
+        told = self._parsed(data)
+        entities = _list(told, "entities", MAX_ENTITIES)
+        deletions = _list(told, "deletions", MAX_ENTITIES)
+        kinds = [(int(_get(gone, "type", 0)), str(_get(gone, "id", ""))) for gone in deletions]
+        found = [_box(entity) for entity in entities]
+        boxes = [box for box in found if box is not None]
+        return SceneUpdate(
+            boxes=boxes,
+            deleted=[ident for kind, ident in kinds if kind != _DELETE_ALL],
+            cleared=any(kind == _DELETE_ALL for kind, _ in kinds),
+            bodiless=len(found) - len(boxes),
+        )
+
+    def transforms(self, data: bytes) -> list[Transform]:
+        """A ``FrameTransform``, or several in one message.
+
+        Raises
+        ------
+        Exception
+            One of :data:`ERRORS`.
+        """
+        told = self._parsed(data)
+        one_of_many = self.name == TRANSFORMS
+        several = _list(told, "transforms", MAX_ENTITIES) if one_of_many else [told]
+        return [
+            Transform(
+                parent=str(_get(one, "parent_frame_id", "")),
+                child=str(_get(one, "child_frame_id", "")),
+                time_ns=_time(_get(one, "timestamp", None)),
+                pose=_pose(_get(one, "translation", None), _get(one, "rotation", None)),
+            )
+            for one in several
+        ]
+
+    def _parsed(self, data: bytes) -> Any:
+        most = MAX_JSON if self._class is None else MAX_BYTES
+        if len(data) > most:
+            raise ValueError(f"a message of {len(data)} bytes; at most {most} are read")
+        if self._class is not None:
+            check_size(data, 0)
+            return self._class.FromString(data)
+        told = json.loads(data)
+        if not isinstance(told, dict):
+            raise TypeError(f"expected a JSON object, not {type(told).__name__}")
+        return told
+
+
+def _get(part: Any, name: str, otherwise: Any) -> Any:
+    """A field of a message or of a JSON object; a sub-message that is missing is ``otherwise``."""
+    if isinstance(part, dict):
+        return part.get(name, otherwise)
+    if part is None:
+        return otherwise
+    known = part.DESCRIPTOR.fields_by_name.get(name)
+    if known is None or (known.has_presence and not part.HasField(name)):
+        return otherwise
+    return getattr(part, name)
+
+
+def _list(part: Any, name: str, most: int = MAX_PARTS) -> list[Any]:
+    told = _get(part, name, None)
+    if told is None:
+        return []
+    if isinstance(told, (str, bytes, dict)):
+        raise TypeError(f"{name} is no list")
+    if len(told) > most:
+        raise ValueError(f"{len(told)} {name}; at most {most} are read")
+    return list(told)
+
+
+def _box(entity: Any) -> Box | None:
+    body = _body(entity)
+    if body is None:
+        return None
+    pairs = _list(entity, "metadata")
+    pose, size = body
+    return Box(
+        id=str(_get(entity, "id", "")),
+        axes=str(_get(entity, "frame_id", "")),
+        time_ns=_time(_get(entity, "timestamp", None)),
+        lifetime_ns=_time(_get(entity, "lifetime", None)),
+        locked=bool(_get(entity, "frame_locked", 0)),
+        metadata={str(_get(pair, "key", "")): str(_get(pair, "value", "")) for pair in pairs},
+        pose=pose,
+        size=size,
+    )
+
+
+def _body(entity: Any) -> tuple[Pose | None, tuple[float, float, float]] | None:
+    """Pose and size of what an entity is: of its largest box, else of another solid, else of a model."""
+    for name in ("cubes", "cylinders", "spheres"):
+        solids = _list(entity, name)
+        if solids:
+            sizes = [_numbers(_get(solid, "size", None), "xyz") for solid in solids]
+            largest = max(range(len(solids)), key=lambda i: _volume(sizes[i]))
+            length, width, height = sizes[largest]
+            return _pose_of(solids[largest]), (length, width, height)
+    models = _list(entity, "models")
+    return (_pose_of(models[0]), (math.nan, math.nan, math.nan)) if models else None
+
+
+def _volume(size: list[float]) -> float:
+    volume = math.prod(size)
+    return volume if math.isfinite(volume) else -1.0
+
+
+def _pose_of(solid: Any) -> Pose | None:
+    pose = _get(solid, "pose", None)
+    return _pose(_get(pose, "position", None), _get(pose, "orientation", None))
+
+
+def _pose(place: Any, turn: Any) -> Pose | None:
+    at = np.array(_numbers(place, "xyz"))
+    quaternion = np.array(_numbers(turn, "xyzw"))
+    if not (np.abs(at) < FAR).all() or not np.isfinite(quaternion).all():
+        return None
+    return at, normed(quaternion)
+
+
+def _numbers(part: Any, names: Iterable[str]) -> list[float]:
+    return [float(_get(part, name, 0.0)) for name in names]
+
+
+def _time(part: Any) -> int:
+    """A timestamp or duration; ns. Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``."""
+    if part is None:
+        return 0
+    seconds = _get(part, "seconds", None)
+    if seconds is None:
+        seconds, nanos = _get(part, "sec", 0), _get(part, "nsec", 0)
+    else:
+        nanos = _get(part, "nanos", 0)
+    time_ns = int(seconds) * 1_000_000_000 + int(nanos)
+    return time_ns if abs(time_ns) < _LATEST else 0

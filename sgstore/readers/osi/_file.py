@@ -1,0 +1,542 @@
+"""Single-channel OSI files (``.osi``, ``.osi.zst``).
+
+The bytes of a single-channel OSI file, as they are or out of zstd, and where in the file they stand.
+
+A compressed file is decompressed block by block, and a block of zstd never becomes more than 128 KiB:
+so whatever a file claims, no more than that comes at once. What a whole file may become is bounded too.
+
+Source: zstd compression format (RFC 8878), sections 3.1.1 and 3.1.2.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import islice
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+import zstandard
+from mcap.records import Channel, Schema
+
+from sgstore.errors import TraceError
+from sgstore.mcap import MAX_LOSSES, MESSAGE_HEAD, READ_ERRORS, RUN_MESSAGES, Messages, open_regular
+from sgstore.readers.osi._schema import (
+    DECODE_ERRORS,
+    GROUND_TRUTH,
+    SENSOR_VIEW,
+    descriptors,
+    fields_of,
+    ground_truth_of,
+    light_class,
+    lights_of,
+    message_class,
+    object_class,
+    parse,
+)
+from sgstore.world import Loss, TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from mcap.records import Metadata
+
+    from sgstore.mcap import RecordPlace
+
+
+PREFIX: Final = struct.Struct("<I")
+"""Head of every message: how many bytes follow."""
+MAX_MESSAGE: Final = 64 << 20
+"""Greatest size of a message; bytes."""
+MAX_RATIO: Final = 2000
+"""How many times larger a file may become that is decompressed."""
+MAX_WINDOW: Final = 128 << 20
+"""Greatest window of a zstd frame (``zstd --long``); bytes."""
+
+ZSTD: Final = b"\x28\xb5\x2f\xfd"
+_ALWAYS: Final = 64 << 20
+"""What a file may become whatever its size; bytes."""
+_PIECE: Final = 1 << 20
+_FRAME_HEAD: Final = 18
+"""Greatest length of the head of a zstd frame; bytes."""
+_SKIPPABLE: Final = range(0x184D2A50, 0x184D2A60)
+_LITERAL, _REPEATED, _COMPRESSED = 0, 1, 2
+
+
+def is_compressed(file: BinaryIO) -> bool:
+    """Whether a file begins as zstd does."""
+    file.seek(0)
+    magic = file.read(4)
+    return magic == ZSTD or (len(magic) == 4 and PREFIX.unpack(magic)[0] in _SKIPPABLE)
+
+
+def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
+    """The content of a file, piece by piece; each with the place of the zstd frame that it is of.
+
+    Parameters
+    ----------
+    file : file
+    start : int
+        Where to begin: at the frame at this offset; -1: at the beginning.
+
+    Yields
+    ------
+    place : int
+        Byte offset of the zstd frame in the file; -1 where the file is not compressed.
+    content : bytes
+
+    Raises
+    ------
+    TraceError
+        From here on the file cannot be decompressed, or it becomes too much.
+    """
+    if start < 0 and not is_compressed(file):
+        file.seek(0)
+        while piece := file.read(_PIECE):
+            yield -1, piece
+        return
+    file.seek(max(start, 0))
+    total = 0
+    while head := file.read(4):
+        place = file.tell() - len(head)
+        if len(head) == 4 and PREFIX.unpack(head)[0] in _SKIPPABLE:
+            length = file.read(4)
+            file.seek(PREFIX.unpack(length)[0] if len(length) == 4 else 0, 1)
+            continue
+        for piece in _frame(file, place):
+            total += len(piece)
+            if total > max(_ALWAYS, MAX_RATIO * file.tell()):
+                reason = f"decompressed to more than {MAX_RATIO} times its size"
+                raise TraceError(reason, offset=place)
+            yield place, piece
+
+
+def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
+    """The blocks of a zstd frame; of one whose end is missing, those that are whole."""
+    file.seek(place)
+    head = file.read(_FRAME_HEAD)
+    try:
+        parameters = zstandard.get_frame_parameters(head)
+        size = zstandard.frame_header_size(head)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).decompressobj()
+        file.seek(place + size)
+        yield decompressor.decompress(head[:size])
+        last = False
+        while not last:
+            block = file.read(3)
+            if len(block) < 3:
+                return
+            bits = int.from_bytes(block, "little")
+            last, kind, length = bool(bits & 1), bits >> 1 & 3, bits >> 3
+            content = file.read(1 if kind == _REPEATED else length)
+            yield decompressor.decompress(block + content)
+        if parameters.has_checksum:
+            yield decompressor.decompress(file.read(4))
+    except READ_ERRORS as error:
+        if len(head) < _FRAME_HEAD and not file.read(1):
+            return  # the file ends inside the head of a frame
+        raise TraceError(f"cannot be decompressed (zstd): {error}", offset=place) from error
+
+
+def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
+    """The data of one message, by its place.
+
+    Parameters
+    ----------
+    path : Path
+    chunk_offset : int
+        Byte offset of the zstd frame that the message begins in, -1 where the file is not compressed.
+    offset : int
+        Byte offset of the message's head in what that frame and the following become, or in the file.
+    length : int
+        Bytes of its data.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened or decompressed, or there is no message of that length there: the file was
+        replaced.
+    """
+    missing = TraceError(
+        f"no message of {length} bytes at {offset} there: the file was replaced", path=path
+    )
+    if not 0 <= length <= MAX_MESSAGE or offset < 0:
+        raise missing
+    wanted = PREFIX.size + length
+    with open_regular(path) as file:
+        try:
+            if chunk_offset < 0:
+                file.seek(offset)
+                record = file.read(wanted)
+            else:
+                record = _cut(pieces(file, chunk_offset), offset, wanted)
+        except (TraceError, *READ_ERRORS) as error:
+            raise missing from error
+    if len(record) != wanted or PREFIX.unpack_from(record)[0] != length:
+        raise missing
+    return record[PREFIX.size :]
+
+
+def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> bytes:
+    """``length`` bytes of a content from ``offset`` on."""
+    found = bytearray()
+    position = 0
+    for _, piece in content:
+        if position + len(piece) > offset:
+            found += piece[max(offset - position, 0) :]
+        position += len(piece)
+        if len(found) >= length:
+            break
+    return bytes(found[:length])
+
+
+# Single-channel OSI files (``.osi``, ``.osi.zst``): messages one after another, each behind its length ----
+# Such a file has no channels, no schemas and no log times. It is given one channel; what its messages are
+# (ground truth or sensor views) is found out by reading the first ones as either, and a message's log time
+# is its own time. A length that cannot be is damage: the walk goes on where the next message begins just as
+# the first one does (with the version of OSI), and what lies between is a loss.
+#
+# Source: open-simulation-interface 3.8.0, trace_file_formats.adoc (single-channel binary trace files).
+
+ENDINGS: Final = (".osi", ".osi.zst")
+"""How the names of such files end; nothing in them tells what they are."""
+CHANNEL: Final = 1
+"""Id of the one channel."""
+RUN_BYTES: Final = 4 << 20
+"""Messages that are handed on together have about this size at most; bytes."""
+
+_ENOUGH, _TRIED = 8, 1000
+"""Messages that are read to find out what they are: enough if they hold anything, and at most."""
+_VERSION, _TIMESTAMP = 1, 2
+_LATEST: Final = 1 << 62
+
+
+class OsiFile:
+    """A single-channel OSI file that is read once or more often, in the words of an MCAP file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path, size, mtime_ns
+        The file, its size in bytes, its time of change.
+    schemas, channels : dict
+        The one schema and the one channel, whose topic is ``ground_truth`` or ``sensor_view``.
+    counts : None
+        Nobody counted the messages.
+    window : tuple of int
+        All log times there are.
+    profile, compression : str
+    metadata, attachments
+        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened, or its first messages are neither ground truth nor sensor views.
+    """
+
+    counts = None
+    window = (0, (1 << 63) - 1)
+    profile, compression = "", "zstd"
+    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
+    attachments: tuple[RecordPlace, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._mark = b""
+        self._file = open_regular(path)
+        try:
+            status = os.fstat(self._file.fileno())
+            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            name = self._recognise()
+        except BaseException:
+            self._file.close()
+            raise
+        topic = "sensor_view" if name == SENSOR_VIEW else "ground_truth"
+        self.schemas = {1: Schema(id=1, data=descriptors(), encoding="protobuf", name=name)}
+        self.channels = {
+            CHANNEL: Channel(
+                id=CHANNEL, topic=topic, message_encoding="protobuf", metadata={}, schema_id=1
+            )
+        }
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
+        """The bytes of an attachment; there are none."""
+        del place
+        return iter(())
+
+    def walk(
+        self,
+        report: TraceReport,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
+    ) -> Iterator[Messages]:
+        """All messages in file order; what cannot be read goes to ``report``.
+
+        Nothing is kept: all messages are ground truth, which takes longer to decode than to decompress.
+        ``chunk_offset`` of a message is the place of the zstd frame that it begins in.
+
+        Raises
+        ------
+        TraceError
+            The file cannot be read any more.
+        """
+        del keep
+        run = _MessageRun()
+        try:
+            for place, offset, data in self._messages(report):
+                if run.held and run.is_full(place):
+                    yield run.messages()
+                    run = _MessageRun(run.last_ns)
+                if wanted is None or wanted(place):
+                    run.add(place, offset, data)
+        except OSError as error:
+            raise TraceError(f"cannot be read: {error}", path=self.path) from error
+        if run.held:
+            yield run.messages()
+
+    def _recognise(self) -> str:
+        """What the messages are; learns how they begin."""
+        report = TraceReport()
+        likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
+        tried = 0
+        for _, _, data in islice(self._messages(report), _TRIED):
+            tried += 1
+            self._mark = self._mark or _beginning(data)
+            for name in likeness:
+                likeness[name] += _likeness(name, data)
+            if tried >= _ENOUGH and max(likeness.values()) > 0:
+                break
+        best = max(likeness, key=lambda name: likeness[name])
+        if likeness[best] > 0:
+            return best
+        reason = f"its messages are neither {GROUND_TRUTH} nor {SENSOR_VIEW} with anything in them"
+        if not tried:
+            told = report.losses[0].reason if report.losses else "the file is empty"
+            reason = f"no message of ASAM OSI: {told}"
+        raise TraceError(reason, path=self.path)
+
+    def _messages(self, report: TraceReport) -> Iterator[tuple[int, int, bytes]]:
+        """Place of the zstd frame, offset in it, and data of every message."""
+        stream = _Stream(self._mark)
+        content = pieces(self._file)
+        while True:
+            try:
+                place, piece = next(content)
+            except StopIteration:
+                break
+            except TraceError as error:
+                left = self.size - max(error.offset or 0, 0)
+                report.losses.append(Loss(error.reason, bytes=left, offset=error.offset or 0))
+                break
+            stream.append(place, piece)
+            yield from stream.take(report, ends=False)
+        yield from stream.take(report, ends=True)
+
+
+@dataclass(slots=True)
+class _MessageRun:
+    """Messages of one zstd frame, or of a file as it is, that are handed on together."""
+
+    last_ns: int = 0
+    place: int = -1
+    size: int = 0
+    held: dict[int, bytes] = field(default_factory=dict[int, bytes])
+    times: list[int] = field(default_factory=list[int])
+
+    def add(self, place: int, offset: int, data: bytes) -> None:
+        self.place = place
+        self.held[offset] = data
+        self.size += len(data)
+        time_ns = time_of(data)
+        self.last_ns = self.last_ns if time_ns is None else time_ns
+        self.times.append(self.last_ns)
+
+    def is_full(self, place: int) -> bool:
+        """Whether a message of the zstd frame at a place has to go into another run."""
+        return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
+
+    def messages(self) -> Messages:
+        held, count = self.held, len(self.held)
+        times = np.array(self.times, np.int64)
+        return Messages(
+            chunk_offset=self.place,
+            channel=np.full(count, CHANNEL, np.int64),
+            sequence=np.zeros(count, np.int64),
+            log_time_ns=times,
+            publish_time_ns=times.astype(np.uint64),
+            offset=np.array(list(held), np.int64),
+            length=np.array([len(data) for data in held.values()], np.int64),
+            read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
+        )
+
+
+class _Stream:
+    """Cuts a content, which comes piece by piece, into messages. ``mark``: how they begin, if it is known."""
+
+    def __init__(self, mark: bytes) -> None:
+        self._mark = mark
+        self._buffer = bytearray()
+        self._start = 0  # of the buffer, in all that came
+        self._frames: list[tuple[int, int]] = []  # where in all that came a frame begins; its place
+
+    def append(self, place: int, piece: bytes) -> None:
+        """One more piece, of the zstd frame at a place."""
+        if not self._frames or self._frames[-1][1] != place:
+            self._frames.append((self._start + len(self._buffer), place))
+        self._buffer += piece
+
+    def take(self, report: TraceReport, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
+        """The messages that are whole. ``ends``: no more pieces come."""
+        at = 0
+        while (left := len(self._buffer) - at) >= PREFIX.size or (ends and left):
+            length = PREFIX.unpack_from(self._buffer, at)[0] if left >= PREFIX.size else 0
+            stop = at + PREFIX.size + length
+            possible = 0 < length <= MAX_MESSAGE
+            if possible and stop <= len(self._buffer) and not self._overruns(at, stop):
+                yield *self._place(at), bytes(self._buffer[at + PREFIX.size : stop])
+                at = stop
+                continue
+            if possible and not ends and stop > len(self._buffer):
+                break  # the rest of it is still to come
+            resume = self._resume(at + 1)
+            if resume is None and not ends and self._mark:
+                # Nothing in sight: what may yet be the beginning of a message stays, the rest is lost.
+                resume = max(at + 1, len(self._buffer) - PREFIX.size - len(self._mark))
+            elif resume is None:
+                resume = len(self._buffer)
+            _lose(report, self._loss(at, resume, length))
+            at = resume
+        del self._buffer[:at]
+        self._start += at
+        while len(self._frames) > 1 and self._frames[1][0] <= self._start:
+            del self._frames[0]
+
+    def _overruns(self, at: int, stop: int) -> bool:
+        """Whether a message that would end here seems to swallow others: none begins here, but one before."""
+        following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
+        if self._mark.startswith(following):
+            return False
+        return self._resume(at + 1, stop) is not None
+
+    def _resume(self, start: int, stop: int | None = None) -> int | None:
+        """Where in the buffer, before ``stop``, the next message seems to begin."""
+        end = None if stop is None else stop - 1 + PREFIX.size + len(self._mark)
+        while self._mark:
+            found = self._buffer.find(self._mark, start + PREFIX.size, end)
+            if found < 0:
+                return None
+            start = found - PREFIX.size
+            if len(self._mark) <= PREFIX.unpack_from(self._buffer, start)[0] <= MAX_MESSAGE:
+                return start
+            start += 1
+        return None
+
+    def _loss(self, at: int, resume: int, length: int) -> Loss:
+        left = resume - at
+        cut = resume == len(self._buffer) and (0 < length <= MAX_MESSAGE or left < PREFIX.size)
+        reason = (
+            f"the file ends inside a message: {left} of {PREFIX.size + length} bytes"
+            if cut
+            else f"damage: a message of {length} bytes, which cannot be"
+        )
+        return Loss(reason, 1 if cut else -1, left, offset=self._place(at)[1])
+
+    def _place(self, at: int) -> tuple[int, int]:
+        position = self._start + at
+        start, place = next(f for f in reversed(self._frames) if f[0] <= position)
+        return place, position - start
+
+
+def _lose(report: TraceReport, loss: Loss) -> None:
+    """Report a loss, as one with the loss before it where that is of the same kind and adjoins."""
+    last = report.losses[-1] if report.losses else None
+    if last and last.messages == loss.messages == -1 and last.offset + last.bytes == loss.offset:
+        report.losses[-1] = replace(last, bytes=last.bytes + loss.bytes)
+    elif last is None or len(report.losses) < MAX_LOSSES:
+        report.losses.append(loss)
+    else:
+        reason = "further damage of the same kinds"
+        report.losses[-1] = replace(last, reason=reason, messages=-1, bytes=last.bytes + loss.bytes)
+
+
+def _beginning(data: bytes) -> bytes:
+    """How messages of a file begin: with the version of OSI and the tag of what follows; empty if without."""
+    try:
+        number, wire, _start, stop = next(fields_of(data, 0, len(data)))
+    except (ValueError, StopIteration):
+        return b""
+    return data[: stop + 1] if (number, wire) == (_VERSION, 2) and 4 <= stop <= 32 else b""
+
+
+def _likeness(name: str, data: bytes) -> int:
+    """How much a message looks like being of a type: the things with a place or an id in it; -1: not at all.
+
+    A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
+    """
+    message, objects, bulbs = _classes_of(name)
+    try:
+        ground = ground_truth_of(parse(message, data))
+        placed = [objects.FromString(content) for content in ground.moving_object]
+        placed += [bulbs.FromString(content) for content in lights_of(ground)] if bulbs else []
+        return _things([*placed, *ground.stationary_object], ground.lane)
+    except DECODE_ERRORS:
+        return -1
+
+
+@cache
+def _classes_of(name: str) -> tuple[type[Any], type[Any], type[Any] | None]:
+    schema = Schema(id=1, data=descriptors(), encoding="protobuf", name=name)
+    message = message_class(schema)
+    return message, object_class(message), light_class(message)
+
+
+def _things(placed: list[Any], lanes: Any) -> int:
+    return sum(
+        thing.id.HasField("value") and thing.base.HasField("position") for thing in placed
+    ) + sum(lane.id.HasField("value") for lane in lanes)
+
+
+def time_of(data: bytes) -> int | None:
+    """The time of an OSI message in ns, or ``None`` where it has none that can be a log time."""
+    seconds, nanos = 0, 0
+    try:
+        for number, wire, start, stop in fields_of(data, 0, len(data)):
+            if number == _TIMESTAMP and wire == 2:
+                for inner, kind, at, end in fields_of(data, start, stop):
+                    value = _number(data[at:end]) if kind == 0 else 0
+                    seconds = value if inner == 1 else seconds
+                    nanos = value if inner == 2 else nanos
+                break
+            if number > _TIMESTAMP:
+                return None
+        else:
+            return None
+    except ValueError:
+        return None
+    time_ns = seconds * 1_000_000_000 + nanos
+    return time_ns if 0 <= time_ns < _LATEST else None
+
+
+def _number(content: bytes) -> int:
+    """A varint, as a number with a sign."""
+    value = sum((byte & 0x7F) << 7 * i for i, byte in enumerate(content))
+    return value - (1 << 64) if value >> 63 & 1 else value

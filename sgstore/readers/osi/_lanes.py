@@ -1,0 +1,580 @@
+"""The lanes of OSI ground truth → text of a road map, for recordings that carry no OpenDRIVE.
+
+OSI tells lanes twice. *Logical* lanes have a border on each side with the length of a reference line at every
+point, the ends of the lanes that they touch, and rules for crossing; they are taken where a recording has
+them. *Physical* lanes have a centre line, boundaries in pieces, ids of neighbours and pairs of antecessor and
+successor; an intersection is mostly one area with the pairs that are ways through it. Left, right, antecessor
+and successor are those of the order in which a line's points stand, whichever way traffic runs. Where there is
+no centre line, it is the middle of the boundaries of both sides, and runs as these are to its left and right.
+Lanes that share a boundary lie side by side, unless they tell what does.
+
+Static data may be told once and never again, in any message. A lane is told by the first message that has it.
+
+Source: open-simulation-interface 3.8.0 (osi_lane.proto, osi_logicallane.proto).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from sgstore.errors import MapError
+from sgstore.readers.osi._schema import (
+    DECODE_ERRORS,
+    SENSOR_VIEW,
+    enum_name,
+    ground_truth_of,
+    has_field,
+    identifiers,
+    message_class,
+)
+from sgstore.roads import (
+    END,
+    MAX_NAME,
+    MAX_POINTS,
+    OF_LANES,
+    START,
+    Area,
+    Border,
+    Joint,
+    LaneLine,
+    PlainLane,
+    PlainSignal,
+    Sections,
+    about_lanes,
+    lane_text,
+    middle_between,
+    plain_lanes,
+    run_of,
+    with_shared_borders,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from mcap.records import Schema
+
+    from sgstore.world import Floats
+
+
+FIELDS: Final = ("lane", "lane_boundary", "logical_lane", "logical_lane_boundary")
+"""Fields of a ground truth that make up a map."""
+
+OWN: Final = "osi:"
+"""Before the OSI id of a light or sign that refers to no map, as its name in the map of the lanes."""
+
+_PLACE: Final = dict.fromkeys(("x", "y", "z"))
+_ID: Final = {"value": None}
+_REFERENCES: Final = {"type": None, "identifier": None}
+_RELATION: Final = {"other_lane_id": _ID}
+_CONNECTION: Final = {"other_lane_id": _ID, "at_begin_of_other_lane": None}
+_GROUND_TRUTH: Final[dict[str, Any]] = {
+    "map_reference": None,
+    "lane": {
+        "id": _ID,
+        "source_reference": _REFERENCES,
+        "classification": {
+            "type": None,
+            "subtype": None,
+            "centerline": _PLACE,
+            "centerline_is_driving_direction": None,
+            "left_adjacent_lane_id": _ID,
+            "right_adjacent_lane_id": _ID,
+            "left_lane_boundary_id": _ID,
+            "right_lane_boundary_id": _ID,
+            "lane_pairing": {"antecessor_lane_id": _ID, "successor_lane_id": _ID},
+        },
+    },
+    "lane_boundary": {
+        "id": _ID,
+        "boundary_line": {"position": _PLACE},
+        "classification": {"type": None},
+    },
+    "logical_lane": {
+        "id": _ID,
+        "type": None,
+        "source_reference": _REFERENCES,
+        "physical_lane_reference": {"physical_lane_id": _ID},
+        "start_s": None,
+        "end_s": None,
+        "move_direction": None,
+        "left_adjacent_lane": _RELATION,
+        "right_adjacent_lane": _RELATION,
+        "left_boundary_id": _ID,
+        "right_boundary_id": _ID,
+        "predecessor_lane": _CONNECTION,
+        "successor_lane": _CONNECTION,
+    },
+    "logical_lane_boundary": {
+        "id": _ID,
+        "boundary_line": {"position": _PLACE, "s_position": None},
+        "physical_boundary_id": _ID,
+        "passing_rule": None,
+    },
+}
+_SENSOR_VIEW: Final = {"global_ground_truth": _GROUND_TRUTH}
+_MAY_LACK: Final = {"subtype", "source_reference", "physical_lane_reference"}
+"""Fields that older versions of OSI do not have, and that a lane is usable without."""
+
+_TYPES: Final = {
+    "NORMAL": "driving",
+    "ONRAMP": "onRamp",
+    "OFFRAMP": "offRamp",
+    "CONNECTINGRAMP": "connectingRamp",
+    **{
+        word.upper(): word
+        for word in (
+            *("biking", "sidewalk", "parking", "stop", "restricted", "border", "shoulder"),
+            *("exit", "entry", "median", "curb", "rail", "tram"),
+        )
+    },
+}
+"""Words of ``Lane.Classification.Subtype`` and ``LogicalLane.Type`` → types of lanes as OpenDRIVE has them."""
+
+_CROSSED: Final = {"TYPE_NO_LINE", "TYPE_DASHED_LINE", "TYPE_BOTTS_DOTS"}
+"""Types of boundaries that traffic may cross."""
+_UNKNOWN: Final = {"TYPE_UNKNOWN", "TYPE_OTHER"}
+_RULES: Final = {
+    "PASSING_RULE_NONE_ALLOWED": (False, False),
+    "PASSING_RULE_INCREASING_T": (True, False),
+    "PASSING_RULE_DECREASING_T": (False, True),
+    "PASSING_RULE_BOTH_ALLOWED": (True, True),
+}
+"""Rule → whether traffic may cross from right to left, and from left to right, along the reference line."""
+
+_LONGEST: Final = 100
+"""Greatest length of the name of a road."""
+_JUMP: Final = 1e-3
+"""Least distance by which a border jumps; m."""
+_FAR: Final = 1e8
+"""Greatest distance of a place from the origin; m."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaneSignal:
+    """A light or sign that is assigned to lanes.
+
+    ``pose``: columns of :data:`sgstore.world.POSE`; ``lanes``: ids of physical or logical lanes.
+    """
+
+    name: str
+    kind: str
+    pose: tuple[float, ...]
+    lanes: tuple[int, ...]
+
+
+def _paths(fields: dict[str, Any]) -> Iterator[str]:
+    """Paths to all fields that a lane must have, with dots between the names."""
+    for name, inner in fields.items():
+        if name not in _MAY_LACK:
+            yield from (f"{name}.{path}" for path in _paths(inner)) if inner else (name,)
+
+
+class OsiLanes:
+    """The lanes that messages tell, taken up one message after another.
+
+    Parameters
+    ----------
+    schema : Schema
+        Of the channel: ``osi3.GroundTruth`` or ``osi3.SensorView``.
+
+    Attributes
+    ----------
+    warnings : list of str
+        What is odd.
+    lost : list of str
+        Which lanes cannot be used, and why, once the text was made.
+
+    Raises
+    ------
+    TraceError
+        The schema is malformed.
+    """
+
+    def __init__(self, schema: Schema) -> None:
+        fields = _SENSOR_VIEW if schema.name == SENSOR_VIEW else _GROUND_TRUTH
+        self._class = message_class(schema, fields)
+        prefix = "global_ground_truth." if schema.name == SENSOR_VIEW else ""
+        self._lacks = {
+            name: [
+                path
+                for path in _paths(_GROUND_TRUTH[name])
+                if not has_field(self._class, f"{prefix}{name}.{path}")
+            ]
+            for name in FIELDS
+        }
+        self._told: dict[str, dict[int, Any]] = {name: {} for name in FIELDS}
+        self._map = ""
+        self._points = 0
+        self._broken: dict[str, list[str]] = {}
+        self.warnings: list[str] = []
+        self.lost: list[str] = []
+
+    def take(self, data: bytes) -> None:
+        """Take up what a message tells of lanes that no message before it told."""
+        try:
+            truth = ground_truth_of(self._class.FromString(data))
+        except DECODE_ERRORS as error:
+            self.warnings.append(f"lanes of a message cannot be read: {error}")
+            return
+        self._map = self._map or str(getattr(truth, "map_reference", ""))
+        for name in FIELDS:
+            things = getattr(truth, name, ())
+            if self._lacks[name]:
+                self._say_lack(name, len(things))
+                continue
+            for thing in things:
+                self._told[name].setdefault(int(thing.id.value), thing)
+
+    def _say_lack(self, name: str, number: int) -> None:
+        warning = f"the schema of {name} lacks the field {self._lacks[name][0]}: none of it is used"
+        if number and warning not in self.warnings:
+            self.warnings.append(warning)
+
+    def text(self, signals: Iterable[LaneSignal] = ()) -> tuple[str, str]:
+        """The text of the road map, and what the recording calls the map; empty if it tells no lanes.
+
+        ``signals``: what applies to lanes; of those that are called alike the first one counts.
+
+        Raises
+        ------
+        MapError
+            There are too many points.
+        """
+        lanes, logical = self._told["lane"], self._told["logical_lane"]
+        if not lanes and not logical:
+            return "", ""
+        borders = _LaneBoundaries(self._told, self._place)
+        lines: list[LaneLine] = []
+        areas: list[Area] = []
+        for ident, lane in logical.items():
+            lines += self._guarded(_logical_line, ident, lane, borders)
+        covered = {ident for lane in logical.values() for ident in _physical(lane)}
+        for ident, lane in lanes.items():
+            if ident in covered:
+                continue
+            if not _is_area(lane):
+                lines += self._guarded(_physical_line, ident, lane, borders)
+            elif (way := _only_way(lane, borders)) is not None:
+                lines.append(way)
+            else:
+                areas += self._guarded(_area, ident, lane, borders)
+        lines = with_shared_borders(_sections_numbered(lines))
+        plain, warnings = plain_lanes(lines, areas)
+        self.lost = [about_lanes(which, what) for what, which in self._broken.items()]
+        if not plain:
+            self.warnings += warnings
+            return "", ""
+        rows = self._rows(lines, plain)
+        named = {
+            one.name: _plain_signal(one, [row for lane in one.lanes for row in rows.get(lane, ())])
+            for one in reversed([*signals])
+        }
+        found = [one for one in reversed(named.values()) if one.lanes and len(one.name) <= MAX_NAME]
+        return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
+
+    def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
+        """Id of each lane → numbers of the plain lanes that it is."""
+        row_of = {lane.name: row for row, lane in enumerate(plain)}
+        rows: dict[int, list[int]] = {}
+        for line in lines:
+            name = line.name or line.ident
+            row = row_of.get(name, row_of.get(f"{name}#{line.ident}"))
+            if row is None:
+                continue
+            ident = int(line.ident)
+            logical = self._told["logical_lane"].get(ident)
+            for lane in {ident, *(_physical(logical) if logical is not None else ())}:
+                rows.setdefault(lane, []).append(row)
+        return rows
+
+    def _guarded(
+        self,
+        read: Callable[[Any, _LaneBoundaries], Any],
+        ident: int,
+        lane: Any,
+        borders: _LaneBoundaries,
+    ) -> list[Any]:
+        try:
+            return [read(lane, borders)]
+        except DECODE_ERRORS as error:
+            self._broken.setdefault(f"left out: {error}", []).append(str(ident))
+            return []
+
+    def _name(self) -> str:
+        # Producers write the path of the file on their own machine: its last part is the map's name.
+        name = PurePosixPath(self._map.replace("\\", "/")).name
+        name = name.removesuffix(".xodr")
+        plain = name.isprintable() and 0 < len(name) <= 64 and not name.startswith("+proj")
+        return f"{name}{OF_LANES}" if plain else ""
+
+    def _place(self, points: Iterable[Any]) -> Floats:
+        """Points (n, 3) of a line."""
+        line = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)
+        self._points += len(line)
+        if self._points > MAX_POINTS:
+            raise MapError(f"lanes of more than {MAX_POINTS:,} points", element="lane")
+        if not (np.abs(line) < _FAR).all():
+            raise ValueError("a point of it is no place")
+        return line
+
+
+def _plain_signal(signal: LaneSignal, lanes: Iterable[int]) -> PlainSignal:
+    x, y, z, heading = signal.pose[:4]
+    return PlainSignal(signal.name, signal.kind, x, y, z, heading, tuple(sorted(set(lanes))))
+
+
+class _LaneBoundaries:
+    """Boundaries by id, their points read once each."""
+
+    def __init__(
+        self, told: dict[str, dict[int, Any]], place: Callable[[Iterable[Any]], Floats]
+    ) -> None:
+        self.told = told
+        self.place = place
+        self._lines: dict[int, Floats] = {}
+        self._logical: dict[int, tuple[Floats, Floats]] = {}
+
+    def physical(self, idents: Iterable[Any]) -> tuple[Border, ...]:
+        """The borders with these ids; those that are missing are passed over."""
+        found: list[Border] = []
+        for ident in map(_number, idents):
+            boundary = self.told["lane_boundary"].get(ident)
+            if boundary is None:
+                continue
+            if ident not in self._lines:
+                self._lines[ident] = self.place(p.position for p in boundary.boundary_line)
+            allowed = self.crossed(ident)
+            found.append(Border(self._lines[ident], allowed, allowed, str(ident)))
+        return tuple(found)
+
+    def crossed(self, ident: int) -> bool | None:
+        """Whether a physical boundary may be crossed; ``None``: that is not known."""
+        boundary = self.told["lane_boundary"].get(ident)
+        if boundary is None or not boundary.HasField("classification"):
+            return None
+        kind = enum_name(boundary.classification, "type")
+        return None if kind in _UNKNOWN else kind in _CROSSED
+
+    def logical(self, idents: Iterable[Any]) -> tuple[Floats, Floats, tuple[Border, ...]]:
+        """Points (n, 3) and their s (n,) of logical boundaries that follow one another, and each of them."""
+        lines: list[Floats] = [np.zeros((0, 3))]
+        places: list[Floats] = [np.zeros(0)]
+        borders: list[Border] = []
+        for ident in map(_number, idents):
+            boundary = self.told["logical_lane_boundary"].get(ident)
+            if boundary is None:
+                continue
+            if ident not in self._logical:
+                line = self.place(p.position for p in boundary.boundary_line)
+                s = np.array([p.s_position for p in boundary.boundary_line], np.float64)
+                if not (np.abs(s) < _FAR).all():
+                    raise ValueError("the s of a point of its boundary is no number")
+                self._logical[ident] = line, s
+            line, s = self._logical[ident]
+            lines.append(line)
+            places.append(s)
+            borders.append(Border(line, *self._rule(boundary), f"logical {ident}"))
+        points, s = np.concatenate(lines), np.concatenate(places)
+        order = np.argsort(s, kind="stable")
+        return points[order], s[order], tuple(borders)
+
+    def _rule(self, boundary: Any) -> tuple[bool | None, bool | None]:
+        """Whether a logical boundary may be crossed to the left and right; else its own line's type counts."""
+        rule = _RULES.get(enum_name(boundary, "passing_rule"))
+        if rule is not None:
+            return rule
+        # From right to left along the reference line: traffic from the right meets the first one.
+        physical = [_number(ident) for ident in boundary.physical_boundary_id]
+        if not physical:
+            return None, None
+        return self.crossed(physical[0]), self.crossed(physical[-1])
+
+
+def _number(ident: Any) -> int:
+    return int(ident.value)
+
+
+def _idents(idents: Iterable[Any]) -> tuple[str, ...]:
+    return tuple(str(ident.value) for ident in idents)
+
+
+def _is_area(lane: Any) -> bool:
+    about = lane.classification
+    return enum_name(about, "type") == "TYPE_INTERSECTION" and not len(about.centerline)
+
+
+def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
+    """An intersection as an area with ways through it."""
+    return Area(
+        str(lane.id.value),
+        tuple(
+            (str(pair.antecessor_lane_id.value), str(pair.successor_lane_id.value))
+            for pair in lane.classification.lane_pairing
+            if pair.HasField("antecessor_lane_id") and pair.HasField("successor_lane_id")
+        ),
+    )
+
+
+def _only_way(lane: Any, borders: _LaneBoundaries) -> LaneLine | None:
+    """An intersection that its boundaries tell as one lane; ``None``: it is an area, or nothing."""
+    about = lane.classification
+    if len(about.lane_pairing) > 1 or not about.left_lane_boundary_id:
+        return None
+    try:
+        return _physical_line(lane, borders)
+    except ValueError:
+        return None
+
+
+def _physical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
+    about = lane.classification
+    pairs = about.lane_pairing
+    before = [pair.antecessor_lane_id for pair in pairs if pair.HasField("antecessor_lane_id")]
+    after = [pair.successor_lane_id for pair in pairs if pair.HasField("successor_lane_id")]
+    kind = enum_name(about, "type")
+    told = about.HasField("centerline_is_driving_direction")
+    lefts = borders.physical(about.left_lane_boundary_id)
+    rights = borders.physical(about.right_lane_boundary_id)
+    centre = borders.place(about.centerline)
+    if len(centre) < 2 or run_of(centre)[-1] < _JUMP:
+        centre = middle_between(*([border.line for border in side] for side in (lefts, rights)))
+    return LaneLine(
+        ident=str(lane.id.value),
+        type=_type_of(kind, _word(about, "subtype")),
+        centre=centre,
+        forward=bool(about.centerline_is_driving_direction) or not told,
+        lefts=lefts,
+        rights=rights,
+        before=tuple(Joint(name) for name in dict.fromkeys(_idents(before))),
+        after=tuple(Joint(name) for name in dict.fromkeys(_idents(after))),
+        left_beside=_idents(about.left_adjacent_lane_id),
+        right_beside=_idents(about.right_adjacent_lane_id),
+        junction=None if kind == "TYPE_INTERSECTION" else "",
+        **_source(lane),
+    )
+
+
+def _word(message: Any, field: str) -> str:
+    """What stands behind ``TYPE_`` or ``SUBTYPE_`` in the name of a value; empty if there is no such field."""
+    known = field in message.DESCRIPTOR.fields_by_name
+    return enum_name(message, field).partition("_")[2] if known else ""
+
+
+def _type_of(kind: str, word: str) -> str:
+    """The type of a lane: by its subtype, else by whether it is for driving."""
+    if word in _TYPES:
+        return _TYPES[word]
+    return "driving" if kind in {"TYPE_DRIVING", "TYPE_INTERSECTION"} else "none"
+
+
+def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
+    left, left_s, lefts = borders.logical(lane.left_boundary_id)
+    right, right_s, rights = borders.logical(lane.right_boundary_id)
+    if len(left) < 2 or len(right) < 2:
+        raise ValueError("it has no boundary with points on each side")
+    # A lane is where both borders are.
+    start, end = max(left_s[0], right_s[0]), min(left_s[-1], right_s[-1])
+    start = max(start, lane.start_s) if lane.HasField("start_s") else start
+    end = min(end, lane.end_s) if lane.HasField("end_s") else end
+    if not abs(lane.start_s) + abs(lane.end_s) < _FAR or not end > start:
+        raise ValueError("there is no s at which it has a boundary on each side")
+    cuts = np.concatenate(([start], left_s, right_s, [end]))
+    cuts = np.unique(cuts[(cuts >= start) & (cuts <= end)])
+    before, after = (
+        [_at(line, s, cuts, side) for line, s in ((left, left_s), (right, right_s))]
+        for side in ("left", "right")
+    )
+    jumps = np.abs(np.hstack(after) - np.hstack(before)).max(axis=1) > _JUMP
+    # Where a border jumps there are two cross sections, but none beyond the lane's own ends.
+    early, late = np.ones(len(cuts), np.bool_), jumps.copy()
+    early[0], late[-1] = not jumps[0], False
+    one, other = (
+        np.stack((b, a), axis=1).reshape(-1, 3)[np.stack((early, late), axis=1).ravel()]
+        for b, a in zip(before, after, strict=True)
+    )
+    ways = enum_name(lane, "move_direction")
+    physical = _physical(lane)
+    crossing = [
+        ident
+        for ident in sorted(physical)
+        if ident in borders.told["lane"]
+        and enum_name(borders.told["lane"][ident].classification, "type") == "TYPE_INTERSECTION"
+    ]
+    return LaneLine(
+        ident=str(lane.id.value),
+        type=_TYPES.get(_word(lane, "type"), "none"),
+        centre=(one + other) / 2,
+        forward=ways != "MOVE_DIRECTION_DECREASING_S",
+        both=ways == "MOVE_DIRECTION_BOTH_ALLOWED",
+        lefts=lefts,
+        rights=rights,
+        sections=Sections(one[:, :2], other[:, :2], (one[:, 2] + other[:, 2]) / 2),
+        before=_connections(lane.predecessor_lane),
+        after=_connections(lane.successor_lane),
+        left_beside=_idents(part.other_lane_id for part in lane.left_adjacent_lane),
+        right_beside=_idents(part.other_lane_id for part in lane.right_adjacent_lane),
+        junction=str(crossing[0]) if crossing else "",
+        **_source(lane),
+    )
+
+
+def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -> Floats:
+    """Points (n, 3) of a line at places; where it jumps, as it is before (``left``) or after (``right``)."""
+    at = np.searchsorted(s, cuts, side)
+    at = np.minimum(at, len(s) - 1) if side == "left" else np.maximum(at - 1, 0)
+    between = np.column_stack([np.interp(cuts, s, column) for column in line.T])
+    return np.where((s[at] == cuts)[:, None], line[at], between)
+
+
+def _physical(lane: Any) -> set[int]:
+    """Ids of the physical lanes that a logical lane is made of."""
+    return {_number(part.physical_lane_id) for part in getattr(lane, "physical_lane_reference", ())}
+
+
+def _connections(connections: Iterable[Any]) -> tuple[Joint, ...]:
+    return tuple(
+        Joint(str(c.other_lane_id.value), START if c.at_begin_of_other_lane else END)
+        for c in connections
+    )
+
+
+def _source(lane: Any) -> dict[str, Any]:
+    """Road, section and number of a lane that was an OpenDRIVE lane; its section is the place where it begins.
+
+    The identifiers are the road, the section's s and the lane, in this order; esmini writes ``road_id:1``.
+    """
+    values = [
+        value.rpartition(":")[2]
+        for source, value in identifiers(lane)
+        if source == "net.asam.opendrive"
+    ]
+    if len(values) < 3 or len(values[0]) > _LONGEST:
+        return {}
+    try:
+        start, number = float(values[1]), int(values[2])
+    except ValueError:
+        return {}
+    usable = abs(start) < _FAR and abs(number) < _FAR
+    return {"road": values[0], "section": start, "number": number} if usable else {}
+
+
+def _sections_numbered(lines: Sequence[LaneLine]) -> list[LaneLine]:
+    """Lanes with sections counted from 0 in their roads instead of the places where they begin, and named."""
+    starts: dict[str, set[float]] = {}
+    for line in lines:
+        if line.road:
+            starts.setdefault(line.road, set()).add(line.section)
+    number = {road: {s: i for i, s in enumerate(sorted(found))} for road, found in starts.items()}
+    numbered: list[LaneLine] = []
+    for line in lines:
+        if line.road:
+            section = number[line.road][line.section]
+            name = f"{line.road}/{section}/{line.number}"
+            numbered.append(replace(line, section=section, name=name))
+        else:
+            numbered.append(line)
+    return numbered

@@ -1,0 +1,496 @@
+"""Moving and stationary objects of OSI as columns.
+
+``osi3.MovingObject`` of many frames as columns, straight from their bytes.
+
+The numbers of an object are almost all doubles, and the objects of a frame mostly have the same fields: then
+the same bytes stand at the same places, and the numbers between them are columns of a matrix. So the layout
+of one object is learned, byte by byte, and all that agree with it in every byte that is no number are read at
+once; what is left over teaches the next layout. Reading the same numbers as attributes takes six times as long.
+
+A ground truth is parsed with its objects as bytes (:data:`sgstore.readers.osi._schema.OPAQUE`), so they may be
+malformed, whatever protobuf said to the message around them. An object whose layout is odd (a field that
+comes twice, a group) or never comes again is read by protobuf itself.
+
+Source: protobuf encoding (protobuf.dev/programming-guides/encoding); osi_object.proto.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.opendrive import kind_of_object
+from sgstore.readers._base import FAR
+from sgstore.readers.osi._lanes import OWN, LaneSignal
+from sgstore.readers.osi._schema import (
+    DECODE_ERRORS,
+    assigned_lanes,
+    enum_name,
+    fields_of,
+    has_field,
+    map_ref,
+    static_pose,
+)
+from sgstore.vocabulary import ENTITY_KINDS, SIGNALS, TypeMeaning, type_meanings
+from sgstore.world import POSE
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.readers._base import EntityTable
+    from sgstore.world import Bools, Floats, Ints
+
+    Bytes = NDArray[np.uint8]
+
+
+BASE: Final = {
+    "position": ("x", "y", "z"),
+    "orientation": ("yaw", "pitch", "roll"),
+    "velocity": ("x", "y", "z"),
+    "acceleration": ("x", "y", "z"),
+    "orientation_rate": ("yaw",),
+    "dimension": ("length", "width", "height"),
+}
+"""Sub-messages of ``BaseMoving`` and what is read of them."""
+_INDICATORS: Final = {3: 0b01, 4: 0b10, 5: 0b11}
+"""``IndicatorState`` LEFT, RIGHT, WARNING → bits ``light_left`` and ``light_right``."""
+_LIT: Final = 3
+"""Least value of ``BrakeLightState`` and ``GenericLightState`` that means that a light is on."""
+_LIGHTS: Final = {
+    "indicator_state": 0,
+    "brake_light_state": 2,
+    "reversing_light": 3,
+    "head_light": 5,
+    "high_beam": 6,
+    "front_fog_light": 7,
+    "rear_fog_light": 7,
+    "emergency_vehicle_illumination": 9,
+    "service_vehicle_illumination": 10,
+}
+"""Fields of ``LightState`` → bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS`."""
+_STATES: Final = 64
+"""More than any state of a light has; states above are not known to the recording's version of OSI."""
+
+_DOUBLE: Final = 9
+"""A double and its tag, which is one byte for fields up to 15; bytes."""
+_VARINT, _FIXED64, _BYTES, _GROUP, _GROUP_END = 0, 1, 2, 3, 4
+_ROUNDS: Final = 64
+"""Layouts that are tried for the objects of one length in a block; what is left is read one by one."""
+_MOST_LAYOUTS: Final = 256
+"""Layouts that are remembered for objects of one length; then they are forgotten and learned anew."""
+
+Tree = dict[int, "Tree | int | NDArray[np.int64]"]
+"""Fields that are read: number → those within, or the column of a double, or what states of a light mean."""
+
+
+class OddError(ValueError):
+    """A message that is well formed, perhaps, but has no layout that others could share."""
+
+
+@dataclass(slots=True)
+class _ObjectLayout:
+    """Where things stand in objects of one shape.
+
+    ``compared``, ``mask``, ``expected``: places of all bytes that are no numbers, which of their bits count,
+    and what those are. ``runs``: first column, place and number of doubles that follow one another. ``zero``:
+    columns of sub-messages that are there but leave the number out. ``lights``: where states of lights stand,
+    and what they mean. ``parts``: which sub-messages of the base there are.
+    """
+
+    compared: Ints
+    mask: Bytes
+    expected: Bytes
+    runs: list[tuple[int, int, int]]
+    zero: Ints
+    lights: list[tuple[int, int, NDArray[np.int64]]]
+    parts: set[str]
+
+    def agree(self, objects: Bytes) -> Bools:
+        """Which of some objects, as rows of bytes, have this layout."""
+        return ((objects[:, self.compared] & self.mask) == self.expected).all(axis=1)
+
+
+@dataclass(slots=True)
+class _Learned:
+    """What a walk through an object finds; see :class:`_ObjectLayout`."""
+
+    mask: Bytes
+    doubles: dict[int, int] = field(default_factory=dict[int, int])
+    zero: list[int] = field(default_factory=list[int])
+    lights: list[tuple[int, int, NDArray[np.int64]]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+    parts: set[int] = field(default_factory=set[int])
+
+
+class MovingObjects:
+    """Reads serialised moving objects.
+
+    Parameters
+    ----------
+    message : type
+        Class of ``osi3.MovingObject``, in the recording's version of OSI.
+    """
+
+    def __init__(self, message: type[Any]) -> None:
+        self._message = message
+        self._parts: dict[int, str] = {}
+        self._base, self._tree = self._trees(message.DESCRIPTOR)
+        self._layouts: dict[int, list[_ObjectLayout]] = {}
+
+    def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints]:
+        """The numbers of serialised objects.
+
+        Returns
+        -------
+        values : (n, 16) float64
+            Columns :data:`sgstore.world.POSE`; NaN where the sub-message is missing, 0 where only
+            the number is.
+        usable : (n,) bool
+            Whether there is a position on earth, and an orientation that is a number if there is one. What is
+            malformed is not usable.
+        lights : (n,) int64
+            Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; -1 if the object tells nothing of its lights.
+        """
+        values = np.full((len(objects), len(POSE)), np.nan)
+        usable = np.zeros(len(objects), np.bool_)
+        lights = np.full(len(objects), -1, np.int64)
+        lengths = np.fromiter(map(len, objects), np.int64, len(objects))
+        order = np.argsort(lengths, kind="stable")
+        cuts = np.flatnonzero(np.diff(lengths[order])) + 1
+        for rows in np.split(order, cuts) if len(order) else ():
+            joined = b"".join([objects[row] for row in rows.tolist()])
+            content = np.frombuffer(joined, np.uint8).reshape(len(rows), -1)
+            for row in self._read_alike(rows, content, values, usable, lights):
+                values[row], usable[row], lights[row] = self._read_one(objects[row])
+        return values, usable, lights
+
+    def _read_alike(
+        self, rows: NDArray[np.intp], content: Bytes, values: Floats, usable: Bools, lights: Ints
+    ) -> list[int]:
+        """Read objects of one length, and return the rows of those that are left over."""
+        odd: list[int] = []
+        for _ in range(_ROUNDS):
+            if not len(rows):
+                break
+            layout = self._layout_of(content[0])
+            agree = None if layout is None else layout.agree(content)
+            if layout is None or agree is None:
+                odd.append(int(rows[0]))
+                rows, content = rows[1:], content[1:]
+                continue
+            alike = agree.all()
+            here, found = (rows, content) if alike else (rows[agree], content[agree])
+            values[here], usable[here] = _numbers(layout, found)
+            lights[here] = _lights(layout, found)
+            if alike:
+                return odd
+            rows, content = rows[~agree], content[~agree]
+        return [*odd, *rows.tolist()]
+
+    def _trees(self, found: Any) -> tuple[dict[str, Any], Tree]:
+        """Descriptors of the sub-messages of the base, and which fields to read."""
+        base = found.fields_by_name["base"]
+        parts: dict[str, Any] = {}
+        inner: Tree = {}
+        column = {name: i for i, name in enumerate(POSE)}
+        for part, names in BASE.items():
+            told = base.message_type.fields_by_name.get(part)
+            if told is None or told.message_type is None:
+                continue
+            parts[part] = told
+            self._parts[told.number] = part
+            within = told.message_type.fields_by_name
+            inner[told.number] = {
+                within[name].number: column[target]
+                for name, target in zip(names, _TARGETS[part], strict=True)
+                if name in within
+            }
+        tree: Tree = {base.number: inner}
+        vehicle = found.fields_by_name.get("vehicle_classification")
+        state = vehicle.message_type.fields_by_name.get("light_state") if vehicle else None
+        if vehicle is not None and state is not None and state.message_type is not None:
+            lamps: Tree = {
+                told.number: _meanings(told, bit)
+                for name, bit in _LIGHTS.items()
+                if (told := state.message_type.fields_by_name.get(name)) is not None
+            }
+            tree[vehicle.number] = {state.number: lamps}
+        self._base_number = int(base.number)
+        return parts, tree
+
+    def _layout_of(self, content: Bytes) -> _ObjectLayout | None:
+        """The layout of an object, learned if it is a new one; ``None`` if it has none."""
+        layouts = self._layouts.setdefault(len(content), [])
+        for layout in layouts:
+            if layout.agree(content[None])[0]:
+                return layout
+        if len(layouts) >= _MOST_LAYOUTS:
+            layouts.clear()
+        try:
+            layouts.append(self._learn(content.tobytes()))
+        except ValueError:
+            return None
+        return layouts[-1]
+
+    def _learn(self, content: bytes) -> _ObjectLayout:
+        found = _Learned(np.full(len(content), 0xFF, np.uint8))
+        self._walk(content, 0, len(content), self._tree, found, ())
+        compared = np.flatnonzero(found.mask)
+        mask = found.mask[compared]
+        return _ObjectLayout(
+            compared=compared,
+            mask=mask,
+            expected=np.frombuffer(content, np.uint8)[compared] & mask,
+            runs=_runs(found.doubles),
+            zero=np.array([c for c in found.zero if c not in found.doubles], np.int64),
+            lights=found.lights,
+            parts={self._parts[number] for number in found.parts},
+        )
+
+    def _walk(
+        self,
+        content: bytes,
+        start: int,
+        stop: int,
+        tree: Tree,
+        found: _Learned,
+        path: tuple[int, ...],
+    ) -> None:
+        seen: set[int] = set()
+        for number, wire, at, end in fields_of(content, start, stop):
+            known = tree.get(number)
+            if (
+                number == 0
+                or wire in {_GROUP, _GROUP_END}
+                or (known is not None and number in seen)
+            ):
+                raise OddError(f"field {number} of wire type {wire}")
+            seen.add(number)
+            # Of a number of variable length only that each of its bytes is followed by another, or not.
+            found.mask[at:end] = 0x80 if wire == _VARINT else 0
+            if isinstance(known, dict) and wire == _BYTES:
+                found.mask[at:end] = 0xFF
+                if path == (self._base_number,):
+                    found.parts.add(number)
+                    found.zero += [column for column in known.values() if isinstance(column, int)]
+                self._walk(content, at, end, known, found, (*path, number))
+            elif isinstance(known, int) and wire == _FIXED64:
+                found.doubles[known] = at
+            elif isinstance(known, np.ndarray) and wire == _VARINT:
+                found.lights.append((at, end, known))
+
+    def _read_one(self, content: bytes) -> tuple[Floats, bool, int]:
+        """Read an object as protobuf does; what is malformed is not usable."""
+        values = np.full(len(POSE), np.nan)
+        try:
+            thing = self._message.FromString(content)
+        except DECODE_ERRORS:
+            return values, False, -1
+        for part, names in BASE.items():
+            if part in self._base and thing.base.HasField(part):
+                told = getattr(thing.base, part)
+                for name, target in zip(names, _TARGETS[part], strict=True):
+                    values[POSE.index(target)] = getattr(told, name, 0.0)
+        oriented = thing.base.HasField("orientation")
+        near = thing.base.HasField("position") and bool(_near(values[None], oriented=oriented)[0])
+        return values, near, light_bits(thing)
+
+
+_TARGETS: Final = {
+    "position": ("x", "y", "z"),
+    "orientation": ("heading", "pitch", "roll"),
+    "velocity": ("vx", "vy", "vz"),
+    "acceleration": ("ax", "ay", "az"),
+    "orientation_rate": ("yaw_rate",),
+    "dimension": ("length", "width", "height"),
+}
+
+
+def _meanings(told: Any, bit: int) -> NDArray[np.int64]:
+    """What each state of a light adds to the mask; -1 for states that the recording's OSI has not."""
+    table = np.full(_STATES, -1, np.int64)
+    for state in told.enum_type.values_by_number if told.enum_type is not None else ():
+        if 0 <= state < _STATES:
+            table[state] = _INDICATORS.get(state, 0) if bit == 0 else (state >= _LIT) << bit
+    return table
+
+
+def _numbers(layout: _ObjectLayout, content: Bytes) -> tuple[Floats, Bools]:
+    values = np.full((len(content), len(POSE)), np.nan)
+    values[:, layout.zero] = 0.0
+    size = content.shape[1]
+    for column, place, count in layout.runs:
+        doubles = np.ndarray((len(content), count), "<f8", content.data, place, (size, _DOUBLE))
+        values[:, column : column + count] = doubles
+    if "position" not in layout.parts:
+        return values, np.zeros(len(content), np.bool_)
+    return values, _near(values, oriented="orientation" in layout.parts)
+
+
+def _runs(doubles: dict[int, int]) -> list[tuple[int, int, int]]:
+    """Doubles by column → place, as runs of columns that stand behind one another, a tag between two."""
+    runs: list[tuple[int, int, int]] = []
+    for column, place in sorted(doubles.items()):
+        if runs and (column, place) == (sum(runs[-1][::2]), runs[-1][1] + _DOUBLE * runs[-1][2]):
+            runs[-1] = (*runs[-1][:2], runs[-1][2] + 1)
+        else:
+            runs.append((column, place, 1))
+    return runs
+
+
+def _near(values: Floats, *, oriented: bool) -> Bools:
+    with np.errstate(invalid="ignore"):
+        return np.all(np.abs(values[:, : 4 if oriented else 3]) < FAR, axis=1)
+
+
+def _lights(layout: _ObjectLayout, content: Bytes) -> Ints:
+    bits = np.full(len(content), -1, np.int64)
+    for start, stop, table in layout.lights:
+        state = np.zeros(len(content), np.uint64)
+        for place in range(stop - 1, start - 1, -1):
+            state = state << np.uint64(7) | (content[:, place] & 0x7F)
+        told = table[np.minimum(state, _STATES - 1).astype(np.int64)]
+        bits = np.where(told < 0, bits, np.maximum(bits, 0) | told)
+    return bits
+
+
+def light_bits(thing: Any) -> int:
+    """Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS` for a ``MovingObject``; -1 if it tells of none."""
+    state = getattr(getattr(thing, "vehicle_classification", None), "light_state", None)
+    if state is None or not state.ListFields():
+        return -1
+    bits = _INDICATORS.get(getattr(state, "indicator_state", 0), 0)
+    for name, bit in _LIGHTS.items():
+        bits |= (bit > 0 and getattr(state, name, 0) >= _LIT) << bit
+    return bits
+
+
+# What stands still in an OSI recording: stationary objects and traffic signs, wherever they are told ----
+# Producers tell them once, with the first message, or in every one, or as the ego comes near. What stands,
+# stood there before it was told: so all of them are gathered before frames are read, and hold for the whole
+# trace.
+#
+# Source: open-simulation-interface 3.8.0 (osi_object.proto, osi_trafficsign.proto).
+
+_FIELDS: Final = {
+    "stationary_object": ("stationary", "unknown"),
+    "traffic_sign": ("sign", "sign"),
+}
+"""Fields of a ground truth → prefix of their types in ``vocabulary.toml``, kind of what that does not map."""
+UNTOLD: Final = frozenset({"TYPE_UNKNOWN", "TYPE_OTHER"})
+_UNITS: Final = {"UNIT_MILE_PER_HOUR": " mph"}
+"""What is said behind the value of a speed limit, by its unit; km/h go without saying."""
+_MAP_OBJECT: Final = re.compile(r"<object\s([^<>]*)>")
+_MAP_ATTRIBUTE: Final = re.compile(r"""(\w+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+
+
+@dataclass(frozen=True, slots=True)
+class _Static:
+    ident: str
+    meaning: TypeMeaning
+    type_name: str
+    map_ref: str
+    pose: tuple[float, ...]
+    unmapped: bool
+    lanes: tuple[int, ...] = ()
+
+
+@dataclass(slots=True)
+class Statics:
+    """The static things of a recording, in the order in which they were told.
+
+    Attributes
+    ----------
+    unplaced : dict
+        What has no usable pose or cannot be read, in words → log time at which it was told.
+    """
+
+    unplaced: dict[str, int] = field(default_factory=dict[str, int])
+    _found: dict[tuple[str, int], _Static] = field(default_factory=dict)  # pyright: ignore[reportUnknownVariableType]
+
+    def look(self, ground: Any, fields: tuple[str, ...], log_time_ns: int) -> None:
+        """Take note of what a ground truth tells; ``fields``: those that its class has."""
+        for name in fields:
+            if name not in _FIELDS:
+                continue
+            for thing in getattr(ground, name):
+                key = (name, thing.id.value)
+                if key in self._found:
+                    continue
+                try:
+                    self._take(key, thing, log_time_ns)
+                except DECODE_ERRORS as error:
+                    words = f"{name.replace('_', ' ')} {key[1]} cannot be read ({error})"
+                    self.unplaced.setdefault(words, log_time_ns)
+
+    def enter(self, roster: EntityTable, map_text: str) -> None:
+        """Enter them all. Objects of the map whose kind is not told are what the map says that they are."""
+        kinds: dict[str, str] | None = None
+        for thing in self._found.values():
+            meaning = thing.meaning
+            if meaning.kind == "unknown" and not meaning.subkind and thing.map_ref:
+                kinds = kinds_of_map(map_text) if kinds is None else kinds
+                kind = kinds.get(thing.map_ref, "unknown")
+                # What only a map has, such as paint on the road, is a thing like any other here.
+                entity = kind in ENTITY_KINDS
+                meaning = TypeMeaning(kind) if entity else TypeMeaning("prop", subkind=kind)
+            roster.enter(thing.ident, meaning, thing.type_name, thing.map_ref, thing.pose)
+            if thing.unmapped:
+                roster.count_unknown(thing.type_name)
+
+    def _take(self, key: tuple[str, int], thing: Any, log_time_ns: int) -> None:
+        name, number = key
+        words = f"{name.replace('_', ' ')} {number} has no usable pose"
+        told = thing.main_sign if name == "traffic_sign" else thing
+        pose = static_pose(told.base)
+        if pose is None:
+            self.unplaced.setdefault(words, log_time_ns)
+            return
+        self.unplaced.pop(words, None)
+        type_name = enum_name(told.classification, "type")
+        prefix, otherwise = _FIELDS[name]
+        meaning = type_meanings().get(f"{prefix}_{type_name}".lower(), TypeMeaning(otherwise))
+        if meaning.kind == "speed_limit":
+            meaning = _with_value(meaning, told.classification)
+        lanes = assigned_lanes(told.classification) if meaning.kind in SIGNALS else []
+        self._found[key] = _Static(
+            ident=str(number),
+            meaning=meaning,
+            type_name=type_name,
+            map_ref=map_ref(thing) or (f"{OWN}{number}" if lanes else ""),
+            pose=pose,
+            unmapped=meaning.kind == "sign" and (type_name in UNTOLD or type_name[-1].isdigit()),
+            lanes=tuple(lanes),
+        )
+
+    def signals(self) -> list[LaneSignal]:
+        """The signs that are assigned to lanes."""
+        return [
+            LaneSignal(thing.map_ref, thing.meaning.kind, thing.pose, thing.lanes)
+            for thing in self._found.values()
+            if thing.lanes
+        ]
+
+
+def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
+    """A speed limit whose subkind ends with its value: ``50``, ``zone 30``, ``35 mph``."""
+    if not has_field(type(classification), "value.value") or not classification.value.value > 0:
+        return meaning
+    value = classification.value
+    unit = enum_name(value, "value_unit") if has_field(type(value), "value_unit") else ""
+    words = [meaning.subkind, f"{value.value:g}{_UNITS.get(unit, '')}"]
+    return replace(meaning, subkind=" ".join(word for word in words if word))
+
+
+@lru_cache(maxsize=1)  # a recording is read twice and more
+def kinds_of_map(text: str) -> dict[str, str]:
+    """Id of each object in an OpenDRIVE text → its kind."""
+    kinds: dict[str, str] = {}
+    for match in _MAP_OBJECT.finditer(text):
+        told = {name: a or b for name, a, b in _MAP_ATTRIBUTE.findall(match[1])}
+        if "id" in told:
+            kinds[told["id"]] = kind_of_object(told.get("type", ""), told.get("name", ""))
+    return kinds

@@ -1,0 +1,393 @@
+"""A store made anew from its recordings: ``rebuild``.
+
+A store is a cache of its traces: when the tables change with a version, or somebody has altered them, it is
+made again from what it was made of. The new store grows beside the old one, in ``STORE.rebuild``; a run that
+was stopped goes on there. It takes the old one's place when it has everything that the old one had, not before.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.config import Config, from_dict
+from sgstore.derive import derive, keep_abstraction
+from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError
+from sgstore.files import working_folder
+from sgstore.importing import Words, import_graphs
+from sgstore.ingest import ingest, recordings
+from sgstore.mcap import digest_of, mark_of
+from sgstore.readers import open_trace
+from sgstore.store import StoreFile, named_as, remains_of, take_place
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator, Sequence
+
+    from sgstore.segments import Progress
+    from sgstore.store import OldMap, OldTrace, Remains
+
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there two runs would meet at the file that both make
+    fcntl = None
+
+
+_SHOWN: Final = 10
+"""Recordings that a message names; the others are counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rebuilt:
+    """A trace that was made anew.
+
+    Attributes
+    ----------
+    trace : str
+        Its name, the same as before.
+    status : str
+        ``added``; ``present``: a run before this one had made it.
+    frames : int
+    path : Path
+        Its recording.
+    """
+
+    trace: str
+    status: str
+    frames: int
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class _ReadingStep:
+    """Traces that are read in one go: with the same settings, part and map, as the same egos."""
+
+    config: Config
+    part: tuple[float | None, float | None]
+    map_id: int | None
+    paths: tuple[Path, ...]
+
+
+def rebuild(
+    store: str | Path,
+    *,
+    look_in: Sequence[str | Path] = (),
+    leave_out: Sequence[str] = (),
+    jobs: int = 1,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> list[Rebuilt]:
+    """Make a store anew from its recordings, with the settings, parts, maps, egos and names that it has.
+
+    Sets that were derived and classes that were asked for are made again, too. The old store stays until the
+    new one has everything; a run that was stopped goes on where it was.
+
+    Parameters
+    ----------
+    store : str or Path
+        Of this version or an older one; it may have been altered, if its table of traces can be read.
+    look_in : sequence of str or Path, optional
+        Folders in which to look for recordings that are not where they were.
+    leave_out : sequence of str, optional
+        Names of traces that the new store is not to have: their recordings are gone, or, of graphs that an
+        older version imported, nobody knows how.
+    jobs : int
+        Recordings that are read at the same time.
+    on_progress : function, optional
+        As :func:`sgstore.ingest.ingest` takes it.
+
+    Returns
+    -------
+    list of Rebuilt
+        The traces, in the order in which they came into the old store.
+
+    Raises
+    ------
+    StoreError
+        Recordings are gone or have changed: it names them; one of them cannot be read as before; or there are
+        tables in the store that are none of ours. Then the store is left as it was.
+    """
+    path = Path(store)
+    whole = remains_of(path)
+    old = _without(path, whole, leave_out)
+    _check_settings(path, old.traces)
+    if old.others:
+        raise StoreError(
+            f"{path}: cannot be made anew: what is none of sgstore's would be lost: {', '.join(old.others)};"
+            " move it to a file of its own first"
+        )
+    fresh = path.with_name(f"{path.name}.rebuild")
+    with _alone(fresh):
+        places = _found(path, old.traces, look_in)
+        _resume(fresh, old)
+        if not fresh.exists():
+            StoreFile.create(fresh)
+        before = {one.trace_id for one in StoreFile(fresh).traces()}
+        for step in _steps(old.traces, places):
+            if isinstance(step, _ReadingStep):
+                _read(fresh, step, old.maps, jobs, on_progress)
+            else:
+                _import(fresh, step, places[step.trace_id], old.maps)
+        _complete(path, fresh, old)
+        named_as(fresh, old)
+        made = {one.trace_id: one for one in StoreFile(fresh).traces()}
+        take_place(fresh, path, whole)
+    return [
+        Rebuilt(
+            one.name,
+            "present" if one.trace_id in before else "added",
+            made[one.trace_id].frames,
+            made[one.trace_id].path,
+        )
+        for one in old.traces
+    ]
+
+
+def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
+    """What is known of a store, but for some traces."""
+    names = [one.name for one in whole.traces]
+    strange = [name for name in leave_out if name not in names]
+    if strange:
+        raise StoreError(f"{path}: no trace {strange[0]!r}; there are: {', '.join(names)}")
+    kept = tuple(one for one in whole.traces if one.name not in leave_out)
+    used = {one.map_id for one in kept}
+    maps = {number: one for number, one in whole.maps.items() if number in used}
+    ids = {one.trace_id for one in kept}
+    sets = [replace(one, traces=tuple(i for i in one.traces if i in ids)) for one in whole.sets]
+    return replace(whole, traces=kept, maps=maps, sets=tuple(one for one in sets if one.traces))
+
+
+@contextmanager
+def _alone(fresh: Path) -> Generator[None]:
+    """No other process makes the same store anew."""
+    lock = fresh.with_name(f"{fresh.name}-lock")
+    try:
+        held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise StoreError(f"{fresh.parent}: cannot be written: {error.strerror}") from error
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StoreError(f"{fresh}: another process is at work on it") from error
+        yield
+        with suppress(OSError):
+            lock.unlink()
+    finally:
+        os.close(held)
+
+
+# Recordings -------------------------------------------------------------------------------------------------
+
+
+def _found(
+    path: Path, traces: Sequence[OldTrace], look_in: Sequence[str | Path]
+) -> dict[int, Path]:
+    """Where the recording of each trace is now.
+
+    Raises
+    ------
+    StoreError
+        Some are gone or have changed; it names them.
+    """
+    known: dict[tuple[Path, str], Path | str] = {}
+    candidates = _by_size(look_in)
+    for one in traces:
+        key = (one.path, one.digest)
+        if key not in known:
+            known[key] = _place(one, candidates)
+    lost = [f"{recording}: {why}" for (recording, _), why in known.items() if isinstance(why, str)]
+    if lost:
+        more = [f"… and {len(lost) - _SHOWN} more"] if len(lost) > _SHOWN else []
+        listed = "\n  ".join([*lost[:_SHOWN], *more])
+        raise StoreError(
+            f"{path}: left as it is: {len(lost)} of {len(known)} recordings cannot be read again:\n  {listed}\n"
+            "  say --look-in FOLDER where they are, or --leave-out TRACE: the new store is not to have it"
+        )
+    places = {one.trace_id: known[one.path, one.digest] for one in traces}
+    return {trace_id: place for trace_id, place in places.items() if isinstance(place, Path)}
+
+
+def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
+    """Where a recording is, or why it cannot be used."""
+    reason = "changed since it was ingested"
+    try:
+        mark = mark_of(trace.path)
+        if mark == (trace.size, trace.mtime_ns):
+            return trace.path
+        if mark[0] == trace.size and digest_of(trace.path) == trace.digest:
+            return trace.path
+    except FileNotFoundError:
+        reason = "gone"
+    except (OSError, SgstoreError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+    for path in candidates.get(trace.size, []):
+        with suppress(SgstoreError):
+            if digest_of(path) == trace.digest:
+                return path
+    return reason
+
+
+def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
+    """The recordings in some folders, by their sizes."""
+    found: dict[int, list[Path]] = {}
+    for path in recordings(folders) if folders else ():
+        with suppress(OSError, TraceError):
+            found.setdefault(mark_of(path)[0], []).append(path.absolute())
+    return found
+
+
+# Steps ------------------------------------------------------------------------------------------------------
+
+
+def _resume(fresh: Path, old: Remains) -> None:
+    """Keep of a run that was stopped what belongs to the new store; forget it if it cannot be used."""
+    if not fresh.exists():
+        return
+    try:
+        file = StoreFile(fresh)
+        there = file.traces()
+    except StoreError:
+        fresh.unlink()
+        fresh.with_name(f"{fresh.name}.wal").unlink(missing_ok=True)
+        return
+    wanted = {one.trace_id: one for one in old.traces}
+    for trace in there:
+        one = wanted.get(trace.trace_id)
+        same = one is not None and _settings(one) == from_dict(trace.settings)
+        if one is None or not same or (one.since, one.until) != (trace.since, trace.until):
+            file.remove(trace.trace_id)
+    file.settle()
+
+
+def _check_settings(path: Path, traces: Sequence[OldTrace]) -> None:
+    """Refuse settings that this version does not know, before anything is read."""
+    try:
+        for one in traces:
+            _settings(one)
+    except ConfigError as error:
+        raise StoreError(f"{path}: left as it is: what a trace was read with: {error}") from error
+
+
+def _settings(trace: OldTrace) -> Config:
+    return replace(from_dict(trace.settings), ego="", egos=())
+
+
+def _steps(
+    traces: Sequence[OldTrace], places: dict[int, Path]
+) -> Iterator[_ReadingStep | OldTrace]:
+    """What is to be done, in the order in which it came: read together what was read alike, or import."""
+    steps: list[_ReadingStep | OldTrace] = []
+    alike = groupby(traces, key=lambda t: (t.digest, t.settings, t.since, t.until, t.map_id))
+    for _, views in alike:
+        group = list(views)
+        first = group[0]
+        if first.imported is not None:
+            steps += group
+            continue
+        path, part = places[first.trace_id], (first.since, first.until)
+        step = _ReadingStep(_as_egos(path, group), part, first.map_id, (path,))
+        last = steps[-1] if steps else None
+        if isinstance(last, _ReadingStep) and replace(last, paths=step.paths) == step:
+            steps[-1] = replace(last, paths=(*last.paths, path))
+        else:
+            steps.append(step)
+    yield from steps
+
+
+def _as_egos(path: Path, views: Sequence[OldTrace]) -> Config:
+    """The settings with which a recording gives the egos that it gave."""
+    config = _settings(views[0])
+    if len(views) > 1:
+        return replace(config, egos=tuple(one.ego for one in views))
+    ego = views[0].ego
+    with open_trace(path, digest=views[0].digest, mapping=config.mapping) as trace:
+        return config if trace.info.ego == ego else replace(config, ego=ego)
+
+
+def _read(
+    fresh: Path,
+    step: _ReadingStep,
+    maps: dict[int, OldMap],
+    jobs: int,
+    on_progress: Callable[[Progress], None] | None,
+) -> None:
+    """Read recordings into the new store; those that are in it already stay."""
+    with _map_file(maps.get(step.map_id) if step.map_id is not None else None) as road_map:
+        outcomes = ingest(
+            fresh,
+            step.paths,
+            road_map=road_map,
+            config=step.config,
+            jobs=jobs,
+            since=step.part[0],
+            until=step.part[1],
+            on_progress=on_progress,
+        )
+    wrong = [str(one.error) for one in outcomes if one.error is not None]
+    if wrong:
+        raise StoreError(_stopped(fresh, wrong))
+
+
+def _stopped(fresh: Path, wrong: list[str]) -> str:
+    listed = "\n  ".join(wrong[:_SHOWN])
+    return f"{fresh}: not complete, so the old store stays; the next run goes on from there:\n  {listed}"
+
+
+@contextmanager
+def _map_file(road_map: OldMap | None) -> Generator[Path | None]:
+    """A map of the old store as a file, for recordings that carry none of their own."""
+    if road_map is None or not road_map.text.lstrip("\ufeff \t\r\n").startswith("<"):
+        yield None
+        return
+    with working_folder("map") as folder:
+        path = folder / "map.xodr"
+        # With a mark of its order, so that no encoding that the text names is taken for its own.
+        path.write_bytes(road_map.text.encode("utf-16", "surrogatepass"))
+        yield path
+
+
+def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -> None:
+    """Bring in graphs of another tool as they were."""
+    how: dict[str, Any] = {"relations": trace.answers, "period_s": trace.period_ns / 1e9 or 1.0}
+    how |= trace.imported or {}
+    form, words = how.pop("form"), how.pop("words", {})
+    try:
+        (done,) = import_graphs(fresh, [path], form, words=Words(**words), **how)
+    except (TypeError, ValueError) as error:
+        raise StoreError(_stopped(fresh, [f"{path}: {error}"])) from error
+    reason = str(done.error or "")
+    unknown = f"import it again afterwards, and say --leave-out {trace.name!r} now"
+    if reason and "words" not in (trace.imported or {}):
+        reason += f" (an older version did not keep how it was imported: {unknown})"
+    if not reason and trace.map_id is not None:
+        now = {one.digest for one in remains_of(fresh).maps.values()}
+        if maps[trace.map_id].digest not in now:
+            StoreFile(fresh).remove(trace.trace_id)
+            reason = f"{path}: the store does not know how it was imported (--kind, --relation, …): {unknown}"
+    if reason:
+        raise StoreError(_stopped(fresh, [reason]))
+
+
+def _complete(path: Path, fresh: Path, old: Remains) -> None:
+    """Make the sets that were derived and the classes that were asked for; see that nothing is missing."""
+    file = StoreFile(fresh)
+    there = {one.trace_id for one in file.traces()}
+    missing = [f"{one.name}: {one.path}" for one in old.traces if one.trace_id not in there]
+    if missing:
+        raise StoreError(_stopped(fresh, [f"gives another trace: {one}" for one in missing]))
+    for one in old.sets:
+        traces = [trace_id for trace_id in one.traces if trace_id in there]
+        if set(one.settings) == {"abstraction"}:
+            keep_abstraction(fresh, one.settings["abstraction"], traces)
+        else:
+            derive(fresh, from_dict(one.settings), one.name, traces, replace_old=True)
+    for name in old.abstractions:
+        with suppress(SgstoreError):  # one of a client's own: its classes are made when asked for
+            file.abstracted.complete(name)
+    if set(there) != {one.trace_id for one in old.traces}:
+        raise StoreError(f"{path}: left as it is: {fresh} holds other traces; remove that file")

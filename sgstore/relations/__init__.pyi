@@ -1,0 +1,59 @@
+# The face of this package: what others may import from it.
+
+from ._contact import contacts as contacts
+from ._contact import contacts_of as contacts_of
+from ._extent import Areas as Areas
+from ._extent import EgoPoses as EgoPoses
+from ._extent import Extent as Extent
+from ._families import RELATIONS as RELATIONS
+from ._filters import Keeping as Keeping
+from ._filters import renamed as renamed
+from ._following import Parking as Parking
+from ._following import gaps as gaps
+from ._map_context import LaneContact as LaneContact
+from ._pairs import NEAR as NEAR
+from ._pairs import TOUCHING as TOUCHING
+from ._pairs import Crowds as Crowds
+from ._pairs import StillPairs as StillPairs
+from ._pairs import gathered as gathered
+from ._pairs import joined_pairs as joined_pairs
+from ._pairs import near_pairs as near_pairs
+from ._pairs import of_kinds as of_kinds
+from ._pairs import pieces as pieces
+from ._pairs import related_pairs as related_pairs
+from ._scene import IS_SIGNAL as IS_SIGNAL
+from ._scene import BlockScene as BlockScene
+from ._scene import Bodies as Bodies
+from ._scene import MapContext as MapContext
+from ._scene import Standing as Standing
+from ._waypoints import waypoints_of as waypoints_of
+
+__all__ = [
+    "Areas",
+    "BlockScene",
+    "Bodies",
+    "Crowds",
+    "EgoPoses",
+    "Extent",
+    "IS_SIGNAL",
+    "Keeping",
+    "LaneContact",
+    "MapContext",
+    "NEAR",
+    "Parking",
+    "RELATIONS",
+    "Standing",
+    "StillPairs",
+    "TOUCHING",
+    "contacts",
+    "contacts_of",
+    "gaps",
+    "gathered",
+    "joined_pairs",
+    "near_pairs",
+    "of_kinds",
+    "pieces",
+    "related_pairs",
+    "renamed",
+    "waypoints_of",
+]

@@ -1,0 +1,90 @@
+"""Where a related body is, seen from another: ahead, behind, to the left, to the right.
+
+An edge goes from what is seen to who sees: *b is in direct front of a* is b → a, by the bearing of b's
+centre in a's axes. Where a's heading is missing there is no edge.
+
+Bounds and noise. A bound belongs to the sector nearer to dead ahead (45° is still direct front), and dead
+ahead and dead behind are neither left nor right, unless the settings say otherwise. Poses come through
+quaternions, degrees and the rotation of axes, and are kept as float32, so what is exactly on a bound in the
+world arrives up to some 1e-7 rad and a tenth of a millimetre beside it. Otherwise what is dead ahead would
+flicker between left and right: a bearing within :data:`NOISE` of a bound counts as on it, and what is less than
+:data:`BESIDE` off the axis as on it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.relations._pairs import if_related
+from sgstore.relations._scene import BlockScene, RelationFamily, edges_between
+from sgstore.vocabulary import RELATION_CODE
+
+if TYPE_CHECKING:
+    from sgstore.config import Config
+    from sgstore.graph import Edges
+    from sgstore.world import Bools, Floats
+
+
+NOISE: Final = 1e-6
+"""Differences of bearing that mean nothing: a millimetre at a kilometre; rad."""
+
+BESIDE: Final = 1e-3
+"""What is not farther off the axis is neither left nor right; m."""
+
+SIDES: Final = ("toLeftOf", "toRightOf")
+
+
+def _direction_names(config: Config) -> tuple[str, ...]:
+    return if_related(config, config.direction.names)
+
+
+def _direction_edges(scene: BlockScene) -> Edges:
+    settings, pairs = scene.config.direction, scene.pairs
+    seen = np.flatnonzero(~np.isnan(pairs.bearing) & bool(settings.names))
+    bounds = np.radians(settings.upper) + NOISE
+    bearing = pairs.bearing[seen]
+    sector = np.searchsorted(bounds, np.abs(bearing))
+    tie = np.abs(bearing) >= np.append(bounds, np.inf)[sector] - 2 * NOISE
+    if settings.ties == "carlasgg":
+        sector += tie & _behind(bearing)
+    elif settings.ties == "both":
+        seen = np.concatenate([seen, seen[tie]])
+        sector = np.concatenate([sector, sector[tie] + 1])
+    codes = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
+    return edges_between(scene, codes[sector], pairs.b[seen], pairs.a[seen])
+
+
+def _behind(bearing: Floats) -> Bools:
+    """Whether CARLASGG takes what is at a bound for the sector behind it: from abeam to the right backwards.
+
+    It looks through its sectors in the order direct front, side front, direct rear, side rear, all of which
+    hold both their bounds. Abeam to the left is 180° in its count; abeam to the right is 360°, not 0°.
+    """
+    aside = np.abs(bearing) - np.pi / 2
+    return (aside > NOISE) | ((aside >= -NOISE) & (bearing < 0))
+
+
+def _side_names(config: Config) -> tuple[str, ...]:
+    return if_related(config, SIDES if config.direction.sides != "none" else ())
+
+
+def _side_edges(scene: BlockScene) -> Edges:
+    if scene.config.direction.sides == "none":
+        none = np.zeros(0, np.intp)
+        return edges_between(scene, SIDES[0], none, none)
+    bodies, pairs = scene.bodies, scene.pairs
+    dx, dy = bodies.x[pairs.b] - bodies.x[pairs.a], bodies.y[pairs.b] - bodies.y[pairs.a]
+    off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(pairs.bearing))
+    if scene.config.direction.sides == "closed":  # to the last bit, as CARLASGG has it
+        aside = np.flatnonzero(~np.isnan(pairs.bearing))
+    else:
+        aside = np.flatnonzero(off_axis > BESIDE)
+    left, right = (RELATION_CODE[name] for name in SIDES)
+    codes = np.where(pairs.bearing[aside] >= 0, left, right).astype(np.int8)
+    return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])
+
+
+DIRECTION = RelationFamily(_direction_names, needs_map=False, edges=_direction_edges)
+SIDE = RelationFamily(_side_names, needs_map=False, edges=_side_edges)

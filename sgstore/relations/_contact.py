@@ -1,0 +1,110 @@
+"""Which bodies touch or overlap: a collision, in a simulator.
+
+Footprints meet where their gap is 0, and boxes meet where they do so in height too: a car under a bridge
+touches nothing. Where a height is missing, what counts is the storey (:data:`sgstore.roads.STOREY`), and where
+the place in height is missing, nothing but the footprints. What has no footprint touches nothing. One of the
+two moves at least, and neither is a signal: signals hang over the road as boxes that mean no body.
+
+It does not depend on how far apart related pairs may be, only on whether pairs that are no ego's are related
+at all.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.geometry import gap
+from sgstore.relations._pairs import if_related
+from sgstore.relations._scene import IS_SIGNAL, RelationFamily, edges_between, meeting
+from sgstore.roads import STOREY
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.graph import Edges
+    from sgstore.relations._scene import BlockScene, Bodies
+    from sgstore.world import Bools, Floats
+
+    Rows = NDArray[np.intp]
+
+
+TOUCH: Final = 1e-4
+"""Gap that means nothing: rounding of positions far from the origin; m."""
+
+
+def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
+    """Each unordered pair of bodies of a frame that touch.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    unwanted : (F,) bool
+        Frames of which no pairs are wanted; it may change between one chunk and the next.
+
+    Yields
+    ------
+    a, b : intp
+        Rows, in chunks.
+    """
+    rows = np.flatnonzero(~IS_SIGNAL[bodies.kind])
+    length, width = bodies.length[rows] / 2, bodies.width[rows] / 2
+    cos, sin = np.abs(np.cos(bodies.heading[rows])), np.abs(np.sin(bodies.heading[rows]))
+    x, y = bodies.x[rows], bodies.y[rows]
+    reach_x, reach_y = cos * length + sin * width + TOUCH, sin * length + cos * width + TOUCH
+    frame = bodies.frame[rows]
+    for a, b in meeting(frame, x - reach_x, x + reach_x):
+        if unwanted[frame[a]].all():
+            continue
+        close = np.abs(y[b] - y[a]) <= reach_y[a] + reach_y[b]
+        yield _touching(bodies, rows[a[close]], rows[b[close]])
+
+
+def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
+    """The bodies that the ego, which is these rows, touches in some of the frames."""
+    mine = ego[bodies.frame]
+    near = frames[bodies.frame] & (mine >= 0) & (mine != np.arange(len(bodies)))
+    others = np.flatnonzero(near & ~IS_SIGNAL[bodies.kind])
+    return _touching(bodies, mine[others], others)
+
+
+def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
+    """The pairs that touch."""
+    close = bodies.moves[a] | bodies.moves[b]
+    a, b = a[close], b[close]
+    a, b = (end[_same_height(bodies, a, b)] for end in (a, b))
+    touch = gap(_boxes(bodies, a), _boxes(bodies, b)) <= TOUCH
+    return a[touch], b[touch]
+
+
+def _boxes(bodies: Bodies, rows: Rows) -> Floats:
+    columns = (bodies.x, bodies.y, bodies.heading, bodies.length, bodies.width)
+    return np.stack([column[rows] for column in columns], axis=1)
+
+
+def _same_height(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Whether boxes meet in height, as far as it is known."""
+    apart = np.abs(bodies.z[b] - bodies.z[a])
+    reach = (bodies.height[a] + bodies.height[b]) / 2 + TOUCH
+    bottoms = np.abs(bodies.bottom[b] - bodies.bottom[a])
+    return ~np.where(np.isnan(reach), bottoms > STOREY, apart > reach)
+
+
+def _names(config: Config) -> tuple[str, ...]:
+    return if_related(config, ("overlaps",))
+
+
+def _edges(scene: BlockScene) -> Edges:
+    settings, (a, b) = scene.config.pairs, scene.contacts
+    if not settings.within > 0:
+        mine = scene.ego[scene.bodies.frame[a]]
+        kept = ((mine == a) | (mine == b)) & settings.ego
+        a, b = a[kept], b[kept]
+    return edges_between(scene, "overlaps", np.concatenate([a, b]), np.concatenate([b, a]))
+
+
+CONTACT = RelationFamily(_names, needs_map=False, edges=_edges)

@@ -1,0 +1,159 @@
+"""What a client wants in its graphs, and what it says that things are: kinds, parts of the map, relations."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+
+from sgstore.relations._scene import kinds_mask
+from sgstore.roads import first_sections
+from sgstore.vocabulary import KIND_CODE, KINDS, MAP_KINDS, RELATION_CODE, RELATIONS, kinds_labelled
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.config import Config
+    from sgstore.graph import Edges, LaneGaps, LaneStates
+    from sgstore.roads import RoadMap
+    from sgstore.vocabulary import TypeMeaning
+    from sgstore.world import Bools, Codes, Entities, Ints
+
+
+OF_LANES: Final = frozenset(
+    {"travelsTo", "laneChange", "opposes", "conflictsWith", "controlsTrafficOf", "mayAffect"}
+)
+"""Relations that have a lane at one end."""
+
+Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
+
+
+class Keeping:
+    """What is kept under a config.
+
+    Parameters
+    ----------
+    config : Config
+    road_map : RoadMap or None
+
+    Attributes
+    ----------
+    parts : (K,) bool
+        Which nodes of the map are kept, its column i node -1 - i. A road is where one of its lanes is, and a
+        junction where one of its roads is.
+    """
+
+    def __init__(self, config: Config, road_map: RoadMap | None) -> None:
+        kept = {kind for label in config.kinds for kind in kinds_labelled(label) or ()}
+        kept = kept if config.kinds else set(KINDS)
+        if config.lanes.granularity == "none":
+            kept -= set(MAP_KINDS)
+        self._kinds = kinds_mask(tuple(sorted(kept)))
+        self._without = frozenset(config.without)
+        self._impossible = (set() if "lane" in kept else OF_LANES) | (
+            set() if set(MAP_KINDS) & kept else {"isIn"}
+        )
+        dropped = [RELATION_CODE[name] for name in config.without]
+        self._relations: Bools = np.ones(len(RELATIONS), np.bool_)
+        self._relations[dropped] = False
+        self.parts: Bools = np.ones(0, np.bool_)
+        self._same: Ints | None = None
+        if road_map is not None:
+            self.parts = self._kept_parts(road_map, config.lanes.types)
+            if not config.lanes.sections:
+                self._same = first_sections(road_map.nodes)
+
+    def _kept_parts(self, road_map: RoadMap, lane_types: tuple[str, ...]) -> Bools:
+        nodes, edges = road_map.nodes, road_map.edges
+        kept = self._kinds[nodes.kind]
+        if not lane_types:
+            return kept
+        wanted = {name.lower() for name in lane_types}
+        of_type = np.array([name.lower() in wanted for name in nodes.lane_type], np.bool_)
+        lane, road, junction = (nodes.kind == KIND_CODE[k] for k in ("lane", "road", "junction"))
+        used = of_type & lane
+        inside = edges.relation == RELATION_CODE["isIn"]
+        child, parent = -1 - edges.src[inside], -1 - edges.dst[inside]
+        for _ in range(2):  # the roads of the lanes, then the junctions of the roads
+            used[parent[used[child]]] = True
+        return kept & (used | ~(lane | road | junction))
+
+    def names(self, computed: set[str], of_map: frozenset[str]) -> set[str]:
+        """The relations that graphs can hold, of those that are computed and those that come with a map."""
+        return ((computed - self._without) | of_map) - self._impossible
+
+    def entities(self, kind: Codes) -> Bools:
+        """Whether entities of these kinds are kept."""
+        return self._kinds[kind]
+
+    def edges(self, edges: Edges) -> Edges:
+        """The edges that are kept: of kept relations, to and from parts of the map that are kept."""
+        kept = self._relations[edges.relation]
+        if not self.parts.all():
+            kept &= self._stays(edges.src) & self._stays(edges.dst)
+        edges = edges if kept.all() else _taken(edges, kept)
+        if self._same is None:
+            return edges
+        src, dst = self._standing_for(edges.src), self._standing_for(edges.dst)
+        merged = replace(edges, src=src, dst=dst)
+        key = np.column_stack([edges.frame, edges.relation, src, dst])
+        return _taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
+
+    def lane_states(self, lanes: LaneStates) -> LaneStates:
+        """Those in lanes that are kept. Of sections that are one lane, the one with the larger share speaks."""
+        kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
+        lanes = lanes if kept.all() else _taken(lanes, kept)
+        if self._same is None or not len(lanes):
+            return lanes
+        lane = self._standing_for(lanes.lane)
+        order = np.lexsort((-lanes.overlap, ~lanes.primary, lane, lanes.node, lanes.frame))
+        key = np.column_stack([lanes.frame, lanes.node, lane])[order]
+        first = np.flatnonzero(np.append(True, (np.diff(key, axis=0) != 0).any(axis=1)))
+        overlap = np.minimum(np.add.reduceat(lanes.overlap[order], first), 1.0)
+        merged = _taken(replace(lanes, lane=lane), order[first])
+        return replace(merged, overlap=overlap)
+
+    def gaps(self, gaps: LaneGaps) -> LaneGaps:
+        """Those that belong to a relation that is kept."""
+        wanted = self._relations[[RELATION_CODE["leads"], RELATION_CODE["follows"]]].any()
+        return gaps if wanted else _taken(gaps, np.zeros(0, np.intp))
+
+    def present(self, present: Bools) -> Bools:
+        """(F, K): which nodes of the map are in the graphs, of those that are in range."""
+        present = present & self.parts
+        if self._same is None:
+            return present
+        other = np.flatnonzero(self._same != np.arange(len(self._same)))
+        frame, row = np.nonzero(present[:, other])
+        present[frame, self._same[other[row]]] = True
+        present[:, other] = False
+        return present
+
+    def _standing_for(self, node: Ints) -> Ints:
+        """Nodes, lanes among them by the node of all sections."""
+        if self._same is None:
+            return node
+        return np.where(node < 0, -1 - self._same[np.where(node < 0, -1 - node, 0)], node)
+
+    def _stays(self, node: Ints) -> Bools:
+        return np.append(self.parts, True)[np.where(node < 0, -1 - node, -1)]
+
+
+def renamed(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
+    """Entities, of the kinds that the client says their types are; type names are in lower case."""
+    if not types or not len(entities):
+        return entities
+    kind = entities.kind.copy()
+    special, subkind = list(entities.special), list(entities.subkind)
+    for row, name in enumerate(entities.type_name):
+        meaning = types.get(name.lower())
+        if meaning is not None:
+            kind[row] = KIND_CODE[meaning.kind]
+            special[row], subkind[row] = meaning.special, meaning.subkind
+    return replace(entities, kind=kind, special=tuple(special), subkind=tuple(subkind))
+
+
+def _taken(table: Columns, rows: Any) -> Columns:
+    """Some of the rows of a table, in the order given."""
+    return type(table)(*(getattr(table, column.name)[rows] for column in fields(table)))

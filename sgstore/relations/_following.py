@@ -1,0 +1,265 @@
+"""The relations ``leads`` and ``follows``, and parked vehicles.
+
+Who drives behind whom along the lanes: ``leads``, from the next one ahead, and ``follows``, to it.
+
+What takes part are vehicles, parked ones too, on lanes for traffic, which face along their lane (by less than
+a right angle: who comes towards one leads nobody). Who never moves follows nobody.
+
+*Its own lanes* are the primary lane of an entity and, in a junction, where lanes lie on one another, every
+other lane of the same junction that its centre is in and, if it is a vehicle, that runs its way
+(:data:`SAME_WAY`): a vehicle at the mouth of a junction is on all the ways that begin there. They are kept,
+because how far it is along the lanes from any entity to any other is told by them (``lane_dist``).
+
+*The next one ahead* is the one that comes first from the vehicle's centre on along the lane and, where nobody
+is before it on its lane, along the lanes that ``travelsTo`` leads to, through junctions too. Where the way
+forks, each branch has a next one: what the vehicle will do is not known, so all of them lead it, and the gap
+tells them apart. Where ways join, vehicles on several of them may have the same next one. Of two whose centres
+are equally far the one with the lower node id counts as the nearer. Lane changes are no ways on, and what is
+farther away along the lanes than the settings look leads nobody.
+
+*The gap* is the distance of the centres along the centre lines less half of both lengths: from bumper to
+bumper, 0 where they overlap, and missing where a length is. Of several ways the shortest counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.graph import Edges, LaneGaps
+from sgstore.relations._scene import RelationFamily, edges_between, kinds_mask
+from sgstore.vocabulary import VEHICLES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.relations._lane_net import LaneNet
+    from sgstore.relations._scene import BlockScene, Bodies, MapContext, Standing
+    from sgstore.roads import LaneHits
+    from sgstore.world import Bools, Codes, Entities, Floats, Ints, States
+
+    Rows = NDArray[np.intp]
+    Column = tuple[Rows, Rows, Floats]
+    Best = tuple[Ints, Floats]
+
+
+SAME_WAY: Final = np.pi / 4
+"""Greatest difference of heading from a lane of a junction that a vehicle takes; rad."""
+
+IS_VEHICLE: Final = kinds_mask(VEHICLES)
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLanes:
+    """Vehicles on their own lanes, sorted by frame, lane and place along it; shape (N,).
+
+    Attributes
+    ----------
+    key : int64
+        Frame times the number of lanes, plus the lane.
+    row : intp
+        Rows of :class:`Bodies`.
+    lane : int64
+        Lanes, counted from 0.
+    along : float64
+        Place of the centre along the lane; m.
+    """
+
+    key: Ints
+    row: Rows
+    lane: Ints
+    along: Floats
+
+    def first_in(self, key: Ints, but: Rows) -> tuple[Rows, Rows]:
+        """The first vehicle in each lane of a frame where there is any but this one: rows asked, and found."""
+        place = np.searchsorted(self.key, key)
+        last = max(len(self.key) - 1, 0)
+        itself = (self.row[np.minimum(place, last)] == but) & (place <= last)
+        place += itself & (self.key[np.minimum(place, last)] == key)
+        found = np.flatnonzero((place <= last) & (self.key[np.minimum(place, last)] == key))
+        return found, place[found]
+
+
+def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
+    """Of each lane that a body touches whether it is one of its own."""
+    lane = -2 - hits.lane
+    junction = np.full(len(bodies), -1)
+    junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
+    within = np.abs(hits.offset) <= net.widths[lane] / 2
+    beside = (net.junction[lane] >= 0) & (net.junction[lane] == junction[hits.row])
+    its_way = (np.abs(hits.heading_error) <= SAME_WAY) | ~IS_VEHICLE[bodies.kind[hits.row]]
+    return hits.primary | (beside & within & its_way)
+
+
+def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
+    """The vehicles that take part, on the lanes that are their own and that they face along."""
+    hits = standing.hits
+    lane = -2 - hits.lane
+    own = standing.own & (np.abs(hits.heading_error) < np.pi / 2)
+    known = IS_VEHICLE[bodies.kind] & ~np.isnan(bodies.heading)
+    kept = np.flatnonzero(own & net.traffic[lane] & known[hits.row])
+    row, lane = hits.row[kept], lane[kept]
+    along = np.clip(standing.along[kept], 0, net.lengths[lane])
+    key = bodies.frame[row] * len(net.lengths) + lane
+    order = np.lexsort((bodies.node[row], along, key))
+    return OwnLanes(key[order], row[order], lane[order], along[order])
+
+
+def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -> Column:
+    """Who follows whom: rows of bodies, and the gap; each pair once.
+
+    Parameters
+    ----------
+    net : LaneNet
+    bodies : Bodies
+    standing : Standing
+        What they stand on.
+    limit : float
+        Greatest distance of the centres along the lanes; m.
+    """
+    if not limit > 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0)
+    own = own_lanes(net, bodies, standing)
+    parts = [*_same_lane(own), *_beyond(net, own, limit)]
+    behind, ahead, distance = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    a, b = own.row[behind], own.row[ahead]
+    kept = np.flatnonzero((distance <= limit) & bodies.moves[a])
+    order = kept[np.lexsort((distance[kept], b[kept], a[kept]))]
+    a, b, distance = a[order], b[order], distance[order]
+    first = np.ones(len(a), np.bool_)
+    first[1:] = (a[1:] != a[:-1]) | (b[1:] != b[:-1])
+    a, b = a[first], b[first]
+    gap = distance[first] - (bodies.length[a] + bodies.length[b]) / 2
+    return a, b, np.maximum(gap, 0)
+
+
+def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
+    """The next ones of those who are the last on their lane, searched lane after lane."""
+    source = np.flatnonzero(np.append(own.key[1:] != own.key[:-1], True)[: len(own.key)])
+    at, base = own.lane[source], own.key[source] - own.lane[source]
+    distance = net.lengths[at] - own.along[source]
+    parts: list[Column] = []
+    best: Best = (np.zeros(0, np.int64), np.zeros(0))
+    # A shortest way comes to no lane twice.
+    for _ in range(len(net.lengths)):
+        fork, at = net.onward(at)
+        source, base, distance = source[fork], base[fork], distance[fork]
+        near = np.flatnonzero(distance <= limit)
+        key = source[near] * len(net.lengths) + at[near]
+        kept, best = _nearer(key, distance[near], best)
+        kept = near[kept]
+        source, at, base, distance = source[kept], at[kept], base[kept], distance[kept]
+        if not len(source):
+            break
+        found, there = own.first_in(base + at, own.row[source])
+        parts.append((source[found], there, distance[found] + own.along[there]))
+        free = np.ones(len(source), np.bool_)
+        free[found] = False
+        source, at, base = source[free], at[free], base[free]
+        distance = distance[free] + net.lengths[at]
+    return parts
+
+
+def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
+    """Rows of the fronts that are where none was as near before, the nearest of each; and the best so far."""
+    known, least = best
+    place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
+    again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)
+    worse = again & (least[place] <= distance) if len(known) else again
+    rows = np.flatnonzero(~worse)
+    rows = rows[np.lexsort((distance[rows], key[rows]))]
+    rows = rows[np.diff(key[rows], prepend=-1) != 0]
+    keys, distances = np.concatenate([key[rows], known]), np.concatenate([distance[rows], least])
+    # Of equal keys the new one, which is nearer, comes first.
+    order = np.argsort(keys, kind="stable")
+    order = order[np.diff(keys[order], prepend=-1) != 0]
+    return rows, (keys[order], distances[order])
+
+
+def _same_lane(own: OwnLanes) -> list[Column]:
+    behind = np.flatnonzero(own.key[1:] == own.key[:-1])
+    return [(behind, behind + 1, own.along[behind + 1] - own.along[behind])]
+
+
+def _names(config: Config) -> tuple[str, ...]:
+    return ("leads", "follows") if config.lanes.ahead > 0 else ()
+
+
+def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
+    """Who follows whom, by node ids, and the gaps."""
+    none = np.zeros(0, np.intp)
+    a, b, gap = (none, none, np.zeros(0)) if ground is None else ground.following
+    return LaneGaps(bodies.frame[a], bodies.node[a], bodies.node[b], gap)
+
+
+def _edges(scene: BlockScene) -> Edges:
+    ground = scene.ground
+    if ground is None:
+        raise ValueError("who follows whom needs a map")
+    a, b, _ = ground.following
+    return Edges.chained(
+        [edges_between(scene, "leads", b, a), edges_between(scene, "follows", a, b)]
+    )
+
+
+FOLLOWING = RelationFamily(_names, needs_map=True, edges=_edges)
+
+
+# Which vehicles are parked: what can be told only when all of a trace has been seen -------------
+
+MOVED: Final = 0.3
+"""What has not come farther than this from where it was first seen has not moved: poses tremble; m."""
+
+
+class Parking:
+    """What a trace tells of its vehicles so far, whoever sees them; it grows with their number, not with time.
+
+    A vehicle is parked if the simulator has it as static; or if it does not move in the whole trace and never
+    stands on a lane for driving above all others (its primary lane). Without a map nothing is known of those
+    that do not move, nor of those that were never in range; whatever moves is not parked.
+    """
+
+    def __init__(self) -> None:
+        self._vehicle: Bools = np.zeros(0, np.bool_)
+        self._static: Bools = np.zeros(0, np.bool_)
+        self._moved: Bools = np.zeros(0, np.bool_)
+        self._stood: Bools = np.zeros(0, np.bool_)
+        self._drove: Bools = np.zeros(0, np.bool_)
+        self._place: Floats = np.zeros((0, 2))
+
+    def learn(self, entities: Entities) -> None:
+        """Take note of entities that appear for the first time."""
+        no: Bools = np.zeros(len(entities), np.bool_)
+        self._vehicle = np.append(self._vehicle, IS_VEHICLE[entities.kind])
+        self._static = np.append(self._static, entities.static)
+        self._moved = np.append(self._moved, no)
+        self._stood, self._drove = np.append(self._stood, no), np.append(self._drove, no)
+        self._place = np.concatenate([self._place, np.full((len(entities), 2), np.nan)])
+
+    def see(self, states: States) -> None:
+        """Take note of where things are, in the order of frames."""
+        place = np.column_stack([states.x, states.y])
+        node = states.node
+        known = np.flatnonzero(np.isfinite(place).all(axis=1))
+        new, first = np.unique(node[known], return_index=True)
+        unseen = np.isnan(self._place[new, 0])
+        self._place[new[unseen]] = place[known[first[unseen]]]
+        away = np.hypot(*(place - self._place[node]).T) > MOVED
+        self._moved[node[away]] = True
+
+    def stand(self, bodies: Bodies, standing: Standing, driving: Bools) -> None:
+        """Take note of what things stand on; ``driving``: which nodes of the map are lanes for driving."""
+        hits = standing.hits
+        primary = hits.primary & driving[-1 - hits.lane]
+        self._drove[bodies.node[hits.row[primary]]] = True
+        self._stood[bodies.node] = True
+
+    @property
+    def parked(self) -> Codes:
+        """(n,): 1: parked, 0: not, -1: not known, or no vehicle."""
+        known = self._stood | self._moved | self._static
+        parked = self._static | ~(self._moved | self._drove)
+        return np.where(self._vehicle & known, parked, -1).astype(np.int8)

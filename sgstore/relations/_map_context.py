@@ -1,0 +1,258 @@
+"""A road map as a generator asks it: what bodies stand on, and which parts of it are in their graphs.
+
+To ask what a footprint meets is the dearest question of all, so it is put once for each footprint that has
+moved: traffic waits, parks and queues much of the time, and scenery never moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.relations._following import next_ahead, own_hits
+from sgstore.relations._lane_net import Centrelines, LaneNet, SignalReach
+from sgstore.relations._scene import IS_SIGNAL, Bodies, MapContext, Standing, joined, kinds_mask
+from sgstore.roads import OFF_ROAD, LaneHits
+from sgstore.vocabulary import DRIVING, ENTITY_KINDS, RELATION_CODE, VEHICLES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.relations._extent import Areas
+    from sgstore.relations._waypoints import Waypoints
+    from sgstore.roads import RoadMap
+    from sgstore.world import Bools, Entities, Floats, Ints, States
+
+    Rows = NDArray[np.intp]
+
+
+ON_OR_OFF: Final = kinds_mask((*VEHICLES, "person", "animal", "prop"))
+"""Kinds of which it means something to be off the road even if they never move; a tree always is."""
+
+SAME_PLACE: Final = 1.0
+"""How far an entity may stand from the one of several alike objects of the map that it is; m."""
+
+DEPTH: Final = 3
+"""Steps of ``isIn`` within a map: lane, road, junction."""
+
+
+class LaneContact:
+    """The answers of a road map for one trace, block after block.
+
+    Parameters
+    ----------
+    road_map : RoadMap
+    ahead : float
+        How far along the lanes is looked; m.
+    waypoints : Waypoints, optional
+        Those of the map, where it has any.
+
+    Attributes
+    ----------
+    driving : (K,) bool
+        Which nodes of the map are lanes for motor traffic.
+
+    Notes
+    -----
+    It remembers which entities stand for signals and objects of the map, and the last footprint of what was in
+    the last block: its memory grows with the number of distinct entities, not with time.
+    """
+
+    def __init__(self, road_map: RoadMap, ahead: float, waypoints: Waypoints | None = None) -> None:
+        nodes, lines = road_map.nodes, Centrelines(road_map.ribbons)
+        self._map = road_map
+        self._waypoints = waypoints
+        self._ahead = ahead
+        self._net = LaneNet(road_map)
+        self._reach = SignalReach(road_map, self._net, lines, ahead)
+        self._footing = _Footing(road_map, lines)
+        self.driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
+        self._parent = _parents(road_map)
+        self._columns: dict[tuple[bool, str], list[int]] = {}
+        for column in np.flatnonzero(nodes.kind < len(ENTITY_KINDS)).tolist():
+            ref = nodes.name[column].partition("#")[0]  # of a repeated object: ref#1, ref#2, …
+            key = bool(IS_SIGNAL[nodes.kind[column]]), ref
+            self._columns.setdefault(key, []).append(column)
+        none = np.zeros(0, np.int64)
+        self._twins: tuple[Ints, Ints] = (none, none)
+        self._controls: tuple[Ints, Ints] = (none, none)
+        self._affects: tuple[Ints, Ints] = (none, none)
+
+    def learn(self, entities: Entities, scenery: States) -> None:
+        """Take note of entities, in order of node id, that appear for the first time, and of their poses."""
+        places = dict(
+            zip(scenery.node.tolist(), zip(scenery.x, scenery.y, strict=True), strict=True)
+        )
+        twins: list[tuple[int, int]] = []
+        controls: list[tuple[int, int]] = []
+        affects: list[tuple[int, int]] = []
+        for row, ref in enumerate(entities.map_ref):
+            if not ref:
+                continue
+            node, is_signal = entities.first + row, bool(IS_SIGNAL[entities.kind[row]])
+            place = places.get(node, (np.nan, np.nan))
+            column = self._column((is_signal, ref), place)
+            if column is not None:
+                twins.append((node, column))
+            if is_signal:
+                controls += [(node, lane) for lane in self._map.lanes_of_signal(ref).tolist()]
+                affects += [(node, lane) for lane in self._reach.of(ref, place).tolist()]
+        self._twins = _appended(self._twins, twins)
+        self._controls = _appended(self._controls, controls)
+        self._affects = _appended(self._affects, affects)
+
+    def _column(self, key: tuple[bool, str], place: tuple[float, float]) -> int | None:
+        """The signal or object of the map that a reference means; of repeated ones the one at that place."""
+        columns = self._columns.get(key, [])
+        if len(columns) < 2:
+            return columns[0] if columns else None
+        nodes = self._map.nodes
+        apart = np.hypot(nodes.x[columns] - place[0], nodes.y[columns] - place[1])
+        at = int(np.argmin(apart))
+        return columns[at] if apart[at] <= SAME_PLACE else None
+
+    def standing(self, bodies: Bodies) -> Standing:
+        """What the bodies of a block stand on; asked once for each block."""
+        hits, along, parts = self._footing.of(bodies)
+        if self._waypoints is not None:
+            rows, nodes = self._waypoints.of(hits, along, bodies)
+            rows, nodes = np.concatenate([parts[0], rows]), np.concatenate([parts[1], nodes])
+            order = np.argsort(rows, kind="stable")
+            parts = rows[order], nodes[order]
+        stands: Bools = np.zeros(len(bodies), np.bool_)
+        stands[hits.row[self.driving[-1 - hits.lane]]] = True
+        placed = np.isfinite(bodies.x) & np.isfinite(bodies.y)
+        off_road = np.flatnonzero(
+            ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
+        )
+        own = own_hits(self._net, bodies, hits)
+        return Standing(hits, along, own, parts, off_road)
+
+    def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> MapContext:
+        """The map under bodies, and around the egos.
+
+        Parameters
+        ----------
+        bodies : Bodies
+        standing : Standing
+            What they stand on.
+        areas : Areas
+            What is in range of the ego; where there is none the whole map is.
+        kept : (K,) bool
+            Which nodes of the map the client wants.
+
+        Returns
+        -------
+        MapContext
+            A lane or crosswalk that a body is in is present even if it begins just out of range, and so are
+            the road and the junction it belongs to. ``off_road`` is present where a body is in it. A signal or
+            object of the map is not present where an entity of the trace that stands for it is.
+        """
+        present = areas.parts(self._map)
+        present[:, -1 - OFF_ROAD] = False
+        doubled, index = joined(self._twins[0], bodies.node)
+        present[bodies.frame[doubled], self._twins[1][index]] = False
+        hits, (at, parts), off_road = standing.hits, standing.parts, standing.off_road
+        rows = np.concatenate([hits.row, at, off_road])
+        nodes = np.concatenate([hits.lane, parts, np.full(len(off_road), OFF_ROAD)])
+        self._add_with_parents(present, bodies.frame[rows], -1 - nodes)
+        present &= kept
+        return MapContext(
+            standing,
+            present,
+            self._controls,
+            self._affects,
+            self._reach.of_map(present),
+            next_ahead(self._net, bodies, standing, self._ahead),
+        )
+
+    def _add_with_parents(self, present: Bools, frame: Ints, column: Ints) -> None:
+        for _ in range(DEPTH):
+            present[frame, column] = True
+            column = self._parent[column]
+            frame, column = frame[column >= 0], column[column >= 0]
+
+
+def _parents(road_map: RoadMap) -> Ints:
+    """(K,): column of the node that each node of the map is in, -1 where there is none."""
+    edges = road_map.edges
+    inside = edges.relation == RELATION_CODE["isIn"]
+    parent = np.full(len(road_map.nodes), -1)
+    parent[-1 - edges.src[inside]] = -1 - edges.dst[inside]
+    return parent
+
+
+def _appended(table: tuple[Ints, Ints], lines: list[tuple[int, int]]) -> tuple[Ints, Ints]:
+    keys, values = np.array(lines, np.int64).reshape(-1, 2).T
+    return np.append(table[0], keys), np.append(table[1], values)
+
+
+Table = tuple["NDArray[Any]", ...]
+"""Columns of equal length and different types; the first, ascending, is the row of a footprint."""
+
+
+class _Footing:
+    """What footprints meet; one that is where it was when it was last seen is not asked about again."""
+
+    def __init__(self, road_map: RoadMap, lines: Centrelines) -> None:
+        self._map = road_map
+        self._lines = lines
+        self._node: Ints = np.zeros(0, np.int64)
+        self._box = np.zeros((0, 6))
+        self._lanes, self._crosswalks = self._ask(np.zeros(0, np.intp), self._box)
+
+    def of(self, bodies: Bodies) -> tuple[LaneHits, Floats, tuple[Ints, Ints]]:
+        """Lanes that bodies touch, with places along them, and crosswalks, by rows; signals touch none."""
+        rows = np.flatnonzero(~IS_SIGNAL[bodies.kind])
+        known = len(self._node)
+        node = np.concatenate([self._node, bodies.node[rows]])
+        frame = np.concatenate([np.full(known, -1), bodies.frame[rows]])
+        box = np.concatenate([self._box, np.column_stack([bodies.boxes, bodies.bottom])[rows]])
+        same_as, last = _runs(node, frame, box)
+        ask = np.flatnonzero(same_as[known:] == np.arange(known, len(node))) + known
+        tables = [
+            tuple(np.concatenate(column) for column in zip(old, new, strict=True))
+            for old, new in zip((self._lanes, self._crosswalks), self._ask(ask, box), strict=True)
+        ]
+        last = last[frame[last] >= 0]
+        self._node, self._box = node[last], box[last]
+        self._lanes, self._crosswalks = (_looked_up(table, same_as[last]) for table in tables)
+        lanes, crosswalks = (_looked_up(table, same_as[known:]) for table in tables)
+        row, *hits, along = lanes
+        return LaneHits(rows[row], *hits), along, (rows[crosswalks[0]], crosswalks[1])
+
+    def _ask(self, rows: Rows, box: Floats) -> tuple[Table, Table]:
+        boxes, bottom = box[rows, :5], box[rows, 5]
+        hits = self._map.lanes_of(boxes, bottom)
+        walkers, crosswalks = self._map.crosswalks_of(boxes, bottom)
+        order = np.argsort(walkers, kind="stable")
+        return (
+            (
+                rows[hits.row],
+                *(getattr(hits, column.name) for column in fields(hits)[1:]),
+                self._lines.along(-2 - hits.lane, boxes[hits.row, 0], boxes[hits.row, 1]),
+            ),
+            (rows[walkers[order]], crosswalks[order]),
+        )
+
+
+def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
+    """For each row the first of the run of rows in which its node keeps its box; and each node's last row."""
+    order = np.lexsort((frame, node))
+    node, bits = node[order], box[order].view(np.int64)  # as bits: NaN is like itself
+    other = np.ones(len(node) + 1, np.bool_)
+    other[1:-1] = node[1:] != node[:-1]
+    begins = other[:-1].copy()
+    begins[1:] |= (bits[1:] != bits[:-1]).any(axis=1)
+    first = np.maximum.accumulate(np.where(begins, np.arange(len(node)), 0))
+    same_as = np.empty(len(node), np.intp)
+    same_as[order] = order[first]
+    return same_as, order[other[1:]]
+
+
+def _looked_up(table: Table, wanted: Rows) -> Table:
+    """The table's lines for each of the rows wanted, which are numbered anew."""
+    owner, index = joined(table[0], wanted)
+    return (owner, *(column[index] for column in table[1:]))

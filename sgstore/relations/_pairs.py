@@ -1,0 +1,452 @@
+"""Related pairs of bodies and their numbers, bounded in memory.
+
+Which bodies are related, and the numbers of those pairs that the families need.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.geometry import bearings, gap
+from sgstore.relations._scene import IS_SIGNAL, Bodies, BodyPairs, kinds_mask, parts, spread
+from sgstore.vocabulary import KIND_CODE, KINDS, VEHICLES, kinds_labelled, normalize_name
+from sgstore.world import Entities, Loss, MessageRefs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config, PairSettings
+    from sgstore.graph import GraphBlock
+    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
+
+    Rows = NDArray[np.intp]
+    Halves = tuple[Rows, Rows]
+
+
+CELLS: Final = 8
+"""Strips of the plane to the distance within which bodies are related: more of them cut a little sharper."""
+
+FAR: Final = 1 << 40
+"""Strips from the origin beyond which positions share a strip: keys fit into 64 bits whatever a trace holds."""
+
+
+IS_VEHICLE: Final = kinds_mask(VEHICLES)
+
+NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+
+
+def if_related(config: Config, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of relations of pairs: none where the config relates no pairs, so that nothing is known of them."""
+    return names if config.pairs.ego or config.pairs.within > 0 else ()
+
+
+def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halves]:
+    """Each unordered pair of bodies that move, signals excepted, and are near enough to one another.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    config : Config
+    unwanted : (F,) bool
+        Frames of which no pairs are wanted; it may change between one chunk and the next.
+
+    Yields
+    ------
+    a, b : intp
+        Rows, in chunks.
+    """
+    rows = np.flatnonzero(bodies.moves & ~IS_SIGNAL[bodies.kind])
+    return pairs_among(bodies, rows, config, unwanted)
+
+
+def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> Iterator[Halves]:
+    """The same of some rows, whatever they are."""
+    within, between = config.pairs.within, config.proximity.between
+    if within > 0:
+        yield from _near_pairs(bodies, rows, within, between, unwanted)
+
+
+def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> BodyPairs:
+    """All pairs that the settings relate: the ego with every body, and moving bodies near one another.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    ego : (F,) intp
+        Row of the ego of each frame, -1 where there is none.
+    near : tuple of intp arrays
+        Other pairs: bodies that are near one another.
+    config : Config
+        Signals and scenery are related to the ego only, unless the settings relate what never moves to its
+        like (:mod:`sgstore.relations._pairs`). What has no position is near nothing; the ego is related to it
+        all the same, by numbers that are missing, unless there is a distance for the ego too.
+    """
+    settings, between = config.pairs, config.proximity.between
+    if not settings.ego:
+        return _with_mirror_images(bodies, *of_kinds(bodies, ego, near, settings), between)
+    mine = ego[bodies.frame]
+    others = np.flatnonzero((mine >= 0) & (mine != np.arange(len(bodies))))
+    a, b = near
+    further = (ego[bodies.frame[a]] != a) & (ego[bodies.frame[b]] != b)
+    with_ego = mine[others], others
+    if settings.ego_within > 0:
+        close = distances(bodies, *with_ego, between) <= settings.ego_within
+        with_ego = with_ego[0][close], with_ego[1][close]
+    halves = of_kinds(bodies, ego, joined_pairs([with_ego, (a[further], b[further])]), settings)
+    return _with_mirror_images(bodies, *halves, between)
+
+
+def of_kinds(bodies: Bodies, ego: Rows, pairs: Halves, settings: PairSettings) -> Halves:
+    """The pairs of the kinds that the settings list, in either order."""
+    if not settings.kinds:
+        return pairs
+    listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last one: the ego
+    for one, other in settings.kinds:
+        listed[np.ix_(_codes(one), _codes(other))] = True
+    listed |= listed.T
+    a, b = pairs
+    of_a, of_b = bodies.kind[a].astype(np.intp), bodies.kind[b].astype(np.intp)
+    kept = listed[of_a, of_b]
+    kept |= listed[-1, of_b] & (ego[bodies.frame[a]] == a)
+    kept |= listed[of_a, -1] & (ego[bodies.frame[b]] == b)
+    return a[kept], b[kept]
+
+
+def _codes(label: str) -> list[int]:
+    if normalize_name(label) == "ego":
+        return [len(KINDS)]
+    return [KIND_CODE[kind] for kind in kinds_labelled(label) or ()]
+
+
+def joined_pairs(halves: list[Halves]) -> Halves:
+    """One list of pairs after another."""
+    return np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves])
+
+
+def _near_pairs(
+    bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
+) -> Iterator[tuple[Rows, Rows]]:
+    """Each unordered pair of these rows that share a frame and are at most so far apart.
+
+    The rows are sorted by frame and by strips across the x axis. The candidates of a row are those after it in
+    its own strip and in the few that follow: a range of the sorted rows.
+    """
+    rows = rows[np.isfinite(bodies.x[rows])]
+    reach = within
+    if between == "footprints":
+        reach += float(np.nan_to_num(np.hypot(bodies.length, bodies.width)[rows]).max(initial=0))
+    strip = np.clip(np.floor(bodies.x[rows] * (CELLS / reach)), -FAR, FAR).astype(np.int64)
+    key = (bodies.frame[rows] << 43) + strip + FAR
+    order = np.argsort(key, kind="stable")
+    rows, key = rows[order], key[order]
+    start = np.arange(1, len(rows) + 1)
+    # One strip more than the distance is wide: the division above may round up.
+    count = np.searchsorted(key, key + CELLS + 1, side="right") - start
+    frame = bodies.frame[rows]
+    for part in parts(count):
+        if unwanted[frame[part]].all():
+            continue
+        owner, index = spread(start[part], count[part])
+        first, second = rows[part][owner], rows[index]
+        near = distances(bodies, first, second, between) <= within
+        yield first[near], second[near]
+
+
+def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
+    """Distances of pairs of bodies, as :attr:`sgstore.config.Proximity.between` says; m.
+
+    The origin of a vehicle that moves is on the ground, that of anything else in the centre of its box: where
+    CARLA has them, as far as a recording tells. A footprint without extent or heading is a point.
+    """
+    if between == "footprints":
+        boxes = bodies.boxes
+        boxes[np.isnan(boxes).any(axis=1), 2:] = 0
+        return gap(boxes[a], boxes[b])
+    z = bodies.z
+    if between == "origins":
+        on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
+        z = np.where(on_ground, bodies.bottom, z)
+    dx, dy, dz = (of[b] - of[a] for of in (bodies.x, bodies.y, z))
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+def _with_mirror_images(bodies: Bodies, a: Rows, b: Rows, between: str) -> BodyPairs:
+    distance = distances(bodies, a, b, between)
+    a, b = np.concatenate([a, b]), np.concatenate([b, a])
+    bearing = bearings(bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a], bodies.heading[a])
+    return BodyPairs(a, b, np.concatenate([distance, distance]), bearing)
+
+
+# Pairs of what never moves: found once, when it appears, and looked up where both of them are in range ----
+
+MOST_LEARNT: Final = 1 << 22
+"""Pairs that are remembered; where there are more they are found anew in every frame."""
+
+
+class StillPairs:
+    """The pairs of the scenery of a trace that are near one another; none, unless the settings want them.
+
+    Parameters
+    ----------
+    config : Config
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._a, self._b = NO_PAIRS
+        self._too_many = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is anything to learn."""
+        return self._config.pairs.static and self._config.pairs.within > 0
+
+    def learn(self, scenery: Bodies) -> None:
+        """Find the pairs of all scenery so far, as if it stood in one frame, unless they are too many."""
+        rows = np.arange(len(scenery))
+        (a, b), over = gathered(
+            lambda unwanted: pairs_among(scenery, rows, self._config, unwanted),
+            np.zeros(len(scenery), np.int64),
+            frames=1,
+            most=MOST_LEARNT,
+        )
+        order = np.argsort(a, kind="stable")
+        self._a, self._b = a[order], b[order]
+        self._too_many = bool(over.any())
+
+    def among(
+        self, bodies: Bodies, keys: Ints, states: int, count: int, unwanted: Bools
+    ) -> Iterator[tuple[Rows, Rows]]:
+        """The pairs of which both are in range.
+
+        Parameters
+        ----------
+        bodies : Bodies
+            What is in range.
+        keys : int64
+            What is in range, ascending: from ``states`` on, frame times ``count`` plus the row of the scenery.
+        states, count : int
+            Rows of the block's states, and of the scenery.
+        unwanted : (F,) bool
+            Frames of which no pairs are wanted; it may change between one chunk and the next.
+
+        Yields
+        ------
+        a, b : intp
+            Places in ``keys``, in chunks.
+        """
+        if self._too_many:
+            yield from pairs_among(bodies, np.flatnonzero(~bodies.moves), self._config, unwanted)
+        if not len(self._a):
+            return
+        first = int(np.searchsorted(keys, states))
+        still = keys[first:] - states
+        start = np.searchsorted(self._a, still % count)
+        length = np.searchsorted(self._a, still % count, side="right") - start
+        frame = bodies.frame[first:]
+        for part in parts(length):
+            if unwanted[frame[part]].all():
+                continue
+            owner, pair = spread(start[part], length[part])
+            owner += part.start
+            other = still[owner] - self._a[pair] + self._b[pair]
+            place = np.minimum(np.searchsorted(still, other), max(len(still) - 1, 0))
+            found = np.flatnonzero(still[place] == other)
+            yield first + owner[found], first + place[found]
+
+
+# Crowds: what keeps pairs of bodies within bounds of memory, whatever a frame holds -------------
+# The pairs of n bodies in one place are n² / 2, and each becomes several edges. Two bounds hold:
+#
+# * a block is cut into pieces of frames that have no more than :data:`AT_ONCE` pairs together;
+# * in one frame no more than :data:`MOST_PAIRS` are related. In a frame with more of them bodies are related to
+#   the ego only, and that is a loss with a name.
+
+MOST_PAIRS: Final = 1 << 18
+"""Pairs of bodies that are related in one frame, each counted once, and pairs that touch. 724 bodies that are
+all near one another have as many, or 5,000 of which each has a hundred others near it."""
+
+AT_ONCE: Final = 1 << 18
+"""Pairs of the frames that are looked at together, as far as it is known before: some 200 MB with all that is
+made of them."""
+
+NEAR: Final = "near"
+TOUCHING: Final = "touching"
+
+_WIDEST: Final = 1 << 20
+"""Cells of the plane from the origin beyond which positions share a cell."""
+
+
+def gathered(
+    chunks: Callable[[Bools], Iterable[Halves]], frame: Ints, frames: int, most: int | None = None
+) -> tuple[Halves, Bools]:
+    """Pairs of bodies, chunk after chunk, but for frames that have too many.
+
+    Parameters
+    ----------
+    chunks : function
+        Yields pairs of rows. It is given an array that says of which frames no more pairs are wanted; that
+        changes while pairs are taken.
+    frame : (N,) int64
+        Frame of each row.
+    frames : int
+        How many frames there are.
+    most : int, optional
+        How many pairs one of them may have; by default :data:`MOST_PAIRS`.
+
+    Returns
+    -------
+    pairs : tuple of intp arrays
+    over : (frames,) bool
+        Which frames have more; they have none among the pairs.
+    """
+    most = MOST_PAIRS if most is None else most
+    over, count = np.zeros(frames, np.bool_), np.zeros(frames, np.int64)
+    none = np.zeros(0, np.intp)
+    found: list[Halves] = [(none, none)]
+    for chunk in chunks(over):
+        found.append(chunk)
+        count += np.bincount(frame[chunk[0]], minlength=frames)
+        new = (count > most) & ~over
+        if new.any():
+            over |= new
+            found = [_without(pairs, over[frame[pairs[0]]]) for pairs in found]
+        elif over.any():
+            found[-1] = _without(chunk, over[frame[chunk[0]]])
+    return (np.concatenate([a for a, _ in found]), np.concatenate([b for _, b in found])), over
+
+
+def _without(pairs: Halves, left_out: Bools) -> Halves:
+    return pairs[0][~left_out], pairs[1][~left_out]
+
+
+def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
+    """A block as consecutive blocks of which none has too many pairs; mostly that is the block itself.
+
+    Parameters
+    ----------
+    frames : FrameBlock
+    kinds : int8
+        Kinds of all entities, those of the block included, by node id.
+    config : Config
+    egos : int
+        How often graphs are made of it.
+
+    Yields
+    ------
+    FrameBlock
+        The first one has what the block introduces, its messages and its events.
+    """
+    most = max(AT_ONCE // max(egos, 1), 1)
+    node = frames.states.node
+    known = (node >= 0) & (node < len(kinds))  # what is not is refused when graphs are made
+    rows = np.flatnonzero(known)
+    rows = rows[~IS_SIGNAL[kinds[node[rows]]]]
+    count = np.bincount(frames.frame_of[rows], minlength=len(frames)).astype(np.int64)
+    pairs = count * count // 2
+    if int(pairs.sum()) > most:
+        pairs = np.minimum(pairs, _neighbours(frames, rows, config))
+    if int(pairs.sum()) <= most:
+        yield frames
+        return
+    start = 0
+    total = np.cumsum(pairs)
+    while start < len(frames):
+        before = int(total[start - 1]) if start else 0
+        stop = max(int(np.searchsorted(total, before + most, side="right")), start + 1)
+        yield _part(frames, start, stop)
+        start = stop
+
+
+def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
+    """(F,): no fewer than the pairs of each frame that are near one another: those of adjacent cells."""
+    states = frames.states
+    reach = max(config.pairs.within, 1.0)
+    size = np.nan_to_num(np.hypot(states.length, states.width)[rows])
+    reach += float(size.max(initial=0))  # what is no nearer does not touch either
+    cells = [
+        np.clip(np.nan_to_num(np.floor(column[rows] / reach)), 2 - _WIDEST, _WIDEST - 2) + _WIDEST
+        for column in (states.x, states.y)
+    ]
+    x, y = (cell.astype(np.int64) for cell in cells)
+    frame = frames.frame_of[rows]
+    wide = 2 * _WIDEST
+    key = (frame * wide + x) * wide + y
+    held, count = np.unique(key, return_counts=True)
+    around = np.zeros(len(held), np.int64)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            other = held + dx * wide + dy
+            at = np.minimum(np.searchsorted(held, other), len(held) - 1)
+            around += np.where(held[at] == other, count[at], 0)
+    of = held // (wide * wide)
+    return np.bincount(of, weights=count * around / 2, minlength=len(frames)).astype(np.int64)
+
+
+def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
+    """Some frames of a block; only the first ones bring what comes with the block."""
+    first, last = int(frames.offsets[start]), int(frames.offsets[stop])
+    entities, scenery, messages = frames.entities, frames.scenery, frames.messages
+    events = frames.events
+    if start:
+        none = slice(0, 0)
+        entities = Entities(
+            entities.first + len(entities),
+            *((), entities.kind[none], (), (), (), entities.static[none], ()),
+        )
+        scenery = scenery.take(np.zeros(0, np.intp))
+        columns = (messages.channel, messages.log_time_ns, messages.chunk_offset)
+        columns += (messages.offset, messages.length)
+        messages = MessageRefs(*(column[none] for column in columns))
+        events = ()
+    return type(frames)(
+        seq=frames.seq[start:stop],
+        time_ns=frames.time_ns[start:stop],
+        log_time_ns=frames.log_time_ns[start:stop],
+        offsets=frames.offsets[start : stop + 1] - first,
+        states=frames.states.take(np.arange(first, last)),
+        ego=frames.ego[start:stop],
+        entities=entities,
+        scenery=scenery,
+        messages=messages,
+        events=events,
+    )
+
+
+class Crowds:
+    """The frames of a trace in which there are too many pairs."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, tuple[int, int, int, Loss]] = {}
+
+    def see(self, graph: GraphBlock) -> None:
+        """Take note of the frames of a block."""
+        for what, frame, bodies in graph.crowded:
+            time = int(graph.frames.log_time_ns[frame])
+            count, seq, most, loss = self._found.get(what) or (
+                *(0, int(graph.frames.seq[frame]), bodies),
+                Loss("", start_ns=time, end_ns=time),
+            )
+            span = Loss("", start_ns=min(loss.start_ns, time), end_ns=max(loss.end_ns, time))
+            self._found[what] = count + 1, seq, most, span
+
+    def losses(self, config: Config) -> list[Loss]:
+        """What was left out, each with the first frame, how many bodies it has, and the setting that counts."""
+        found: list[Loss] = []
+        for what, (count, seq, bodies, span) in self._found.items():
+            if what == NEAR:
+                of = f"are within {config.pairs.within:g} m of one another ('pairs.within')"
+                told = "how near and where bodies are is told of the ego alone"
+            else:
+                of, told = "touch one another", "what touches is told of the ego alone"
+            more = f", and {count - 1} more frames like it" if count > 1 else ""
+            reason = (
+                f"frame {seq} has {bodies:,} bodies, of which more than {MOST_PAIRS:,} pairs {of}:"
+                f" {told}{more}"
+            )
+            found.append(Loss(reason, start_ns=span.start_ns, end_ns=span.end_ns))
+        return found

@@ -1,0 +1,312 @@
+"""The input of relation families: bodies, pairs and map context of a block.
+
+Which intervals of a line meet: how candidates are found without looking at all pairs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from sgstore.graph import Edges
+from sgstore.vocabulary import KIND_CODE, RELATION_CODE, SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.roads import LaneHits
+    from sgstore.world import Bools, Codes, Floats, Ints
+
+    Rows = NDArray[np.intp]
+
+
+CHUNK: Final = 1 << 16
+"""Candidates that are looked at together: bounds the memory of a crowd, and keeps it within a cache."""
+
+FAR: Final = 1e9
+"""Where the line ends; m. What lies beyond is taken to be there: it may be a candidate for more."""
+
+_ROUNDING: Final = 1e-15
+"""Relative error of a place on the line on which all groups lie one behind the other."""
+
+
+def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
+    """Each unordered pair of intervals of one group that meet, once; and some more that all but meet.
+
+    Parameters
+    ----------
+    group : (N,) int64
+        0 and above.
+    low, high : (N,) float64
+        Ends of the intervals. What is NaN meets nothing.
+
+    Yields
+    ------
+    a, b : (n,) intp
+        Rows, in chunks of about :data:`CHUNK`.
+    """
+    rows = np.flatnonzero(~np.isnan(low + high))
+    if not len(rows):
+        return
+    group, low, high = group[rows], np.clip(low[rows], -FAR, FAR), np.clip(high[rows], -FAR, FAR)
+    base = float(low.min())
+    span = float(high.max()) - base + 1
+    # All groups one behind the other: the intervals that meet one are the next in order, up to its end.
+    start = group * span + (low - base)
+    order = np.argsort(start, kind="stable")
+    rows, start = rows[order], start[order]
+    slack = _ROUNDING * span * (int(group.max()) + 2)
+    end = group[order] * span + (high[order] - base) + slack
+    first = np.arange(1, len(rows) + 1)
+    count = np.searchsorted(start, end, side="right") - first
+    for part in parts(count):
+        owner, index = spread(first[part], count[part])
+        yield rows[part][owner], rows[index]
+
+
+def parts(count: Ints) -> Iterator[slice]:
+    """Consecutive slices of counts that each add up to :data:`CHUNK` or little more."""
+    total = np.cumsum(count)
+    bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
+    for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
+        yield slice(begin, end)
+
+
+# What a family of relations sees: the bodies of many frames, the related pairs among them, the map under them
+# ------------------------------------------------------------------------------------------------
+# All of it is computed once for a block and shared by the families. A *body* is an entity in one frame: one
+# that stands still in sixty frames is sixty bodies, so that nothing but array arithmetic is needed on them.
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """Entities in the graphs of a block, one row an entity and frame, in no order that matters; shape (N,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    node : int64
+        Node id.
+    kind : int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    moves : bool
+        False for scenery.
+    x, y, z, heading, length, width, height : float64
+        The box; m, m, m, rad, m, m, m.
+    """
+
+    frame: Ints
+    node: Ints
+    kind: Codes
+    moves: Bools
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    length: Floats
+    width: Floats
+    height: Floats
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def take(self, rows: NDArray[np.intp]) -> Bodies:
+        """Some of the rows, in the order given."""
+        return Bodies(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    @property
+    def bottom(self) -> Floats:
+        """(N,): height of the lower side of the box; m. What has no height is all at ``z``."""
+        return self.z - np.nan_to_num(self.height) / 2
+
+    @property
+    def boxes(self) -> Floats:
+        """(N, 5): ``x, y, heading, length, width``."""
+        return np.stack([self.x, self.y, self.heading, self.length, self.width], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPairs:
+    """Ordered pairs of bodies that are related, each with its mirror image; shape (K,).
+
+    Attributes
+    ----------
+    a, b : intp
+        Rows of :class:`Bodies`, in the same frame.
+    distance : float64
+        Between the centres, in space; m.
+    bearing : float64
+        Of b from a, in (-π, π]; rad. NaN where a's heading is missing; 0 where the centres coincide.
+    """
+
+    a: NDArray[np.intp]
+    b: NDArray[np.intp]
+    distance: Floats
+    bearing: Floats
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What bodies stand on, whoever looks.
+
+    Attributes
+    ----------
+    hits : LaneHits
+        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Signals touch none.
+    along : float64
+        For each hit the place of the body's centre along the lane, beyond its ends too; m.
+    own : bool
+        For each hit whether the lane is one of the body's own (:func:`sgstore.relations._following.own_hits`).
+    parts : tuple of int64 arrays
+        Rows of :class:`Bodies`, ascending, and node ids of the crosswalks and waypoints that they are at.
+    off_road : intp array
+        Rows of the bodies that touch no driving lane, ascending.
+    """
+
+    hits: LaneHits
+    along: Floats
+    own: Bools
+    parts: tuple[Ints, Ints]
+    off_road: NDArray[np.intp]
+
+    def take(self, place: NDArray[np.intp]) -> Standing:
+        """The same of some of the bodies; ``place`` (N,): their new rows, -1 for those left out."""
+        hits, (rows, nodes) = self.hits, self.parts
+        kept, there = place[hits.row] >= 0, place[rows] >= 0
+        columns = {column.name: getattr(hits, column.name)[kept] for column in fields(hits)}
+        off_road = place[self.off_road]
+        return Standing(
+            replace(hits, **(columns | {"row": place[columns["row"]]})),
+            self.along[kept],
+            self.own[kept],
+            (place[rows[there]], nodes[there]),
+            off_road[off_road >= 0],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MapContext:
+    """The map under the bodies of a block, and around its egos.
+
+    Attributes
+    ----------
+    standing : Standing
+    present : (F, K) bool
+        Which nodes of the map are in which graph; column i is node -1 - i.
+    controls, affects : tuple of int64 arrays
+        Node ids of signals of the trace, ascending, and of a lane that each applies to or may affect.
+    map_affects : tuple of int64 arrays
+        Node ids of signals of the map, and of a lane that each may affect.
+    following : tuple of intp, intp, float64 arrays
+        Rows of bodies: one that follows, the one that leads it, and the gap between them along the lanes; m.
+    """
+
+    standing: Standing
+    present: Bools
+    controls: tuple[Ints, Ints]
+    affects: tuple[Ints, Ints]
+    map_affects: tuple[Ints, Ints]
+    following: tuple[NDArray[np.intp], NDArray[np.intp], Floats]
+
+
+@dataclass(frozen=True, slots=True)
+class BlockScene:
+    """The frames of a block, ready for the families of relations.
+
+    Attributes
+    ----------
+    config : Config
+    bodies : Bodies
+    ego : (F,) intp
+        Row of the ego of each frame, -1 where there is none.
+    pairs : BodyPairs
+    contacts : tuple of intp arrays
+        Rows of bodies that touch one another, each pair once.
+    ground : MapContext or None
+        None without a map.
+    """
+
+    config: Config
+    bodies: Bodies
+    ego: NDArray[np.intp]
+    pairs: BodyPairs
+    contacts: tuple[NDArray[np.intp], NDArray[np.intp]]
+    ground: MapContext | None
+
+
+class RelationFamily(NamedTuple):
+    """Relations that are computed together.
+
+    Attributes
+    ----------
+    names : function
+        The relations that it yields under a config.
+    needs_map : bool
+        Whether it knows nothing without a map. Then :attr:`BlockScene.ground` is not None.
+    edges : function
+        The edges of a scene; pure.
+    """
+
+    names: Callable[[Config], tuple[str, ...]]
+    needs_map: bool
+    edges: Callable[[BlockScene], Edges]
+
+
+def edges_between(
+    scene: BlockScene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
+) -> Edges:
+    """Edges from body to body (rows), all with one relation or each with its own code."""
+    bodies = scene.bodies
+    return Edges(bodies.frame[src], _codes(relation, len(src)), bodies.node[src], bodies.node[dst])
+
+
+def edges_to_map(
+    scene: BlockScene, relation: str, src: NDArray[np.intp] | Ints, dst: Ints
+) -> Edges:
+    """Edges from bodies (rows) to nodes of the map (node ids)."""
+    bodies = scene.bodies
+    return Edges(bodies.frame[src], _codes(relation, len(src)), bodies.node[src], dst)
+
+
+def _codes(relation: str | Codes, count: int) -> Codes:
+    if isinstance(relation, str):
+        return np.full(count, RELATION_CODE[relation], np.int8)
+    return relation
+
+
+def kinds_mask(names: tuple[str, ...]) -> Bools:
+    """Table by kind code: whether the kind is one of those named."""
+    table = np.zeros(len(KIND_CODE), np.bool_)
+    table[[KIND_CODE[name] for name in names]] = True
+    return table
+
+
+IS_SIGNAL: Final = kinds_mask(SIGNALS)
+
+
+def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Many ranges in one array.
+
+    Returns
+    -------
+    owner, index : (sum of counts,) intp
+        For each range i in turn, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
+    """
+    owner = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return owner, np.arange(len(owner)) + (starts - before)[owner]
+
+
+def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """All matches of ``wanted`` in ascending ``keys``: rows of ``wanted``, ascending, and rows of ``keys``."""
+    start = np.searchsorted(keys, wanted)
+    return spread(start, np.searchsorted(keys, wanted, side="right") - start)

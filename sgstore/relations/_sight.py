@@ -1,0 +1,208 @@
+"""What the ego sees: whatever is not hidden behind other bodies.
+
+The eye is above the centre of the ego, at the height of its roof. A body is seen when the straight line from
+there to its centre, or to one of the four corners of its footprint at the height of its centre, is free. A body
+hides what lies behind its footprint, as far as the line passes it between its lower and its upper side: a car
+hides the car behind it, not the traffic light above, and a bridge hides nothing on the road below.
+
+* What has no height hides nothing, nor does a signal, nor a body whose footprint the eye is in: seen from
+  within, a box says nothing of what is around. The ego hides nothing, and nobody hides itself.
+* Where the height of the eye or of what is looked at is missing, the plane alone counts. What has no footprint
+  is looked at by its centre; what has no place is not seen.
+* A line along a side, or through a corner, is free. There is no limit but the range of the graph, and neither
+  the direction in which the ego looks nor the weather counts: those are a matter of sensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.geometry import corners, wrapped
+from sgstore.relations._scene import IS_SIGNAL, RelationFamily, edges_between, meeting
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.graph import Edges
+    from sgstore.relations._scene import BlockScene, Bodies
+    from sgstore.world import Bools, Floats, Ints
+
+    Rows = NDArray[np.intp]
+
+
+GRAZE: Final = 1e-6
+"""What is no deeper within a footprint passes it by; m."""
+
+AT_ONCE: Final = 4096
+"""Pairs of a body and another before it that are looked at together."""
+
+POINTS: Final = 5
+"""Points of a body that are looked at: its centre and the four corners."""
+
+
+def seen(bodies: Bodies, ego: Rows) -> Rows:
+    """Rows of the bodies that the ego of their frame sees.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    ego : (F,) intp
+        Row of the ego of each frame; -1: nothing is seen.
+    """
+    mine = ego[bodies.frame]
+    there = (mine >= 0) & (mine != np.arange(len(bodies)))
+    rows = np.flatnonzero(there & np.isfinite(bodies.x) & np.isfinite(bodies.y))
+    views = _views(bodies, rows, mine[rows])
+    hidden = np.zeros((len(rows), POINTS), np.bool_)
+    for target, cover in _in_one_direction(views, bodies.frame[rows]):
+        # Near ones first: they hide the most, and what is hidden is not looked at again.
+        order = np.argsort(views.near[cover], kind="stable")
+        for first in range(0, len(order), AT_ONCE):
+            part = order[first : first + AT_ONCE]
+            for point in range(POINTS):
+                pairs = part[~hidden[target[part], point]]
+                blocked = pairs[_blocked(views, target[pairs], cover[pairs], point)]
+                hidden[target[blocked], point] = True
+    return rows[~hidden.all(axis=1)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """Bodies as they are seen from the eye, which is the origin, the axes being those of the map; shape (N,).
+
+    Attributes
+    ----------
+    x, y : (N, 5) float64
+        Points that are looked at: the centre, and the corners, which are in the centre too where the footprint
+        is not known; m.
+    z : float64
+        Height of these points above the eye; m.
+    low, high : float64
+        Directions between which the footprint lies, ``low`` in [-π, π), ``high`` not below it; rad.
+    near, far : float64
+        Bounds of the distances of its points; m.
+    hides : bool
+        Whether it can hide anything.
+    cos, sin, length, width : float64
+        Direction and half the size of the footprint; m.
+    bottom, top : float64
+        Heights of the lower and the upper side above the eye; m.
+    """
+
+    x: Floats
+    y: Floats
+    z: Floats
+    low: Floats
+    high: Floats
+    near: Floats
+    far: Floats
+    hides: Bools
+    cos: Floats
+    sin: Floats
+    length: Floats
+    width: Floats
+    bottom: Floats
+    top: Floats
+
+
+def _views(bodies: Bodies, rows: Rows, eye: Rows) -> _Views:
+    x, y = bodies.x[rows] - bodies.x[eye], bodies.y[rows] - bodies.y[eye]
+    z = bodies.z[rows] - bodies.z[eye] - np.nan_to_num(bodies.height[eye]) / 2
+    heading, length, width = bodies.heading[rows], bodies.length[rows], bodies.width[rows]
+    around = corners(np.stack([x, y, heading, length, width], axis=1))
+    known = ~np.isnan(around).any(axis=(1, 2))
+    around[~known] = np.stack([x, y], axis=1)[~known][:, None]
+    points_x = np.column_stack([x, around[:, :, 0]])
+    points_y = np.column_stack([y, around[:, :, 1]])
+    cos, sin = np.cos(heading), np.sin(heading)
+    lon, lat = np.abs(x * cos + y * sin), np.abs(y * cos - x * sin)
+    within = (lon <= length / 2) & (lat <= width / 2)
+    middle = np.arctan2(y, x)
+    aside = wrapped(np.arctan2(points_y, points_x) - middle[:, None])
+    low = np.where(within, -np.pi, wrapped(middle + aside.min(axis=1)))
+    low = np.where(low >= np.pi, -np.pi, low)
+    wide = np.where(within, 2 * np.pi, np.ptp(aside, axis=1))
+    ahead, beside = np.maximum(lon - length / 2, 0), np.maximum(lat - width / 2, 0)
+    height = bodies.height[rows]
+    return _Views(
+        x=points_x,
+        y=points_y,
+        z=z,
+        low=low,
+        high=low + wide,
+        near=np.sqrt(ahead * ahead + beside * beside),
+        far=np.sqrt((points_x**2 + points_y**2).max(axis=1, initial=0)),
+        hides=known & (height > 0) & ~within & ~IS_SIGNAL[bodies.kind[rows]],
+        cos=cos,
+        sin=sin,
+        length=length / 2 - GRAZE,
+        width=width / 2 - GRAZE,
+        bottom=z - height / 2,
+        top=z + height / 2,
+    )
+
+
+def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]:
+    """Bodies, and others that may hide them: somewhere they are in one direction, and nearer."""
+    # What reaches beyond π is there a second time, from the other side.
+    again = np.flatnonzero(views.high > np.pi)
+    rows = np.concatenate([np.arange(len(views.low)), again])
+    low = np.concatenate([views.low, views.low[again] - 2 * np.pi])
+    high = np.concatenate([views.high, views.high[again] - 2 * np.pi])
+    for one, other in meeting(frame[rows], low, high):
+        first, second = rows[one], rows[other]
+        target, cover = np.concatenate([first, second]), np.concatenate([second, first])
+        kept = views.hides[cover] & (views.near[cover] < views.far[target]) & (target != cover)
+        yield target[kept], cover[kept]
+
+
+def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
+    """Whether the line to a point of the target runs through the cover, between its lower and upper side."""
+    cos, sin = views.cos[cover], views.sin[cover]
+    x, y = views.x[cover, 0], views.y[cover, 0]
+    to_x, to_y = views.x[target, point], views.y[target, point]
+    # In the axes of the cover; shares of the way from the eye, 0, to the point, 1.
+    enters, leaves = _within(
+        -x * cos - y * sin, to_x * cos + to_y * sin, views.length[cover], 0.0, 1.0
+    )
+    enters, leaves = _within(
+        x * sin - y * cos, to_y * cos - to_x * sin, views.width[cover], enters, leaves
+    )
+    height = views.z[target]
+    low, high = (
+        np.minimum(enters * height, leaves * height),
+        np.maximum(enters * height, leaves * height),
+    )
+    passes = (low >= views.top[cover]) | (high <= views.bottom[cover])  # never where one is missing
+    return (enters < leaves) & ~passes
+
+
+def _within(
+    start: Floats, run: Floats, half: Floats, enters: Floats | float, leaves: Floats | float
+) -> tuple[Floats, Floats]:
+    """The part of a way, between two shares of it, on which a coordinate is between minus and plus ``half``."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-half - start) / run, (half - start) / run
+    return (
+        np.maximum(np.minimum(one, other), enters),
+        np.minimum(np.maximum(one, other), leaves),
+    )
+
+
+def _names(config: Config) -> tuple[str, ...]:
+    return ("sees",) if config.sees else ()
+
+
+def _edges(scene: BlockScene) -> Edges:
+    bodies, ego = scene.bodies, scene.ego
+    rows = seen(bodies, ego) if scene.config.sees else np.zeros(0, np.intp)
+    return edges_between(scene, "sees", ego[bodies.frame[rows]], rows)
+
+
+SIGHT = RelationFamily(_names, needs_map=False, edges=_edges)

@@ -1,0 +1,443 @@
+"""Which footprints touch which lanes, and how: the look-up that every frame needs most.
+
+A lane is a chain of quadrangles (:class:`~sgstore.roads._ribbons.Ribbons`), short where it bends. Footprints
+and quadrangles are brought together by the cells of a grid; separating axes tell which of them touch, and
+the share of a footprint in a quadrangle is a sum over the quadrangle's edges in closed form. All of it is
+numpy over chunks of footprints that fit the caches; shapely's intersection alone would take longer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.roads._ribbons import Ribbons, wrapped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.world import Bools, Floats, Ints
+
+
+TOUCH: Final = 1e-3
+"""Footprints this close to a lane touch it, so that no seam between lanes is a gap; m."""
+
+_CELL: Final = 4.0
+"""Edge of a grid cell; m."""
+_CHUNK: Final = 1 << 13
+"""Pairs of a footprint and a cell that are worked on at a time."""
+_MOST_ENTRIES: Final = 32
+"""Cells that a quadrangle may lie in on average; the grid is made coarser until it is so."""
+_POINT: Final = 1e-9
+"""Lengths below this are none; m."""
+_MOST_STEPS: Final = 256
+"""Quadrangles that are walked along a lane to the one beside a footprint's centre."""
+
+
+@dataclass(frozen=True, slots=True)
+class Touches:
+    """Footprints and lanes that touch, ordered by footprint and lane; shape (H,).
+
+    ``row``, ``lane`` (from 0), ``overlap``, ``offset``, ``heading_error`` as in
+    :class:`~sgstore.roads.LaneHits`; ``inside``: the footprint's centre lies in the lane.
+    """
+
+    row: Ints
+    lane: Ints
+    overlap: Floats
+    offset: Floats
+    heading_error: Floats
+    inside: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class _Quads:
+    """Quadrangles of lanes, in the order of lanes and along them; shape (Q,), corners (4, Q).
+
+    Corners run right start, right end, left end, left start: counter-clockwise, ``turn`` +1, unless the
+    lane has a negative width there. All of one lies within ``radius`` of its middle.
+    """
+
+    lane: Ints
+    first: Bools  # of its lane
+    last: Bools
+    x: Floats
+    y: Floats
+    corners: Floats  # (Q, 8): x, then y
+    turn: Floats
+    middle_x: Floats
+    middle_y: Floats
+    radius: Floats
+    z: Floats  # (2, Q): at its start and its end
+    heading: Floats  # (2, Q)
+
+
+def _quads(ribbons: Ribbons) -> _Quads:
+    lane = ribbons.lane
+    start = np.flatnonzero(lane[1:] == lane[:-1])
+    right, left = (ribbons.right_x, ribbons.right_y), (ribbons.left_x, ribbons.left_y)
+    x, y = (
+        np.stack((this[start], this[start + 1], other[start + 1], other[start]))
+        for this, other in zip(right, left, strict=True)
+    )
+    _unfold(x, y)
+    twice = (x[2] - x[0]) * (y[3] - y[1]) - (x[3] - x[1]) * (y[2] - y[0])
+    kept = np.abs(twice) > 1e-9
+    start, x, y = start[kept], x[:, kept], y[:, kept]
+    lane = lane[start]
+    middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
+    change = np.diff(lane) != 0
+    one = np.ones(min(len(lane), 1), bool)
+    heading = np.stack((ribbons.heading[start], ribbons.heading[start + 1]))
+    heading[1] = heading[0] + wrapped(heading[1] - heading[0])
+    return _Quads(
+        lane=lane,
+        first=np.concatenate((one, change)),
+        last=np.concatenate((change, one)),
+        x=x,
+        y=y,
+        corners=np.ascontiguousarray(np.concatenate((x, y)).T),
+        turn=np.sign(twice[kept]),
+        middle_x=middle_x,
+        middle_y=middle_y,
+        radius=np.hypot(x - middle_x, y - middle_y).max(axis=0),
+        z=np.stack((ribbons.z[start], ribbons.z[start + 1])),
+        heading=heading,
+    )
+
+
+def _unfold(x: Floats, y: Floats) -> None:
+    """End cross sections that cross where they cross, in place.
+
+    On the inner side of a bend that is tighter than the lane is wide, the border runs backwards, beyond the
+    centre of the bend: nothing is there that is not in the lane anyhow.
+    """
+    from_x, from_y = x[0] - x[3], y[0] - y[3]  # from left to right, at the start
+    to_x, to_y = x[1] - x[2], y[1] - y[2]  # and at the end
+    side = from_x * to_y - from_y * to_x
+    parallel = np.abs(side) < 1e-12
+    side = np.where(parallel, 1.0, side)
+    step_x, step_y = x[2] - x[3], y[2] - y[3]
+    at_start = (step_x * to_y - step_y * to_x) / side
+    at_end = (step_x * from_y - step_y * from_x) / side
+    crossing = ~parallel & (at_start > 0) & (at_start < 1) & (at_end > 0) & (at_end < 1)
+    cross_x, cross_y = x[3] + at_start * from_x, y[3] + at_start * from_y
+    for which, (start, end) in ((at_start < 0.5, (3, 2)), (at_start >= 0.5, (0, 1))):
+        rows = np.flatnonzero(crossing & which)
+        x[start, rows] = x[end, rows] = cross_x[rows]
+        y[start, rows] = y[end, rows] = cross_y[rows]
+
+
+class _Grid:
+    """Which quadrangles lie in which cells of a square grid; only cells with something in them are kept."""
+
+    def __init__(self, quads: _Quads) -> None:
+        low = np.stack((quads.x.min(axis=0), quads.y.min(axis=0)))
+        high = np.stack((quads.x.max(axis=0), quads.y.max(axis=0)))
+        self.origin = low.min(axis=1, initial=np.inf)[:, None]
+        self.cell = _CELL
+        while True:
+            self.first, last = self.cells(low), self.cells(high)
+            self.shape = last.max(axis=1, initial=0)[:, None] + 1
+            entries = (last - self.first + 1).prod(axis=0).sum()
+            if entries <= _MOST_ENTRIES * max(low.shape[1], 64) and self.shape.max() < 1 << 30:
+                break
+            self.cell *= 2
+        quad, x, y = _cells_between(self.first, last)
+        key = x * self.shape[1] + y
+        order = np.argsort(key, kind="stable")
+        self.quad = quad[order]
+        self.keys, begin = np.unique(key[order], return_index=True)
+        self.begin = np.append(begin, len(key))
+
+    def cells(self, places: Floats) -> Ints:
+        """(2, N) int64: the cells that places (2, N) lie in."""
+        return np.floor((places - self.origin) / self.cell).astype(np.int64)
+
+    def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
+        """Numbers of the rectangles of cells ``first`` to ``last`` (2, N), and the quadrangles in them.
+
+        Each pair comes once: one that shares several cells counts in the first of them alone.
+        """
+        row, x, y = _cells_between(first, last)
+        key = x * self.shape[1] + y
+        place = np.minimum(np.searchsorted(self.keys, key), len(self.keys) - 1)
+        held = np.flatnonzero(self.keys[place] == key)
+        row, x, y, place = row[held], x[held], y[held], place[held]
+        sizes = self.begin[place + 1] - self.begin[place]
+        cell = np.repeat(np.arange(len(place)), sizes)
+        at = np.arange(len(cell)) + (self.begin[place] - np.cumsum(sizes) + sizes)[cell]
+        quad = self.quad[at]
+        # In the first cell of the rectangle everything counts; in others what does not begin before.
+        inner_x, inner_y = (x > first[0][row])[cell], (y > first[1][row])[cell]
+        once = (~inner_x | (self.first[0][quad] == x[cell])) & (
+            ~inner_y | (self.first[1][quad] == y[cell])
+        )
+        return row[cell[once]], quad[once]
+
+
+def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
+    """Numbers and cells of all rectangles of cells from ``first`` to ``last``, both (2, N) and included."""
+    spans = np.maximum(last - first + 1, 0)
+    sizes = spans[0] * spans[1]
+    row = np.repeat(np.arange(len(sizes)), sizes)
+    number = np.arange(len(row)) - (np.cumsum(sizes) - sizes)[row]
+    x, y = np.divmod(number, np.maximum(spans[1], 1)[row])
+    return row, first[0][row] + x, first[1][row] + y
+
+
+@dataclass(frozen=True, slots=True)
+class _Shapes:
+    """Footprints, shape (N,): ``a`` and ``b`` are half their length and width, ``z`` their height."""
+
+    x: Floats
+    y: Floats
+    cos: Floats
+    sin: Floats
+    a: Floats
+    b: Floats
+    z: Floats
+    heading: Floats
+
+    @classmethod
+    def of(cls, boxes: Floats, z: Floats) -> _Shapes:
+        """From boxes (N, 5); a side that is missing or 0 is as long as what counts as touching."""
+        half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5].T)) / 2, TOUCH / 2)
+        heading = np.nan_to_num(boxes[:, 2])
+        x, y = np.ascontiguousarray(boxes[:, :2].T)
+        return cls(x, y, np.cos(heading), np.sin(heading), half[0], half[1], z, heading)
+
+
+class LaneIndex:
+    """All lanes of a map, to be asked what touches them.
+
+    Parameters
+    ----------
+    ribbons : Ribbons
+    storey : float
+        Greatest difference of height between a footprint and what it touches; m.
+    """
+
+    def __init__(self, ribbons: Ribbons, storey: float) -> None:
+        self._quads = _quads(ribbons)
+        self._grid = _Grid(self._quads)
+        self._storey = storey
+
+    def touches(self, boxes: Floats, z: Floats) -> Touches:
+        """What footprints (N, 5) at heights (N,) touch; see :meth:`sgstore.roads.RoadMap.lanes_of`."""
+        shapes = _Shapes.of(boxes, z)
+        parts = [_no_touches()]
+        parts += [self._gathered(shapes, row, quad) for row, quad in self._candidates(shapes)]
+        return Touches(
+            *(
+                np.concatenate([getattr(part, column.name) for part in parts])
+                for column in fields(Touches)
+            )
+        )
+
+    def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
+        """Footprints and quadrangles that are close, each pair once, by chunks of footprints."""
+        grid, quads = self._grid, self._quads
+        cos, sin = np.abs(shapes.cos), np.abs(shapes.sin)
+        reach = np.stack((cos * shapes.a + sin * shapes.b, sin * shapes.a + cos * shapes.b)) + TOUCH
+        around = np.hypot(shapes.a, shapes.b) + TOUCH
+        centre = np.stack((shapes.x, shapes.y))
+        rows = np.flatnonzero(np.isfinite(centre + reach).all(axis=0))
+        if not len(rows) or not len(grid.quad):
+            return
+        low, high = (centre - reach)[:, rows], (centre + reach)[:, rows]
+        top = grid.origin + grid.shape * grid.cell
+        first = np.maximum(grid.cells(np.minimum(low, top)), 0)
+        last = np.minimum(grid.cells(np.clip(high, grid.origin - 1.0, top)), grid.shape - 1)
+        total = np.cumsum(np.maximum(last - first + 1, 0).prod(axis=0))
+        cuts = np.searchsorted(total, np.arange(_CHUNK, total[-1] + _CHUNK, _CHUNK)) + 1
+        for begin, end in pairwise([0, *np.unique(cuts).tolist()]):
+            row, quad = grid.pairs(first[:, begin:end], last[:, begin:end])
+            row = rows[begin:end][row]
+            squared = (quads.middle_x[quad] - shapes.x[row]) ** 2
+            squared += (quads.middle_y[quad] - shapes.y[row]) ** 2
+            close = squared <= (quads.radius[quad] + around[row]) ** 2
+            yield row[close], quad[close]
+
+    def _gathered(self, shapes: _Shapes, row: Ints, quad: Ints) -> Touches:
+        quads = self._quads
+        near = _Pairs.of(quads, shapes, row, quad)
+        touch, inside = near.touching()
+        touch = np.flatnonzero(touch)
+        near, inside = near.take(touch), inside[touch]
+        share, distance = near.beside()
+        z = quads.z[:, near.quad]
+        level = z[0] + (z[1] - z[0]) * np.clip(share, 0.0, 1.0)
+        apart = np.abs(level - shapes.z[near.row]) > self._storey
+        if apart.any():
+            same = np.flatnonzero(~apart)
+            near, inside, distance = near.take(same), inside[same], distance[same]
+        lane = quads.lane[near.quad]
+        key = near.row * (int(quads.lane[-1]) + 1) + lane
+        order = np.argsort(key, kind="stable")
+        starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+        if not len(starts):
+            return _no_touches()
+        best = order[_first_least(distance[order], starts)]
+        area = np.add.reduceat(np.abs(near.common_areas())[order], starts)
+        overlap = np.minimum(area / (4 * near.a[best] * near.b[best]), 1.0)
+        within = np.logical_or.reduceat(inside[order], starts)
+        row = near.row[best]
+        offset, error = self._aside(shapes, row, near.quad[best])
+        return Touches(row, lane[best], overlap, offset, error, within)
+
+    def _aside(self, shapes: _Shapes, row: Ints, quad: Ints) -> tuple[Floats, Floats]:
+        """Lateral offset and heading error of footprints on the lanes of these quadrangles.
+
+        What counts is the place of the lane whose cross section runs through the footprint's centre. It may be
+        in a quadrangle that the footprint does not touch, which is walked to. Between its ends the centre
+        line is taken for the parabola that has the ends' headings.
+        """
+        quads = self._quads
+        here = _Pairs.of(quads, shapes, row, quad)
+        walking, towards = np.arange(len(quad)), np.zeros(len(quad), np.int64)
+        quad, there = quad.copy(), here.between()
+        for _ in range(_MOST_STEPS):
+            at = quad[walking]
+            step = ((there > 1) & ~quads.last[at]).astype(np.int64)
+            step -= (there < 0) & ~quads.first[at]
+            # Where a lane is folded two quadrangles may send on to each other: nobody turns back.
+            goes = np.flatnonzero((step != 0) & (step != -towards))
+            walking, towards = walking[goes], step[goes]
+            if not len(walking):
+                break
+            quad[walking] += towards
+            there = _Pairs.of(quads, shapes, row[walking], quad[walking]).between()
+        here = _Pairs.of(quads, shapes, row, quad)
+        share = np.clip(here.between(), 0.0, 1.0)
+        heading = quads.heading[:, quad]
+        bend = heading[1] - heading[0]
+        error = wrapped(shapes.heading[row] - heading[0] - bend * share)
+        x, y, along_x, along_y = here.middle_line()
+        bulge = np.hypot(along_x, along_y) * bend * share * (1 - share) / 2
+        foot_x, foot_y = x + share * along_x, y + share * along_y
+        return bulge - foot_x * np.sin(error) - foot_y * np.cos(error), error
+
+
+def _first_least(values: Floats, starts: Ints) -> Ints:
+    """Where each group of values, which start at ``starts``, has its least value for the first time."""
+    least = np.minimum.reduceat(values, starts)
+    group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
+    rows = np.flatnonzero(values == least[group])[::-1]
+    first = np.empty(len(starts), np.int64)
+    first[group[rows]] = rows  # of several assignments to one place the last holds
+    return first
+
+
+def _no_touches() -> Touches:
+    none, nothing = np.zeros(0, np.int64), np.zeros(0)
+    return Touches(none, none, nothing, nothing, nothing, np.zeros(0, bool))
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Footprints and quadrangles, shape (n,); corners (4, n) in the footprint's axes, its centre the origin."""
+
+    row: Ints
+    quad: Ints
+    a: Floats
+    b: Floats
+    turn: Floats
+    x: Floats
+    y: Floats
+
+    @classmethod
+    def of(cls, quads: _Quads, shapes: _Shapes, row: Ints, quad: Ints) -> _Pairs:
+        # The corners of one quadrangle are fetched together, from one line of the cache, and then kept in runs
+        # of memory, one for each corner: that is what makes the sums below fast.
+        corners = quads.corners.take(quad, axis=0).T
+        x = np.subtract(corners[:4], shapes.x[row], order="C")
+        y = np.subtract(corners[4:], shapes.y[row], order="C")
+        cos, sin = shapes.cos[row], shapes.sin[row]
+        along, across = x * cos + y * sin, y * cos - x * sin
+        return cls(row, quad, shapes.a[row], shapes.b[row], quads.turn[quad], along, across)
+
+    def take(self, rows: Ints) -> _Pairs:
+        """Some of the pairs."""
+        return _Pairs(
+            self.row[rows],
+            self.quad[rows],
+            self.a[rows],
+            self.b[rows],
+            self.turn[rows],
+            self.x.take(rows, axis=1),
+            self.y.take(rows, axis=1),
+        )
+
+    def touching(self) -> tuple[Bools, Bools]:
+        """Whether no axis separates them, and whether the footprint's centre lies in the quadrangle."""
+        a, b = self.a + TOUCH, self.b + TOUCH
+        x, y = self.x, self.y
+        apart = (x.min(axis=0) > a) | (x.max(axis=0) < -a)
+        apart |= (y.min(axis=0) > b) | (y.max(axis=0) < -b)
+        inside = np.ones(len(apart), bool)
+        for i in range(4):
+            edge_x, edge_y = x[i - 3] - x[i], y[i - 3] - y[i]
+            beyond = (edge_x * y[i] - edge_y * x[i]) * self.turn
+            edge_x, edge_y = np.abs(edge_x), np.abs(edge_y)
+            apart |= beyond > a * edge_y + b * edge_x
+            inside &= beyond <= TOUCH * (edge_x + edge_y)
+        return ~apart, inside
+
+    def middle_line(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Start of the centre line of each quadrangle, and the way to its end."""
+        x, y = (self.x[0] + self.x[3]) / 2, (self.y[0] + self.y[3]) / 2
+        return x, y, (self.x[1] + self.x[2]) / 2 - x, (self.y[1] + self.y[2]) / 2 - y
+
+    def beside(self) -> tuple[Floats, Floats]:
+        """Where the footprint's centre lies along the centre line, 0 … 1 from end to end; squared distance."""
+        x, y, along_x, along_y = self.middle_line()
+        share = -(x * along_x + y * along_y) / np.maximum(along_x**2 + along_y**2, 1e-18)
+        at = np.clip(share, 0.0, 1.0)
+        return share, (x + at * along_x) ** 2 + (y + at * along_y) ** 2
+
+    def between(self) -> Floats:
+        """Where the footprint's centre lies between both cross sections, 0 … 1 from the start to the end.
+
+        Unlike the feet on straight pieces it runs on from quadrangle to quadrangle without a gap or overlap.
+        """
+        ahead, start = self._ahead(0, 3)
+        behind, end = self._ahead(1, 2)
+        both = ahead - behind
+        usable = (start > _POINT) & (end > _POINT) & (both > _POINT)
+        return np.where(usable, ahead / np.where(usable, both, 1.0), self.beside()[0])
+
+    def _ahead(self, right: int, left: int) -> tuple[Floats, Floats]:
+        """How far ahead of a cross section the footprint's centre lies, and how wide the lane is there."""
+        across_x, across_y = self.x[left] - self.x[right], self.y[left] - self.y[right]
+        width = np.hypot(across_x, across_y)
+        ahead = self.y[right] * across_x - self.x[right] * across_y
+        return ahead / np.maximum(width, _POINT), width
+
+    def common_areas(self) -> Floats:
+        """Area of each footprint that lies in the quadrangle; negative where that is clockwise.
+
+        The area of a polygon P in the box [-a, a] × [-b, b] is ∮ x̂ dy along P's edges where |y| ≤ b, with
+        x̂ = x held within ±a: Green's theorem for the field (x̂, 0). Along an edge the integral of x̂ is a
+        difference of x̂ (x - x̂ / 2), its antiderivative.
+        """
+        a, b = self.a, self.b
+        area = np.zeros(len(a))
+        for i in range(4):
+            x, y = self.x[i], self.y[i]
+            run, rise = self.x[i - 3] - x, self.y[i - 3] - y
+            low = np.minimum(np.maximum(y, -b), b)
+            high = np.minimum(np.maximum(self.y[i - 3], -b), b)
+            slope = run / np.where(np.abs(rise) > 1e-12, rise, 1.0)
+            from_x, to_x = x + slope * (low - y), x + slope * (high - y)
+            from_held = np.minimum(np.maximum(from_x, -a), a)
+            to_held = np.minimum(np.maximum(to_x, -a), a)
+            across = to_x - from_x
+            level = np.abs(across) < 1e-9
+            integral = to_held * (to_x - to_held / 2) - from_held * (from_x - from_held / 2)
+            mean = np.where(level, from_held, integral / np.where(level, 1.0, across))
+            area += (high - low) * mean
+        return area

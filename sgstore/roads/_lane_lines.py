@@ -1,0 +1,764 @@
+"""Plain lanes from lane lines, links and borders.
+
+Lanes told as lines and links → plain lanes.
+
+Simulators that carry no OpenDRIVE tell lanes as lines: each in a direction of its own, which need not be that
+of its traffic, with the ids of the lanes that it touches. Here they get cross sections, run with their
+traffic, and are related to one another. What cannot be used is left out and named.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import shapely
+
+from sgstore.errors import MapError
+from sgstore.roads._cross_sections import (
+    APART,
+    WIDE,
+    Sections,
+    along_line,
+    cross_sections,
+    feet,
+    half_width,
+    run_of,
+    thinned,
+    way_between,
+)
+from sgstore.roads._lanes import PlainLane
+from sgstore.vocabulary import DRIVING, TRAFFIC
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from sgstore.world import Floats
+
+
+START: Final = "start"
+END: Final = "end"
+
+MAX_POINTS: Final = 2_000_000
+"""Greatest number of points of all lines together."""
+MAX_LANES: Final = 30_000
+MAX_WAYS: Final = 20_000
+"""Greatest number of ways through areas."""
+MAX_RELATED: Final = 500_000
+"""Greatest number of times that lanes name others as touching them or lying beside them."""
+GAP: Final = 5.0
+"""Ends of lanes that are farther apart do not touch, whatever is told of them; m."""
+SEAM: Final = 1.0
+"""Gaps up to this length between a lane and the next one are closed; m."""
+LISTED: Final = 8
+"""Lanes that a warning names."""
+_MOST_ACROSS: Final = 16
+"""Lanes without traffic that may lie between two lanes that are neighbours across them."""
+_ABOUT: Final = 1.0
+"""Centre lines of a junction's lanes that come this close to one another belong together; m."""
+
+
+class Joint(NamedTuple):
+    """A lane that touches an end of another, and with which end: ``start``, ``end``, or empty: not told."""
+
+    lane: str
+    contact: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """A line beside a lane.
+
+    Attributes
+    ----------
+    line : (k, 3) float64
+    to_left, to_right : bool or None
+        Whether traffic may cross it from its right to its left, and back, as the lane's line runs; ``None``:
+        that is not known.
+    ident : str
+        What the lanes that it bounds call it; empty: nothing.
+    """
+
+    line: Floats
+    to_left: bool | None = None
+    to_right: bool | None = None
+    ident: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LaneLine:
+    """A lane. Left, right, start and end are those of its line, whichever way its traffic runs.
+
+    Attributes
+    ----------
+    ident : str
+        What others call it.
+    type : str
+        As OpenDRIVE has it.
+    centre : (n, 3) float64
+        Its centre line; m.
+    forward, both : bool
+        Whether traffic runs along the line; whether it runs both ways.
+    lefts, rights : tuple of Border
+        In any order.
+    sections : Sections, optional
+        Cross sections along the line, where they are told; else the lines say where they lie.
+    before, after : tuple of Joint
+        What touches its start and its end.
+    left_beside, right_beside : tuple of str
+    name, road, section, number
+        As :class:`~sgstore.roads.MapNodes` has them; without a road it is one of the lanes side by side.
+    junction : str or None
+        ``None``: it lies in a junction that has no name.
+    """
+
+    ident: str
+    type: str
+    centre: Floats
+    forward: bool = True
+    both: bool = False
+    lefts: tuple[Border, ...] = ()
+    rights: tuple[Border, ...] = ()
+    sections: Sections | None = None
+    before: tuple[Joint, ...] = ()
+    after: tuple[Joint, ...] = ()
+    left_beside: tuple[str, ...] = ()
+    right_beside: tuple[str, ...] = ()
+    name: str = ""
+    road: str = ""
+    section: int = 0
+    number: int = 0
+    junction: str | None = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A junction that is told as an area, with the ways through it: from which lane to which."""
+
+    ident: str
+    ways: tuple[tuple[str, str], ...]
+
+
+@dataclass(slots=True)
+class _Network:
+    """Lanes by number, and what touches what."""
+
+    lines: list[LaneLine]
+    sections: list[Sections]
+    index: dict[str, int]
+    warnings: list[str] = field(default_factory=list[str])
+    _turned: dict[tuple[int, int], bool] = field(default_factory=dict[tuple[int, int], bool])
+
+    def direction(self, lane: int) -> int:
+        return 1 if self.lines[lane].forward else -1
+
+    def end_of(self, lane: int, contact: str) -> Floats:
+        """Where the line of a lane starts or ends."""
+        middle = self.sections[lane].middle
+        return middle[0 if contact == START else -1]
+
+    def gap(self, lane: int, end: str, other: int, contact: str) -> float:
+        """How far an end of a lane is from an end of another; m."""
+        return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
+
+    def runs_against(self, lane: int, other: int) -> bool:
+        """Whether the lines of two lanes side by side run against one another."""
+        key = (lane, other) if lane < other else (other, lane)
+        if key not in self._turned:
+            self._turned[key] = _turned_round(*(self.sections[row].middle for row in key))
+        return self._turned[key]
+
+    def exits(self, lane: int, contact: str) -> bool:
+        """Whether traffic leaves a lane at this end of its line."""
+        line = self.lines[lane]
+        return line.both or line.forward == (contact == END)
+
+    def enters(self, lane: int, contact: str) -> bool:
+        """Whether traffic comes into a lane at this end of its line."""
+        line = self.lines[lane]
+        return line.both or line.forward == (contact == START)
+
+
+def plain_lanes(
+    lines: Sequence[LaneLine], areas: Sequence[Area] = ()
+) -> tuple[list[PlainLane], list[str]]:
+    """Plain lanes, and warnings of what was left out or had to be guessed.
+
+    Raises
+    ------
+    MapError
+        There are too many lanes, neighbours, or ways.
+
+    Notes
+    -----
+    Each way through an area is a lane: the cubic from the end of one lane to the start of the other.
+    """
+    _check_numbers(lines, areas)
+    network = _shaped(lines)
+    _add_ways(network, areas)
+    joints = _joints(network)
+    beside = _beside(network)
+    roads, junctions = _roads(network, beside), _junctions(network)
+    onto = _onto(network, joints)
+    names = _names(network)
+    _close_seams(network, joints)
+    lanes: list[PlainLane] = []
+    for row, line in enumerate(network.lines):
+        sections = network.sections[row]
+        sections = sections if line.forward else sections.turned_round()
+        left, right = beside[row] if line.forward else beside[row][::-1]
+        against = set(_against(network, row, left | right))
+        lanes.append(
+            PlainLane(
+                name=names[row],
+                type=line.type,
+                road=roads[row],
+                junction=junctions[row],
+                section=line.section,
+                number=line.number,
+                left=sections.left,
+                right=sections.right,
+                z=sections.z,
+                onto=tuple(sorted(onto[row])),
+                left_beside=tuple(sorted(left)),
+                right_beside=tuple(sorted(right)),
+                against=tuple(sorted(against)),
+                changes=tuple(_changes(network, row, beside[row], against)),
+            )
+        )
+    return lanes, network.warnings
+
+
+def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
+    related = sum(
+        len(line.before) + len(line.after) + len(line.left_beside) + len(line.right_beside)
+        for line in lines
+    )
+    ways = sum(len(area.ways) for area in areas)
+    for number, limit, what in (
+        (len(lines), MAX_LANES, "lanes"),
+        (related, MAX_RELATED, "neighbours of lanes"),
+        (ways, MAX_WAYS, "ways through intersections"),
+    ):
+        if number > limit:
+            raise MapError(f"{number:,} {what}; a map may have {limit:,}", element="lane")
+
+
+# Surfaces ------------------------------------------------------------------------------------------
+
+
+def _shaped(lines: Sequence[LaneLine]) -> _Network:
+    """The lanes that have a surface, and it."""
+    network = _Network([], [], {})
+    usable: list[LaneLine] = []
+    short: list[str] = []
+    twice: list[str] = []
+    for line in lines:
+        centre = thinned(line.centre)
+        if line.ident in network.index:
+            twice.append(line.ident)
+        elif line.sections is None and (len(centre) < 2 or run_of(centre)[-1] < 1e-3):
+            short.append(line.ident)
+        else:
+            network.index[line.ident] = len(usable)
+            usable.append(replace(line, centre=centre))
+    _tell(network, twice, "there are two of this id; the first one counts")
+    _tell(network, short, "no centre line and no ways through: left out")
+    guessed: list[str] = []
+    for line in usable:
+        sections, told = (line.sections, True) if line.sections else _cut(line, usable, network)
+        network.lines.append(line)
+        network.sections.append(sections)
+        guessed += [line.ident] * (not told)
+    width = f"no boundary beside them: as wide as lanes beside them are apart, else {WIDE} m"
+    _tell(network, guessed, width)
+    return network
+
+
+def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[Sections, bool]:
+    lefts, rights = (
+        [thin for border in side if len(thin := thinned(border.line)) > 1]
+        for side in (line.lefts, line.rights)
+    )
+    half = WIDE / 2
+    if not lefts and not rights:
+        beside = (network.index.get(i) for i in (*line.left_beside, *line.right_beside))
+        others = [lines[row].centre for row in beside if row is not None]
+        half = half_width(line.centre, [other for other in others if len(other) > 1])
+    return cross_sections(line.centre, lefts, rights, half)
+
+
+def about_lanes(lanes: Sequence[str], what: str) -> str:
+    """A warning that names lanes; the first few of many."""
+    more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
+    return f"{'lanes' if len(lanes) > 1 else 'lane'} {', '.join(lanes[:LISTED])}{more}: {what}"
+
+
+def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
+    if lanes:
+        network.warnings.append(about_lanes(lanes, what))
+
+
+def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
+    """Lanes for the ways through areas."""
+    missing: list[str] = []
+    astray: list[str] = []
+    for area in areas:
+        number = 0
+        for start, end in dict.fromkeys(area.ways):
+            lanes = network.index.get(start), network.index.get(end)
+            if lanes[0] is None or lanes[1] is None:
+                missing.append(area.ident)
+            elif not all(
+                _touches(network.lines[lane], area.ident, at_exit=at_exit)
+                for lane, at_exit in ((lanes[0], True), (lanes[1], False))
+            ):
+                astray.append(f"{area.ident} from {start} to {end}")
+            else:
+                number += 1
+                _add_way(network, area.ident, number, (lanes[0], lanes[1]))
+    _tell(network, list(dict.fromkeys(missing)), "a way through it leads to a missing lane")
+    _tell(network, astray, "told to be a way through, but not by the lanes at its ends: it is none")
+
+
+def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
+    """Whether a lane's traffic comes from or leaves into an area, as far as the lane tells what it touches."""
+    joints = line.after if line.forward == at_exit else line.before
+    joints = (*line.before, *line.after) if line.both else joints
+    untold = not line.before and not line.after
+    return untold or any(joint.lane == area for joint in joints)
+
+
+def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) -> None:
+    start, end = (network.lines[lane] for lane in lanes)
+    leaves, enters = END if start.forward else START, START if end.forward else END
+    sections = way_between(_gate(network, lanes[0], leaves), _gate(network, lanes[1], enters))
+    ident = f"{area}:{start.ident}-{end.ident}"
+    network.index[ident] = len(network.lines)
+    network.sections.append(sections)
+    network.lines.append(
+        LaneLine(
+            ident,
+            start.type,
+            np.column_stack((sections.middle, sections.z)),
+            before=(Joint(start.ident, leaves),),
+            after=(Joint(end.ident, enters),),
+            name=f"{area}/0/{number}",
+            road=area,
+            number=number,
+            junction=area,
+        )
+    )
+
+
+def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
+    """An end of a lane: place, heading of its traffic, width and height."""
+    sections = network.sections[lane]
+    at, other = (0, 1) if contact == START else (-1, -2)
+    middle = sections.middle
+    way = (middle[other] - middle[at]) * (1 if contact == START else -1)
+    way *= network.direction(lane)
+    width = float(np.hypot(*(sections.left[at] - sections.right[at])))
+    return middle[at], float(np.arctan2(way[1], way[0])), width, float(sections.z[at])
+
+
+# Where traffic flows on ----------------------------------------------------------------------------
+
+
+_Joined = tuple[int, str, int, str]
+"""Ends of lanes that touch: lane, which end, other lane, which end of it."""
+
+
+def _joints(network: _Network) -> set[_Joined]:
+    joints: set[_Joined] = set()
+    far: list[str] = []
+    for row, line in enumerate(network.lines):
+        for own, touched in ((START, line.before), (END, line.after)):
+            for joint in touched:
+                other = network.index.get(joint.lane)
+                if other is None:
+                    continue
+                contact = joint.contact or _contact(network, row, own, other)
+                if network.gap(row, own, other, contact) > GAP:
+                    far.append(f"{line.ident} to {joint.lane}")
+                else:
+                    joints |= {(row, own, other, contact), (other, contact, row, own)}
+    _tell(network, far, f"told to touch, but their ends are more than {GAP} m apart: they do not")
+    return joints
+
+
+def _contact(network: _Network, lane: int, end: str, other: int) -> str:
+    """Which end of the other lane touches an end of a lane: as it says itself, else the nearer one."""
+    line, ident = network.lines[other], network.lines[lane].ident
+    says = {
+        contact
+        for contact, touched in ((START, line.before), (END, line.after))
+        if any(joint.lane == ident for joint in touched)
+    }
+    if len(says) == 1:
+        return says.pop()
+    return min((START, END), key=lambda contact: network.gap(lane, end, other, contact))
+
+
+def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
+    onto: list[set[int]] = [set() for _ in network.lines]
+    for row, end, other, contact in joints:
+        if network.exits(row, end) and network.enters(other, contact):
+            onto[row].add(other)
+    return onto
+
+
+def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
+    """Draw lanes out to the next one where a small gap is left, as in lines of points half a metre apart."""
+    nearest: dict[int, tuple[float, str, int, str]] = {}
+    for row, end, other, contact in sorted(joints):
+        gap = network.gap(row, end, other, contact)
+        if network.exits(row, end) and network.enters(other, contact) and APART < gap <= SEAM:
+            nearest[row] = min(nearest.get(row, (np.inf, "", 0, "")), (gap, end, other, contact))
+    sections = list(network.sections)
+    for row, (_, end, other, contact) in nearest.items():
+        own, onward = sections[row], network.sections[other]
+        own = own if end == END else own.turned_round()
+        onward = onward if contact == START else onward.turned_round()
+        own = own.up_to(onward.left[0], onward.right[0], float(onward.z[0]))
+        network.sections[row] = own if end == END else own.turned_round()
+
+
+# Side by side --------------------------------------------------------------------------------------
+
+_Sides = tuple[set[int], set[int]]
+"""Lanes to the left and to the right of a line."""
+
+
+def _beside(network: _Network) -> list[_Sides]:
+    """What lies beside each line: as it says itself, or as the other says of it."""
+    beside: list[_Sides] = [(set(), set()) for _ in network.lines]
+    for row, line in enumerate(network.lines):
+        for side, idents in enumerate((line.left_beside, line.right_beside)):
+            for ident in idents:
+                other = network.index.get(ident)
+                if other is None or other == row:
+                    continue
+                beside[row][side].add(other)
+                back = side if network.runs_against(row, other) else 1 - side
+                beside[other][back].add(row)
+    across = [
+        tuple(_across(network, beside, row, side) for side in (0, 1))
+        for row in range(len(network.lines))
+    ]
+    for sides, more in zip(beside, across, strict=True):
+        for side in (0, 1):
+            sides[side].update(more[side])
+    return beside
+
+
+def _turned_round(one: Floats, other: Floats) -> bool:
+    """Whether two lines side by side run against one another."""
+    way, back = one[-1] - one[0], other[-1] - other[0]
+    same = float(way @ back)
+    if abs(same) < 0.5 * float(np.hypot(*way) * np.hypot(*back)):
+        # Both bend: what counts is where they lie next to one another.
+        near = along_line(one, other[[0, -1]])
+        return bool(near[1] < near[0])
+    return same < 0
+
+
+def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
+    """Lanes of traffic that only lanes without traffic part from a lane of traffic."""
+    if network.lines[row].type not in TRAFFIC:
+        return set()
+    found: set[int] = set()
+    seen, front = {row}, [(row, side)]
+    for _ in range(_MOST_ACROSS):
+        onward: list[tuple[int, int]] = []
+        for lane, towards in front:
+            for other in sorted(beside[lane][towards] - seen):
+                seen.add(other)
+                if network.lines[other].type in TRAFFIC:
+                    found.add(other)
+                else:
+                    turned = network.runs_against(lane, other)
+                    onward.append((other, 1 - towards if turned else towards))
+        front = onward
+    return found
+
+
+def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int]:
+    """Lanes of traffic beside a lane of traffic whose traffic comes the other way."""
+    if network.lines[row].type not in TRAFFIC:
+        return
+    for other in others:
+        if network.lines[other].type in TRAFFIC:
+            turned = network.runs_against(row, other)
+            same = (network.lines[row].forward == network.lines[other].forward) != turned
+            if not same or network.lines[row].both or network.lines[other].both:
+                yield other
+
+
+def _changes(
+    network: _Network, row: int, beside: _Sides, against: set[int]
+) -> Iterator[tuple[int, float, float]]:
+    """Where traffic may change from a lane to those beside it, along its own direction of travel."""
+    line, middle = network.lines[row], network.sections[row].middle
+    if line.type not in DRIVING:
+        return
+    length = float(run_of(middle)[-1])
+    for side, others in enumerate(beside):
+        reached = [
+            other
+            for other in sorted(others)
+            if network.lines[other].type in DRIVING
+            and (other not in against or line.both or network.lines[other].both)
+        ]
+        stretches = _open_stretches(network, row, side) if reached else []
+        for other in reached if stretches else []:
+            reach = along_line(middle, network.sections[other].middle)
+            for start, end in stretches:
+                low, high = max(start, float(reach.min())), min(end, float(reach.max()))
+                if high > low:
+                    yield (
+                        (other, low, high) if line.forward else (other, length - high, length - low)
+                    )
+
+
+def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
+    """Where along its line the borders on one side of a lane may be crossed; the nearest border counts."""
+    line, middle = network.lines[row], network.sections[row].middle
+    borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
+    spans: list[tuple[float, float, float, bool]] = []
+    for border in borders:
+        along = along_line(middle, border.line[:, :2])
+        start, end = float(along.min()), float(along.max())
+        half = (start + end) / 2
+        inner = np.column_stack([np.interp([half], run_of(middle), c) for c in middle.T])
+        nearest = border.line[np.argmin(np.hypot(*(border.line[:, :2] - inner).T)), :2]
+        allowed = bool(border.to_left if side == 0 else border.to_right)
+        spans.append((start, end, float(np.hypot(*(nearest - inner[0]))), allowed))
+    cuts = sorted({place for span in spans for place in span[:2]})
+    found: list[tuple[float, float]] = []
+    for start, end in pairwise(cuts):
+        over = [span for span in spans if span[0] <= start and span[1] >= end]
+        if over and min(over, key=lambda span: span[2])[3]:
+            follows = bool(found) and found[-1][1] == start
+            found.append((found.pop()[0] if follows else start, end))
+    return found
+
+
+# Roads and junctions -------------------------------------------------------------------------------
+
+
+def _names(network: _Network) -> list[str]:
+    """Names of lanes, each once: what two lanes would be called alike has its id added."""
+    wanted = [line.name or line.ident for line in network.lines]
+    count: dict[str, int] = defaultdict(int)
+    for name in wanted:
+        count[name] += 1
+    return [
+        name if count[name] == 1 else f"{name}#{line.ident}"
+        for name, line in zip(wanted, network.lines, strict=True)
+    ]
+
+
+def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
+    """Roads of lanes; those that have none belong with the lanes beside them."""
+    road = [line.road for line in network.lines]
+    for row, line in enumerate(network.lines):
+        if road[row]:
+            continue
+        road[row] = line.ident
+        front = [row] if line.junction == "" else []
+        while front:
+            for other in set().union(*beside[front.pop()]):
+                if not road[other] and network.lines[other].junction == "":
+                    road[other] = line.ident
+                    front.append(other)
+    return road
+
+
+def _junctions(network: _Network) -> list[str]:
+    """Junctions of lanes; those without a name are lanes that cross or touch, named after the first."""
+    junction = [line.junction or "" for line in network.lines]
+    rows = [row for row, line in enumerate(network.lines) if line.junction is None]
+    if not rows:
+        return junction
+    centres: Any = [shapely.LineString(network.sections[row].middle) for row in rows]
+    union: Any = shapely.union_all(shapely.buffer(centres, _ABOUT / 2, quad_segs=1))
+    parts: Any = shapely.get_parts(union)
+    tree = shapely.STRtree(parts)
+    starts: Any = [shapely.Point(network.sections[row].middle[0]) for row in rows]
+    inside = dict(zip(*tree.query(starts, predicate="intersects").tolist(), strict=True))
+    name: dict[int, str] = {}
+    for number, row in enumerate(rows):
+        part = inside[number]
+        junction[row] = name.setdefault(part, network.lines[row].ident)
+    return junction
+
+
+# Lanes that are told by their borders alone: the line between them, and which lanes share a border ----
+# The pieces of a border come in any order, each in whichever direction; two of them may lie side by side, as
+# double lines do. Which way a lane's line runs is told by what is its left and what its right.
+
+MAX_PIECES: Final = 1_000
+"""Greatest number of pieces of a border; a lane that has more is left out, and named."""
+_DOUBLE: Final = 1.0
+"""Pieces of a border that are no farther apart lie side by side, unless one goes on from the other; m."""
+_ONE_SIDED: Final = 0.5
+"""Least share of the way between two borders along which they lie as they are told to."""
+_BORDER_LOOKS: Final = 9
+"""Places along a lane and along a border at which they are looked at."""
+_SHARED: Final = 0.1
+"""Least part of a border that two lanes must share to lie side by side, of the shorter lane."""
+
+
+def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
+    """The line in the middle of two borders, by shares of their lengths.
+
+    Parameters
+    ----------
+    lefts, rights : sequence of (k, 3) float64
+        Pieces of the borders.
+
+    Returns
+    -------
+    middle : (n, 3) float64
+        It runs so that the left border is to its left.
+
+    Raises
+    ------
+    ValueError
+        A border has no length or too many pieces, or they cross or are the same.
+    """
+    left, right = _chained(lefts, "left"), _chained(rights, "right")
+    along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
+    across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
+    right = right if along <= across else right[::-1]
+    for end in (0, -1):
+        left, right = _cut_back(left, right, end), _cut_back(right, left, end)
+    shares = [run_of(line) / run_of(line)[-1] for line in (left, right)]
+    at = np.unique(np.concatenate(shares))
+    one, other = (
+        np.column_stack([np.interp(at, share, column) for column in line.T])
+        for share, line in zip(shares, (left, right), strict=True)
+    )
+    middle = (one + other) / 2
+    step, aside = np.diff(middle[:, :2], axis=0), (one - other)[:, :2]
+    aside = (aside[:-1] + aside[1:]) / 2
+    area = step[:, 0] * aside[:, 1] - step[:, 1] * aside[:, 0]
+    if not abs(area.sum()) > max(_ONE_SIDED * np.abs(area).sum(), APART * run_of(middle)[-1]):
+        raise ValueError("its boundaries cross, or are one and the same")
+    return thinned(middle if area.sum() > 0 else middle[::-1])
+
+
+def _chained(pieces: Sequence[Floats], side: str) -> Floats:
+    """The pieces of a border as one line, beginning with the longest: always the next end that is nearest."""
+    left = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
+    if not left:
+        raise ValueError(f"neither a centre line nor a boundary to its {side}")
+    if len(left) > MAX_PIECES:
+        raise ValueError(f"more than {MAX_PIECES} boundaries to its {side}")
+    left.sort(key=lambda piece: -run_of(piece)[-1])
+    chain, left = left[0], left[1:]
+    ends = np.array([piece[[0, -1], :2] for piece in left]).reshape(-1, 2, 2)
+    while left:
+        # (piece, end of the piece, end of the chain)
+        away = np.hypot(*np.moveaxis(ends[:, :, None] - chain[[0, -1], :2], -1, 0))
+        number, own, at = (int(i) for i in np.unravel_index(np.argmin(away), away.shape))
+        piece, ends = left.pop(number), np.delete(ends, number, axis=0)
+        half = run_of(piece)[-1] / 2
+        middle = np.array([[np.interp(half, run_of(piece), piece[:, i]) for i in (0, 1)]])
+        found = feet(middle, [chain])
+        if not found.is_end[0] and np.hypot(*(found.at - middle)[0]) <= _DOUBLE:
+            continue
+        if at == 1:
+            chain = np.concatenate((chain, piece if own == 0 else piece[::-1]))
+        else:
+            chain = np.concatenate((piece if own == 1 else piece[::-1], chain))
+    return thinned(chain)
+
+
+def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
+    """A border without what reaches beyond the end of the other one, by more than they are apart there."""
+    run = run_of(line)
+    found = feet(other[[end], :2], [line])
+    along, apart = float(found.along[0]), float(np.hypot(*(found.at[0] - other[end, :2])))
+    beyond = along if end == 0 else run[-1] - along
+    if beyond <= max(apart, APART) or not 0 < along < run[-1]:
+        return line
+    cut = np.array([[np.interp(along, run, column) for column in line.T]])
+    return (
+        np.concatenate((cut, line[run > along]))
+        if end == 0
+        else np.concatenate((line[run < along], cut))
+    )
+
+
+def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
+    """Lanes with those beside them with which they share a border, on sides of which they tell nothing.
+
+    Lanes share a border if they lie on either side of it, along one and the same part of it.
+    """
+    users: dict[str, dict[tuple[int, int], Floats]] = defaultdict(dict)
+    for row, line in enumerate(lines):
+        if len(thinned(line.centre)) < 2:
+            continue
+        for side, borders in enumerate((line.lefts, line.rights)):
+            for border in borders:
+                if border.ident and len(border.line) > 1:
+                    users[border.ident][row, side] = thinned(border.line)
+    beside: dict[tuple[int, int], list[str]] = defaultdict(list)
+    for shared in users.values():
+        untold = [key for key in shared if not _told(lines, key)]
+        if len(shared) < 2 or not untold or min(map(len, shared.values())) < 2:
+            continue
+        places = {key: _place(lines[key[0]].centre, border) for key, border in shared.items()}
+        for key in untold:
+            beside[key] += [
+                lines[other[0]].ident
+                for other in shared
+                if other[0] != key[0] and _share(places[key], places[other])
+            ]
+    return [
+        replace(
+            line,
+            left_beside=line.left_beside or tuple(dict.fromkeys(beside[row, 0])),
+            right_beside=line.right_beside or tuple(dict.fromkeys(beside[row, 1])),
+        )
+        for row, line in enumerate(lines)
+    ]
+
+
+def _told(lines: Sequence[LaneLine], key: tuple[int, int]) -> bool:
+    row, side = key
+    return bool((lines[row].left_beside, lines[row].right_beside)[side])
+
+
+def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
+    """From where to where along a border a lane lies, and whether to its left; looked at from both of them."""
+    centre, border = thinned(centre)[:, :2], border[:, :2]
+    own, at = _looks(centre), run_of(border)[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
+    onto, back = feet(own, [border]), feet(_looks(border), [centre])
+    beside = np.concatenate((~onto.is_end, ~back.is_end))
+    if not beside.any():
+        return 0.0, 0.0, True
+    along = np.concatenate((onto.along, at))[beside]
+    aside = np.concatenate((own - onto.at, back.at - _looks(border)))[beside]
+    piece = np.clip(np.searchsorted(run_of(border), along, "right") - 1, 0, len(border) - 2)
+    way = np.diff(border, axis=0)[piece]
+    left = float((way[:, 0] * aside[:, 1] - way[:, 1] * aside[:, 0]).sum()) > 0
+    return float(along.min()), float(along.max()), left
+
+
+def _looks(line: Floats) -> Floats:
+    """Places (n, 2) along a line, at even distances."""
+    run = run_of(line)
+    at = run[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
+    return np.column_stack([np.interp(at, run, column) for column in line[:, :2].T])
+
+
+def _share(one: tuple[float, float, bool], other: tuple[float, float, bool]) -> bool:
+    common = min(one[1], other[1]) - max(one[0], other[0])
+    shorter = min(one[1] - one[0], other[1] - other[0])
+    return one[2] != other[2] and common > max(_SHARED * shorter, APART)

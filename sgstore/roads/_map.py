@@ -1,0 +1,697 @@
+"""``RoadMap``: lanes, roads, junctions, crosswalks and signals as arrays.
+
+Places and shapes: nodes of a map that have no extent, and places within those that have one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter, defaultdict
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sgstore.roads._footprints import LaneIndex
+from sgstore.roads._lane_graph import FARTHEST, LaneGraph, LaneReach
+from sgstore.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
+from sgstore.vocabulary import DRIVING, ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from sgstore.world import Bools, Codes, Floats, Ints
+
+
+def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
+    """(N,) shapely points."""
+    points: Any = shapely.points(np.column_stack([x, y]))
+    return points
+
+
+def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
+    """(N,) bool: which of (N, 2) places lie in a shapely polygon."""
+    return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
+
+
+# The words for the turns of lanes, whatever a map was read from ---------------------------------
+
+STRAIGHT: Final = np.radians(30.0)
+"""A lane through a junction that turns by less goes straight on; rad."""
+
+
+def turn_words(turn: Floats) -> list[str]:
+    """``left``, ``right`` or ``straight`` for lanes that turn by so much, positive to the left; rad."""
+    words = np.where(turn > STRAIGHT, "left", np.where(turn < -STRAIGHT, "right", "straight"))
+    return list(map(str, words))
+
+
+# RoadMap: lanes, roads, junctions, crosswalks and signals as arrays, with look-ups for many things at once
+# ------------------------------------------------------------------------------------------------
+# A map is read once (:mod:`sgstore.opendrive`), is never changed, and is asked in bulk: which lanes do
+# these thousand footprints touch, which parts of the map lie around these sixty egos. Every answer is a set,
+# because lanes overlap in junctions and storeys lie above one another.
+#
+# Nodes. Every part of a map that can be a node of a scene graph has a node id below zero: ``off_road`` is
+# -1, then come lanes, roads, junctions, crosswalks, signals and objects, in this order. ``nodes`` lists them
+# all.
+
+__all__ = [
+    "OFF_ROAD",
+    "STOREY",
+    "LaneChanges",
+    "LaneGraph",
+    "LaneHits",
+    "LanePoints",
+    "MapEdges",
+    "MapNodes",
+    "Ribbons",
+    "RoadMap",
+    "first_sections",
+    "lanes_ref",
+]
+
+OFF_ROAD: Final = -1
+"""Node id of the single node that stands for whatever is not a driving lane."""
+
+STOREY: Final = 2.5
+"""Greatest difference of height at which a footprint can be in a lane; m."""
+
+Geometries = NDArray[np.object_]
+"""An array of shapely geometries."""
+
+_FIRST_LANE: Final = OFF_ROAD - 1
+_QUADRANT: Final = np.pi / 4
+_MOST_PRESENT: Final = 1 << 24
+"""Nodes times points that are looked at in one go."""
+_MERGED: Final = " without sections"
+"""What the variant of a map ends in whose lanes are one node for all sections."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapNodes:
+    """All nodes of a map, one row a node, in order of descending node id: row i has node id -1 - i.
+
+    Attributes
+    ----------
+    kind : (K,) int8
+        Codes of :data:`sgstore.vocabulary.KINDS`.
+    name : tuple of str
+        ``road/section/lane`` of a lane, else the id that the map gives it; ``off_road``.
+    x, y, z, heading : (K,) float64
+        A point on it and its direction there (a lane: the middle of its centre line, in the direction of
+        travel). NaN for ``off_road``, and where there is none.
+    lane_type : tuple of str
+        ``driving``, ``sidewalk``, … as OpenDRIVE has it; empty for what is no lane.
+    road, junction, turn : tuple of str
+        Ids of the road and of the junction it belongs to; ``left``, ``right``, ``straight`` for a lane in a
+        junction; empty where there is none.
+    section, lane : (K,) int64
+        Section and lane number in the road; 0 for what is no lane.
+    length, width, speed_limit : (K,) float64
+        m, mean m, m/s; NaN where there is none.
+    curvature : (K,) float64
+        Of the centre line at a waypoint, positive to the left; 1/m. NaN for what is none.
+    """
+
+    kind: Codes
+    name: tuple[str, ...]
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    lane_type: tuple[str, ...]
+    road: tuple[str, ...]
+    junction: tuple[str, ...]
+    turn: tuple[str, ...]
+    section: Ints
+    lane: Ints
+    length: Floats
+    width: Floats
+    speed_limit: Floats
+    curvature: Floats
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @classmethod
+    def of(cls, kind: str | Sequence[str], name: Sequence[str], **columns: Any) -> MapNodes:
+        """Nodes of one kind, or one each, from the columns at hand; others are missing (empty, 0, NaN)."""
+        n = len(name)
+        kinds = [kind] * n if isinstance(kind, str) else kind
+        missing: dict[str, Any] = {"section": np.zeros(n, np.int64), "lane": np.zeros(n, np.int64)}
+        texts = {"lane_type", "road", "junction", "turn"}
+        values = {
+            column.name: missing.get(
+                column.name, ("",) * n if column.name in texts else np.full(n, np.nan)
+            )
+            for column in fields(cls)
+        }
+        values |= {"kind": np.array([KIND_CODE[k] for k in kinds], np.int8), "name": tuple(name)}
+        return cls(**(values | columns))
+
+    def take(self, rows: Ints) -> MapNodes:
+        """Some of the nodes, in the order given."""
+        columns: dict[str, Any] = {}
+        for column in fields(self):
+            values = getattr(self, column.name)
+            whole = isinstance(values, np.ndarray)
+            columns[column.name] = values[rows] if whole else tuple(values[r] for r in rows)
+        return MapNodes(**columns)
+
+    @classmethod
+    def joined(cls, parts: Sequence[MapNodes]) -> MapNodes:
+        """One part after another."""
+        columns: dict[str, Any] = {}
+        for column in fields(cls):
+            values = [getattr(part, column.name) for part in parts]
+            whole = isinstance(values[0], np.ndarray)
+            columns[column.name] = np.concatenate(values) if whole else tuple(chain(*values))
+        return cls(**columns)
+
+
+@dataclass(frozen=True, slots=True)
+class MapEdges:
+    """Edges among the nodes of a map; shape (E,).
+
+    Attributes
+    ----------
+    relation : int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    src, dst : int64
+        Node ids.
+    """
+
+    relation: Codes
+    src: Ints
+    dst: Ints
+
+    def __len__(self) -> int:
+        return len(self.relation)
+
+
+@dataclass(frozen=True, slots=True)
+class LaneHits:
+    """Which footprints touch which lanes; one row a touch, ordered by footprint; shape (H,).
+
+    Attributes
+    ----------
+    row : int64
+        The footprint, as a row of the question.
+    lane : int64
+        Node id of the lane.
+    overlap : float64
+        Share of the footprint's area that lies in the lane, 0 … 1.
+    offset : float64
+        Lateral offset of the footprint's centre from the lane's centre line, positive to the left of the
+        direction of travel; m.
+    heading_error : float64
+        Heading of the footprint less the direction of travel there, in (-π, π]; rad.
+    primary : bool
+        True for one hit of each footprint that has a hit: centre inside first, then the smaller heading
+        error (by quadrants of 45°), then the larger overlap, then the lower lane.
+    """
+
+    row: Ints
+    lane: Ints
+    overlap: Floats
+    offset: Floats
+    heading_error: Floats
+    primary: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class LaneChanges:
+    """Where traffic may change from one lane to the one beside it; one row a stretch, shape (n,).
+
+    Attributes
+    ----------
+    lane, to : int64
+        Lanes, counted from 0.
+    start, end : float64
+        Along the centre line of ``lane``; m.
+    """
+
+    lane: Ints
+    to: Ints
+    start: Floats
+    end: Floats
+
+    def __len__(self) -> int:
+        return len(self.lane)
+
+    @classmethod
+    def none(cls) -> LaneChanges:
+        """No permission anywhere."""
+        no_lanes, nowhere = np.zeros(0, np.int64), np.zeros(0)
+        return cls(no_lanes, no_lanes, nowhere, nowhere)
+
+
+class RoadMap:
+    """A road map. See the module for what it holds and how its nodes are numbered.
+
+    Parameters
+    ----------
+    name, text : str
+    nodes : MapNodes
+    edges : MapEdges
+    ribbons : Ribbons
+        The surface of the lanes, in the order of their nodes.
+    shapes : (K,) object
+        Geometries of the nodes that are neither lanes nor made of lanes; ``None`` where there is none.
+    lane_changes : LaneChanges, optional
+    road_types, junction_types, controllers : mapping, optional
+    warnings : iterable of str, optional
+    variant : str, optional
+        In what it differs from the map that the text alone describes.
+
+    Attributes
+    ----------
+    name : str
+        What people call it: the file's name, or the name in the map's header.
+    text : str
+        The text it was read from.
+    digest : str
+        SHA-256 of the text and the variant, in hexadecimal digits: what identifies the map.
+    nodes : MapNodes
+    edges : MapEdges
+        Static relations: ``isIn`` (lane → road, road → junction), ``travelsTo``, ``opposes``, ``toLeftOf``,
+        ``toRightOf``, ``laneChange``, ``conflictsWith`` among lanes, ``controlsTrafficOf`` (signal → lane).
+    ribbons : Ribbons
+        The surface of the lanes. Lane i of it, and wherever lanes are counted from 0, has node id -2 - i.
+    lane_changes : LaneChanges
+        Where along their lanes the ``laneChange`` edges hold.
+    road_types : mapping of str to tuple of (float, str)
+        Id of a road → what it is (``town``, ``motorway``, …) from which place along its reference line on; m.
+    junction_types : mapping of str to str
+        Id of a junction → ``default``, ``direct``, ``virtual``, …
+    controllers : mapping of str to tuple of str
+        Id of a controller → ids of the signals that it switches together.
+    warnings : tuple of str
+        Defects of the map that were passed over, each with its road.
+    """
+
+    def __init__(  # noqa: PLR0913 (a map is all of this)
+        self,
+        *,
+        name: str,
+        text: str,
+        nodes: MapNodes,
+        edges: MapEdges,
+        ribbons: Ribbons,
+        shapes: Geometries,
+        lane_changes: LaneChanges | None = None,
+        road_types: Mapping[str, tuple[tuple[float, str], ...]] | None = None,
+        junction_types: Mapping[str, str] | None = None,
+        controllers: Mapping[str, tuple[str, ...]] | None = None,
+        warnings: Iterable[str] = (),
+        variant: str = "",
+    ) -> None:
+        self.name = name
+        self.text = text
+        self.digest = hashlib.sha256((text + variant).encode("utf-8", "surrogatepass")).hexdigest()
+        self.nodes = nodes
+        self.edges = edges
+        self.ribbons = ribbons
+        self.lane_changes = lane_changes or LaneChanges.none()
+        self.road_types = dict(road_types or {})
+        self.junction_types = dict(junction_types or {})
+        self.controllers = dict(controllers or {})
+        self.warnings = tuple(warnings)
+        self._shapes = shapes
+        self._variant = variant
+        self._lanes = len(ribbons.offsets) - 1
+
+    def outlines(self) -> Geometries:
+        """(K,) shapely polygons, lines or points of the nodes; ``None`` for what has no extent of its own.
+
+        Roads, junctions and ``off_road`` have none: a road is its lanes.
+        """
+        return self._outlines.copy()
+
+    def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
+        """Lanes, of any type, that footprints touch on their storey.
+
+        Parameters
+        ----------
+        boxes : (N, 5) float64
+            ``x, y, heading, length, width`` of each footprint; m, m, rad, m, m. A length or width that is 0 or
+            NaN makes it a point or a line. A NaN in ``x, y`` touches nothing.
+        z : (N,) float64
+            Height of the footprint's centre *on the ground* (the bottom of the box); m. NaN: any storey.
+
+        Notes
+        -----
+        What is within 1 mm of a lane touches it. On a lane the storey is that of the place beside the
+        footprint's centre. A heading error in a lane that bends is taken there, too.
+        """
+        touches = self._index.touches(np.asarray(boxes, np.float64), np.asarray(z, np.float64))
+        quadrant = np.floor(np.abs(touches.heading_error) / _QUADRANT)
+        order = np.lexsort((touches.lane, -touches.overlap, quadrant, ~touches.inside, touches.row))
+        first = np.diff(touches.row[order], prepend=-1) != 0
+        primary = np.zeros(len(order), np.bool_)
+        primary[order[first]] = True
+        return LaneHits(
+            touches.row,
+            _FIRST_LANE - touches.lane,
+            touches.overlap,
+            touches.offset,
+            touches.heading_error,
+            primary,
+        )
+
+    def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
+        """Rows of ``boxes`` and node ids of the crosswalks that they touch, ordered by row.
+
+        Boxes and heights as in :meth:`lanes_of`.
+        """
+        columns, tree = self._crosswalks
+        boxes = np.asarray(boxes, np.float64)
+        rows = np.flatnonzero(np.isfinite(boxes[:, :2]).all(axis=1))
+        if not len(columns) or not len(rows):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        row, place = tree.query(_rectangles(boxes[rows]), predicate="intersects")
+        row, column = rows[row], columns[place]
+        same = ~(np.abs(self.nodes.z[column] - np.asarray(z, np.float64)[row]) > STOREY)
+        row, column = row[same], column[same]
+        order = np.lexsort((column, row))
+        return row[order], -1 - column[order]
+
+    def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
+        """Rows of the points and node ids of all parts of the map (but ``off_road``) within ``radius`` of them.
+
+        A road or a junction is near when one of its lanes is. Ordered by row, and from the first node on.
+        """
+        rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        places = np.column_stack((x, y))
+        step = max(_MOST_PRESENT // len(self.nodes), 1)
+        for first in range(0, len(places), step):
+            present = self._present(places[first : first + step], radius)
+            row, column = np.nonzero(present)
+            rows.append(first + row)
+            columns.append(column)
+        return np.concatenate(rows), -1 - np.concatenate(columns)
+
+    def _present(self, places: Floats, radius: float) -> Bools:
+        """(N, K): which nodes lie within ``radius`` of which places (N, 2)."""
+        columns, tree = self._extents
+        finite = np.flatnonzero(np.isfinite(places).all(axis=1))
+        points: Any = shapely.points(places[finite])
+        row, place = tree.query(points, predicate="dwithin", distance=radius)
+        present = np.zeros((len(places), len(self.nodes)), np.bool_)
+        present[finite[row], columns[place]] = True
+        for child, parent in self._containment:
+            at, which = np.nonzero(present[:, child])
+            present[at, parent[which]] = True
+        return present
+
+    def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
+        """Rows of lines or polygons and node ids of the parts of the map within ``distance`` of them.
+
+        Parameters
+        ----------
+        corners : (N, V, 2) float64
+            Ends of lines (V = 2), or corners of simple polygons, all around; m.
+        distance : float
+            m.
+
+        Notes
+        -----
+        Roads, junctions and ``off_road`` have no shape of their own and are near nothing.
+        """
+        make = shapely.linestrings if corners.shape[1] == 2 else shapely.polygons
+        shapes: Any = make(corners)
+        columns, tree = self._extents
+        row, place = tree.query(shapes, predicate="dwithin", distance=distance)
+        order = np.lexsort((columns[place], row))
+        return row[order], -1 - columns[place][order]
+
+    def lanes_of_signal(self, signal: str) -> Ints:
+        """Node ids of the driving lanes that an OpenDRIVE signal applies to; empty for an unknown id.
+
+        The lanes of a signal that the map does not have may be told by :func:`lanes_ref` instead of its id.
+        """
+        if signal.startswith(_LANES_REF):
+            names = _names_in(signal)
+            nodes = self.nodes
+            found = [
+                -1 - column
+                for column in range(len(nodes))
+                if nodes.lane_type[column] in DRIVING and nodes.name[column] in names
+            ]
+            return np.array(found, np.int64)
+        return self._controlled.get(signal, np.zeros(0, np.int64))
+
+    def waypoints(self, spacing: float) -> LanePoints:
+        """Points along the centre lines of all lanes, every ``spacing`` metres from each lane's start.
+
+        Raises
+        ------
+        ValueError
+            ``spacing`` is not above 0.
+        """
+        return waypoints(self.ribbons, spacing)
+
+    @cached_property
+    def without_sections(self) -> RoadMap:
+        """The same map with one node for all lanes of a number in a road, whatever their section.
+
+        The node is that of the first of them, by the name ``road_number``. The nodes of the others stay, so
+        that node ids mean the same, without any edge. What is asked of the surface is still told by section.
+        It is another map: it has another digest.
+        """
+        nodes, same = self.nodes, first_sections(self.nodes)
+        first = same == np.arange(len(nodes))
+        lane = (nodes.kind == KIND_CODE["lane"]) & (nodes.lane != 0)
+        name = tuple(
+            f"{road}_{number}" if merged else name
+            for name, road, number, merged in zip(
+                nodes.name, nodes.road, nodes.lane.tolist(), lane & first, strict=True
+            )
+        )
+        length = np.bincount(same, np.nan_to_num(nodes.length), len(nodes))
+        return RoadMap(
+            name=self.name,
+            text=self.text,
+            nodes=replace(nodes, name=name, length=np.where(lane & first, length, nodes.length)),
+            edges=merged_edges(self.edges, same),
+            ribbons=self.ribbons,
+            shapes=self._shapes,
+            lane_changes=self.lane_changes,
+            road_types=self.road_types,
+            junction_types=self.junction_types,
+            controllers=self.controllers,
+            warnings=self.warnings,
+            variant=f"{self._variant}{_MERGED}",
+        )
+
+    @cached_property
+    def graph(self) -> LaneGraph:
+        """Distances and routes along the lanes, which are counted from 0."""
+        among = (self.edges.src >= _FIRST_LANE - self._lanes + 1) & (self.edges.src <= _FIRST_LANE)
+        flow, change = (
+            among & (self.edges.relation == RELATION_CODE[name])
+            for name in ("travelsTo", "laneChange")
+        )
+        return LaneGraph(
+            self.ribbons.lengths,
+            *(_FIRST_LANE - ends[flow] for ends in (self.edges.src, self.edges.dst)),
+            *(_FIRST_LANE - ends[change] for ends in (self.edges.src, self.edges.dst)),
+        )
+
+    @cached_property
+    def reach(self) -> tuple[Ints, Ints, Floats]:
+        """Where lanes begin, measured along other lanes from whose start one can drive there, or back.
+
+        Returns
+        -------
+        lane, other : (n,) int64
+            Node ids. A lane stands beside itself too; two lanes come twice where one can drive either way.
+        start : (n,) float64
+            Of ``other``, along the lanes from the start of ``lane``; negative where one drives from ``other``
+            to ``lane``; m. No more than :data:`FARTHEST` lies between the end of one and the start of the next.
+
+        Notes
+        -----
+        Of a map without sections there is none: places along its lanes are told by section.
+        """
+        lanes = np.arange(self._lanes)
+        if _MERGED in self._variant:
+            lanes = lanes[:0]
+        ways = self.graph.downstream(FARTHEST) if len(lanes) else LaneReach.none()
+        start = self.ribbons.lengths[ways.lane] + ways.distance
+        lane = np.concatenate([lanes, ways.lane, ways.other])
+        other = np.concatenate([lanes, ways.other, ways.lane])
+        starts = np.concatenate([np.zeros(len(lanes)), start, -start])
+        order = np.lexsort((starts, other, lane))
+        return _FIRST_LANE - lane[order], _FIRST_LANE - other[order], starts[order]
+
+    @cached_property
+    def _index(self) -> LaneIndex:
+        return LaneIndex(self.ribbons, STOREY)
+
+    @cached_property
+    def _outlines(self) -> Geometries:
+        shapes = self._shapes.copy()
+        shapes[1 : 1 + self._lanes] = lane_polygons(self.ribbons)
+        folded = ~shapely.is_missing(shapes) & ~shapely.is_valid(shapes)
+        shapes[folded] = shapely.make_valid(
+            shapes[folded], method="structure", keep_collapsed=False
+        )
+        return shapes
+
+    @cached_property
+    def _crosswalks(self) -> tuple[Ints, shapely.STRtree]:
+        columns = np.flatnonzero(self.nodes.kind == KIND_CODE["crosswalk"])
+        return columns, shapely.STRtree(self._shapes[columns])
+
+    @cached_property
+    def _extents(self) -> tuple[Ints, shapely.STRtree]:
+        outlines = self._outlines
+        columns = np.flatnonzero(~shapely.is_missing(outlines))
+        return columns, shapely.STRtree(outlines[columns])
+
+    @cached_property
+    def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
+        """Columns of what is in something, and of what it is in: lanes in roads, then roads in junctions."""
+        inside = self.edges.relation == RELATION_CODE["isIn"]
+        child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
+        lane = self.nodes.kind[child] == KIND_CODE["lane"]
+        return (child[lane], parent[lane]), (child[~lane], parent[~lane])
+
+    @cached_property
+    def _controlled(self) -> dict[str, Ints]:
+        controls = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
+        src, dst = self.edges.src[controls], self.edges.dst[controls]
+        return {self.nodes.name[-1 - node]: dst[src == node] for node in np.unique(src).tolist()}
+
+
+_LANES_REF: Final = "lanes:"
+
+
+def lanes_ref(names: Iterable[str]) -> str:
+    """What stands for the id of a signal that a map does not have, but of which the lanes are known by name."""
+    return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
+
+
+def _names_in(ref: str) -> set[str]:
+    try:
+        told = json.loads(ref.removeprefix(_LANES_REF))
+    except (ValueError, RecursionError):
+        return set()
+    return {name for name in told if isinstance(name, str)} if isinstance(told, list) else set()
+
+
+def first_sections(nodes: MapNodes) -> Ints:
+    """(K,): column of the first lane with the road and the number of each lane; of other nodes their own."""
+    same = np.arange(len(nodes))
+    first: dict[tuple[str, int], int] = {}
+    for column in np.flatnonzero(nodes.kind == KIND_CODE["lane"]).tolist():
+        key = nodes.road[column], int(nodes.lane[column])
+        if key[1]:  # what is numbered in no section, as parking spaces are, stays as it is
+            same[column] = first.setdefault(key, column)
+    return same
+
+
+def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
+    """Edges among the nodes that stand for others, each once; ``same`` as of :func:`first_sections`."""
+    src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
+    table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
+    relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
+    return MapEdges(relation.astype(np.int8), src, dst)
+
+
+def _rectangles(boxes: Floats) -> Geometries:
+    """Footprints as polygons; a side that is missing or 0 is made a tenth of a millimetre long."""
+    half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5])) / 2, 5e-5)
+    heading = np.nan_to_num(boxes[:, 2])
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    along = half[:, :1] * np.array([1.0, -1.0, -1.0, 1.0])
+    across = half[:, 1:] * np.array([1.0, 1.0, -1.0, -1.0])
+    x = boxes[:, :1] + cos * along - sin * across
+    y = boxes[:, 1:2] + sin * along + cos * across
+    polygons: Any = shapely.polygons(np.stack((x, y), axis=-1))
+    return polygons
+
+
+# What is in a road map, counted -----------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MapCount:
+    """So many parts of a map, of one kind.
+
+    Attributes
+    ----------
+    part : str
+        ``lane``, ``road``, ``junction``, ``crosswalk``, ``signal``, ``controller``, ``object`` or ``warning``.
+    kind : str
+        Type of the lanes, roads or junctions; kind of the signals or objects; text of the warning.
+    count : int
+    length : float or None
+        Of all of them together; m.
+    """
+
+    part: str
+    kind: str
+    count: int
+    length: float | None = None
+
+
+def summary(road_map: RoadMap) -> list[MapCount]:
+    """What is in a road map: lanes by type, the most first, and so on; last what was passed over.
+
+    A road that is of several types one after another counts under each, with the length that it has of it.
+    """
+    nodes = road_map.nodes
+    kinds = [KINDS[code] for code in nodes.kind]
+    lanes = [(nodes.lane_type[row], float(nodes.length[row])) for row in _of(kinds, "lane")]
+    junctions = [road_map.junction_types.get(nodes.name[r], "") for r in _of(kinds, "junction")]
+    signals = Counter(kind for kind in kinds if kind in SIGNALS)
+    objects = Counter(kind for kind in kinds if kind in ENTITY_KINDS and kind not in SIGNALS)
+    single = [
+        MapCount("crosswalk", "", kinds.count("crosswalk")),
+        *(MapCount("signal", kind, count) for kind, count in signals.most_common()),
+        MapCount("controller", "", len(road_map.controllers)),
+        *(MapCount("object", kind, count) for kind, count in objects.most_common()),
+    ]
+    return [
+        *_measured("lane", lanes),
+        *_measured("road", _stretches(road_map, kinds)),
+        *(MapCount("junction", kind, count) for kind, count in Counter(junctions).most_common()),
+        *(part for part in single if part.count),
+        *(MapCount("warning", text, count) for text, count in Counter(road_map.warnings).items()),
+    ]
+
+
+def _of(kinds: list[str], kind: str) -> list[int]:
+    return [row for row, found in enumerate(kinds) if found == kind]
+
+
+def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]:
+    """Kinds with their lengths as parts, the kind that there is most of first."""
+    count: Counter[str] = Counter()
+    total: defaultdict[str, float] = defaultdict(float)
+    for kind, length in lengths:
+        count[kind] += 1
+        total[kind] += float(np.nan_to_num(length))
+    order = sorted(count, key=lambda kind: (-total[kind], kind))
+    return [MapCount(part, kind, count[kind], total[kind]) for kind in order]
+
+
+def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
+    """Types of roads and how long they hold; each type once a road, and the empty one where none is told."""
+    nodes = road_map.nodes
+    for row in _of(kinds, "road"):
+        length = float(nodes.length[row])
+        types = road_map.road_types.get(nodes.name[row], ())
+        cuts = [start if 0 <= start <= length else 0.0 for start, _ in types] + [length]
+        held: defaultdict[str, float] = defaultdict(float)
+        for (_, kind), (start, end) in zip(types, pairwise(cuts), strict=True):
+            held[kind] += max(end - start, 0.0)
+        yield from held.items() or [("", length)]

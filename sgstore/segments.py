@@ -1,0 +1,531 @@
+"""One recording to sealed segments, one for each ego, with outcome and counts.
+
+What is told of an ingest: how far it has come, and what became of each recording.
+"""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+
+from sgstore import errors
+from sgstore.config import ALL_EGOS, Config, from_dict
+from sgstore.errors import SgstoreError, TraceError
+from sgstore.map_files import Maps, lost_lanes
+from sgstore.mcap import check_name
+from sgstore.readers import on_map, open_trace
+from sgstore.relations import Crowds, renamed
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
+from sgstore.store import Place, Segment, StoreFile, new_segment
+from sgstore.trace_parts import TracePart
+from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled
+from sgstore.world import Loss, longest_step_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from sgstore.readers import OpenTrace
+    from sgstore.roads import RoadMap
+    from sgstore.world import Codes, FrameBlock, Ints, TraceInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the work on a recording has come, and all of it.
+
+    Attributes
+    ----------
+    path : Path
+    frames : int
+        Frames done of this recording.
+    bytes_done, size : int
+        About how much of the file has been read, and its size.
+    all_frames, all_bytes, all_size : int
+        The same of all recordings together.
+    files_done, files : int
+        Recordings that are done, and how many there are.
+    """
+
+    path: Path
+    frames: int
+    bytes_done: int
+    size: int
+    all_frames: int = 0
+    all_bytes: int = 0
+    all_size: int = 0
+    files_done: int = 0
+    files: int = 1
+
+
+@dataclass(slots=True)
+class TraceOutcome:
+    """What became of a recording, as one ego has it.
+
+    Attributes
+    ----------
+    path : Path
+    status : str
+        ``added``; ``replaced``: read anew; ``present``: the store had it already, read with the same settings;
+        ``new``: it would be added, if this were no trial; ``failed``.
+    name : str
+        Of the trace in the store; empty if it failed.
+    ego : str
+        The simulator's id of the ego; empty if there is none or it is not known.
+    frames : int
+    entities : dict
+        Kind → how many entities there are of it, in and out of range.
+    unknown_types : dict
+        Type names that no mapping knows → how many entities bear them.
+    clock_jumps, gaps : int
+        How often the clock of the recording runs backwards, or further than 2.5 periods.
+    seconds : float
+        How long it took.
+    warnings : list of str
+        What is odd but lost nothing.
+    losses : list of Loss
+        What of the recording could not be used.
+    error : SgstoreError or None
+        Why it failed.
+    """
+
+    path: Path
+    status: str = "failed"
+    name: str = ""
+    ego: str = ""
+    frames: int = 0
+    entities: dict[str, int] = field(default_factory=dict[str, int])
+    unknown_types: dict[str, int] = field(default_factory=dict[str, int])
+    clock_jumps: int = 0
+    gaps: int = 0
+    seconds: float = 0.0
+    warnings: list[str] = field(default_factory=list[str])
+    losses: list[Loss] = field(default_factory=list[Loss])
+    error: SgstoreError | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The outcome as plain values, from which :meth:`from_dict` makes it again."""
+        told = {"class": type(self.error).__name__, "message": str(self.error)}
+        return asdict(self) | {"path": str(self.path), "error": told if self.error else None}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """The outcome that plain values describe; an error keeps its class and its message."""
+        told = values["error"]
+        error = getattr(errors, told["class"])(told["message"]) if told else None
+        changed: dict[str, Any] = {
+            "path": Path(values["path"]),
+            "error": error,
+            "losses": [Loss(**loss) for loss in values["losses"]],
+        }
+        return cls(**(values | changed))
+
+
+# What is to be done with recordings, as a value that another process can be given ---------------
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What is to be done with recordings.
+
+    Attributes
+    ----------
+    store : Path
+        Need not be there yet.
+    road_map : Path or None
+        A file, or a folder of them; see :class:`sgstore.map_files.Maps`.
+    config : Config
+    part : TracePart
+        Which frames are read.
+    force : bool
+        Whether what the store has already is read anew.
+    dry_run : bool
+        Whether it is only said what would be done.
+    block_frames : int
+        Frames that are worked on at once.
+    """
+
+    store: Path
+    road_map: Path | None = None
+    config: Config = field(default_factory=Config)
+    part: TracePart = field(default_factory=TracePart)
+    force: bool = False
+    dry_run: bool = False
+    block_frames: int = 120
+
+    def as_dict(self) -> dict[str, Any]:
+        """The job as plain values."""
+        return {
+            "store": str(self.store),
+            "road_map": None if self.road_map is None else str(self.road_map),
+            "config": self.config.as_dict(),
+            "part": [self.part.since, self.part.until, self.part.rate],
+            "force": self.force,
+            "dry_run": self.dry_run,
+            "block_frames": self.block_frames,
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """The job that plain values describe."""
+        road_map = values["road_map"]
+        changed: dict[str, Any] = {
+            "store": Path(values["store"]),
+            "road_map": None if road_map is None else Path(road_map),
+            "config": from_dict(values["config"]),
+            "part": TracePart(*values["part"]),
+        }
+        return cls(**(values | changed))
+
+
+# What is counted while a trace is read: frames, entities by kind, and how its clock runs --------
+
+SHOWN: Final = 20
+"""Jumps and gaps that are listed; the others are counted."""
+
+
+@dataclass(slots=True)
+class TraceTally:
+    """Counts of a trace.
+
+    Attributes
+    ----------
+    frames : int
+    kinds : Counter
+        Code of a kind → entities of it.
+    times : array
+        Simulation times of the frames, 8 bytes each; ns.
+    """
+
+    frames: int = 0
+    kinds: Counter[int] = field(default_factory=Counter[int])
+    times: array[int] = field(default_factory=lambda: array("q"))
+
+    def see(self, frames: FrameBlock) -> None:
+        """Count the next frames."""
+        self.frames += len(frames)
+        self.kinds.update(frames.entities.kind.tolist())
+        self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
+
+    @property
+    def entities(self) -> dict[str, int]:
+        """Kind → how many entities there are of it, in the vocabulary's order."""
+        return {KINDS[code]: self.kinds[code] for code in sorted(self.kinds)}
+
+    @property
+    def seconds(self) -> float:
+        """From the first frame to the last; s."""
+        return (self.times[-1] - self.times[0]) / 1e9 if self.times else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """What was counted, as plain values.
+
+        Returns
+        -------
+        dict
+            ``entities``; ``clock_jumps``, ``gaps``: how often the clock runs backwards, or further than 2.5
+            median periods; ``clock_jumps_at``, ``gaps_at``: the first of them, each with the number of the
+            frame behind (``seq``), its time since the trace began (``t``), and the step (``seconds``).
+        """
+        times = np.frombuffer(self.times, np.int64)
+        steps = np.diff(times)
+        forward = steps[steps > 0]
+        period = float(np.median(forward)) if len(forward) else 0.0
+        report: dict[str, Any] = {"entities": self.entities}
+        longest = longest_step_ns(int(max(period, 1)))
+        for name, found in (("clock_jumps", steps < 0), ("gaps", steps > longest)):
+            rows = np.flatnonzero(found)
+            report[name] = len(rows)
+            report[f"{name}_at"] = [
+                {
+                    "seq": row + 1,
+                    "t": int(times[row + 1] - times[0]) / 1e9,
+                    "seconds": int(steps[row]) / 1e9,
+                }
+                for row in rows[:SHOWN].tolist()
+            ]
+        return report
+
+
+# One recording → sealed segments, one for each ego ----------------------------------------------
+
+EGOS_AT_ONCE: Final = 4
+"""Egos whose graphs are built in one pass over a recording: each needs the memory of a segment."""
+
+_VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
+
+
+@dataclass(slots=True)
+class EgoView:
+    """A recording as one ego has it.
+
+    Attributes
+    ----------
+    outcome : TraceOutcome
+    sealed : Path or None
+        Folder of its segment, if one was built.
+    """
+
+    outcome: TraceOutcome
+    sealed: Path | None = None
+
+
+@dataclass(slots=True)
+class _Wanted:
+    """A view that is to be read.
+
+    What is known of the recording, with its ego; the ego's node id, once that is known; whether a frame had it;
+    the frames that have too many pairs.
+    """
+
+    view: EgoView
+    info: TraceInfo
+    node: int = -1
+    met: bool = False
+    crowds: Crowds = field(default_factory=Crowds)
+
+
+class SegmentReader:
+    """Reads recordings, one after another.
+
+    Parameters
+    ----------
+    job : Job
+    on_block : function
+        Called after every block with the frames done, about how many bytes of the file were read, and its size.
+
+    Raises
+    ------
+    MapError
+        The road map that is given cannot be read.
+    """
+
+    def __init__(self, job: Job, on_block: Callable[[int, int, int], None]) -> None:
+        self._job = job
+        self._on_block = on_block
+        self._maps = Maps(job.road_map, job.config.signs)
+        self._file: StoreFile | None = None
+
+    def read(self, path: Path, folder: Path) -> list[EgoView]:
+        """Read a recording; segments are built in folders below the one that is given, which need not exist."""
+        start = time.perf_counter()
+        views: list[EgoView] = []
+        try:
+            self._read(path, folder, views)
+        except SgstoreError as error:
+            views = views or [EgoView(TraceOutcome(path))]
+            for view in views:
+                if view.outcome.status == "failed" and view.outcome.error is None:
+                    view.outcome.error = error
+        for view in views:
+            view.outcome.seconds = time.perf_counter() - start
+        return views
+
+    def _read(self, path: Path, folder: Path, views: list[EgoView]) -> None:
+        job = self._job
+        check_name(path)
+        with open_trace(
+            path,
+            ego=job.config.ego,
+            digest=self._known_digest(path),
+            mapping=job.config.mapping,
+        ) as trace:
+            road_map, odd = self._maps.of(trace.info)
+            lost = lost_lanes(trace.info, road_map)
+            on_map(trace, road_map)
+            wanted = [one for one in self._wanted(trace, views) if self._is_new(one, road_map)]
+            if job.dry_run:
+                for one in wanted:
+                    one.view.outcome.status = "new"
+                    one.view.outcome.warnings += odd
+                    one.view.outcome.losses += lost
+                return
+            for first in range(0, len(wanted), EGOS_AT_ONCE):
+                group = wanted[first : first + EGOS_AT_ONCE]
+                for one in group:
+                    one.view.outcome.warnings += odd
+                    one.view.outcome.losses += lost
+                self._build(trace, group, road_map, folder / str(first))
+
+    # Which views ----------------------------------------------------------------------------------------------
+
+    def _wanted(self, trace: OpenTrace, views: list[EgoView]) -> Iterator[_Wanted]:
+        """The views of a recording that are asked for; one whose ego is not in it has an error."""
+        info, egos = trace.info, self._job.config.egos
+        if not egos:
+            views.append(EgoView(TraceOutcome(info.path, ego=info.ego)))
+            yield _Wanted(views[0], info)
+            return
+        everyone, seen = egos == (ALL_EGOS,), set[str]()
+        for name in self._vehicles(trace) if everyone else egos:
+            view = EgoView(TraceOutcome(info.path, ego=name))
+            views.append(view)
+            try:
+                found = name if everyone else _ident(info, name, self._job.config.mapping)
+            except SgstoreError as error:
+                view.outcome.error = error
+                continue
+            if found in seen:  # two names of one
+                views.pop()
+                continue
+            seen.add(found)
+            view.outcome.ego = found
+            yield _Wanted(view, replace(info, ego=found))
+
+    def _vehicles(self, trace: OpenTrace) -> list[str]:
+        """The ids of all vehicles of a recording."""
+        found: list[str] = []
+        for block in trace.blocks(self._job.block_frames):
+            entities = self._meant(block).entities
+            rows = np.flatnonzero(np.isin(entities.kind, _VEHICLES))
+            found += [entities.ident[row] for row in rows.tolist()]
+        if not found:
+            raise TraceError("no vehicle in it can be the ego", path=trace.info.path)
+        return found
+
+    def _is_new(self, wanted: _Wanted, road_map: RoadMap | None) -> bool:
+        """Whether the store lacks a view, or it is to be read anew."""
+        store, job, outcome = self._store(), self._job, wanted.view.outcome
+        if store is None or job.force:
+            return True
+        part = (job.part.since, job.part.until)
+        try:
+            shown = map_of_graphs(road_map, job.config)
+            name = store.stored(wanted.info, job.config, shown, part)
+        except SgstoreError as error:
+            outcome.error = error
+            return False
+        if name is None:
+            return True
+        outcome.status, outcome.name = "present", name
+        outcome.frames = store.trace(name).frames
+        return False
+
+    def _known_digest(self, path: Path) -> str:
+        """The digest of a file that the store knows by path, size and time of change: it need not be hashed."""
+        store = self._store()
+        return "" if store is None or self._job.force else store.known_digest(path)
+
+    def _store(self) -> StoreFile | None:
+        if self._file is None and self._job.store.exists():
+            self._file = StoreFile(self._job.store)
+        return self._file
+
+    # Building -------------------------------------------------------------------------------------------------
+
+    def _build(
+        self, trace: OpenTrace, group: list[_Wanted], road_map: RoadMap | None, folder: Path
+    ) -> None:
+        """Build the segments of some views in one pass over the recording."""
+        job, size = self._job, self._job.block_frames
+        generator = SceneGraphGenerator(road_map, job.config)
+        tally = TraceTally()
+        blocks = job.part.blocks(map(self._meant, trace.blocks(size)), size)
+        first = next(blocks, None)
+        if first is None:
+            raise TraceError("no frame of it can be read", path=trace.info.path)
+        with ExitStack() as stack:
+            segments: list[Segment] = []
+            for number, one in enumerate(group):
+                place = folder.with_name(f"{folder.name}-{number}")
+                place.mkdir(parents=True)
+                part = (job.part.since, job.part.until)
+                segment = new_segment(
+                    job.store,
+                    one.info,
+                    job.config,
+                    road_map=map_of_graphs(road_map, job.config),
+                    answers=generator.answers,
+                    part=part,
+                    place=Place(place, len(group)),
+                )
+                segments.append(stack.enter_context(segment))
+                one.view.sealed = place
+            while block := first or next(blocks, None):
+                first = None
+                self._append(generator, block, group, segments)
+                tally.see(block)
+                self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
+            self._seal(trace, group, segments, tally, generator.parked)
+
+    def _append(
+        self,
+        generator: SceneGraphGenerator,
+        block: FrameBlock,
+        group: list[_Wanted],
+        segments: list[Segment],
+    ) -> None:
+        # Origins do not depend on the ego, so all segments keep the same numbers.
+        kept, *_ = [segment.as_kept(block) for segment in segments]
+        egos = [kept.ego]
+        if self._job.config.egos:
+            egos = [_ego_of(block, one) for one in group]
+        for piece in generator.pieces(kept, len(egos)):
+            first = int(piece.seq[0] - kept.seq[0]) if len(piece) else 0
+            here = [ego[first : first + len(piece)] for ego in egos]
+            graphs = generator.one_by_one(piece, here)
+            for one, segment in zip(group, segments, strict=True):
+                graph = next(graphs)
+                one.crowds.see(graph)
+                segment.append(graph)
+                del graph  # the next one is made when nobody holds this one
+
+    def _seal(
+        self,
+        trace: OpenTrace,
+        group: list[_Wanted],
+        segments: list[Segment],
+        tally: TraceTally,
+        parked: Codes,
+    ) -> None:
+        report, told = trace.report, tally.as_dict()
+        moot = report.about_ego if self._job.config.egos else []
+        warnings = [warning for warning in report.warnings if warning not in moot]
+        for one, segment in zip(group, segments, strict=True):
+            outcome = one.view.outcome
+            if self._job.config.egos and not one.met:
+                reason = f"the ego {one.info.ego!r} is in none of the frames that were read"
+                outcome.error = TraceError(reason, path=one.info.path)
+                continue
+            outcome.frames = tally.frames
+            outcome.entities = tally.entities
+            outcome.clock_jumps, outcome.gaps = told["clock_jumps"], told["gaps"]
+            outcome.unknown_types = self._job.config.unknown_of(report.unknown_types)
+            outcome.warnings += warnings
+            outcome.losses += [*report.losses, *one.crowds.losses(self._job.config)]
+            kept = replace(report, warnings=outcome.warnings, losses=outcome.losses, about_ego=[])
+            segment.seal(kept, told, parked)
+            outcome.status = "sealed"
+
+    def _meant(self, block: FrameBlock) -> FrameBlock:
+        """The frames, their entities as the client says that type names are meant."""
+        return replace(block, entities=renamed(block.entities, self._job.config.types))
+
+
+def _ident(info: TraceInfo, name: str, mapping: str) -> str:
+    """The id of the ego that a name means, as the reader of the recording understands it."""
+    with open_trace(info.path, ego=name, digest=info.digest, mapping=mapping) as trace:
+        return trace.info.ego
+
+
+def _ego_of(block: FrameBlock, one: _Wanted) -> Ints:
+    """(F,) int64: node id of an ego in each frame, -1 where it is absent."""
+    if one.node < 0 and one.info.ego in block.entities.ident:
+        one.node = block.entities.first + block.entities.ident.index(one.info.ego)
+    here = np.zeros(len(block), np.bool_)
+    here[block.frame_of[block.states.node == one.node]] = True
+    one.met = one.met or bool(here.any())
+    return np.where(here, one.node, -1)
+
+
+def _reached(frames: FrameBlock, size: int) -> int:
+    """About how much of a file has been read with a block."""
+    messages = frames.messages
+    places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
+    return min(int(places.max(initial=0)), size)

@@ -1,0 +1,47 @@
+# The face of this package: what others may import from it.
+
+from ._choose import Selection as Selection
+from ._choose import SelectionSpec as SelectionSpec
+from ._choose import Strategy as Strategy
+from ._choose import listed as listed
+from ._choose import locked_selection as locked_selection
+from ._choose import select as select
+from ._cover import Cover as Cover
+from ._cover import Fitted as Fitted
+from ._cover import minimal as minimal
+from ._cover import within as within
+from ._curve import Curve as Curve
+from ._curve import curve as curve
+from ._sets import SetFamily as SetFamily
+from ._splits import parse_split as parse_split
+from ._splits import split as split
+from ._splits import split_table as split_table
+from ._units import Budget as Budget
+from ._units import Measure as Measure
+from ._units import SelectionUnit as SelectionUnit
+from ._units import Units as Units
+from ._units import units_of as units_of
+
+__all__ = [
+    "Budget",
+    "Cover",
+    "Curve",
+    "Fitted",
+    "Measure",
+    "Selection",
+    "SelectionSpec",
+    "SelectionUnit",
+    "SetFamily",
+    "Strategy",
+    "Units",
+    "curve",
+    "listed",
+    "locked_selection",
+    "minimal",
+    "parse_split",
+    "select",
+    "split",
+    "split_table",
+    "units_of",
+    "within",
+]

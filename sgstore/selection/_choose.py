@@ -1,0 +1,532 @@
+"""Selection strategies, budgets, and locks of a selection.
+
+A budget that is spent unit by unit; what units share is paid once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sgstore.coverage import ReportTable, names_of
+from sgstore.errors import ConfigError
+from sgstore.locks import CasePart, lock_of
+from sgstore.selection._cover import affordable, cheapest, minimal, within
+from sgstore.selection._units import Budget, Measure, SelectionUnit, holdings, kept, units_of
+from sgstore.store import seq_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from sgstore.coverage import ChosenFrames
+    from sgstore.locks import Lock
+    from sgstore.selection._units import Holdings, Units
+    from sgstore.world import Bools, Floats, Ints
+
+
+ROUNDING = 1 + 1e-12
+"""Sums of costs may be a hair above a budget that they meet."""
+
+
+@dataclass
+class BudgetTracker:
+    """What is left of a budget, and what was bought.
+
+    Attributes
+    ----------
+    units : Units
+    cost : (U,) float64
+        What each unit costs alone.
+    weights : (N,) float64 or None
+        What each frame costs, where units share frames.
+    bought : (N,) bool
+    spent : float
+    left : float
+    """
+
+    units: Units
+    cost: Floats
+    weights: Floats | None
+    bought: Bools
+    spent: float
+    left: float
+
+    @classmethod
+    def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
+        """A full purse."""
+        shared = units.overlap and measure is not Measure.units
+        weights = units.weights(measure) if shared else None
+        nothing = np.zeros(len(units.frame_id), np.bool_)
+        return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
+
+    def prices(self, some: Ints) -> Floats:
+        """What each of some units would cost now; 0: all of it was bought with others."""
+        if self.weights is None:
+            return self.cost[some]
+        begin, end = self.units.begin[some].tolist(), self.units.end[some].tolist()
+        rows = (slice(low, high) for low, high in zip(begin, end, strict=True))
+        return np.array([self.weights[own][~self.bought[own]].sum() for own in rows])
+
+    def buy(self, one: int, price: float) -> None:
+        """Take a unit."""
+        self.bought[self.units.begin[one] : self.units.end[one]] = True
+        self.spent += price
+        self.left -= price
+
+    def fitting(self, order: Ints, most: float = np.inf) -> Ints:
+        """Buy units in order, up to so much; what does not fit any more, or brings no frame, is passed over."""
+        found: list[int] = []
+        end = max(self.left - most * ROUNDING, 0.0)
+        cost = self.cost[order]
+        smallest = np.minimum.accumulate(cost[::-1])[::-1] if self.weights is None else None
+        for place, (one, alone) in enumerate(zip(order.tolist(), cost.tolist(), strict=True)):
+            room = self.left - end
+            if room <= 0 or (smallest is not None and smallest[place] > room):
+                break
+            price = (
+                alone if self.weights is None else float(self.prices(order[place : place + 1])[0])
+            )
+            if 0 < price <= room:
+                found.append(one)
+                self.buy(one, price)
+        return np.array(found, np.int64)
+
+
+# Which units are selected: all, few that keep everything, some of each class or stratum, the rarest first
+# ------------------------------------------------------------------------------------------------
+
+
+class Strategy(StrEnum):
+    """How units are chosen."""
+
+    every = "every"
+    minimal = "minimal"
+    per_class = "per-class"
+    rarest = "rarest"
+    stratify = "stratify"
+
+
+@dataclass(frozen=True)
+class SelectionSpec:
+    """What is to be selected.
+
+    Attributes
+    ----------
+    way : Strategy
+    piece : SelectionUnit
+    clip_s : float
+        Length of clips; s.
+    abstraction : str
+    combos : int
+        0: classes are to be kept; k: combinations of k features.
+    of_ego : bool
+        Whether only features of the ego count, and of lanes by how they lie to it.
+    each : int
+        In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
+    by : str
+        Expression whose value is the stratum of a frame.
+    temper : float
+        A stratum gets a share of the budget as the power of its size: 1 as it is, 0 the same for all.
+    budget : Budget or None
+    least : Measure
+        What is to be as little as possible.
+    seed : int
+    stride_s : float or None
+        From the beginning of one clip to that of the next; s. If that is less than their length, clips overlap.
+        ``None``: the length.
+    """
+
+    way: Strategy = Strategy.every
+    piece: SelectionUnit = SelectionUnit.frame
+    clip_s: float = 2.0
+    abstraction: str = "RSV"
+    combos: int = 0
+    of_ego: bool = False
+    each: int = 1
+    by: str = ""
+    temper: float = 1.0
+    budget: Budget | None = None
+    least: Measure = Measure.units
+    seed: int = 0
+    stride_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning.
+
+        Raises
+        ------
+        ConfigError
+        """
+        if self.way is Strategy.stratify and not (self.budget or self.each):
+            raise ConfigError("strata need a budget (--budget 600s), or a number (--per-class 10)")
+        if (
+            self.way is Strategy.per_class
+            and self.each > 1
+            and (self.stride_s or math.inf) < self.clip_s
+        ):
+            raise ConfigError(
+                "clips that overlap share frames, so a class that is in two of them may have come once:"
+                " to have each class several times, leave out --stride"
+            )
+        if not 0 <= self.temper <= 10:
+            raise ConfigError(
+                f"--temper {self.temper:g}; expected 0 (the same for all) to 1 (as they are)"
+            )
+
+    def as_dict(self, query: str) -> dict[str, Any]:
+        """All of it as plain values, as a lock says it."""
+        cover = self.way in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
+        return {
+            "query": query or None,
+            "way": self.way.value,
+            "unit": self.piece.value,
+            "clip_s": self.clip_s if self.piece is SelectionUnit.clip else None,
+            "stride_s": self.stride_s if self.piece is SelectionUnit.clip else None,
+            "abstraction": self.abstraction if cover else None,
+            "combos": self.combos if cover else None,
+            "of_ego": self.of_ego if cover and self.combos else None,
+            "each": self.each if self.way in {Strategy.per_class, Strategy.stratify} else None,
+            "by": self.by or None,
+            "temper": self.temper if self.way is Strategy.stratify else None,
+            "budget": None if self.budget is None else str(self.budget),
+            "least": self.least.value if cover else None,
+            "seed": self.seed,
+        }
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Units that were selected.
+
+    Attributes
+    ----------
+    wish : SelectionSpec
+    units : Units
+    picked : int64
+        Numbers of units, in the order in which they were chosen.
+    holdings : Holdings or None
+        What units hold, if that was asked.
+    result : dict
+        What is known of the choice: ``cost``, ``bound``, …; plain values, the same for the same recordings.
+    said : list of str
+        The same in sentences.
+    strata : dict
+        Of each stratum, by its value: units, and units that were chosen.
+    """
+
+    wish: SelectionSpec
+    units: Units
+    picked: Ints
+    holdings: Holdings | None = None
+    result: dict[str, Any] = field(default_factory=dict[str, Any])
+    said: list[str] = field(default_factory=list[str])
+    strata: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
+
+
+def select(chosen: ChosenFrames, wish: SelectionSpec) -> Selection:
+    """Select units of some frames.
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction.
+    ConfigError
+        What is wished for has no meaning, or is too large to be gone through.
+    QueryError, ExportError
+        The expression of the strata is none.
+    """
+    units = units_of(chosen, wish.piece, wish.clip_s, wish.stride_s)
+    if not len(units):
+        said = [f"{chosen.text}: no frame to select from"]
+        return Selection(
+            wish, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
+        )
+    found = _selected(wish, units, units.ranks(wish.seed))
+    if not units.overlap:
+        return found
+    frames, seconds = (units.together(found.picked, m) for m in (Measure.frames, Measure.seconds))
+    said = (
+        f"together {_number(frames)} of {len(units.frame_id):,} frames, {_number(seconds)} s: what clips share"
+        " counts once"
+    )
+    result = found.result | {"frames": int(frames), "seconds": round(seconds, 6)}
+    return replace(found, result=result, said=[*found.said, said])
+
+
+def _selected(wish: SelectionSpec, units: Units, rank: Ints) -> Selection:
+    match wish.way:
+        case Strategy.every:
+            return _every(wish, units, rank)
+        case Strategy.stratify:
+            return _stratified(wish, units, rank)
+        case _:
+            held = holdings(units, wish.abstraction, wish.combos, of_ego=wish.of_ego)
+            if wish.way is Strategy.rarest:
+                return _rarest(wish, units, rank, held)
+            return _covering(wish, units, rank, held)
+
+
+def _every(wish: SelectionSpec, units: Units, rank: Ints) -> Selection:
+    """All units, or units at random until the budget is used up."""
+    picked = np.arange(len(units))
+    if wish.budget is not None:
+        purse = BudgetTracker.of(units, wish.budget.measure, wish.budget.most)
+        picked = purse.fitting(np.argsort(rank))
+        picked = picked if picked.size < len(units) else np.arange(len(units))
+    return Selection(wish, units, picked, result={"units": len(picked), "of": len(units)})
+
+
+def _covering(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
+    each = wish.each if wish.way is Strategy.per_class else 1
+    shared = units.overlap
+    if shared and wish.least is not Measure.units:
+        cover = cheapest(units, held, wish.least, rank)
+    else:
+        cover = minimal(held.family(units, units.costs(wish.least), each, rank))
+    result = _said_of(held, units, wish)
+    met = _met(held, units, cover.chosen)
+    bound = cover.bound if wish.least is not Measure.units else round(cover.bound)
+    result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound, "exact": cover.exact}
+    result["greedy"] = cover.greedy
+    said = [
+        f"{len(cover.chosen)} of {len(units)} {units.piece}s keep all {held.total} {held.kind}"
+        + (f", each in {each} {units.piece}s or in all that have it" if each > 1 else ""),
+        f"{wish.least}: {_number(cover.cost)}; lower bound {_number(bound)}, so "
+        + (
+            "there is none smaller"
+            if cover.exact
+            else f"at most {_above(cover.cost, bound)} too many"
+        )
+        + f" (greedy choice alone: {_number(cover.greedy)})",
+    ]
+    budget = wish.budget
+    if budget is None:
+        return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
+    whole = units.together(cover.chosen, budget.measure)
+    if whole <= budget.most * ROUNDING:
+        said.append(f"that is {_number(whole)} {budget.measure}, within {budget}")
+        return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
+    if shared and budget.measure is not Measure.units:
+        fitted = affordable(units, held, budget.measure, rank, budget.most * ROUNDING)
+    else:
+        family = held.family(units, units.costs(budget.measure), each, rank)
+        fitted = within(family, budget.most * ROUNDING)
+    reached = _met(held, units, fitted.chosen)
+    result = _said_of(held, units, wish) | {
+        "units": len(fitted.chosen),
+        "cost": fitted.cost,
+        "kept": reached,
+        "met": fitted.met,
+        "at_most": int(fitted.most + 1e-6),
+    }
+    said = [
+        f"within {budget}: {len(fitted.chosen)} of {len(units)} {units.piece}s keep {reached} of"
+        f" {held.total} {held.kind}"
+        + (f" ({fitted.met} of each up to {each} times)" if each > 1 else ""),
+        f"upper bound: no choice within the budget meets more than {int(fitted.most + 1e-6)}"
+        f" (this one: {fitted.met}); all would take {_number(whole)} {budget.measure}"
+        " with the smallest set that is known",
+    ]
+    return Selection(wish, units, fitted.chosen, held, result, said)
+
+
+def _said_of(held: Holdings, units: Units, wish: SelectionSpec) -> dict[str, Any]:
+    return {"of": len(units), "elements": held.total, "kind": held.kind, "least": wish.least.value}
+
+
+def _met(held: Holdings, units: Units, picked: Ints) -> int:
+    """How many elements some units hold."""
+    taken = np.zeros(len(units), np.bool_)
+    taken[picked] = True
+    return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if value == round(value) else f"{value:,.2f}"
+
+
+def _above(cost: float, bound: float) -> str:
+    return f"{_number(cost - bound)} ({(cost - bound) / bound:.1%})" if bound else _number(cost)
+
+
+def _rarest(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
+    """For each class that no unit has yet, the rarest first, the unit that brings most besides."""
+    measure = wish.budget.measure if wish.budget else wish.least
+    purse = BudgetTracker.of(units, measure, wish.budget.most if wish.budget else np.inf)
+    family = held.family(units, purse.cost, 1, rank)
+    starts, sets = family.by_element()
+    there = np.zeros(len(held.frames), np.bool_)
+    picked: list[int] = []
+    for element in np.lexsort((np.arange(len(held.frames)), held.frames)).tolist():
+        if there[element]:
+            continue
+        options = sets[starts[element] : starts[element + 1]]
+        price = purse.prices(options)
+        options, price = options[price <= purse.left], price[price <= purse.left]
+        if not len(options):
+            continue
+        gain = np.array([(~there[family.elements(one)]).sum() for one in options.tolist()])
+        best = int(np.lexsort((rank[options], -gain / price))[0])
+        picked.append(int(options[best]))
+        purse.buy(picked[-1], float(price[best]))
+        there[family.elements(picked[-1])] = True
+    reached = int(held.weight[there].sum())
+    used = purse.spent
+    said = [
+        f"the rarest first: {len(picked)} of {len(units)} {units.piece}s"
+        f" ({_number(used)} {measure}) keep {reached} of {held.total} {held.kind}"
+    ]
+    result = _said_of(held, units, wish) | {"units": len(picked), "cost": used, "kept": reached}
+    return Selection(wish, units, np.array(picked, np.int64), held, result, said)
+
+
+def _stratified(wish: SelectionSpec, units: Units, rank: Ints) -> Selection:
+    stratum, names = _strata(wish, units)
+    order = np.lexsort((rank, stratum))
+    size = np.bincount(stratum, minlength=len(names))
+    if wish.budget is None:
+        within_own = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
+        picked = order[within_own < wish.each]
+    else:
+        purse = BudgetTracker.of(units, wish.budget.measure, wish.budget.most)
+        share = size.astype(np.float64) ** wish.temper
+        share = share / max(share.sum(), 1e-12)
+        picked = _allotted(order, stratum, purse, share * wish.budget.most, rank)
+    taken = np.bincount(stratum[picked], minlength=len(names))
+    strata = {
+        name: (int(all_), int(some))
+        for name, all_, some in zip(names, size.tolist(), taken.tolist(), strict=True)
+    }
+    said = [f"{len(picked)} of {len(units)} {units.piece}s, of {len(names)} strata by {wish.by}"]
+    result = {
+        "units": len(picked),
+        "of": len(units),
+        "strata": {n: list(v) for n, v in strata.items()},
+    }
+    return Selection(wish, units, picked, None, result, said, strata)
+
+
+def _allotted(order: Ints, stratum: Ints, purse: BudgetTracker, shares: Floats, rank: Ints) -> Ints:
+    """Each stratum up to its share; then, of what is left of the budget, units at random."""
+    within_share: list[Ints] = []
+    used = np.zeros(len(shares))
+    for number, share in enumerate(shares.tolist()):
+        before = purse.spent
+        within_share.append(purse.fitting(order[stratum[order] == number], share))
+        used[number] = purse.spent - before
+    picked = np.concatenate([np.zeros(0, np.int64), *within_share])
+    # Shares are rarely a whole number of units: the rest goes to those strata that are furthest below theirs.
+    others = np.setdiff1d(order, picked)
+    lack = (shares - used)[stratum[others]] / purse.cost[others]
+    others = others[np.lexsort((rank[others], -lack))]
+    first = np.unique(stratum[others], return_index=True)[1]
+    return np.concatenate([picked, purse.fitting(others[np.sort(first)])])
+
+
+def _strata(wish: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
+    """The stratum of each unit, the value that most of its frames have; and all values."""
+    from sgstore.exporters import Labels
+
+    asked = np.flatnonzero(units.asked)
+    labels = Labels.asked(units.chosen.store, {"stratum": wish.by}, units.frame_id[asked])
+    values = labels.of(units.frame_id[asked])["stratum"]
+    names = sorted({_value(value) for value in values})
+    number = {name: i for i, name in enumerate(names)}
+    code = np.full(len(units.frame_id), -1)
+    code[asked] = [number[_value(value)] for value in values]
+    stratum = np.zeros(len(units), np.int64)
+    for unit, row in units.members():
+        known = code[row] >= 0
+        key, often = np.unique(unit[known] * len(names) + code[row[known]], return_counts=True)
+        of, value = np.divmod(key, len(names))
+        best = np.lexsort((value, -often, of))
+        first = best[np.unique(of[best], return_index=True)[1]]
+        stratum[of[first]] = value[first]
+    return stratum, names
+
+
+def _value(value: Any) -> str:
+    """A value as a stratum is called."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def listed(selection: Selection) -> ReportTable:
+    """The units that were chosen, in the order in which they were.
+
+    Returns
+    -------
+    ReportTable
+        ``unit`` (``TRACE#FIRST-LAST``, as a lock calls it), ``frames``, and, if it was asked what units hold,
+        ``holds`` and ``new``: of these, how many no unit before it has.
+    """
+    units, held = selection.units, selection.holdings
+    first = names_of(units.chosen.store, units.first[selection.picked])
+    last = seq_of(units.last[selection.picked]).tolist()
+    frames = units.sizes[selection.picked].tolist()
+    names = [
+        name if name.rpartition("#")[2] == str(end) else f"{name}-{end}"
+        for name, end in zip(first, last, strict=True)
+    ]
+    if held is None:
+        return ReportTable(("unit", "frames"), list(zip(names, frames, strict=True)))
+    unit, element = held.pairs
+    has = np.bincount(unit, held.weight[element], len(units)).astype(np.int64)
+    so_far = kept(held.pairs, held.weight, selection.picked, len(units))
+    new = np.diff(so_far, prepend=0).tolist()
+    rows = zip(names, frames, has[selection.picked].tolist(), new, strict=True)
+    return ReportTable(("unit", "frames", "holds", "new"), list(rows))
+
+
+# A selection as a lock --------------------------------------------------------------------------
+
+
+def locked_selection(
+    selection: Selection,
+    query: str = "",
+    parts: Mapping[int, str] | None = None,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    payloads: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Lock:
+    """The lock of a selection.
+
+    Parameters
+    ----------
+    selection : Selection
+    query : str
+        The query whose frames were selected from; empty: all.
+    parts : mapping of int to str, optional
+        The part that each unit belongs to: :func:`sgstore.selection._splits.split`.
+    parameters : mapping, optional
+        Values of ``$name`` in the query.
+    payloads : bool
+        Whether the messages of the recordings count, too; then they must be there.
+    progress : callable, optional
+        Called with the number of cases done and of all.
+
+    Raises
+    ------
+    TraceError
+        A recording is gone, was replaced, or is damaged.
+    """
+    units = selection.units
+    wanted = [
+        CasePart(
+            units.frame_id[units.begin[unit] : units.end[unit]],
+            units.log_time_ns[units.begin[unit] : units.end[unit]],
+            (parts or {}).get(unit, ""),
+        )
+        for unit in sorted(selection.picked.tolist())
+    ]
+    how = selection.wish.as_dict(query)
+    how |= {"parameters": dict(parameters or {}), "result": dict(selection.result)}
+    return lock_of(units.chosen.store, wanted, how, payloads=payloads, progress=progress)

@@ -1,0 +1,471 @@
+"""What is selected: frames, clips or whole traces; and what each of them holds."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.coverage import UNKNOWN, classed, combined, features, is_of_ego, periods_of, run_begins
+from sgstore.errors import ConfigError
+from sgstore.selection._sets import SetFamily, distinct, spread
+from sgstore.store import lengths_of_messages, trace_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.coverage import ChosenFrames, Classed, Combinations
+    from sgstore.world import Bools, Floats, Ints
+
+
+MOST: Final = 150_000_000
+"""Most memberships of elements in units that are held at once: more are an error, not a part of the answer."""
+
+_CELLS: Final = 50_000_000
+"""Truth values that are looked at together."""
+
+
+class SelectionUnit(StrEnum):
+    """What is chosen or not: a frame, consecutive frames of some seconds, a whole trace."""
+
+    frame = "frame"
+    clip = "clip"
+    trace = "trace"
+
+
+class Measure(StrEnum):
+    """What a selection costs."""
+
+    units = "units"
+    frames = "frames"
+    seconds = "seconds"
+    bytes = "bytes"
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much may be selected.
+
+    Attributes
+    ----------
+    most : float
+    measure : Measure
+    """
+
+    most: float
+    measure: Measure
+
+    @classmethod
+    def parse(cls, text: str) -> Budget:
+        """``600s``, ``10min``, ``2h``, ``5GB``, ``300MiB``, ``1000frames``, ``40units`` as a budget.
+
+        Raises
+        ------
+        ConfigError
+            It is none of these, or nothing at all.
+        """
+        found = _BUDGET.fullmatch(text)
+        if found is None or float(found[1]) <= 0 or found[2].lower() not in _MEASURES:
+            raise ConfigError(
+                f"not a budget: {text!r}; expected 600s, 10min, 2h, 5GB, 300MiB, 1000frames or 40units"
+            )
+        factor, measure = _MEASURES[found[2].lower()]
+        return cls(float(found[1]) * factor, measure)
+
+    def __str__(self) -> str:
+        return f"{self.most:g} {self.measure}"
+
+
+_BUDGET: Final = re.compile(r"\s*(\d{1,15}(?:\.\d+)?)\s*([A-Za-z]+)\s*")
+_BYTES: Final = {
+    f"{prefix}{ending}": (base ** (power + 1), Measure.bytes)
+    for ending, base in (("b", 1000), ("ib", 1024))
+    for power, prefix in enumerate("kmgt")
+}
+_MEASURES: Final[dict[str, tuple[float, Measure]]] = {
+    "s": (1, Measure.seconds),
+    "min": (60, Measure.seconds),
+    "h": (3600, Measure.seconds),
+    "b": (1, Measure.bytes),
+    **_BYTES,
+    **{
+        name: (1, measure)
+        for measure in (Measure.frames, Measure.units)
+        for name in (measure.value, measure.value[:-1])
+    },
+}
+
+
+@dataclass(frozen=True)
+class Units:
+    """Frames in units, which may overlap.
+
+    Attributes
+    ----------
+    chosen : ChosenFrames
+        The frames that were asked for.
+    piece : SelectionUnit
+    frame_id : (N,) int64
+        The frames of all units, ascending.
+    asked : (N,) bool
+        Whether a frame is one that was asked for: only these count. Others are in whole traces.
+    log_time_ns : (N,) int64
+    begin, end : (U,) int64
+        The rows of each unit, the last one not included; both ascend, and each row is in a unit.
+    """
+
+    chosen: ChosenFrames
+    piece: SelectionUnit
+    frame_id: Ints
+    asked: Bools
+    log_time_ns: Ints
+    begin: Ints
+    end: Ints
+
+    def __len__(self) -> int:
+        return len(self.begin)
+
+    @property
+    def overlap(self) -> bool:
+        """Whether a frame is in several units."""
+        return bool((self.begin[1:] < self.end[:-1]).any())
+
+    @property
+    def sizes(self) -> Ints:
+        """(U,): how many frames each unit has."""
+        return self.end - self.begin
+
+    @property
+    def first(self) -> Ints:
+        """(U,): ids of the first frames of the units."""
+        return self.frame_id[self.begin]
+
+    @property
+    def last(self) -> Ints:
+        """(U,): ids of their last frames."""
+        return self.frame_id[self.end - 1]
+
+    def rows_of(self, picked: Ints) -> Ints:
+        """Rows of the frames of some units, ascending, each once."""
+        step = np.zeros(len(self.frame_id) + 1, np.int64)
+        np.add.at(step, self.begin[picked], 1)
+        np.add.at(step, self.end[picked], -1)
+        return np.flatnonzero(np.cumsum(step)[:-1])
+
+    def members(self) -> Iterator[tuple[Ints, Ints]]:
+        """Units and rows of their frames, unit after unit, whole units at a time."""
+        ends = np.cumsum(self.sizes)
+        low = 0
+        while low < len(self):
+            base = int(ends[low] - self.sizes[low])
+            high = max(int(np.searchsorted(ends, base + _CELLS // 10, side="right")), low + 1)
+            unit, row = spread(self.begin[low:high], self.end[low:high])
+            yield low + unit, row
+            low = high
+
+    def weights(self, measure: Measure) -> Floats:
+        """(N,): what each frame costs; it lasts the median period of its trace."""
+        match measure:
+            case Measure.units | Measure.frames:
+                return np.ones(len(self.frame_id))
+            case Measure.seconds:
+                return periods_of(self.chosen.store, self.frame_id) / 1e9
+            case Measure.bytes:
+                found = np.zeros(len(self.frame_id))
+                for frame_id, length in lengths_of_messages(self.chosen.store.file, self.frame_id):
+                    np.add.at(found, np.searchsorted(self.frame_id, frame_id), length)
+                return found
+
+    def costs(self, measure: Measure) -> Floats:
+        """(U,): what each unit costs alone."""
+        if measure is Measure.units:
+            return np.ones(len(self))
+        return self.summed(self.weights(measure), measure)
+
+    def summed(self, weights: Floats, measure: Measure) -> Floats:
+        """(U,): the weights of the frames of each unit; nothing is free."""
+        if not len(self):
+            return np.zeros(0)
+        ranges = np.stack([self.begin, self.end], axis=1).ravel()
+        found = np.add.reduceat(np.append(weights, 0.0), ranges)[::2]
+        # A trace of one frame has no period, a frame perhaps no message.
+        return np.maximum(found, 1e-3 if measure is Measure.seconds else 1.0)
+
+    def together(self, picked: Ints, measure: Measure) -> float:
+        """What some units cost together: a frame that is in several of them costs once."""
+        if measure is Measure.units:
+            return float(len(picked))
+        if not self.overlap:
+            return float(self.costs(measure)[picked].sum())
+        return float(self.weights(measure)[self.rows_of(picked)].sum())
+
+    def ranks(self, seed: int) -> Ints:
+        """(U,): an order of the units at random, the same in every store that has the same traces."""
+        mixed = _mixed(self.first.astype(np.uint64) + np.uint64(seed * int(_STEP) % (1 << 64)))
+        order = np.lexsort((self.first, mixed))
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order))
+        return rank
+
+
+_STEP: Final = np.uint64(0x9E3779B97F4A7C15)
+
+
+def _mixed(
+    words: np.ndarray[tuple[int], np.dtype[np.uint64]],
+) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    """SplitMix64 (Steele, Lea, Flood, 2014)."""
+    words = words + _STEP
+    words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return words ^ (words >> np.uint64(31))
+
+
+def units_of(
+    chosen: ChosenFrames, piece: SelectionUnit, clip_s: float = 2.0, stride_s: float | None = None
+) -> Units:
+    """The units of some frames.
+
+    A clip is a part of a run of consecutive frames that were asked for, of a given time. The first one begins
+    with the run, the others a stride after one another, until one reaches the end of the run; that one may be
+    shorter. A step in time of more than 2.5 median periods ends a run. A trace is taken whole if one of its
+    frames was asked for.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    piece : SelectionUnit
+    clip_s : float
+        Length of clips; s.
+    stride_s : float, optional
+        From the beginning of one clip to that of the next; s. Shorter than they are long, they overlap. By
+        default as long.
+
+    Raises
+    ------
+    ConfigError
+        Clips would have no length, or frames would lie between them.
+    """
+    stride_s = clip_s if stride_s is None else stride_s
+    if not clip_s > 0:
+        raise ConfigError(f"clips of {clip_s:g} s; expected a time above zero, such as 2s")
+    if not 0 < stride_s <= clip_s:
+        raise ConfigError(
+            f"clips of {clip_s:g} s that begin every {stride_s:g} s: expected a time above zero, and no longer"
+            " than a clip, so that every frame is in one"
+        )
+    found = chosen.store.file.arrays(
+        "SELECT frame_id, time_ns, log_time_ns FROM frames ORDER BY frame_id"
+    )
+    frame_id, time_ns, log_time_ns = (column.astype(np.int64) for column in found.values())
+    rows = chosen.rows_of(frame_id)
+    asked = np.zeros(len(frame_id), np.bool_)
+    asked[rows] = True
+    if piece is SelectionUnit.trace:
+        rows = np.flatnonzero(np.isin(trace_of(frame_id), trace_of(frame_id[rows])))
+    each = np.arange(len(rows))
+    own = Units(chosen, piece, frame_id[rows], asked[rows], log_time_ns[rows], each, each + 1)
+    if piece is SelectionUnit.frame or not len(rows):
+        return own
+    if piece is SelectionUnit.clip:
+        begin, end = _clips(own, time_ns[rows], clip_s, stride_s)
+    else:
+        begin, end = _ranges(np.append(True, np.diff(trace_of(own.frame_id)) != 0))
+    return replace(own, begin=begin, end=end)
+
+
+def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
+    """Where ranges begin and end whose first rows are known."""
+    begin = np.flatnonzero(fresh)
+    return begin, np.append(begin[1:], len(fresh))
+
+
+def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tuple[Ints, Ints]:
+    """Where clips begin and end."""
+    period = periods_of(frames.chosen.store, frames.frame_id)
+    fresh = run_begins(frames.chosen.store, frames.frame_id, time_ns)
+    starts, ends = _ranges(fresh)
+    run = np.cumsum(fresh) - 1
+    # Frames stand at whole periods, more or less: what is a hair early belongs to the next clip.
+    since = time_ns - time_ns[starts][run] + (period * 0.25).astype(np.int64)
+    length, stride = max(round(clip_s * 1e9), 1), max(round(stride_s * 1e9), 1)
+    part = since // stride
+    fresh[1:] |= part[1:] != part[:-1]
+    begin = np.flatnonzero(fresh)
+    # Runs one after another on one axis of time, so far apart that no clip of one reaches the next.
+    far = np.cumsum(since[ends - 1] + 2 * length) - since[ends - 1]
+    end = np.searchsorted(since + far[run], far[run[begin]] + part[begin] * stride + length)
+    reaches = end == ends[run[begin]]
+    kept = ~reaches | np.append(True, ~reaches[:-1] | (run[begin][1:] != run[begin][:-1]))
+    return begin[kept], end[kept].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Holdings:
+    """What units hold: classes, or combinations of features.
+
+    Attributes
+    ----------
+    classed : Classed
+        The frames with their classes.
+    pairs : (2, M) int64
+        Units, and the elements that each holds; each pair once, in order.
+    weight : (E,) int64
+        How many combinations an element stands for: those that are in the same frames are one.
+    frames : (E,) int64
+        Frames that were asked for with each.
+    kind : str
+        What the elements are.
+    has : (C, E) bool or None
+        Elements of the classes that occur; ``None``: they are the elements.
+    """
+
+    classed: Classed
+    pairs: Ints
+    weight: Ints
+    frames: Ints
+    kind: str
+    has: Bools | None = None
+
+    @property
+    def total(self) -> int:
+        """How many classes or combinations there are."""
+        return int(self.weight.sum())
+
+    def family(self, units: Units, cost: Floats, need: int, rank: Ints) -> SetFamily:
+        """The units as sets of their elements."""
+        found = SetFamily.of(self.pairs, len(units), len(self.frames), cost, need, rank)
+        return replace(found, weight=self.weight)
+
+    def over(self, units: Units) -> Holdings:
+        """The same of other units of the same frames."""
+        pairs = _classes_of(units, self.classed)
+        return replace(self, pairs=pairs if self.has is None else _of_units(pairs, self.has))
+
+
+def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = False) -> Holdings:
+    """What units hold: their classes, or the combinations of so many features that occur in their frames.
+
+    Parameters
+    ----------
+    units : Units
+    abstraction : str
+    combos : int
+        0: classes.
+    of_ego : bool
+        Whether only features count that speak of the ego, or of a lane by how it lies to the ego.
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction.
+    ConfigError
+        There are more combinations, or combinations in units, than can be gone through.
+    """
+    of = classed(units.chosen, abstraction)
+    pairs = _classes_of(units, of)
+    if not combos:
+        sizes = of.sizes()[of.present()]
+        return Holdings(of, pairs, np.ones_like(sizes), sizes, f"classes in {abstraction}")
+    own = features(of, abstraction)
+    if of_ego:
+        keep = [i for i, name in enumerate(own.names) if is_of_ego(name)]
+        names = tuple(own.names[i] for i in keep)
+        own = replace(own, names=names, counts=own.counts[:, keep])
+    found = combined(own, combos)
+    inside, weight, frames = _distinct_combinations(found)
+    kind = f"combinations of {combos} features{' of the ego' if of_ego else ''} in {abstraction}"
+    return Holdings(of, _of_units(pairs, inside), weight, frames, kind, inside)
+
+
+def _classes_of(units: Units, of: Classed) -> Ints:
+    """(2, M): units, and the classes that occur, counted from 0, that each holds."""
+    present = of.present()
+    number = np.full(len(of.names) + 1, UNKNOWN)
+    number[present] = np.arange(len(present))
+    code = np.full(len(units.frame_id), UNKNOWN)
+    code[np.searchsorted(units.frame_id, of.frame_id)] = number[of.code]
+    held = 0
+    parts: list[Ints] = []
+    for unit, row in units.members():
+        known = code[row] != UNKNOWN
+        key = distinct(unit[known] * max(len(present), 1) + code[row[known]])
+        parts.append(np.stack(np.divmod(key, max(len(present), 1))))
+        held += len(key)
+        if held > MOST:
+            raise ConfigError(f"more than {MOST:,} classes in units: ask for a longer stride")
+    return np.concatenate(parts, axis=1) if parts else np.zeros((2, 0), np.int64)
+
+
+def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
+    """Combinations by the classes that have them: (classes, E), how many are alike, and frames of each."""
+    has = found.features.there
+    there = np.flatnonzero(found.frames)
+    number: dict[bytes, int] = {}
+    weight: list[int] = []
+    frames: list[int] = []
+    step = max(_CELLS // max(len(has), 1), 1)
+    for low in range(0, len(there), step):
+        part = there[low : low + step]
+        inside = np.ones((len(has), len(part)), np.bool_)
+        for column in found.members[part].T:
+            inside &= has[:, column]
+        for row, many in zip(
+            np.packbits(inside, axis=0).T, found.frames[part].tolist(), strict=True
+        ):
+            place = number.setdefault(row.tobytes(), len(number))
+            if place == len(weight):
+                weight.append(0)
+                frames.append(many)
+            weight[place] += 1
+    if len(number) * len(has) > 40 * _CELLS:
+        raise ConfigError(
+            f"{len(number):,} combinations in {len(has):,} classes: too many to go through; ask for"
+            " a smaller k, or for an abstraction with fewer labels"
+        )
+    rows = np.frombuffer(b"".join(number), np.uint8).reshape(len(number), -1)
+    inside = np.unpackbits(rows, axis=1, count=len(has)).T.astype(np.bool_)
+    return inside, np.array(weight, np.int64), np.array(frames, np.int64)
+
+
+def _of_units(pairs: Ints, has: Bools) -> Ints:
+    """Units and their elements, of units and their classes, and of classes and their elements."""
+    held = 0
+    parts: list[Ints] = []
+    unit, row = pairs
+    step = max(_CELLS // max(has.shape[1], 1), 1)
+    for low, high in _whole_units(unit, step):
+        first = np.flatnonzero(np.append(True, np.diff(unit[low:high]) != 0))
+        which, element = np.nonzero(np.logical_or.reduceat(has[row[low:high]], first, axis=0))
+        held += len(which)
+        if held > MOST:
+            raise ConfigError(
+                f"more than {MOST:,} combinations in units: ask for a smaller k, for longer clips, or for an"
+                " abstraction with fewer labels"
+            )
+        parts.append(np.stack([unit[low:high][first][which], element]))
+    return np.concatenate(parts, axis=1) if parts else np.zeros((2, 0), np.int64)
+
+
+def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
+    """Ranges of rows that end where a unit ends, about ``step`` long."""
+    low = 0
+    while low < len(unit):
+        high = int(np.searchsorted(unit, unit[min(low + step, len(unit)) - 1], side="right"))
+        yield low, high
+        low = high
+
+
+def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
+    """How many elements are kept after each of some units."""
+    place = np.full(units, -1)
+    place[picked] = np.arange(len(picked))
+    rows = place[pairs[0]] >= 0
+    elements, where = pairs[1][rows], place[pairs[0][rows]]
+    order = np.lexsort((where, elements))
+    first = order[np.unique(elements[order], return_index=True)[1]]
+    gained = np.bincount(where[first], weight[elements[first]], minlength=len(picked))
+    return np.cumsum(gained).astype(np.int64)

@@ -1,0 +1,753 @@
+"""Online generation: plain frames in, one scene graph after another out.
+
+Frames from plain values: what a client, or a recording, says of one instant.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections import OrderedDict
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from sgstore.geometry import wrapped
+from sgstore.graph import EdgeColumns, LaneDistances, SceneGraph
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    KIND_CODE,
+    KINDS,
+    LIGHT_STATE_CODE,
+    LIGHT_STATES,
+    MAP_KINDS,
+    RELATION_CODE,
+    RELATIONS,
+    SPECIALS,
+    VEHICLE_LIGHTS,
+    kind_named,
+    suggestion,
+)
+from sgstore.world import (
+    POSE,
+    Entities,
+    FrameBlock,
+    MessageRefs,
+    Origin,
+    States,
+    number,
+    origin_of,
+    quantize,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.vocabulary import TypeMeaning
+    from sgstore.world import Codes, Floats, Ints
+
+    Attributes = dict[str, Any]
+    Edge = tuple[int, str, int, Attributes]
+
+__all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper"]
+
+
+_NAN: Final = math.nan
+NUMBERS: Final = (*POSE, "steer", "throttle", "brake")
+WHOLE: Final = ("lights", "light_state", "derived")
+"""Columns of :attr:`Entity.numbers` and of :attr:`Entity.whole`, as :class:`sgstore.world.States` has them."""
+_ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
+
+
+class Entity(NamedTuple):
+    """What a frame says of one entity: inside units (rad), codes as in :class:`sgstore.world.States`."""
+
+    ident: str
+    kind: int
+    special: str
+    subkind: str
+    type_name: str
+    static: bool
+    map_ref: str
+    numbers: tuple[float, ...]
+    whole: tuple[int, ...]
+
+    @property
+    def constants(self) -> tuple[int, str, str]:
+        """What may not change while it is known."""
+        return self.kind, self.special, self.subkind
+
+    def meant(self, told: TypeMeaning | None) -> Entity:
+        """The entity as its type is said to be meant, if anything is said."""
+        if told is None:
+            return self
+        kind = KIND_CODE[told.kind]
+        return self._replace(kind=kind, special=told.special, subkind=told.subkind)
+
+
+class Frame:
+    """One instant, to be filled with what is there.
+
+    Parameters
+    ----------
+    time_ns : int
+        Simulation time; ns. Any number: nothing is computed from it.
+    ego : str or int, optional
+        Id of the ego, one of those that are added; none: nobody is the ego.
+
+    Attributes
+    ----------
+    time_ns : int
+    ego : str
+        Empty: none.
+    entities : list of Entity
+        In the order in which they were added.
+    """
+
+    __slots__ = ("ego", "entities", "time_ns")
+
+    def __init__(self, time_ns: int, ego: str | int | None = None) -> None:
+        self.time_ns = int(time_ns)
+        self.ego = "" if ego is None else str(ego)
+        self.entities: list[Entity] = []
+
+    def __len__(self) -> int:
+        return len(self.entities)
+
+    def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
+        """The frame, its entities of the kinds that type names (in lower case) are said to mean."""
+        if not types:
+            return self
+        frame = Frame(self.time_ns, self.ego)
+        frame.entities = [
+            entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
+        ]
+        return frame
+
+    def __repr__(self) -> str:
+        return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
+
+    def add(  # noqa: PLR0913  an entity has as many properties
+        self,
+        ident: str | int,
+        kind: str,
+        x: float,
+        y: float,
+        z: float = _NAN,
+        *,
+        heading: float = _NAN,
+        pitch: float = _NAN,
+        roll: float = _NAN,
+        length: float = _NAN,
+        width: float = _NAN,
+        height: float = _NAN,
+        vx: float = _NAN,
+        vy: float = _NAN,
+        vz: float = _NAN,
+        ax: float = _NAN,
+        ay: float = _NAN,
+        az: float = _NAN,
+        yaw_rate: float = _NAN,
+        light_state: str | None = None,
+        lights: Iterable[str] | None = None,
+        steer: float = _NAN,
+        throttle: float = _NAN,
+        brake: float = _NAN,
+        special: str = "",
+        subkind: str = "",
+        type_name: str = "",
+        static: bool = False,
+        map_ref: str = "",
+    ) -> None:
+        """Add an entity.
+
+        Parameters
+        ----------
+        ident : str or int
+            The client's own id. An entity keeps it from frame to frame; no two share one.
+        kind : str
+            One of :data:`sgstore.vocabulary.ENTITY_KINDS`, or another label of one: ``Pedestrian``.
+        x, y, z : float
+            Centre of its box, in the map's axes (x east, y north, z up); m.
+        heading, pitch, roll : float
+            Orientation, counter-clockwise from the x axis; degrees.
+        length, width, height : float
+            Full extents of its box; m.
+        vx, vy, vz, ax, ay, az : float
+            Velocity and acceleration, in the map's axes; m/s, m/s².
+        yaw_rate : float
+            degrees/s.
+        light_state : str, optional
+            What a traffic light shows: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
+        lights : iterable of str, optional
+            Lights of a vehicle that are on, of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; ``None``: not known.
+        steer, throttle, brake : float
+            Control inputs; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+        special, subkind, type_name : str
+            Special kind, subkind, the simulator's own type name; see :class:`sgstore.world.Entities`.
+        static : bool
+            Whether it never moves. It is added once, in any frame, and stays for good.
+        map_ref : str
+            Id of the OpenDRIVE signal or object that it is; for a traffic light this tells which lanes
+            it controls.
+
+        Raises
+        ------
+        ValueError
+            The kind, a light or a state of one is unknown; it says what is known.
+
+        Notes
+        -----
+        Whatever is left out or not finite is not known, which is not 0: an entity without a size is a
+        point, one without a heading has no front.
+        """
+        numbers = (
+            *(x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate),
+            *(length, width, height, steer, throttle, brake),
+        )
+        self.entities.append(
+            Entity(
+                ident=str(ident),
+                kind=_kind_code(kind),
+                special=_one_of("special kind", special, SPECIALS) if special else "",
+                subkind=subkind,
+                type_name=type_name,
+                static=static,
+                map_ref=map_ref,
+                numbers=tuple(map(_inside, NUMBERS, numbers)),
+                whole=(_mask_of(lights), _light_code(light_state), 0),
+            )
+        )
+
+
+def _inside(name: str, value: float) -> float:
+    """A number as it is kept inside: radians, and NaN for whatever is not finite."""
+    value = float(value)
+    if not math.isfinite(value):
+        return _NAN
+    return math.radians(value) if name in _ANGLES else value
+
+
+def _kind_code(kind: str) -> int:
+    return KIND_CODE[_one_of("kind", kind_named(kind) or kind, ENTITY_KINDS)]
+
+
+def _light_code(state: str | None) -> int:
+    if state is None:
+        return -1
+    return LIGHT_STATE_CODE[_one_of("state of a traffic light", state, LIGHT_STATES)]
+
+
+def _mask_of(lights: Iterable[str] | None) -> int:
+    if lights is None:
+        return -1
+    mask = 0
+    for name in lights:
+        mask |= 1 << VEHICLE_LIGHTS.index(_one_of("light of a vehicle", name, VEHICLE_LIGHTS))
+    return mask
+
+
+def _one_of(what: str, name: str, known: tuple[str, ...]) -> str:
+    if name in known:
+        return name
+    like = suggestion(name, known)
+    hint = f"did you mean {like!r}?" if like else f"known: {', '.join(known)}"
+    raise ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+class Replay:
+    """Frames of a recording as :class:`Frame`, as a client would have made them from the simulator.
+
+    Memory grows with the number of distinct entities, as that of any reader does.
+    """
+
+    def __init__(self) -> None:
+        self._known: list[tuple[str, int, str, str, str, bool, str]] = []
+
+    def frames(self, block: FrameBlock) -> Iterator[Frame]:
+        """The frames of the next block of a trace, exactly: no number changes."""
+        new = block.entities
+        columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
+        columns = (*columns, new.static.tolist(), new.map_ref)
+        self._known += zip(*columns, strict=True)
+        standing = self._entities(block.scenery, 0, len(block.scenery))
+        for row, (time, ego) in enumerate(
+            zip(block.time_ns.tolist(), block.ego.tolist(), strict=True)
+        ):
+            frame = Frame(time, self._known[ego][0] if ego >= 0 else None)
+            start, stop = block.offsets[row : row + 2].tolist()
+            there = self._entities(block.states, start, stop)
+            if standing:  # in the order of the node ids, so that a client gives the same ones
+                nodes = [*block.scenery.node.tolist(), *block.states.node[start:stop].tolist()]
+                order = np.argsort(nodes, kind="stable").tolist()
+                there = [(*standing, *there)[i] for i in order]
+                standing = []
+            frame.entities = there
+            yield frame
+
+    def _entities(self, states: States, start: int, stop: int) -> list[Entity]:
+        numbers = np.stack([getattr(states, name)[start:stop] for name in NUMBERS], axis=1)
+        whole = np.stack([getattr(states, name)[start:stop] for name in WHOLE], axis=1)
+        return [
+            Entity(*self._known[node], numbers=tuple(values), whole=tuple(codes))
+            for node, values, codes in zip(
+                states.node[start:stop].tolist(), numbers.tolist(), whole.tolist(), strict=True
+            )
+        ]
+
+
+# A block's graph of one frame as records: the same as a store gives of it, and each entity's own id ----
+
+MOST_RECORDS: Final = 1 << 16
+"""Edges of a graph of which records are made at once; where there are more, they stay columns."""
+
+TRACE: Final = "online"
+"""What the graphs of the online mode have for the name of a trace."""
+
+_IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
+_TELLS: Final = np.isin(np.arange(len(RELATIONS)), (_IS_IN, _LEADS, _FOLLOWS))
+"""Of each relation whether its edges may have attributes."""
+_BOX: Final = ("x", "y", "z", "length", "width", "height")
+_MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
+_STILL: Final = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
+"""What stands for ever has velocity 0."""
+_INPUTS: Final = ("steer", "throttle", "brake")
+_DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
+_MAP_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
+_MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
+
+
+class EntityConstants(NamedTuple):
+    """What does not change about an entity."""
+
+    node: int
+    ident: str
+    kind: str
+    special: str
+    subkind: str
+
+    def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
+        """As they stand in a graph."""
+        texts = {"special": self.special, "subkind": self.subkind}
+        return {
+            "kind": self.kind,
+            "name": f"{self.kind} {self.node}",
+            "ident": self.ident,
+            "is_ego": is_ego,
+            "is_static": is_static,
+            **{name: text for name, text in texts.items() if text},
+        }
+
+
+class Records:
+    """Makes records of graphs.
+
+    Parameters
+    ----------
+    road_map : RoadMap or None
+        The map that they lie on. What is known of its nodes is put together when they are first met.
+    """
+
+    def __init__(self, road_map: RoadMap | None) -> None:
+        self._map = road_map
+        self._reach = None if road_map is None else LaneDistances(*road_map.reach)
+        self._map_nodes: dict[int, Attributes] = {}
+        self._standing: dict[int, Attributes] = {}
+        if road_map is not None:
+            edges = road_map.edges
+            order = np.lexsort((-edges.dst, edges.relation, -edges.src))
+            self._src, self._dst = edges.src[order], edges.dst[order]
+            self._relation = edges.relation[order]
+
+    def stand(self, known: EntityConstants, states: States, row: int) -> None:
+        """Take note of what stands: its pose comes once."""
+        numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
+        numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
+        about = known.attributes(is_ego=False, is_static=True)
+        self._standing[known.node] = about | _numbers(numbers) | _STILL
+
+    def graph(
+        self, graph: GraphBlock, outer: Ints, known: dict[int, EntityConstants]
+    ) -> SceneGraph:
+        """The graph of a block's only frame.
+
+        Parameters
+        ----------
+        graph : GraphBlock
+            Of one frame.
+        outer : int64
+            Node id of the block → node id of the records; those of the map are the same.
+        known : dict
+            Node id of the records → entity, of all that move in the frame.
+        """
+        frames = graph.frames
+        ego = int(outer[frames.ego[0]]) if frames.ego[0] >= 0 else None
+        nodes: dict[int, Attributes] = {}
+        moving = zip(outer[frames.states.node].tolist(), _moving(frames.states), strict=True)
+        for node, told in sorted(moving, key=itemgetter(0)):
+            about = known[node].attributes(is_ego=node == ego, is_static=False)
+            nodes[node] = about | told
+        present = graph.presence.node
+        for node in np.sort(outer[present[present >= 0]]).tolist():
+            nodes[node] = dict(self._standing[node])
+        mapped = -np.sort(-present[present < 0])
+        for node in mapped.tolist():
+            nodes[node] = dict(self._map_node(node))
+        return SceneGraph(
+            frame_id=int(frames.seq[0]),
+            trace=TRACE,
+            seq=int(frames.seq[0]),
+            time_ns=int(frames.time_ns[0]),
+            ego=ego,
+            nodes=nodes,
+            edges=self._edges(graph, outer, mapped),
+            reach=self._reach,
+        )
+
+    def _map_node(self, node: int) -> Attributes:
+        found = self._map_nodes.get(node)
+        if found is not None or self._map is None:
+            return found or {}
+        nodes, row = self._map.nodes, -1 - node
+        texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
+        numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
+        numbers["heading"] = math.degrees(numbers["heading"])
+        about: Attributes = {"kind": KINDS[nodes.kind[row]], "is_ego": False, "is_static": True}
+        about |= {name: text for name, text in texts.items() if text} | _numbers(numbers)
+        if about["kind"] not in MAP_KINDS:
+            about |= _STILL
+        if nodes.lane_type[row]:
+            about |= {"section": int(nodes.section[row]), "lane": int(nodes.lane[row])}
+        self._map_nodes[node] = about
+        return about
+
+    def _edges(self, graph: GraphBlock, outer: Ints, present: Ints) -> Sequence[Edge]:
+        """Edges that have an end in the trace, in the order of their ends, then those of the map."""
+        src, relation, dst = _distinct(graph, outer)
+        about: dict[int, Attributes] = {}
+        known = _attributes(graph, outer)
+        rows = np.flatnonzero(_TELLS[relation])
+        keys = zip(relation[rows].tolist(), src[rows].tolist(), dst[rows].tolist(), strict=True)
+        for row, key in zip(rows.tolist(), keys, strict=True):
+            if key in known:
+                about[row] = known[key]
+        rows = self._map_edges(present)
+        if len(rows):
+            src, dst = (
+                np.concatenate(of) for of in ((src, self._src[rows]), (dst, self._dst[rows]))
+            )
+            relation = np.concatenate([relation, self._relation[rows]])
+        edges = EdgeColumns(_narrow(src), relation, _narrow(dst), about)
+        return edges if len(edges) > MOST_RECORDS else edges[:]
+
+    def _map_edges(self, present: Ints) -> Ints:
+        """Rows of the edges of the map whose ends are both present."""
+        if self._map is None or not len(present):
+            return np.zeros(0, np.intp)
+        here = np.zeros(len(self._map.nodes), np.bool_)
+        here[-1 - present] = True
+        return np.flatnonzero(here[-1 - self._src] & here[-1 - self._dst])
+
+
+def _moving(states: States) -> list[Attributes]:
+    """Attributes of states, in outward units: of whole columns first, then row by row."""
+    columns: dict[str, Floats] = {
+        name: getattr(states, name) for name in (*_BOX, *_MOTION, *_INPUTS)
+    }
+    columns["heading"] = np.degrees(wrapped(states.heading))
+    columns |= {name: np.degrees(getattr(states, name)) for name in ("pitch", "roll", "yaw_rate")}
+    speed = np.sqrt(states.vx**2 + states.vy**2 + np.nan_to_num(states.vz) ** 2)
+    columns["speed"] = number(speed).astype(np.float64)
+    columns["accel"] = states.ax * np.cos(states.heading) + states.ay * np.sin(states.heading)
+    names = tuple(columns)
+    table = np.stack([columns[name] for name in names], axis=1)
+    known = np.isfinite(table).tolist()
+    codes = zip(
+        states.lights.tolist(), states.light_state.tolist(), states.derived.tolist(), strict=True
+    )
+    return [
+        {name: value for name, value, told in zip(names, row, is_known, strict=True) if told}
+        | _coded(*whole)
+        for row, is_known, whole in zip(table.tolist(), known, codes, strict=True)
+    ]
+
+
+def _coded(lights: int, light: int, derived: int) -> Attributes:
+    """What codes say: lights of a vehicle, what a traffic light shows, what was derived."""
+    about: Attributes = {}
+    if lights >= 0:
+        about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
+    if light >= 0:
+        about["light_state"] = LIGHT_STATES[light]
+    return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(_DERIVED)}
+
+
+def _distinct(graph: GraphBlock, outer: Ints) -> tuple[Ints, Codes, Ints]:
+    """Ends and relations of the edges that have an end in the trace, each once, in the order of their ends."""
+    edges = graph.edges
+    src, dst = _outward(edges.src, outer), _outward(edges.dst, outer)
+    order = np.lexsort((dst, edges.relation, src))
+    src, relation, dst = src[order], edges.relation[order], dst[order]
+    new = np.ones(len(src), np.bool_)
+    new[1:] = (np.diff(src) != 0) | (np.diff(relation) != 0) | (np.diff(dst) != 0)
+    return src[new], relation[new], dst[new]
+
+
+def _attributes(graph: GraphBlock, outer: Ints) -> dict[tuple[int, int, int], Attributes]:
+    """Attributes of the edges that have any, by relation and ends."""
+    lanes, gaps = graph.lanes, graph.gaps
+    told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
+    columns = (
+        *(_outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
+        *(number(column).tolist() for column in told),
+        *(lanes.primary.tolist(), lanes.own.tolist()),
+    )
+    known: dict[tuple[int, int, int], Attributes] = {}
+    for node, lane, overlap, offset, error, along, primary, own in zip(*columns, strict=True):
+        numbers = {
+            "overlap": overlap,
+            "lane_offset": offset,
+            "heading_error": math.degrees(error),
+            "along": along,
+        }
+        known[_IS_IN, node, lane] = _numbers(numbers) | {"is_primary": primary, "is_own": own}
+    columns = (_outward(gaps.src, outer), _outward(gaps.dst, outer), number(gaps.gap))
+    for a, b, gap in zip(*(column.tolist() for column in columns), strict=True):
+        known[_FOLLOWS, a, b] = _numbers({"gap": gap})
+        known[_LEADS, b, a] = _numbers({"gap": gap})
+    return known
+
+
+def _outward(nodes: Ints, outer: Ints) -> Ints:
+    """Node ids of the records for those of a block."""
+    return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
+
+
+def _narrow(nodes: Ints) -> NDArray[np.integer[Any]]:
+    """The same node ids in half the space, unless one of them is larger than it takes."""
+    narrow = nodes.astype(np.int32)
+    return narrow if np.array_equal(narrow, nodes) else nodes
+
+
+def _degrees(heading: Floats) -> list[float]:
+    """Headings in (-180, 180]."""
+    return np.degrees(wrapped(heading)).tolist()
+
+
+def _numbers(values: dict[str, float]) -> Attributes:
+    """What of numbers is known."""
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+# Frame after frame to scene graph after scene graph, in bounded memory --------------------------
+# Node ids are given in the order of appearance and never to two entities. The tables of a generator grow with
+# every entity that it meets, so it is made anew when most of those it knows are gone; what it keeps between
+# blocks saves work and changes no graph, so nobody can tell. What has been absent while :data:`REMEMBERED`
+# others came is forgotten, and would come back as somebody new.
+
+REMEMBERED: Final = 20_000
+"""Entities that are absent and still known by their ids; some 5 MB."""
+
+SPARE: Final = 2048
+"""Entities that may be gone before a generator is made anew."""
+
+
+class Generator(Protocol):
+    """What makes graphs of blocks: :class:`sgstore.sgg.SceneGraphGenerator`."""
+
+    @property
+    def kinds(self) -> Codes:
+        """Kinds of the entities that it has met, by node id."""
+        ...
+
+    def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
+        """The graphs of the next frames, as each ego has them."""
+        ...
+
+
+class Stepper:
+    """Frame after frame to scene graph after scene graph.
+
+    Parameters
+    ----------
+    make : callable
+        Makes a generator that has seen nothing yet.
+    road_map : RoadMap or None
+        The map that its graphs lie on.
+    ego : str
+        The ego of frames that name none.
+
+    Attributes
+    ----------
+    last : tuple or None
+        The last graphs as blocks, and the kinds of their entities by the blocks' node ids.
+    """
+
+    def __init__(
+        self, make: Callable[[], Generator], road_map: RoadMap | None, ego: str = ""
+    ) -> None:
+        self._make = make
+        self._generator = make()
+        self._ego = ego
+        self._records = Records(road_map)
+        self._seq = 0
+        self._origin: Origin | None = None
+        self.last: tuple[list[GraphBlock], Codes] | None = None
+        self._next = 0
+        self._moving: OrderedDict[str, EntityConstants] = (
+            OrderedDict()
+        )  # whom the last frame had, at the end
+        self._standing: dict[str, tuple[Entity, EntityConstants]] = {}
+        # The generator's own node ids, which begin anew with it, and what they are outside.
+        self._inner: dict[str, int] = {}
+        self._introduced = 0
+        self._outer: Ints = np.zeros(64, np.int64)
+
+    def step(self, frame: Frame, egos: Sequence[str]) -> list[SceneGraph]:
+        """The scene graphs of the next frame; see :meth:`sgstore.sgg.SceneGraphGenerator.step`.
+
+        Parameters
+        ----------
+        frame : Frame
+        egos : sequence of str
+            Whose graphs; an empty id means the ego of the frame, else that of the config.
+        """
+        moving, new = self._met(frame)
+        if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
+            self._generator, self._inner, self._introduced = self._make(), {}, 0
+            new = [entity for entity, _ in self._standing.values()]
+        block = self._kept(self._block(frame, moving, new))
+        for row, entity in enumerate(new):
+            self._records.stand(self._standing[entity.ident][1], block.scenery, row)
+        here = {entity.ident for entity in moving}
+        named = (ego or frame.ego or self._ego for ego in egos)
+        nodes = [self._inner[ego] if ego in here else -1 for ego in named]
+        self.last = None  # let go of the graphs before this one: of a crowd they are large
+        graphs = self._generator.blocks(block, [np.array([node]) for node in nodes])
+        self._seq += 1
+        self.last = graphs, self._generator.kinds
+        while len(self._moving) > len(moving) + REMEMBERED:
+            ident, _ = self._moving.popitem(last=False)
+            self._inner.pop(ident, None)
+        known = {self._moving[e.ident].node: self._moving[e.ident] for e in moving}
+        with GcPaused():
+            return [self._records.graph(graph, self._outer, known) for graph in graphs]
+
+    def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
+        """What moves in a frame, and what stands in it that was not known.
+
+        Everything is checked before anything is remembered: a frame that is refused has not been.
+        """
+        moving: dict[str, Entity] = {}
+        new: dict[str, Entity] = {}
+        for entity in frame.entities:
+            ident = entity.ident
+            stands = ident in self._standing or ident in new
+            known = self._moving.get(ident)
+            if ident in moving or (stands and not entity.static):
+                raise ValueError(f"two entities have the id {ident!r}")
+            if entity.static and known is not None:
+                raise ValueError(f"entity {ident!r} moved before and is static now")
+            if known is not None and known.kind != KINDS[entity.kind]:
+                now = KINDS[entity.kind]
+                raise ValueError(f"entity {ident!r} was of kind {known.kind!r} and is {now!r} now")
+            if not entity.static:
+                moving[ident] = entity
+            elif not stands:
+                new[ident] = entity
+        for entity in frame.entities:
+            self._remember(entity, new)
+        return list(moving.values()), list(new.values())
+
+    def _remember(self, entity: Entity, new: dict[str, Entity]) -> None:
+        ident = entity.ident
+        if ident in self._moving:
+            self._moving.move_to_end(ident)
+        elif ident not in self._standing:
+            known = EntityConstants(
+                self._next, ident, KINDS[entity.kind], entity.special, entity.subkind
+            )
+            self._next += 1
+            if ident in new:
+                self._standing[ident] = entity, known
+            else:
+                self._moving[ident] = known
+
+    def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
+        """A frame as a block, in the generator's own node ids."""
+        first = self._introduced
+        new = [*standing, *(e for e in moving if e.ident not in self._inner)]
+        self._introduced += len(new)
+        while self._introduced > len(self._outer):
+            self._outer = np.concatenate([self._outer, self._outer])
+        for inner, entity in enumerate(new, start=first):
+            self._inner[entity.ident] = inner
+            self._outer[inner] = self._node(entity)
+        time, none = np.array([frame.time_ns]), np.zeros(0, np.int64)
+        return FrameBlock(
+            seq=np.array([self._seq]),
+            time_ns=time,
+            log_time_ns=time,
+            offsets=np.array([0, len(moving)]),
+            states=self._states(moving),
+            ego=np.array([-1]),  # it is told apart from the block
+            entities=_entities(first, new),
+            scenery=self._states(standing),
+            messages=MessageRefs(none, none, none, none, none),
+        )
+
+    def _kept(self, block: FrameBlock) -> FrameBlock:
+        """A block with the numbers that a store would keep of it, if these frames were its trace."""
+        self._origin = self._origin or origin_of(block)
+        return quantize(block, self._origin or Origin(0.0, 0.0, 0.0))
+
+    def _node(self, entity: Entity) -> int:
+        known = self._standing[entity.ident][1] if entity.static else self._moving[entity.ident]
+        return known.node
+
+    def _states(self, of: list[Entity]) -> States:
+        numbers = np.array([e.numbers for e in of], np.float64).reshape(-1, len(NUMBERS))
+        whole = np.array([e.whole for e in of], np.int64).reshape(-1, len(WHOLE))
+        lights, light_state, derived = whole.T
+        return States.of(
+            node=np.array([self._inner[e.ident] for e in of], np.int64),
+            lights=lights,
+            light_state=light_state.astype(np.int8),
+            derived=derived,
+            **{name: numbers[:, i] for i, name in enumerate(NUMBERS)},
+        )
+
+
+class GcPaused:
+    """No garbage is looked for meanwhile, if it is at all.
+
+    The records of a graph are thousands of small objects, none of them garbage. Python would look through them
+    several times while they are made, and every few frames through all that the client has: 30 ms and more.
+    What is let go again before the end is never looked through: Python counts what is more than it was.
+    """
+
+    def __enter__(self) -> None:
+        self._running = gc.isenabled()
+        gc.disable()
+
+    def __exit__(self, *_exception: object) -> None:
+        if self._running:
+            gc.enable()
+
+
+def _entities(first: int, new: list[Entity]) -> Entities:
+    return Entities(
+        first=first,
+        ident=tuple(e.ident for e in new),
+        kind=np.array([e.kind for e in new], np.int8),
+        special=tuple(e.special for e in new),
+        subkind=tuple(e.subkind for e in new),
+        type_name=tuple(e.type_name for e in new),
+        static=np.array([e.static for e in new], np.bool_),
+        map_ref=tuple(e.map_ref for e in new),
+    )

@@ -1,0 +1,97 @@
+# The face of this package: what others may import from it.
+
+from ._contents import DIGEST_BYTES as DIGEST_BYTES
+from ._contents import WINDOW as WINDOW
+from ._contents import FrameSpans as FrameSpans
+from ._contents import Mark as Mark
+from ._contents import MessagePlaces as MessagePlaces
+from ._contents import graph_digests as graph_digests
+from ._contents import lengths_of_messages as lengths_of_messages
+from ._contents import marks as marks
+from ._contents import messages_of as messages_of
+from ._create import SCHEMA_VERSION as SCHEMA_VERSION
+from ._file import StoreFile as StoreFile
+from ._frames import SEQ_BITS as SEQ_BITS
+from ._frames import begins as begins
+from ._frames import seq_of as seq_of
+from ._frames import trace_of as trace_of
+from ._joins import UserTables as UserTables
+from ._locking import Folder as Folder
+from ._packing import BUCKET_BITS as BUCKET_BITS
+from ._packing import frame_ids as frame_ids
+from ._rebuild import OldMap as OldMap
+from ._rebuild import OldTrace as OldTrace
+from ._rebuild import Remains as Remains
+from ._rebuild import named_as as named_as
+from ._rebuild import remains_of as remains_of
+from ._rebuild import take_place as take_place
+from ._rows import Batches as Batches
+from ._rows import GivenTable as GivenTable
+from ._rows import ParquetTable as ParquetTable
+from ._rows import Rows as Rows
+from ._rows import arrow_file as arrow_file
+from ._rows import arrow_table as arrow_table
+from ._rows import count_parquet as count_parquet
+from ._rows import pandas_frame as pandas_frame
+from ._rows import polars_frame as polars_frame
+from ._rows import write_csv as write_csv
+from ._rows import write_parquet as write_parquet
+from ._similarity import SimilarFrames as SimilarFrames
+from ._staging import Place as Place
+from ._staging import Sealed as Sealed
+from ._traces import FrameRef as FrameRef
+from ._traces import StoredTrace as StoredTrace
+from ._traces import free_name as free_name
+from ._traces import trace_id_of as trace_id_of
+from ._verify import verify_file as verify_file
+from ._write import Segment as Segment
+from ._write import new_segment as new_segment
+
+__all__ = [
+    "BUCKET_BITS",
+    "Batches",
+    "DIGEST_BYTES",
+    "Folder",
+    "FrameRef",
+    "FrameSpans",
+    "GivenTable",
+    "Mark",
+    "MessagePlaces",
+    "OldMap",
+    "OldTrace",
+    "ParquetTable",
+    "Place",
+    "Remains",
+    "Rows",
+    "SCHEMA_VERSION",
+    "SEQ_BITS",
+    "Sealed",
+    "Segment",
+    "SimilarFrames",
+    "StoreFile",
+    "StoredTrace",
+    "UserTables",
+    "WINDOW",
+    "arrow_file",
+    "arrow_table",
+    "begins",
+    "count_parquet",
+    "frame_ids",
+    "free_name",
+    "graph_digests",
+    "lengths_of_messages",
+    "marks",
+    "messages_of",
+    "named_as",
+    "new_segment",
+    "pandas_frame",
+    "polars_frame",
+    "remains_of",
+    "seq_of",
+    "take_place",
+    "trace_id_of",
+    "trace_of",
+    "verify_file",
+    "write_csv",
+    "write_parquet",
+]

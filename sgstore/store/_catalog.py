@@ -1,0 +1,168 @@
+"""What a store holds, as the compiler of queries wants to know it, under each abstraction that it may name.
+
+Under an abstraction a query sees other tables under the same names: *shadows*, which stand before its
+statement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sgstore.abstractions import SUBSETS
+from sgstore.lang import Catalog, RelationScope, TraceFacts
+from sgstore.quoting import literal
+from sgstore.store._derive import sets_of
+from sgstore.store._traces import stored_traces
+from sgstore.vocabulary import RELATIONS, normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.abstractions import Subset
+    from sgstore.lang import Triple
+    from sgstore.store._derive import DerivedSet
+
+
+def catalog_of(connection: DuckDBPyConnection) -> Catalog:
+    """The catalog of a store, with those of its abstractions in it."""
+
+    def kinds(of: str) -> frozenset[str]:
+        found = connection.execute(f"SELECT DISTINCT kind FROM {of}").fetchall()
+        return frozenset(kind for (kind,) in found)
+
+    classed = connection.execute(
+        "SELECT DISTINCT abstraction FROM frame_class UNION SELECT DISTINCT abstraction FROM later_class"
+    ).fetchall()
+    whole = Catalog(
+        edges=_counted(connection, "edge"),
+        map_edges=_counted(connection, "map_edge"),
+        moving=kinds("entity WHERE NOT is_static"),
+        fixed=kinds("entity WHERE is_static"),
+        mapped=kinds("map_node"),
+        traces=tuple(
+            TraceFacts(
+                t.trace_id,
+                t.name,
+                t.ego,
+                frozenset(t.answers),
+                RelationScope.of(t.settings),
+                t.period_ns,
+            )
+            for t in stored_traces(connection)
+        ),
+        classed=tuple(sorted(name for (name,) in classed)),
+    )
+    sets = {normalize_name(name): _narrowed(whole, name, of) for name, of in SUBSETS.items()}
+    derived: dict[str, list[DerivedSet]] = {}
+    for one in sets_of(connection):
+        derived.setdefault(one.name, []).append(one)
+    for name, of in derived.items():
+        sets[normalize_name(name)] = replace(
+            _derived(connection, whole, name, of), relations=_relations(connection, whole, of)
+        )
+    return replace(whole, sets=sets)
+
+
+def _counted(connection: DuckDBPyConnection, table: str) -> dict[Triple, int]:
+    sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM {table} GROUP BY ALL"
+    return {(r, a, b): n for r, a, b, n in connection.execute(sql).fetchall()}
+
+
+def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
+    """The catalog under an abstraction that has some of the nodes and edges."""
+    kinds = of.kinds
+    if kinds is None:
+        return replace(whole, name=name)
+    among = _words(kinds)
+    ends = f"src_kind IN ({among}) AND dst_kind IN ({among})"
+    shadows = [
+        (table, f'SELECT * FROM main."{table}" WHERE relation IN ({_words(relations)}) AND {ends}')
+        for table, relations in (("edge", of.moving), ("map_edge", of.lasting))
+    ]
+    shadows += [
+        (table, f'SELECT * FROM main."{table}" WHERE kind IN ({among})')
+        for table in ("node", "state")
+    ]
+
+    def held(edges: dict[Triple, int], relations: frozenset[str]) -> dict[Triple, int]:
+        return {
+            (r, a, b): n for (r, a, b), n in edges.items() if r in relations and {a, b} <= kinds
+        }
+
+    return replace(
+        whole,
+        name=name,
+        relations=of.moving | of.lasting,
+        shadows=tuple(shadows),
+        edges=held(dict(whole.edges), of.moving),
+        map_edges=held(dict(whole.map_edges), of.lasting),
+        moving=whole.moving & kinds,
+        fixed=whole.fixed & kinds,
+        mapped=whole.mapped & kinds,
+    )
+
+
+def _derived(
+    connection: DuckDBPyConnection, whole: Catalog, name: str, of: list[DerivedSet]
+) -> Catalog:
+    """The catalog under a derived set: of the traces that have it."""
+    answers = {one.trace_id: frozenset(one.answers) for one in of}
+    reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
+    word = literal(name)
+    shadows = {
+        table: f'SELECT * FROM main."{table}" WHERE trace_id IN'
+        f" (SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
+        for table in ("frame", "bucket")
+    }
+    shadows["edge"] = (
+        "SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask"
+        f" FROM derived_edge WHERE set_name = {word}"
+    )
+    shadows["lane_gap"] = f"SELECT frame_id, src, dst, gap FROM derived_gap WHERE set_name = {word}"
+    shadows["node"] = (
+        f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = {word} AND NOT moves"
+    )
+    shadows["state"] = (
+        'SELECT s.* FROM main."state" AS s JOIN derived_node AS d'
+        f" ON d.set_name = {word} AND d.moves AND d.bucket = s.frame_id >> 6 AND d.node_id = s.node_id"
+        " AND (d.mask & (CAST(1 AS BIGINT) << CAST(s.frame_id & 63 AS INTEGER))) <> 0"
+    )
+    return replace(
+        whole,
+        name=name,
+        shadows=tuple(shadows.items()),
+        edges=_counted(connection, f"({shadows['edge']})"),
+        traces=tuple(
+            replace(trace, answers=answers[trace.trace_id], reach=reaches[trace.trace_id])
+            for trace in whole.traces
+            if trace.trace_id in answers
+        ),
+    )
+
+
+def _relations(
+    connection: DuckDBPyConnection, whole: Catalog, of: list[DerivedSet]
+) -> frozenset[str] | None:
+    """The relations that a derived set has by its settings; ``None``: that is not known.
+
+    What no trace of it answers is lacking, if one of them has a road map: it is all that a relation may need
+    beside settings. Without one, what the traces themselves answer is.
+    """
+    if any("abstraction" in one.settings for one in of):
+        return (
+            None  # a function of ours or a client's made it, of which we only know what it has made
+        )
+    numbers = {one.trace_id for one in of}
+    answered = {relation for one in of for relation in one.answers}
+    told = connection.execute("SELECT trace_id FROM trace WHERE map_id IS NOT NULL").fetchall()
+    if numbers & {number for (number,) in told}:
+        return frozenset(answered)
+    known = (t.answers for t in whole.traces if t.trace_id in numbers)
+    return frozenset(RELATIONS) - (frozenset[str]().union(*known) - answered)
+
+
+def _words(names: Iterable[str]) -> str:
+    return ", ".join(f"'{name}'" for name in sorted(names)) or "NULL"

@@ -1,0 +1,297 @@
+"""The classes of frames in each abstraction: on their way into a store, and made when asked for.
+
+Classes are masks like edges: one row for each class of a bucket, because driving repeats itself. Those that
+are made at ingest are published with their trace; others wait until they are asked for, and are then kept.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.abstractions import (
+    AT_INGEST,
+    Classes,
+    GraphColumns,
+    MapColumns,
+    abstraction_named,
+    lane_roles,
+)
+from sgstore.store._frames import (
+    CodedClasses,
+    Triples,
+    coded_classes,
+    imported_names,
+    times,
+    triples,
+)
+from sgstore.store._graphs import Graphs
+from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, masks_of, texts, trace_bucket
+from sgstore.store._publish import add_files, note, writing
+from sgstore.store._staging import Staging
+from sgstore.store._traces import frame_named, trace_named
+from sgstore.world import BUCKET_FRAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.abstractions import Labelled
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.store._locking import Access
+    from sgstore.store._packing import Columns
+    from sgstore.world import Codes, Ints
+
+
+_LATER: Final = "later_class"
+
+_MISSING: Final = """
+SELECT trace_id FROM {0}trace WHERE trace_id NOT IN (
+  SELECT bucket >> 18 FROM {0}later_class WHERE abstraction = $name UNION ALL
+  SELECT bucket >> 18 FROM {0}frame_class WHERE abstraction = $name)
+ORDER BY ingested_at, name
+"""
+
+
+class TraceClasses:
+    """Classes of the frames of one trace, block by block.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Abstractions.
+    """
+
+    def __init__(self, names: Sequence[str] = AT_INGEST) -> None:
+        self._of = [(abstraction_named(name), Classes()) for name in names]
+
+    def columns(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
+        """Tables ``frame_class`` and ``later_class``, of frames whose numbers are ``seq``."""
+        rows: list[tuple[str, str]] = []
+        buckets: list[Ints] = []
+        masks: list[Ints] = []
+        for abstraction, classes in self._of:
+            names = classes.of(abstraction.function(seen))
+            number = {name: i for i, name in enumerate(dict.fromkeys(names))}
+            code = np.array([number[name] for name in names], np.int64)
+            bucket = trace_bucket(trace_id, seq)
+            first, mask = masks_of((bucket, code), seq % BUCKET_FRAMES)
+            rows += [(abstraction.name, names[row]) for row in first.tolist()]
+            buckets.append(bucket[first])
+            masks.append(mask)
+        return {
+            "abstraction": texts(abstraction for abstraction, _ in rows),
+            "class": texts(name for _, name in rows),
+            "bucket": np.concatenate(buckets),
+            "mask": np.concatenate(masks),
+        }
+
+
+class IngestedClasses:
+    """The classes of a trace that is being ingested on a map, if it has one; and the roles of its lanes."""
+
+    def __init__(self, road_map: RoadMap | None) -> None:
+        self._grounds = None if road_map is None else MapColumns.of(road_map)
+        self._classes = TraceClasses()
+
+    def tables(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> dict[str, Columns]:
+        """Tables ``frame_class`` and ``lane_role``; ``kinds`` are those of the entities so far, by node id."""
+        seen = GraphColumns.of(graph, kinds, self._grounds)
+        seq = graph.frames.seq
+        return {
+            "frame_class": self._classes.columns(seen, trace_id, seq),
+            "lane_role": _role_columns(seen, trace_id, seq),
+        }
+
+
+def _role_columns(seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
+    frame, lane, roles = lane_roles(seen)
+    number = {role: i for i, role in enumerate(dict.fromkeys(roles))}
+    code = np.array([number[role] for role in roles], np.int64)
+    bucket = trace_bucket(trace_id, seq[frame])
+    first, mask = masks_of((code, bucket, lane), seq[frame] % BUCKET_FRAMES)
+    return {
+        "role": texts(roles[row] for row in first.tolist()),
+        "bucket": bucket[first],
+        "node_id": lane[first],
+        "mask": mask,
+    }
+
+
+class Abstracted:
+    """The frames of a store as abstractions have them. Made by :attr:`StoreFile.abstracted`."""
+
+    def __init__(self, path: Path, access: Access) -> None:
+        self._path = path
+        self._access = access
+        self._graphs = Graphs()
+
+    def complete(self, name: str) -> int:
+        """Compute the classes in an abstraction of the traces that lack them, and keep them.
+
+        Each trace is one transaction: what is done stays done, and another call goes on from there.
+
+        Returns
+        -------
+        int
+            How many traces lacked them.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            Others keep the store for too long, or the disk is full.
+        """
+        name = abstraction_named(name).name
+        with self._access.reading() as connection:
+            traces = _missing(connection, name)
+        for trace_id in traces:
+            self._complete(name, trace_id)
+        return len(traces)
+
+    def _complete(self, name: str, trace_id: int) -> None:
+        staging = Staging(self._path)
+        try:
+            classes = TraceClasses((name,))
+            with self._access.reading() as connection:
+                for seq, seen in self._graphs.of_trace(connection, trace_id):
+                    staging.settle(whole=True)
+                    staging.insert(_LATER, classes.columns(seen, trace_id, seq))
+            files, _ = staging.seal()
+            with writing(self._access, staging.folder) as connection:
+                # Another process may have been faster, or have removed the trace.
+                if trace_id in _missing(connection, name, "store."):
+                    add_files(connection, staging, files)
+                    note(connection, trace_id, [_LATER])
+        finally:
+            staging.close()
+
+    def classes(self, name: str, trace: int | str | None = None) -> dict[str, NDArray[np.generic]]:
+        """The class of each frame in an abstraction, computed where it was not.
+
+        Returns
+        -------
+        dict
+            ``frame_id``, int64, ascending; ``class``, str, empty where a graph was given up.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            There is no such trace, or others keep the store for too long.
+        """
+        self.complete(name)
+        with self._access.reading() as connection:
+            low, high = 0, (1 << 63) - 1
+            if trace is not None:
+                low, _ = trace_named(connection, str(trace))
+                low, high = (one << (BUCKET_BITS + FRAME_BITS) for one in (low, low + 1))
+                high -= 1
+            found = connection.execute(
+                "SELECT frame_id, coalesce(class, '') AS class FROM classes WHERE abstraction = ?"
+                " AND frame_id >= ? AND frame_id <= ? ORDER BY frame_id",
+                [abstraction_named(name).name, low, high],
+            ).fetchnumpy()
+        return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
+
+    def class_of(self, frame_id: int, name: str) -> str | None:
+        """The class of a frame in an abstraction; ``None`` where it is not in the store, or was given up."""
+        with self._access.reading() as connection:
+            found = connection.execute(
+                "SELECT any_value(class) FROM classes WHERE frame_id = ? AND abstraction = ?",
+                [frame_id, name],
+            ).fetchone()
+        return found[0] if found else None
+
+    def roles_of(self, frame_id: int) -> dict[int, str]:
+        """What lanes are to the ego of a frame, by node id: :func:`sgstore.abstractions.lane_roles`."""
+        with self._access.reading() as connection:
+            found = connection.execute(
+                "SELECT node_id, role FROM roles WHERE frame_id = ?", [frame_id]
+            ).fetchall()
+        return dict(found)
+
+    def coded(self, name: str) -> CodedClasses:
+        """The class of each frame as a number, computed where it was not.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            Others keep the store for too long.
+        """
+        self.complete(name)
+        with self._access.reading() as connection:
+            return coded_classes(connection, abstraction_named(name).name)
+
+    def times(self) -> tuple[Ints, Ints]:
+        """Ids of all frames, ascending, and their simulation times; ns."""
+        with self._access.reading() as connection:
+            return times(connection)
+
+    def imported_names(self) -> dict[str, int]:
+        """What imported files call their graphs, and the ids of the frames that these became."""
+        with self._access.reading() as connection:
+            return imported_names(connection)
+
+    def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
+        """What the graphs of frames are made of in an abstraction, some frames at a time.
+
+        Parameters
+        ----------
+        name : str
+        frame_id : int64
+            Ascending.
+
+        Yields
+        ------
+        rows : int64
+            Which of the frames these are.
+        triples : Triples
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        """
+        function = abstraction_named(name).function
+        with self._access.reading() as connection:
+            for rows, seen in self._graphs.of_ids(connection, frame_id):
+                yield rows, triples(function(seen))
+
+    def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
+        """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            There is no such frame.
+        """
+        abstraction = abstraction_named(name)
+        with self._access.reading() as connection:
+            frame = frame_named(connection, ref)
+            _, seen = self._graphs.of_frames(connection, frame.frame_id, frame.frame_id)
+        about = {
+            "frame_id": frame.frame_id,
+            "trace": frame.trace,
+            "seq": frame.seq,
+            "time_ns": frame.time_ns,
+            "abstraction": abstraction.name,
+        }
+        return abstraction.function(seen), about
+
+
+def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> list[int]:
+    """Traces of which the classes in an abstraction are not kept."""
+    found = connection.execute(_MISSING.format(catalog), {"name": name}).fetchall()
+    return [trace_id for (trace_id,) in found]

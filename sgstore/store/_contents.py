@@ -1,0 +1,267 @@
+"""Content digests of frames, and frames under an abstraction.
+
+What frames hold, as digests: equal exactly where the public views show the same, in every store.
+
+Numbers count by their bits, texts by their letters, and a frame by its number in its trace, so that the digest
+of a part of a trace does not depend on the store that it is in, nor on what else is there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.abstractions import abstraction_named
+from sgstore.store._frames import seq_of, trace_of
+from sgstore.store._graphs import Graphs
+from sgstore.store._locking import Access
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.abstractions import GraphColumns, Labelled
+    from sgstore.store._file import StoreFile
+    from sgstore.world import Ints
+
+    Words = NDArray[np.uint64]
+
+
+WINDOW: Final = 4_000
+"""Frames that are read at once."""
+
+DIGEST_BYTES: Final = 16
+
+_MARKS: Final = """
+SELECT t.trace_id, c.digest AS config, coalesce(m.digest, '') AS map
+FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
+"""
+
+_WANTED: Final = "(SELECT unnest($frames) AS frame_id) w"
+
+_NODES: Final = (
+    "kind is_ego special subkind is_static x y z heading pitch roll speed vx vy vz accel ax "
+    "ay az yaw_rate length width height light_state light_left light_right light_brake "
+    "light_reverse light_position light_low_beam light_high_beam light_fog light_interior "
+    "light_special1 light_special2 steer throttle brake derived_velocity derived_acceleration "
+    "derived_yaw_rate lane_type road section lane junction turn speed_limit curvature"
+)
+
+_TABLES: Final = {
+    "frames": ("seq", "ego"),
+    "nodes": ("node_id", *_NODES.split()),
+    "edges": ("src", "relation", "dst"),
+    "lane_states": (
+        *("src", "dst", "overlap", "lane_offset", "heading_error", "is_primary", "along", "is_own"),
+    ),
+    "lane_gaps": ("src", "dst", "gap"),
+}
+"""Views, and the columns of them that a graph is made of. Changing them changes every digest."""
+
+_MESSAGES: Final = f"""
+SELECT p.frame_id, p.channel, p.log_time_ns, p.chunk_offset, p.message_offset, p.length
+FROM payloads p JOIN {_WANTED} ON w.frame_id = p.frame_id
+ORDER BY p.chunk_offset, p.message_offset
+"""
+
+
+_LENGTHS: Final = f"""
+SELECT min(f.frame_id) AS frame_id, any_value(p.length) AS length
+FROM frame f JOIN {_WANTED} ON w.frame_id = f.frame_id JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
+GROUP BY f.trace_id, p.chunk_offset, p."offset"
+"""
+
+TOGETHER: Final = 200_000
+"""About how many frames are asked about at once, of whole traces."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """What the graphs of a trace were made with.
+
+    Attributes
+    ----------
+    config, map : str
+        Digests of the settings, and of the text of the road map; empty without one.
+    """
+
+    config: str
+    map: str
+
+
+def marks(file: StoreFile) -> dict[int, Mark]:
+    """What the graphs of the traces of a store were made with, by the ids of the traces."""
+    return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
+
+
+def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> Iterator[str]:
+    """A digest of the graphs of each of some groups of frames.
+
+    Parameters
+    ----------
+    file : StoreFile
+    frames : sequence of int64
+        Groups of ids, ascending in each.
+    """
+    with file.snapshot():
+        for low, high in _windows([len(group) for group in frames]):
+            groups = frames[low:high]
+            hashes = [hashlib.blake2b(digest_size=DIGEST_BYTES) for _ in groups]
+            wanted = np.unique(np.concatenate(groups))
+            for view, columns in _TABLES.items():
+                rows = _rows(file, view, columns, wanted)
+                for number, group in enumerate(groups):
+                    _add(hashes[number], rows, group)
+            yield from (one.hexdigest() for one in hashes)
+
+
+def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Ranges of groups of about :data:`WINDOW` frames together, one group at least."""
+    low = together = 0
+    for high, size in enumerate(sizes):
+        if together + size > WINDOW and high > low:
+            yield low, high
+            low, together = high, 0
+        together += size
+    if low < len(sizes):
+        yield low, len(sizes)
+
+
+def _rows(file: StoreFile, view: str, columns: Sequence[str], wanted: Ints) -> tuple[Ints, Words]:
+    """The rows of a view: the frame of each, and words; in an order that depends on them alone."""
+    listed = ", ".join(f'v."{column}"' for column in columns)
+    sql = f"SELECT v.frame_id, {listed} FROM {view} v JOIN {_WANTED} ON w.frame_id = v.frame_id"
+    found = file.arrays(sql, {"frames": wanted.tolist()})
+    frame_id = found.pop("frame_id").astype(np.int64)
+    words = np.empty((len(frame_id), 1 + len(columns)), np.uint64)
+    words[:, 0] = seq_of(frame_id).astype(np.uint64)
+    for place, column in enumerate(found.values(), start=1):
+        words[:, place] = _words(column)
+    order = np.lexsort((*words.T[3:0:-1], frame_id))  # what tells rows apart stands in front
+    words, frame_id = words[order], frame_id[order]
+    same = (np.diff(words[:, :4], axis=0) == 0).all(axis=1) & (np.diff(frame_id) == 0)
+    if same.any():
+        order = np.lexsort((*words.T[:0:-1], frame_id))
+        words, frame_id = words[order], frame_id[order]
+    fresh = np.ones(len(words), np.bool_)
+    fresh[1:] = (words[1:] != words[:-1]).any(axis=1) | (frame_id[1:] != frame_id[:-1])
+    return frame_id[fresh], words[fresh]
+
+
+_MISSING_DIGEST: Final = np.uint64(0x6E756C6C6E756C6C)
+
+
+def _words(values: NDArray[Any]) -> Words:
+    """Values as 64 bits each."""
+    plain = np.ma.getdata(values)
+    missing = np.ma.getmaskarray(values)
+    if plain.dtype.kind == "f":
+        numbers = plain.astype(np.float64) + 0.0  # one zero
+        missing = missing | np.isnan(numbers)
+        words = numbers.view(np.uint64)
+    elif plain.dtype.kind in "biu":
+        words = plain.astype(np.int64).view(np.uint64)
+    else:
+        texts = [
+            "" if gone else str(text) for text, gone in zip(plain.tolist(), missing, strict=True)
+        ]
+        known = {text: _word(text) for text in set(texts)}
+        words = np.fromiter((known[text] for text in texts), np.uint64, len(texts))
+    return np.where(missing, _MISSING_DIGEST, words)
+
+
+def _word(text: str) -> int:
+    whole = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=8).digest()
+    return int.from_bytes(whole, "little")
+
+
+def _add(digest: Any, rows: tuple[Ints, Words], group: Ints) -> None:
+    frame_id, words = rows
+    low = int(np.searchsorted(frame_id, group[0]))
+    high = int(np.searchsorted(frame_id, group[-1], side="right"))
+    own = words[low:high]
+    if len(group) < group[-1] - group[0] + 1:  # others may lie between
+        own = own[np.isin(frame_id[low:high], group)]
+    digest.update(np.array([len(own)], "<u8").tobytes())
+    digest.update(np.ascontiguousarray(own, "<u8").tobytes())
+
+
+@dataclass(frozen=True, slots=True)
+class MessagePlaces:
+    """Messages that belong to frames, by their places in the recording, in order of these.
+
+    Attributes
+    ----------
+    frame_id : (M,) int64
+    channel : (M,) object
+        Topics.
+    log_time_ns, chunk_offset, offset, length : (M,) int64
+    """
+
+    frame_id: Ints
+    channel: NDArray[np.object_]
+    log_time_ns: Ints
+    chunk_offset: Ints
+    offset: Ints
+    length: Ints
+
+
+def messages_of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
+    """The messages that belong to some frames of one trace, a message once for each of its frames."""
+    found = file.arrays(_MESSAGES, {"frames": frame_id.tolist()})
+    frame, channel, *numbers = found.values()
+    return MessagePlaces(
+        frame.astype(np.int64),
+        np.asarray(channel, object),
+        *(column.astype(np.int64) for column in numbers),
+    )
+
+
+def lengths_of_messages(file: StoreFile, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
+    """Bytes of messages that belong to frames, whose ids ascend; a message once, with its first frame."""
+    ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
+    low = 0
+    while low < len(frame_id):
+        high = int(ends[np.searchsorted(ends, min(low + TOGETHER, len(frame_id)))])
+        found = file.arrays(_LENGTHS, {"frames": frame_id[low:high].tolist()})
+        yield found["frame_id"].astype(np.int64), found["length"].astype(np.int64)
+        low = high
+
+
+# Frames of a store as an abstraction has them, many at a time: what writes graphs to files asks for ----
+
+
+class FrameSpans:
+    """Ranges of frames of a store, seen as an abstraction has them. Maps are remembered between them.
+
+    Parameters
+    ----------
+    file : StoreFile
+    abstraction : str
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction.
+    """
+
+    def __init__(self, file: StoreFile, abstraction: str) -> None:
+        self.abstraction = abstraction_named(abstraction)
+        self._access = Access(file.path)
+        self._graphs = Graphs()
+
+    def labelled(self, first: int, last: int) -> tuple[NDArray[np.int64], GraphColumns, Labelled]:
+        """The frames of one trace from one id to another: their numbers, what was seen, and what is made of it.
+
+        Raises
+        ------
+        StoreError
+            Others keep the store for too long.
+        """
+        with self._access.reading() as connection:
+            seq, seen = self._graphs.of_frames(connection, first, last)
+        return seq, seen, self.abstraction.function(seen)

@@ -1,0 +1,594 @@
+"""A store: one DuckDB file, opened only while it is read or published to."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+import sgstore.store._create as schema
+import sgstore.store._rebuild as anew
+import sgstore.store._rows as rows
+from sgstore.errors import StoreError, TraceError
+from sgstore.store._classes import Abstracted
+from sgstore.store._derive import Deriving
+from sgstore.store._graphs import Scenes
+from sgstore.store._locking import (
+    WAIT_S,
+    Access,
+    EngineError,
+    default_memory,
+    spill_folder,
+    translated,
+)
+from sgstore.store._packing import plain
+from sgstore.store._payloads import payload_place
+from sgstore.store._publish import publish_in, remove
+from sgstore.store._rows import BATCH, Batches, GivenTable, Rows, give
+from sgstore.store._staging import scratch
+from sgstore.store._traces import (
+    FrameRef,
+    Identity,
+    StoredTrace,
+    already_stored,
+    frame_named,
+    stored_name,
+    stored_traces,
+    trace_named,
+)
+from sgstore.store._write import Segment
+from sgstore.world import Channel, MessageRefs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable, Sequence
+    from contextlib import AbstractContextManager
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config
+    from sgstore.graph import SceneGraph
+    from sgstore.lang import Catalog
+    from sgstore.readers import Media
+    from sgstore.roads import RoadMap
+    from sgstore.store._joins import JoinedTable, UserTables
+    from sgstore.store._rows import Parameters
+    from sgstore.store._similarity import SimilarFrames
+    from sgstore.store._staging import Sealed
+    from sgstore.store._verify import Verification
+    from sgstore.world import TraceInfo
+
+
+T = TypeVar("T")
+
+
+class StoreFile:
+    """A store, by its path. It is opened only while something is asked of it or published to it.
+
+    Parameters
+    ----------
+    path : str or Path
+    memory : int
+        Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is
+        less. Beyond it the database spills to temporary files.
+    wait_s : float
+        How long to wait for others that write, or read while this one writes; s.
+    spill : int
+        Most that the temporary files of a question take; bytes. 0: 10 GB.
+    tables : UserTables, optional
+        Tables of users' own that are seen beside its views.
+
+    Raises
+    ------
+    StoreError
+        There is no such file, it is no store, or one of another version; or a table is called like one of its
+        own.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        memory: int = 0,
+        wait_s: float = WAIT_S,
+        tables: UserTables | None = None,
+        spill: int = 0,
+    ) -> None:
+        self.path = Path(path)
+        self.tables = tables
+        self._memory = most = memory or default_memory()
+        self._access = Access(self.path, memory=most, wait_s=wait_s, tables=tables, spill=spill)
+        self._scenes = Scenes()
+        self._seen: set[tuple[str, int, int]] = set()
+        self._abstracted: Abstracted | None = None
+        with self._reading():  # what is no store of ours is refused there
+            pass
+
+    @classmethod
+    def create(cls, path: str | Path, *, memory: int = 0, wait_s: float = WAIT_S) -> StoreFile:
+        """The store at a path, made empty if nothing is there.
+
+        Raises
+        ------
+        StoreError
+            What is there is no store, or one of another version; or its folder cannot be written.
+        """
+        path = Path(path)
+        if not path.exists():
+            schema.create(path)
+        return cls(path, memory=memory, wait_s=wait_s)
+
+    @contextmanager
+    def snapshot(self) -> Generator[None]:
+        """Keep the store open for several questions: they see the same state, and cost less."""
+        with self._reading():
+            yield
+
+    def rows(
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+    ) -> Rows:
+        """All rows of a statement of ours.
+
+        Parameters
+        ----------
+        sql : str
+            Trusted; users' statements go through :meth:`user_sql`.
+        parameters : sequence or mapping, optional
+            Values of ``?`` or of ``$name``.
+        given : iterable of GivenTable
+            Tables that it speaks of beside those of the store.
+
+        Raises
+        ------
+        StoreError
+            The database refuses it.
+        """
+        with self._answered(lambda at, _: rows.run(at, sql, parameters), given) as found:
+            return found
+
+    def arrays(
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+    ) -> dict[str, NDArray[np.generic]]:
+        """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL."""
+        with self._answered(lambda at, _: rows.arrays(at, sql, parameters), given) as found:
+            return found
+
+    @contextmanager
+    def batches(
+        self,
+        sql: str,
+        parameters: Parameters | None = None,
+        size: int = BATCH,
+        *,
+        given: Iterable[GivenTable] = (),
+    ) -> Generator[Batches]:
+        """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
+
+        def ask(connection: DuckDBPyConnection, _: ExitStack) -> Batches:
+            return Batches(connection, sql, parameters, size)
+
+        with self._answered(ask, given) as found:
+            yield found
+
+    def user_sql(
+        self, sql: str, *, timeout_s: float | None = None, max_rows: int | None = None
+    ) -> Rows:
+        """All rows of a statement of a user's.
+
+        Parameters
+        ----------
+        sql : str
+            One statement that only reads. It sees the store and no files, and cannot change settings.
+        timeout_s : float, optional
+            When to stop it; s.
+        max_rows : int, optional
+            How many rows to give; ``Rows.truncated`` tells whether there are more.
+
+        Raises
+        ------
+        SqlError
+            It is not one statement that only reads, the database refuses it, or it runs for too long.
+        """
+        size = BATCH if max_rows is None else max(min(BATCH, max_rows + 1), 1)
+        values: list[tuple[Any, ...]] = []
+        with self.user_batches(sql, timeout_s=timeout_s, size=size) as batches:
+            for batch in batches:
+                values += batch.values
+                if max_rows is not None and len(values) > max_rows:
+                    break
+        more = max_rows is not None and len(values) > max_rows
+        return Rows(batches.columns, batches.types, values[:max_rows], truncated=more)
+
+    @contextmanager
+    def user_batches(
+        self, sql: str, *, timeout_s: float | None = None, size: int = BATCH
+    ) -> Generator[Batches]:
+        """The rows of a statement of a user's as a stream; see :meth:`user_sql`."""
+
+        def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
+            statement = rows.user_statement(connection, sql, timeout_s=timeout_s, size=size)
+            return until.enter_context(statement)
+
+        with self._answered(ask) as found:
+            yield found
+
+    def joined(self) -> dict[str, JoinedTable]:
+        """How the rows of users' own tables belong to frames, by the names of the tables."""
+        with self._reading() as connection:
+            return {} if self.tables is None else self.tables.joined(connection)
+
+    def catalog(self) -> Catalog:
+        """What the store holds, as the compiler of queries wants to know it."""
+        from sgstore.store._catalog import catalog_of
+
+        with self._reading() as connection:
+            catalog = catalog_of(connection)
+            return catalog if self.tables is None else self.tables.known(connection, catalog)
+
+    def traces(self) -> tuple[StoredTrace, ...]:
+        """All traces, in the order in which they came."""
+        with self._reading() as connection:
+            return stored_traces(connection)
+
+    def trace(self, ref: int | str) -> StoredTrace:
+        """A trace by its name, its id, or a unique beginning of its name.
+
+        Raises
+        ------
+        StoreError
+            None or several are meant; it says which there are.
+        """
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(ref))
+            found = [t for t in stored_traces(connection) if t.trace_id == trace_id]
+            if not found:
+                raise StoreError(
+                    f"{self.path}: the settings of {ref!r} are gone; see 'sgstore verify'"
+                )
+            return found[0]
+
+    def frame(self, ref: int | str) -> FrameRef:
+        """A frame by its id, ``TRACE#SEQ``, or ``TRACE@12.3s``: the last one at or before that time.
+
+        Parameters
+        ----------
+        ref : int or str
+            TRACE is what :meth:`trace` takes; the time is seconds since the trace began.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame; it says which there are.
+        """
+        with self._reading() as connection:
+            return frame_named(connection, ref)
+
+    def graph(self, ref: int | str) -> SceneGraph:
+        """The scene graph of a frame, as :meth:`frame` takes it: all that the views show of it.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame.
+        """
+        with self._reading() as connection:
+            return self._scenes.graph(connection, frame_named(connection, ref))
+
+    def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
+        """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = (
+                "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
+                " WHERE t.trace_id = ? AND m.text IS NOT NULL"  # one of named parts has none
+            )
+            return connection.execute(sql, [trace_id]).fetchone()
+
+    def channels(self, trace: int | str) -> tuple[Channel, ...]:
+        """Channels of the recording of a trace; ``messages`` is -1."""
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = (
+                "SELECT channel_id, coalesce(topic, ''), coalesce(schema, ''), coalesce(schema_encoding, ''),"
+                " coalesce(message_encoding, ''), -1, role FROM channel WHERE trace_id = ? ORDER BY channel_id"
+            )
+            return tuple(Channel(*row) for row in connection.execute(sql, [trace_id]).fetchall())
+
+    def context(self, trace: int | str) -> MessageRefs:
+        """Places of the messages that later ones of a trace depend on; ``channel`` counts :meth:`channels`."""
+        with self._reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = (
+                "WITH number AS (SELECT channel_id, row_number() OVER (ORDER BY channel_id) - 1 AS channel"
+                " FROM channel WHERE trace_id = $trace)"
+                ' SELECT n.channel, c.log_time_ns, c.chunk_offset, c."offset", c.length'
+                " FROM context c JOIN number n ON n.channel_id = c.channel_id WHERE c.trace_id = $trace"
+                ' ORDER BY c.log_time_ns, c.chunk_offset, c."offset"'
+            )
+            columns = rows.arrays(connection, sql, {"trace": trace_id})
+            return MessageRefs(*(column.astype(np.int64) for column in columns.values()))
+
+    def payload(self, ref: int | str, channel: str) -> bytes:
+        """The data of the message of a channel that belongs to a frame, read from the recording.
+
+        Parameters
+        ----------
+        ref : int or str
+            What :meth:`frame` takes.
+        channel : str
+            Topic.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame or channel, or no message of the channel belongs to the frame.
+        TraceError
+            The recording is gone, was replaced, or is damaged there.
+        """
+        from sgstore.readers import read_message
+
+        path, _, place = self._payload_place(ref, channel)
+        return read_message(path, **place)
+
+    def carried(self, ref: int | str, channel: str) -> Media:
+        """What the message of a channel that belongs to a frame carries: a picture, a video, or the message.
+
+        Parameters
+        ----------
+        ref, channel
+            As :meth:`payload` takes them.
+
+        Returns
+        -------
+        Media
+            A frame of H.264 or H.265 comes with the key frame that it needs and all between.
+
+        Raises
+        ------
+        StoreError
+            As :meth:`payload`.
+        TraceError
+            As :meth:`payload`; or the recording lacks what a frame of a video needs to be decoded.
+        """
+        from sgstore.readers import read_carried
+
+        path, channel_id, place = self._payload_place(ref, channel)
+        return read_carried(path, channel=channel_id, **place)
+
+    def _payload_place(self, ref: int | str, channel: str) -> tuple[Path, int, dict[str, int]]:
+        """Recording, channel's id and place of the message that belongs to a frame."""
+        with self._reading() as connection:
+            frame = frame_named(connection, ref)
+            found = payload_place(connection, frame, channel)
+            sql = "SELECT uri, size, mtime_ns, digest FROM trace WHERE trace_id = ?"
+            (recording,) = connection.execute(sql, [frame.trace_id]).fetchall()
+        channel_id, chunk_offset, offset, length = found
+        place = {"chunk_offset": chunk_offset, "offset": offset, "length": length}
+        return self._unchanged(*recording), channel_id, place
+
+    def _unchanged(self, uri: str, size: int, mtime_ns: int, digest: str) -> Path:
+        """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
+        from sgstore.mcap import digest_of, mark_of
+
+        path = Path(uri)
+        try:
+            mark = (uri, *mark_of(path))
+        except OSError as error:
+            raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
+        if mark != (uri, size, mtime_ns) and mark not in self._seen:
+            if mark[1] != size or digest_of(path) != digest:
+                raise TraceError("not the file that was ingested; ingest it anew", path=path)
+            self._seen.add(mark)
+        return path
+
+    def stored(
+        self,
+        info: TraceInfo,
+        config: Config,
+        road_map: RoadMap | None,
+        part: tuple[float | None, float | None] = (None, None),
+    ) -> str | None:
+        """The name under which the store has a recording already; ``None`` if it has it not.
+
+        Parameters
+        ----------
+        info, config, road_map
+            As :meth:`segment` takes them.
+        part : tuple
+            The part of it that is read: since and until; s.
+
+        Raises
+        ------
+        StoreError
+            It has another part of it, or with another config or map; or another trace has its id.
+        """
+        with self._reading() as connection:
+            return already_stored(connection, Identity.of(info, config, road_map, part))
+
+    def segment(
+        self,
+        info: TraceInfo,
+        config: Config,
+        *,
+        road_map: RoadMap | None = None,
+        answers: tuple[str, ...] = (),
+    ) -> Segment:
+        """A place to build the graphs of a trace, aside from the store, until they are published.
+
+        Parameters
+        ----------
+        info : TraceInfo
+        config : Config
+            What the graphs are made with.
+        road_map : RoadMap, optional
+            The map that they lie on.
+        answers : tuple of str
+            Relations that they can hold.
+        """
+        identity = Identity.of(info, config, road_map)
+        return Segment(self.path, info, identity, road_map, answers, access=self._access)
+
+    def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
+        """Bring a trace into the store, in one transaction.
+
+        Parameters
+        ----------
+        sealed : Sealed
+        replace : bool
+            Whether it takes the place of the trace with its id, under the same name.
+
+        Returns
+        -------
+        str
+            The name of the trace in the store.
+
+        Raises
+        ------
+        StoreError
+            The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
+        """
+        return publish_in(self._access, sealed, replace=replace)
+
+    def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
+        """The name under which the store has the trace of a segment; ``None`` if it has it not.
+
+        Parameters
+        ----------
+        sealed : Sealed
+        as_it_is : bool
+            Whether it must have been read in the same way.
+
+        Raises
+        ------
+        StoreError
+            As :meth:`stored`.
+        """
+        found = already_stored if as_it_is else stored_name
+        with self._reading() as connection:
+            return found(connection, sealed.identity)
+
+    def known_digest(self, path: Path) -> str:
+        """The digest of a recording that has been ingested from a path and looks the same since; else empty."""
+        from sgstore.mcap import mark_of
+
+        try:
+            mark = mark_of(path)
+        except (OSError, TraceError):
+            return ""
+        sql = "SELECT any_value(digest) FROM trace WHERE uri = ? AND size = ? AND mtime_ns = ?"
+        with self._reading() as connection:
+            found = connection.execute(sql, [plain(str(path.resolve())), *mark]).fetchone()
+        return str(found[0]) if found and found[0] else ""
+
+    def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
+        """Delete traces, in one transaction, with the settings and the maps that no other trace has.
+
+        Raises
+        ------
+        StoreError
+            One of them is not there, or others keep the store for too long.
+        """
+        with self._reading():
+            gone = {trace.trace_id: trace for trace in map(self.trace, traces)}
+        with scratch(spill_folder()) as connection, self._access.writing(connection):
+            for trace_id in gone:
+                remove(connection, trace_id)
+        return tuple(gone.values())
+
+    @property
+    def abstracted(self) -> Abstracted:
+        """Frames as abstractions have them, and their classes."""
+        if self._abstracted is None:
+            self._abstracted = Abstracted(self.path, self._access)
+        return self._abstracted
+
+    def like(
+        self, ref: int | str, abstraction: str, ignored: Sequence[str], limit: int
+    ) -> list[SimilarFrames]:
+        """Frames like another; see :func:`sgstore.store._similarity.frames_like`."""
+        from sgstore.store._similarity import frames_like
+
+        with translated(self.path):
+            return frames_like(self._access, ref, abstraction, ignored, limit)
+
+    @property
+    def deriving(self) -> Deriving:
+        """Sets of relations that were derived from the states."""
+        return Deriving(self.path, self._access)
+
+    def verify(self, *, recordings: bool = False) -> Verification:
+        """Look whether everything is as it was published.
+
+        Parameters
+        ----------
+        recordings : bool
+            Whether the recordings are hashed again, too: each is read as a whole.
+        """
+        import sgstore.store._verify as verifying
+        from sgstore.mcap import digest_of
+
+        with self._reading() as connection:
+            found = verifying.verify(connection, self.path)
+            if recordings:
+                again = verifying.verify_recordings(connection, digest_of)
+                found.recordings = again.recordings
+                found.faults += again.faults
+        return found
+
+    def settle(self) -> None:
+        """Work in what a writer that was killed left beside the store: it is safe, but no longer at rest.
+
+        Nothing is done if there is nothing, or if others keep the store for too long.
+        """
+        anew.settle(self.path, self._access, self._memory)
+
+    def compact(self) -> None:
+        """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
+
+        Traces come one behind the other, so that a scan for one relation looks into all of them; and what was
+        removed leaves holes. Answers are the same. It is worth its time after many traces have come or gone.
+
+        Raises
+        ------
+        StoreError
+            Others keep the store for too long, there is no room for a second one, or somebody else's tables are
+            in it, too: they would be lost.
+        """
+        anew.compact(self.path, self._access, self._memory)
+
+    def refuse_others(self) -> None:
+        """Raise a StoreError if there are tables or views of somebody else's: compacting would lose them."""
+        anew.refuse_others(self.path, self._access)
+
+    @contextmanager
+    def _answered(
+        self,
+        ask: Callable[[DuckDBPyConnection, ExitStack], T],
+        given: Iterable[GivenTable] = (),
+    ) -> Generator[T]:
+        """What a question finds, while the store is open.
+
+        If the database fails by a fault of its own, the question is asked again. What it enters into the stack
+        is left with the store.
+        """
+        with ExitStack() as stack:
+
+            def asked() -> T:
+                connection = stack.enter_context(self._reading())
+                with translated(self.path):
+                    give(connection, given)
+                    return ask(connection, stack)
+
+            try:
+                found = asked()
+            except EngineError:
+                stack.close()
+                if not self._access.restart():
+                    raise
+                found = asked()
+            yield found
+
+    def _reading(self) -> AbstractContextManager[DuckDBPyConnection]:
+        return self._access.reading()

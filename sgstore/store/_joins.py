@@ -1,0 +1,319 @@
+"""Tables of users' own beside a store: labels, outcomes, splits, joined to its frames.
+
+A table comes as a file (Parquet, CSV, JSON) or as a data frame. It is read once, by a database of its own that
+sees nothing of the store, and kept as Parquet in a folder of this process. The store's readers may read files
+there and nowhere else, and each of them has the table as a view. So memory does not grow with its length.
+
+A row belongs to a frame by its ``frame_id``, or by ``trace`` and one of ``seq``, ``time_ns``, ``t`` (seconds
+since the trace began): by time, to the frame that is nearest, if it is no further than half a period of
+the trace. With nothing but ``trace`` it belongs to all frames of the trace. Such a table has the column
+``frame_id``, NULL where there is no such frame. A table without these columns is joined by whatever it has.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import duckdb
+
+from sgstore.errors import StoreError
+from sgstore.files import temporary_folder
+from sgstore.lang import TableFacts, Type
+from sgstore.quoting import literal
+from sgstore.store._packing import TOLERANCE
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Mapping
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.lang import Catalog
+
+
+MEMORY: Final = 256 << 20
+"""Most memory for reading a table; bytes. Beyond it the database spills to disk."""
+
+MAX_TABLES: Final = 64
+"""Tables beside one store."""
+
+_NAME: Final = re.compile(r"[A-Za-z_]\w{0,62}", re.ASCII)
+_TAKEN: Final = frozenset({"ego", "env", "frame", "trace"})
+"""Names that mean something else in patterns."""
+
+_READERS: Final = {
+    ".parquet": "read_parquet({})",
+    ".pq": "read_parquet({})",
+    ".csv": "read_csv({}, header = true, sample_size = -1)",
+    ".tsv": "read_csv({}, header = true, sample_size = -1)",
+    ".json": "read_json_auto({})",
+    ".jsonl": "read_json_auto({}, format = 'newline_delimited')",
+    ".ndjson": "read_json_auto({}, format = 'newline_delimited')",
+}
+
+_BY_FRAME: Final = """
+SELECT TRY_CAST(u.frame_id AS BIGINT) AS frame_id, u.* EXCLUDE (frame_id) FROM {0} u
+"""
+_BY_NUMBER: Final = """
+SELECT f.frame_id, u.* FROM {0} u
+LEFT JOIN frames f ON f.trace = CAST(u.trace AS VARCHAR) AND f.seq = TRY_CAST(u.seq AS BIGINT)
+"""
+_BY_TRACE: Final = """
+SELECT f.frame_id, u.* FROM {0} u LEFT JOIN frames f ON f.trace = CAST(u.trace AS VARCHAR)
+"""
+_BY_TIME: Final = """
+SELECT CASE WHEN u.":ns" <= f.until THEN f.frame_id END AS frame_id, u.* EXCLUDE (":ns")
+FROM (
+  SELECT u.*, {1} AS ":ns" FROM {0} u LEFT JOIN trace t ON t.name = CAST(u.trace AS VARCHAR)
+) u ASOF LEFT JOIN (
+  SELECT t.name AS trace, f.frame_id, f.time_ns + coalesce(t.period_ns, 0) // 2 + {2} AS until,
+         greatest(f.time_ns - coalesce(t.period_ns, 0) // 2 - {2},
+                  (f.time_ns + lag(f.time_ns) OVER (PARTITION BY f.trace_id ORDER BY f.seq) + 1) // 2) AS since
+  FROM frame f JOIN trace t ON t.trace_id = f.trace_id
+) f ON f.trace = CAST(u.trace AS VARCHAR) AND u.":ns" >= f.since
+"""
+_NANOSECONDS: Final = {
+    "time_ns": "TRY_CAST(u.time_ns AS BIGINT)",
+    "t": "t.start_ns + CAST(round(TRY_CAST(u.t AS DOUBLE) * 1e9) AS BIGINT)",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class UserTable:
+    """A table of a user's own.
+
+    Attributes
+    ----------
+    name : str
+    source : str
+        The file that it was read from, or the type of the data frame.
+    place : Path
+        Where it is kept.
+    columns : mapping of str to str
+        Its columns, with their types in the database.
+    key : str
+        How its rows belong to frames: ``frame_id``, ``seq``, ``time_ns``, ``t``, ``trace`` (all frames of it);
+        empty: they do not.
+    """
+
+    name: str
+    source: str
+    place: Path
+    columns: Mapping[str, str]
+    key: str
+
+    @property
+    def view(self) -> str:
+        """The statement whose rows are those of the table, with their ``frame_id``."""
+        rows = f"read_parquet({literal(str(self.place))})"
+        match self.key:
+            case "frame_id":
+                return _BY_FRAME.format(rows)
+            case "seq":
+                return _BY_NUMBER.format(rows)
+            case "trace":
+                return _BY_TRACE.format(rows)
+            case "time_ns" | "t":
+                return _BY_TIME.format(rows, _NANOSECONDS[self.key], TOLERANCE)
+            case _:
+                return f"SELECT * FROM {rows}"
+
+
+@dataclass(frozen=True, slots=True)
+class JoinedTable:
+    """How the rows of a table belong to the frames of a store.
+
+    Attributes
+    ----------
+    rows : int
+    matched : int
+        Rows that belong to a frame.
+    frames : int
+        Frames that have rows.
+    """
+
+    rows: int
+    matched: int
+    frames: int
+
+
+class UserTables:
+    """Tables beside a store.
+
+    Parameters
+    ----------
+    given : mapping of str to str, Path or data frame
+        Files, or what DuckDB takes for a table: of pandas, polars, pyarrow.
+
+    Raises
+    ------
+    StoreError
+        A name is none, or a table cannot be read.
+
+    Attributes
+    ----------
+    tables : tuple of UserTable
+    """
+
+    def __init__(self, given: Mapping[str, object]) -> None:
+        if len(given) > MAX_TABLES:
+            raise StoreError(f"{len(given)} tables; {MAX_TABLES} can be joined at a time")
+        names = [name.lower() for name in given]
+        twice = next((name for name in given if names.count(name.lower()) > 1), None)
+        if twice is not None:
+            raise StoreError(
+                f"there are two tables {twice!r}, if the case of letters does not count"
+            )
+        for name in given:
+            if not _NAME.fullmatch(name) or name.lower() in _TAKEN:
+                raise StoreError(
+                    f"not a name for a table: {name!r}; expected letters, digits and '_', and none of"
+                    f" {', '.join(sorted(_TAKEN))}"
+                )
+        folder = tables_folder() / secrets.token_hex(4)
+        self.tables = tuple(_kept(name, table, folder) for name, table in given.items())
+
+    def show(self, connection: DuckDBPyConnection) -> None:
+        """Make the tables visible to a connection that reads a store.
+
+        Raises
+        ------
+        StoreError
+            A name is that of a table or view of the store.
+        """
+        for table in self.tables:
+            taken = connection.execute(
+                "SELECT 1 FROM information_schema.tables WHERE table_catalog = current_database()"
+                " AND lower(table_name) = lower(?)",
+                [table.name],
+            ).fetchone()
+            if taken:
+                raise StoreError(
+                    f"the store has a table or view {table.name!r} of its own; give yours another name"
+                )
+            connection.execute(f'CREATE TEMP VIEW "{table.name}" AS {table.view}')
+
+    def known(self, connection: DuckDBPyConnection, catalog: Catalog) -> Catalog:
+        """A catalog in which patterns can speak of the tables whose rows belong to frames, one row a frame."""
+        single = {
+            name: None
+            if one.frames == one.matched
+            else f"{one.matched} rows for {one.frames} frames"
+            for name, one in self.joined(connection).items()
+        }
+        found = {
+            table.name: TableFacts(
+                table.name,
+                {column: type_of(declared) for column, declared in table.columns.items()},
+                single.get(table.name, "no rows that belong to frames"),
+                self._traces(connection, table),
+                joins=bool(table.key),
+            )
+            for table in self.tables
+        }
+        sets = {name: replace(one, tables=found) for name, one in catalog.sets.items()}
+        return replace(catalog, tables=found, sets=sets)
+
+    def _traces(self, connection: DuckDBPyConnection, table: UserTable) -> frozenset[int] | None:
+        """Ids of the traces of a table whose rows are of traces."""
+        if table.key != "trace":
+            return None
+        sql = f'SELECT DISTINCT frame_id >> 24 FROM "{table.name}" WHERE frame_id IS NOT NULL'
+        return frozenset(row[0] for row in connection.execute(sql).fetchall())
+
+    def joined(self, connection: DuckDBPyConnection) -> dict[str, JoinedTable]:
+        """How the rows of each table that can belong to frames do so."""
+        found: dict[str, JoinedTable] = {}
+        for table in self.tables:
+            if table.key:
+                sql = (
+                    "SELECT count(*), count(f.frame_id), count(DISTINCT f.frame_id)"
+                    f' FROM "{table.name}" u LEFT JOIN frame f ON f.frame_id = u.frame_id'
+                )
+                found[table.name] = JoinedTable(*connection.execute(sql).fetchall()[0])
+        return found
+
+
+def type_of(declared: str) -> Type:
+    """The type in patterns of a column, given its type in the database: number, truth value, else text."""
+    if declared == "BOOLEAN":
+        return Type.boolean
+    numeric = declared.removeprefix("U").startswith(("TINYINT", "SMALLINT", "INT", "BIGINT"))
+    other = declared.startswith(("HUGEINT", "UHUGEINT", "FLOAT", "DOUBLE", "DECIMAL"))
+    return Type.number if (numeric or other) and not declared.endswith("]") else Type.text
+
+
+def tables_folder() -> Path:
+    """The folder of this process for tables, which the readers of stores may read; it need not be there."""
+    return temporary_folder() / "tables"
+
+
+def _kept(name: str, given: object, folder: Path) -> UserTable:
+    """A table as it is kept: read and written as Parquet, unless it is there already."""
+    source = str(given) if isinstance(given, str | Path) else type(given).__name__
+    place = folder / f"{name}.parquet"
+    with _told(name, source), duckdb.connect(":memory:", config=_config(folder)) as connection:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        connection.execute(f"COPY ({_reading(connection, name, given)}) TO {literal(str(place))}")
+        described = connection.execute(
+            f"DESCRIBE SELECT * FROM read_parquet({literal(str(place))})"
+        ).fetchall()
+    columns = {str(row[0]): str(row[1]) for row in described}
+    return UserTable(name, source, place, columns, _key_of(columns))
+
+
+def _reading(connection: DuckDBPyConnection, name: str, given: object) -> str:
+    """The statement that reads a table."""
+    if not isinstance(given, str | Path):
+        connection.register("given", given)
+        return "SELECT * FROM given"
+    path = Path(given)
+    if not path.is_file():
+        raise StoreError(f"table {name}: {path}: no such file")
+    if path.stat().st_size == 0:
+        raise StoreError(f"table {name}: {path}: an empty file")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise StoreError(
+            f"table {name}: {path}: cannot be read; expected a file that ends in {', '.join(_READERS)}"
+        )
+    return f"SELECT * FROM {reader.format(_literal(path))}"
+
+
+def _literal(path: Path) -> str:
+    # A name may hold what stands for other names in a pattern of names.
+    text = re.sub(r"([*?\[])", r"[\1]", str(path.resolve()))
+    return literal(text)
+
+
+def _config(folder: Path) -> dict[str, str | bool | int | float | list[str]]:
+    return {
+        "memory_limit": f"{MEMORY // 1024}KiB",
+        "temp_directory": str(folder),
+        "autoload_known_extensions": False,
+        "autoinstall_known_extensions": False,
+        "python_enable_replacements": False,
+    }
+
+
+def _key_of(columns: Mapping[str, Any]) -> str:
+    names = {name.lower() for name in columns}
+    if "frame_id" in names:
+        return "frame_id"
+    if "trace" not in names:
+        return ""
+    return next((key for key in ("seq", "time_ns", "t") if key in names), "trace")
+
+
+@contextmanager
+def _told(name: str, source: str) -> Generator[None]:
+    """Errors of the database and of the disk as errors of a table."""
+    try:
+        yield
+    except (duckdb.Error, OSError) as error:
+        message = " ".join(str(error).split())
+        raise StoreError(f"table {name}: {source}: {message}") from error

@@ -1,0 +1,739 @@
+"""Shared access to the DuckDB file: locks, guards, recovery, and errors.
+
+What a store's file may be, and what a connection that writes to it may see.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import os
+import stat
+import threading
+import time
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from glob import escape
+from typing import TYPE_CHECKING, Final
+
+import duckdb
+
+import sgstore.store._schema as shape
+from sgstore.errors import SqlError, StoreError
+from sgstore.files import HeldFolder, new_place, sweep
+from sgstore.quoting import literal
+from sgstore.store._joins import tables_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.store._joins import UserTables
+
+
+Stamp = tuple[tuple[int, ...], ...]
+
+_KINDS: Final = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def refuse_special(path: Path) -> None:
+    """Refuse what is no file: to open a pipe would wait for somebody to write into it.
+
+    Raises
+    ------
+    StoreError
+    """
+    for file in (path.with_name(f"{path.name}.wal"), path):
+        try:
+            mode = file.stat().st_mode
+        except FileNotFoundError:
+            continue
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not a name of a file"
+            raise StoreError(f"{path}: cannot be read: {reason}") from error
+        if not stat.S_ISREG(mode):
+            what = _KINDS.get(stat.S_IFMT(mode), "no file")
+            whose = "" if file == path else f"{file.name} beside it is "
+            raise StoreError(
+                f"{path}: {whose}{what}: not a store; expected a file that 'sgstore ingest' made"
+            )
+    if not path.exists():
+        raise StoreError(f"{path}: no such store; 'sgstore ingest' makes one")
+
+
+def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...]) -> None:
+    """Let a connection see no files but a store and what is in some folders, for good."""
+    if not connection.execute("SELECT current_setting('enable_external_access')").fetchall()[0][0]:
+        return
+    whole = str(path.absolute())
+    endings = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
+    ((spill,),) = connection.execute("SELECT current_setting('temp_directory')").fetchall()
+    names = [str(folder.absolute()) for folder in folders]
+    places = [*names, *map(escape, names), spill]  # to read one takes a pattern
+    connection.execute("SET allowed_paths = $1", [[whole + ending for ending in endings]])
+    connection.execute("SET allowed_directories = $1", [places])
+    connection.execute("SET autoload_known_extensions = false")
+    connection.execute("SET autoinstall_known_extensions = false")
+    connection.execute("SET python_enable_replacements = false")
+    connection.execute("SET enable_external_access = false")
+    connection.execute("SET lock_configuration = true")
+
+
+def stamp_of(path: Path) -> Stamp:
+    """What changes whenever a store does: which file it is, its size and time, and those of its log."""
+    found: list[tuple[int, ...]] = []
+    for file in (path, path.with_name(f"{path.name}.wal")):
+        with suppress(OSError):
+            of = file.stat()
+            found.append((of.st_dev, of.st_ino, of.st_size, of.st_mtime_ns, of.st_ctime_ns))
+    return tuple(found)
+
+
+# A folder beside a store for what is on its way into it, called ``STORE.segment-…`` -------------
+
+_NAME: Final = ".segment-"
+
+
+class Folder(HeldFolder):
+    """A folder beside a store that is locked for as long as its process lives.
+
+    Parameters
+    ----------
+    store : Path
+
+    Attributes
+    ----------
+    path : Path
+
+    Raises
+    ------
+    StoreError
+        Nothing can be written there, or the store can have no such name.
+    """
+
+    def __init__(self, store: Path) -> None:
+        refuse_odd_name(store)
+        try:
+            super().__init__(store.parent, f"{store.name}{_NAME}")
+        except OSError as error:
+            raise StoreError(f"{store.parent}: cannot be written: {error.strerror}") from error
+
+
+def remove_left_behind(store: Path) -> None:
+    """Remove what killed processes left on its way into a store."""
+    sweep(store.parent, f"{store.name}{_NAME}")
+
+
+def refuse_odd_name(store: Path) -> None:
+    """Refuse a name that the database cannot be told.
+
+    Raises
+    ------
+    StoreError
+        It is not UTF-8, or has a zero byte in it.
+    """
+    try:
+        if b"\0" not in str(store).encode():
+            return
+    except UnicodeEncodeError:
+        pass
+    shown = str(store).encode(errors="backslashreplace").decode().replace("\0", "\\x00")
+    raise StoreError(
+        f"{shown}: the name of a store and of its folders is UTF-8; rename what is not"
+    )
+
+
+# What is said of errors of the database that are no fault of the question -----------------------
+
+
+def engine_fault(error: duckdb.Error) -> str | None:
+    """What went wrong, in a line, if an error is a fault of the database itself; else ``None``."""
+    if not isinstance(error, duckdb.InternalException | duckdb.FatalException):
+        return None
+    reason = str(error).strip().partition("\n")[0].removeprefix("INTERNAL Error: ")
+    return f"a fault of DuckDB {duckdb.__version__} itself, not of the question: {reason}"
+
+
+def spill_fault(message: str) -> str | None:
+    """What is said of a question that needs more memory and disk than it may take; ``None``: another error."""
+    if not message.startswith("Out of Memory Error"):
+        return None
+    return (
+        "stopped: it needs more memory, and disk beside it, than it may take; allow it more (--max-spill 50GB;"
+        " memory and max_spill of Store), or ask for less: fewer variables, a narrower WHERE, no ORDER BY"
+    )
+
+
+# How readers and writers share one DuckDB file: within a process, and among processes -----------
+# DuckDB lets one process write a file, or many read it, and refuses everyone else at once. Here nobody is
+# refused: whoever comes waits, for a bounded time, and the file is held only while it is read or published to.
+#
+# * *Among processes* DuckDB's own lock decides. A writer that waits for readers holds a second lock, the
+#   *gate* (``STORE.gate``), that new readers pass first, so that a stream of them cannot keep it out for ever.
+# * *Within a process* that lock is not enough, because POSIX forgets all locks of a process on a file when any
+#   descriptor of it is closed. All readers of a file share one instance of the database, a writer has it
+#   alone, and **nothing in this process may open a store's file by other means while it is written**.
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there writers and readers take their turns as they come
+    fcntl = None
+
+
+STORAGE_VERSION: Final = "v1.5.0"
+"""Format of the file: the newest that every supported DuckDB can read."""
+
+_BUSY: Final = ("Could not set lock on file", "Conflicting lock is held")
+"""What DuckDB says when another process has the file."""
+
+_HELD_HERE: Final = (
+    "Unique file handle conflict",
+    "different configuration than existing connections",
+)
+"""What it says when this process has it already, by a connection that is none of ours."""
+
+WAIT_S: Final = 60.0
+"""How long to wait for others that read or write; s."""
+
+_HELD_HERE_S: Final = 0.25
+"""How long to wait for such a connection, which may just be closing; s."""
+
+_SURPRISES: Final = (
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, StopIteration),
+    *(TypeError, ValueError),
+)
+"""What our code ends in where the rows of a store are not as they must be."""
+
+_PAUSE: Final = 0.005, 0.1
+"""First and longest pause between two attempts; s."""
+
+
+def without_faults(connection: DuckDBPyConnection) -> None:
+    """Turn off what some versions of DuckDB do wrong.
+
+    * Before 2.0 its optimizer *compressed_materialization* loses a column of some joins of grouped relations
+      ("Failed to bind column reference").
+    * In 2.0 operators that gather small chunks take the dictionary of one row group for that of another
+      ("dict-surviving cache"), in stores of some hundred traces. Without that, patterns are as fast.
+    """
+    if duckdb.__version__.startswith("1."):
+        connection.execute("SET disabled_optimizers = 'compressed_materialization'")
+        return
+    with suppress(duckdb.CatalogException):  # a later version may have no such setting
+        # GLOBAL: every reading has a session of its own.
+        connection.execute("SET GLOBAL enable_caching_operators = false")
+
+
+_CAREFUL: Final = (
+    *("common_aggregate", "common_subplan", "compressed_materialization", "duplicate_groups"),
+    *("join_filter_pushdown", "late_materialization", "statistics_propagation", "top_n"),
+)
+"""Optimizers of DuckDB that queries are fast enough without."""
+
+
+def _be_careful(connection: DuckDBPyConnection) -> None:
+    """Turn off whatever may be at fault and is not needed: for a question that has met a fault of DuckDB."""
+    known = {row[0] for row in connection.execute("FROM duckdb_optimizers()").fetchall()}
+    off = ",".join(name for name in _CAREFUL if name in known)
+    connection.execute(f"SET disabled_optimizers = {literal(off)}")
+
+
+def default_memory() -> int:
+    """A quarter of the machine's memory, 1 GiB at most; bytes."""
+    try:
+        machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        machine = 1 << 32
+    return max(min(machine // 4, 1 << 30), 1 << 28)
+
+
+SPILL: Final = 10 * 10**9
+"""Most that reading puts on disk beside its memory, unless it is allowed more; bytes."""
+
+
+def memory_setting(memory: int) -> str:
+    """An amount of memory as DuckDB reads it."""
+    return f"{memory // 1024}KiB"
+
+
+@dataclass(slots=True)
+class _FileLock:
+    """The state of one file in this process.
+
+    ``checked`` says whether the instance has been found to be a store as ``schema.sql`` makes it, ``good`` what
+    file it was that last was.
+    """
+
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    instance: DuckDBPyConnection | None = None
+    checked: bool = False
+    good: Stamp = ()
+    readers: int = 0
+    writing: bool = False
+    waiting: int = 0
+    careful: bool = False
+    cursors: list[DuckDBPyConnection] = field(default_factory=list["DuckDBPyConnection"])
+    held: threading.local = field(default_factory=threading.local)
+
+    @property
+    def mine(self) -> int:
+        """How many readings this thread has under way."""
+        return getattr(self.held, "count", 0)
+
+    @mine.setter
+    def mine(self, count: int) -> None:
+        self.held.count = max(count, 0)  # a reading may end in another thread than it began in
+
+
+_doors: dict[Path, _FileLock] = {}
+_doors_lock = threading.Lock()
+
+
+class Access:
+    """A DuckDB file that is opened only while it is used.
+
+    Parameters
+    ----------
+    path : Path
+    memory : int
+        Most memory that reading may take; bytes. 0: :func:`default_memory`. Beyond it DuckDB spills to files.
+    spill : int
+        Most that these take; bytes. 0: :data:`SPILL`.
+    wait_s : float
+        How long to wait for others; s.
+    tables : UserTables, optional
+        Tables of users' own that readers see too.
+    checked : bool
+        Whether whatever is no store as ``schema.sql`` makes it is refused. To be left out only by who looks for
+        what is wrong with it, and reads nothing before.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        memory: int = 0,
+        wait_s: float = WAIT_S,
+        tables: UserTables | None = None,
+        checked: bool = True,
+        spill: int = 0,
+    ) -> None:
+        self.path = path
+        self._checked = checked
+        self._tables = tables
+        self._memory = memory or default_memory()
+        self._spill = spill or SPILL
+        self._wait_s = wait_s
+        refuse_odd_name(path)
+        with _doors_lock:
+            known = _doors.get(path.resolve())
+            self._door = known or _doors.setdefault(path.resolve(), _FileLock())
+        if known is None:  # once in the life of a process
+            remove_left_behind(path)
+
+    @contextmanager
+    def reading(self) -> Generator[DuckDBPyConnection]:
+        """A read-only connection. Readings may be nested; all that overlap see the same state.
+
+        Raises
+        ------
+        StoreError
+            There is no such file, it is no database, or a writer kept it for too long.
+        """
+        deadline = _Deadline(self._wait_s)
+        connection = self._enter(deadline)
+        try:
+            if self._tables is not None:
+                self._tables.show(connection)
+            with translated(self.path):
+                yield connection
+        except _SURPRISES as error:
+            if self._checked and (reason := self._damage(connection, error)):
+                raise StoreError(
+                    f"{self.path}: not as it was published: {reason}; 'sgstore verify' says all,"
+                    " 'sgstore rebuild' makes it anew from its recordings"
+                ) from error
+            raise
+        finally:
+            try:
+                connection.close()
+            finally:
+                self._leave(connection)
+
+    def _damage(self, connection: DuckDBPyConnection, error: Exception) -> str:
+        """What is wrong with the store where our own code could make nothing of what it read."""
+        trace = error.__traceback__
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        where = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
+        if where == __name__ or not where.startswith(("sgstore.", "json", "numpy")):
+            return ""  # the fault of who called us
+        from sgstore.store._verify import damage  # only where something is wrong
+
+        return damage(connection, self.path)
+
+    def restart(self) -> bool:
+        """Close the file after a fault of DuckDB; it is opened anew without what may be at fault.
+
+        Returns
+        -------
+        bool
+            Whether a question may be asked again: not if other threads read the file, too, or if it was open
+            in this way already.
+        """
+        door = self._door
+        with door.changed:
+            if door.readers != door.mine:
+                return False
+            for connection in (*door.cursors, door.instance):
+                if connection is not None:
+                    connection.close()
+            door.instance = None
+            again, door.careful = not door.careful, True
+        return again
+
+    def _enter(self, deadline: _Deadline) -> DuckDBPyConnection:
+        door = self._door
+        if not door.mine:  # a nested one must not wait for a writer who waits for the outer one
+            _pass_gate(self.path, deadline)
+        with door.changed:
+            free = door.changed.wait_for(
+                lambda: not door.writing and (door.mine or not door.waiting), deadline.left()
+            )
+            if not free:
+                raise StoreError(f"{self.path}: another thread has been writing for too long")
+            if door.instance is None:
+                door.instance = self._opened(deadline)
+                door.checked = False
+            try:
+                if self._checked and not door.checked:
+                    self._check(door.instance)
+                    door.checked = True
+                connection = door.instance.cursor()
+            except BaseException:
+                self._close_unused()
+                raise
+            door.cursors.append(connection)
+            door.readers += 1
+            door.mine += 1
+            return connection
+
+    def _leave(self, connection: DuckDBPyConnection) -> None:
+        door = self._door
+        with door.changed:
+            door.cursors.remove(connection)
+            door.mine -= 1
+            door.readers -= 1
+            self._close_unused()
+
+    def _close_unused(self) -> None:
+        door = self._door
+        if not door.readers and door.instance is not None:
+            instance, door.instance = door.instance, None  # gone even if closing it is interrupted
+            instance.close()
+            door.changed.notify_all()
+
+    def _check(self, connection: DuckDBPyConnection, database: str = "") -> None:
+        """Refuse what is no store as ours are; one that was looked at before is not looked at again."""
+        stamp = stamp_of(self.path)
+        if stamp and stamp == self._door.good:
+            return
+        with translated(self.path):
+            shape.check(connection, database or shape.database_of(connection), self.path)
+        self._door.good = stamp
+
+    def _opened(self, deadline: _Deadline) -> DuckDBPyConnection:
+        # One configuration for all readers: they share the instance, users' statements among them.
+        config: dict[str, str | bool | int | float | list[str]] = {
+            "memory_limit": memory_setting(self._memory),
+            "temp_directory": str(spill_folder()),
+            "max_temp_directory_size": memory_setting(self._spill),
+            "autoload_known_extensions": False,
+            "autoinstall_known_extensions": False,
+            "python_enable_replacements": False,
+        }
+        while True:
+            try:
+                refuse_special(self.path)
+                with translated(self.path):
+                    connection = duckdb.connect(str(self.path), read_only=True, config=config)
+                    # Among the settings above DuckDB might take these before the folder, and refuse that.
+                    connection.execute("SET allowed_directories = [?]", [str(tables_folder())])
+                    without_faults(connection)
+                    if self._door.careful:
+                        _be_careful(connection)
+                    connection.execute("SET enable_external_access = false")
+                    connection.execute("SET lock_configuration = true")
+                    return connection
+            except BusyError as busy:
+                deadline.pause(busy)
+
+    @contextmanager
+    def writing(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
+        """One transaction on the file, as :meth:`attached` has it. It is undone if the block raises.
+
+        Raises
+        ------
+        StoreError
+            There is no such file, it cannot be written, or others kept it for too long.
+        """
+        with self.attached(connection, *folders), _transaction(connection):
+            yield
+
+    @contextmanager
+    def attached(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
+        """The file attached as ``store`` to a connection of the caller's; nobody else has it meanwhile.
+
+        From then on the connection sees no files but the store and what is in the folders that are named, and
+        its settings are locked.
+        """
+        with self._alone() as deadline, _closed_gate(self.path, deadline):
+            with translated(self.path):
+                shut_in(connection, self.path, folders)
+            self._attach(connection, deadline)
+            checked = False
+            try:
+                if self._checked:
+                    self._check(connection, "store")
+                    checked = True
+                with translated(self.path):
+                    yield
+            finally:
+                # What failed has been raised already; the caller closes the connection anyway.
+                with suppress(duckdb.Error):
+                    connection.execute("DETACH store")
+                    if checked:  # what came into it is ours
+                        self._door.good = stamp_of(self.path)
+
+    @contextmanager
+    def _alone(self) -> Generator[_Deadline]:
+        """No other thread of this process has the file."""
+        door, deadline = self._door, _Deadline(self._wait_s)
+        if door.mine:
+            raise StoreError(f"{self.path}: cannot be written while the same thread reads it")
+        with door.changed:
+            door.waiting += 1
+            try:
+                free = door.changed.wait_for(
+                    lambda: not door.writing and not door.readers, deadline.left()
+                )
+                if not free:
+                    raise StoreError(f"{self.path}: another thread has been using it for too long")
+                door.writing = True
+            finally:
+                door.waiting -= 1
+        try:
+            yield deadline
+        finally:
+            with door.changed:
+                door.writing = False
+                door.changed.notify_all()
+
+    def _attach(self, connection: DuckDBPyConnection, deadline: _Deadline) -> None:
+        while True:
+            refuse_special(self.path)  # ATTACH would make an empty one if there is none
+            try:
+                with translated(self.path):
+                    connection.execute(
+                        f"ATTACH {literal(str(self.path.absolute()))} AS store"
+                        f" (STORAGE_VERSION '{STORAGE_VERSION}')"
+                    )
+                return
+            except BusyError as busy:
+                deadline.pause(busy)
+
+
+@contextmanager
+def _transaction(connection: DuckDBPyConnection) -> Generator[None]:
+    connection.execute("BEGIN TRANSACTION")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        with suppress(duckdb.Error):  # a transaction that broke has been undone already
+            connection.execute("ROLLBACK")
+        raise
+    # So that no write-ahead log is left at rest. If it fails, it is left, and what is in it is safe.
+    with suppress(duckdb.Error):
+        connection.execute("CHECKPOINT store")
+
+
+def interrupt_readers() -> None:
+    """End whatever this process is asking of stores; called by another thread than those that ask.
+
+    A single step of the database, such as one over three tables without a join, may take for ever, and heeds
+    this alone.
+    """
+    for door in tuple(_doors.values()):
+        for connection in tuple(door.cursors):
+            with suppress(duckdb.Error):  # it was closed meanwhile
+                connection.interrupt()
+
+
+class BusyError(StoreError):
+    """Others have the file."""
+
+
+class EngineError(StoreError):
+    """The database has failed by a fault of its own."""
+
+
+class HeldHereError(BusyError):
+    """The process has it already, by a connection that sgstore did not make."""
+
+
+@contextmanager
+def translated(path: Path) -> Generator[None]:
+    """Errors of DuckDB as errors of the store at ``path``, and an interruption as what it is.
+
+    DuckDB turns Ctrl-C into errors of its own: into a RuntimeError while a statement runs, and into one that
+    quotes the KeyboardInterrupt while it looks at our arrays.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "Query interrupted" in str(error):
+            raise KeyboardInterrupt from error
+        raise
+    except duckdb.Error as error:
+        message = str(error).strip()
+        if isinstance(error, duckdb.InterruptException) or "KeyboardInterrupt" in message:
+            raise KeyboardInterrupt from error
+        if (fault := engine_fault(error)) is not None:
+            raise EngineError(f"{path}: {fault}") from error
+        if any(phrase in message for phrase in _HELD_HERE):
+            raise HeldHereError(
+                f"{path}: open in this process already, by a connection of duckdb's own (duckdb.connect);"
+                " close that first, or ask by sgstore.open(…).sql"
+            ) from error
+        if any(phrase in message for phrase in _BUSY):
+            raise BusyError(f"{path}: in use by another process for too long") from error
+        if (spilled := spill_fault(message)) is not None:
+            raise SqlError(spilled) from error
+        raise StoreError(f"{path}: {_reason(message)}") from error
+
+
+def _reason(message: str) -> str:
+    # A name that ends in .csv or the like makes DuckDB think of a table that it could read.
+    phrases = (
+        "not a valid DuckDB database file",
+        "Is a directory",
+        "in-memory database in read-only",
+    )
+    if any(phrase in message for phrase in phrases):
+        return "not a store; expected a file that 'sgstore ingest' made"
+    if "database does not exist" in message:
+        return "no such store; 'sgstore ingest' makes one"
+    if "database file with version number" in message:
+        return "made by a newer DuckDB than is installed here; upgrade the package duckdb"
+    return message
+
+
+class _Deadline:
+    """A bounded wait with growing pauses."""
+
+    def __init__(self, wait_s: float) -> None:
+        self._start = time.monotonic()
+        self._end = self._start + wait_s
+        self._next, self._longest = _PAUSE
+
+    def left(self) -> float:
+        return max(self._end - time.monotonic(), 0)
+
+    def pause(self, error: StoreError) -> None:
+        """Sleep a little, or raise the error if there is no time left."""
+        if isinstance(error, HeldHereError):
+            if time.monotonic() - self._start > _HELD_HERE_S:
+                raise error
+            gc.collect()  # it may be one that nobody has any more
+        if not self.left():
+            raise error
+        time.sleep(min(self._next, self.left()))
+        self._next = min(self._next * 1.5, self._longest)
+
+
+def _gate(path: Path) -> Path:
+    return path.with_name(f"{path.name}.gate")
+
+
+def _pass_gate(path: Path, deadline: _Deadline) -> None:
+    """Wait while a writer waits for readers to go. A courtesy: DuckDB's lock decides."""
+    if fcntl is None:
+        return
+    try:
+        gate = os.open(_gate(path), os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except OSError:
+        return
+    try:
+        _lock(gate, fcntl.LOCK_SH, path, deadline)
+    finally:
+        os.close(gate)
+
+
+@contextmanager
+def _closed_gate(path: Path, deadline: _Deadline) -> Generator[None]:
+    """Keep new readers of other processes out."""
+    if fcntl is None:
+        yield
+        return
+    gate = _Gate(path)
+    atexit.register(gate.remove)  # should an interrupt come at an odd moment
+    try:
+        gate.close(deadline)
+        yield
+    finally:
+        gate.remove()
+        atexit.unregister(gate.remove)
+
+
+class _Gate:
+    """The gate of a store, closed by this process."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = -1
+
+    def close(self, deadline: _Deadline) -> None:
+        """Wait until nobody else has closed it, and close it."""
+        try:
+            self._lock = os.open(_gate(self._path), os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise StoreError(f"{self._path}: cannot be written: {error.strerror}") from error
+        if fcntl is not None:
+            _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
+
+    def remove(self) -> None:
+        """Open it, unless another process has it now."""
+        if fcntl is None or self._lock < 0:
+            return
+        # Whoever waits has it open and does not mind that it has no name any more.
+        with suppress(OSError):
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _gate(self._path).unlink()
+        with suppress(OSError):
+            os.close(self._lock)
+        self._lock = -1
+
+
+def _lock(gate: int, how: int, path: Path, deadline: _Deadline) -> None:
+    if fcntl is None:
+        return
+    while True:
+        try:
+            fcntl.flock(gate, how | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            deadline.pause(StoreError(f"{path}: another process has been writing for too long"))
+
+
+def spill_folder() -> Path:
+    """A folder that does not exist yet; DuckDB makes it when memory runs out, and removes it."""
+    return new_place("spill")

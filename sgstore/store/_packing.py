@@ -1,0 +1,283 @@
+"""Graphs of a block as columns of the store's tables: codes and masks.
+
+A mask holds the 60 frames of a bucket. An edge that holds in many of them is one row, and so is a static
+node that is present in many.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.graph import Edges
+from sgstore.world import BUCKET_FRAMES, GAP, KEPT, TOLERANCE_NS, TOLERANCE_SHARE, number, turned
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from sgstore.graph import GraphBlock
+    from sgstore.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
+
+
+Whole = NDArray[np.signedinteger[Any]]
+
+Columns = dict[str, NDArray[Any]]
+"""A table's columns by name, all of one length. What is missing is not finite, :data:`MISSING`, or empty."""
+
+MISSING: Final = -(1 << 31)
+"""A whole number that is missing. A masked array would say it better, but DuckDB 1.5 does not see masks."""
+
+EDGE_ROWS: Final = 1 << 18
+"""Edges that become rows together: what is made of more on the way takes more memory than they do."""
+
+BUCKET_BITS: Final = 18
+"""Bits of a bucket's number in its trace."""
+FRAME_BITS: Final = 6
+"""Bits of a frame's number in its bucket."""
+MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
+
+TOLERANCE: Final = f"greatest({TOLERANCE_NS}, coalesce(period_ns, 0) // {TOLERANCE_SHARE})"
+"""SQL: :func:`sgstore.world.tolerance_ns` of a trace's ``period_ns``."""
+LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
+"""SQL: :func:`sgstore.world.longest_step_ns` of it."""
+
+
+@dataclass(slots=True)
+class NodeKinds:
+    """Kinds of the nodes of a trace by node id: entities, which become more, and parts of its map."""
+
+    entities: Codes
+    map: Codes
+
+    def learn(self, entities: Entities) -> None:
+        """Take note of entities that appear for the first time, in order of node id."""
+        if len(entities) and entities.first != len(self.entities):
+            raise ValueError(f"new entities begin at {entities.first}, not {len(self.entities)}")
+        self.entities = np.concatenate([self.entities, entities.kind])
+
+    def of(self, nodes: Ints) -> Codes:
+        """Kinds of nodes."""
+        kinds = np.empty(len(nodes), np.int8)
+        kinds[nodes >= 0] = self.entities[nodes[nodes >= 0]]
+        kinds[nodes < 0] = self.map[-1 - nodes[nodes < 0]]
+        return kinds
+
+
+def trace_bucket(trace_id: int, seq: Ints) -> Ints:
+    """Buckets of frames of a trace."""
+    return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
+
+
+def frame_ids(trace_id: int, seq: Ints) -> Ints:
+    """Ids of frames of a trace."""
+    return (trace_bucket(trace_id, seq) << FRAME_BITS) + seq % BUCKET_FRAMES
+
+
+def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]:
+    """Rows with equal keys become one, with the bits of all of them.
+
+    Parameters
+    ----------
+    keys : sequence of (N,) int
+        Columns of the key, the most significant first.
+    bits : (N,) int64
+        0 … 59.
+
+    Returns
+    -------
+    first : (M,) intp
+        A row for each distinct key, in ascending order of keys.
+    mask : (M,) int64
+    """
+    if not len(bits):
+        return np.zeros(0, np.intp), bits
+    packed = _packed(keys)
+    order = np.argsort(packed, kind="stable")
+    ranked = packed[order]
+    starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1]))
+    return order[starts], np.bitwise_or.reduceat(np.left_shift(1, bits[order]), starts)
+
+
+def _packed(keys: Sequence[Whole]) -> Ints:
+    """The columns of a key, none of them empty, as one number that sorts as they do."""
+    spans = [int(key.max()) - int(key.min()) + 1 for key in keys]
+    if math.prod(spans) >= 1 << 62:  # ids that are far apart: their ranks instead
+        return np.unique(np.stack(keys), axis=1, return_inverse=True)[1].reshape(-1)
+    packed = np.zeros(len(keys[0]), np.int64)
+    for key, span in zip(keys, spans, strict=True):
+        packed = packed * span + (key - key.min())
+    return packed
+
+
+def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
+    """Table ``frame``."""
+    frames = graph.frames
+    return {
+        "frame_id": frame_ids(trace_id, frames.seq),
+        "bucket": trace_bucket(trace_id, frames.seq),
+        "bit": frames.seq % BUCKET_FRAMES,
+        "seq": frames.seq,
+        "time_ns": frames.time_ns,
+        "log_time_ns": frames.log_time_ns,
+        "ego": unless(frames.ego, frames.ego < 0),
+    }
+
+
+def state_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds, origin: Origin) -> Columns:
+    """Table ``state``, but for the constants of entities; kinds and states of lights as codes."""
+    frames, states = graph.frames, graph.frames.states
+    row = frames.frame_of
+    plain = {name: getattr(states, name) for name in KEPT}
+    plain |= {
+        "heading": turned(states.heading),
+        "x": states.x - origin.x,
+        "y": states.y - origin.y,
+        "z": states.z - origin.z,
+        "speed": np.sqrt(states.vx**2 + states.vy**2 + np.nan_to_num(states.vz) ** 2),
+    }
+    columns: Columns = {name: number(values) for name, values in plain.items()}
+    return columns | {
+        "kind": kinds.of(states.node),
+        "frame_id": frame_ids(trace_id, frames.seq)[row],
+        "node_id": states.node,
+        "is_ego": states.node == frames.ego[row],
+        "lights": unless(states.lights, states.lights < 0),
+        "light_state": unless(states.light_state, states.light_state < 0),
+        "derived": states.derived,
+    }
+
+
+def node_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
+    """Table ``node``; kinds as codes."""
+    seq = graph.frames.seq[graph.presence.frame]
+    kind, bucket, node = (
+        kinds.of(graph.presence.node),
+        trace_bucket(trace_id, seq),
+        graph.presence.node,
+    )
+    first, mask = masks_of((kind, bucket, node), seq % BUCKET_FRAMES)
+    return {"kind": kind[first], "bucket": bucket[first], "node_id": node[first], "mask": mask}
+
+
+def edge_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Iterator[Columns]:
+    """Table ``edge``, in pieces of about :data:`EDGE_ROWS`; relations and kinds as codes."""
+    edges = graph.edges
+    count = -(-len(edges) // EDGE_ROWS)
+    if count <= 1:
+        yield _edge_columns(graph, edges, trace_id, kinds)
+        return
+    piece = (edges.src % count).astype(np.int32)  # what becomes one row has one source
+    for which in range(count):
+        rows = np.flatnonzero(piece == which)
+        part = Edges(*(getattr(edges, column.name)[rows] for column in fields(Edges)))
+        yield _edge_columns(graph, part, trace_id, kinds)
+
+
+def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKinds) -> Columns:
+    seq, ego = graph.frames.seq[edges.frame], graph.frames.ego[edges.frame]
+    # Without an ego it is -1, and so is a node of the map.
+    of_ego = ((edges.src == ego) * 2 + (edges.dst == ego)) * (ego >= 0)
+    bucket = trace_bucket(trace_id, seq)
+    # Kinds follow from the nodes: the table is sorted by them when it is published.
+    keys = (edges.relation, of_ego, bucket, edges.src, edges.dst)
+    first, mask = masks_of(keys, seq % BUCKET_FRAMES)
+    src, dst = edges.src[first], edges.dst[first]
+    return {
+        "relation": edges.relation[first],
+        "src_is_ego": of_ego[first] >= 2,
+        "dst_is_ego": of_ego[first] % 2 == 1,
+        "src_kind": kinds.of(src),
+        "dst_kind": kinds.of(dst),
+        "bucket": bucket[first],
+        "src": src,
+        "dst": dst,
+        "mask": mask,
+    }
+
+
+def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
+    """Table ``lane_state``; kinds as codes."""
+    lanes = graph.lanes
+    return {
+        "kind": kinds.of(lanes.node),
+        "frame_id": frame_ids(trace_id, graph.frames.seq)[lanes.frame],
+        "node_id": lanes.node,
+        "lane": lanes.lane,
+        "overlap": number(lanes.overlap),
+        "lane_offset": number(lanes.offset),
+        "heading_error": number(lanes.heading_error),
+        "is_primary": lanes.primary,
+        "along": number(lanes.along),
+        "is_own": lanes.own,
+        "is_ego": graph.frames.ego[lanes.frame] == lanes.node,
+    }
+
+
+def gap_columns(graph: GraphBlock, trace_id: int) -> Columns:
+    """Table ``lane_gap``."""
+    gaps = graph.gaps
+    return {
+        "frame_id": frame_ids(trace_id, graph.frames.seq)[gaps.frame],
+        "src": gaps.src,
+        "dst": gaps.dst,
+        "gap": number(gaps.gap),
+    }
+
+
+def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
+    """Table ``entity``; kinds as codes."""
+    entities, scenery = graph.frames.entities, graph.frames.scenery
+    rows = scenery.node - entities.first
+    if len(rows) and not 0 <= rows.min() <= rows.max() < len(entities):
+        raise ValueError("scenery of entities that the block does not introduce")
+    poses = {
+        name: np.full(len(entities), np.nan)
+        for name in ("x", "y", "z", "heading", "length", "width", "height")
+    }
+    for name, values in poses.items():
+        values[rows] = getattr(scenery, name)
+    poses["heading"] = turned(poses["heading"])
+    for name in ("x", "y", "z"):
+        poses[name] -= getattr(origin, name)
+    return {
+        "node_id": entities.first + np.arange(len(entities)),
+        "kind": entities.kind,
+        "ident": texts(entities.ident),
+        "special": texts(entities.special),
+        "subkind": texts(entities.subkind),
+        "type_name": texts(entities.type_name),
+        "is_static": entities.static,
+        "map_ref": texts(entities.map_ref),
+        **{name: number(values) for name, values in poses.items()},
+    }
+
+
+def message_columns(messages: MessageRefs, channel_ids: Ints) -> Columns:
+    """Places of messages, with the channels' ids in the file."""
+    columns = {f.name: getattr(messages, f.name) for f in fields(messages)}
+    return columns | {"channel": channel_ids[messages.channel]}
+
+
+def unless(values: Whole, missing: Bools) -> Ints:
+    """Values, and :data:`MISSING` where they are missing."""
+    return np.where(missing, np.int64(MISSING), values)
+
+
+def texts(values: Iterable[str]) -> NDArray[Any]:
+    """Texts as the database takes them; empty where there is none."""
+    return np.array([plain(value) for value in values], object)
+
+
+def plain(text: str) -> str:
+    """A text with ``?`` for what is not Unicode: parts of files that are not what they say."""
+    return text.encode("utf-8", "replace").decode()
+
+
+def as_json(values: dict[str, Any]) -> str:
+    """Plain values as JSON that the database takes; the same values give the same text."""
+    return plain(json.dumps(values, sort_keys=True, ensure_ascii=False))

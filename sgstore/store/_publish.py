@@ -1,0 +1,329 @@
+"""Publishing and removing traces, and adding to published ones, in one transaction.
+
+From a sealed segment into the store, and out of it: what one transaction does.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from glob import escape
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final
+
+import sgstore.store._schema as shape
+from sgstore.errors import StoreError
+from sgstore.quoting import literal
+from sgstore.store._locking import spill_folder
+from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP, plain
+from sgstore.store._staging import Checksum, Staging, expressions, scratch
+from sgstore.store._traces import already_stored, free_name, stored_name
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterable, Iterator
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.store._locking import Access
+    from sgstore.store._staging import Sealed
+    from sgstore.store._traces import Identity
+    from sgstore.world import TraceInfo
+
+
+MAP_TABLES: Final = ("map", "map_node", "map_edge", "map_reach")
+"""Tables of a road map; they come into a store once, whatever the number of traces on it."""
+
+_TRACE: Final = f"""
+INSERT INTO trace BY NAME
+WITH steps AS (SELECT time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
+SELECT $trace_id AS trace_id, $uri AS uri, $size AS size, $mtime_ns AS mtime_ns,
+       $digest AS digest, $flavour AS flavour, nullif($ego, '') AS ego, $since AS since, $until AS until,
+       count(*) AS frames,
+       arg_min(time_ns, frame_id) AS start_ns, arg_max(time_ns, frame_id) AS end_ns,
+       coalesce((SELECT quantile_disc(step, 0.5) FROM steps), 0) AS period_ns,
+       $origin_x AS origin_x, $origin_y AS origin_y, $origin_z AS origin_z, $answers AS answers,
+       $report AS report, $version AS version
+FROM frame;
+INSERT INTO bucket BY NAME
+WITH steps AS (
+  SELECT bucket, 1::BIGINT << bit AS one, time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
+SELECT bucket, $trace_id AS trace_id, bit_or(one) AS valid,
+       bit_or(CASE WHEN step BETWEEN 0 AND {LONGEST_STEP} THEN one ELSE 0 END) AS joined
+FROM steps CROSS JOIN trace GROUP BY bucket;
+"""
+
+
+def fill_trace(
+    connection: DuckDBPyConnection, info: TraceInfo, identity: Identity, values: dict[str, Any]
+) -> None:
+    """Complete the tables of a trace: its own row, and its buckets.
+
+    Parameters
+    ----------
+    values : dict
+        Columns of table ``trace`` that the segment knows.
+    """
+    about = values | {
+        "trace_id": identity.trace_id,
+        "uri": plain(str(info.path.resolve())),
+        "size": info.size,
+        "mtime_ns": info.mtime_ns,
+        "digest": info.digest,
+        "flavour": info.flavour,
+        "ego": identity.ego,
+        "since": identity.since,
+        "until": identity.until,
+        "version": version("sgstore"),
+    }
+    for statement in _TRACE.split(";\n")[:-1]:
+        used = {key: value for key, value in about.items() if f"${key}" in statement}
+        connection.execute(statement, used)
+
+
+def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
+    """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
+    with scratch(spill_folder()) as connection, access.writing(connection, sealed.folder):
+        return _publish(connection, sealed, replace=replace)
+
+
+def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -> str:
+    """Copy the files of a trace into the attached store; the name of the trace there."""
+    identity = sealed.identity
+    taken = connection.execute("SELECT name FROM store.trace").fetchall()
+    if not replace and already_stored(connection, identity, catalog="store."):
+        name = stored_name(connection, identity, catalog="store.")
+        raise StoreError(f"{sealed.path}: came into the store meanwhile, as {name!r}")
+    name = stored_name(connection, identity, catalog="store.")
+    if name is None:
+        name = free_name(plain(sealed.path.stem), {name for (name,) in taken})
+    else:
+        _delete(connection, identity.trace_id)
+    given: dict[str, Any] = {"name": name, "ingested_at": datetime.now(UTC).replace(tzinfo=None)}
+    given["map_id"] = _map_id(connection, sealed)
+    given["config_id"] = _config_id(connection, identity)
+    for table in sealed.files:
+        if table not in MAP_TABLES:
+            _insert(connection, sealed, table, given)
+    _note(connection, sealed.checksums, trace_id=identity.trace_id)
+    connection.execute(_ORPHANS)  # of a trace that was replaced
+    return name
+
+
+def _insert(
+    connection: DuckDBPyConnection, sealed: Sealed, table: str, given: dict[str, Any]
+) -> None:
+    """Insert the files of a table, with the values that only the store can give."""
+    of_store = (
+        "SELECT column_name FROM duckdb_columns()"
+        " WHERE database_name = 'store' AND schema_name = 'main' AND table_name = ?"
+    )
+    columns = {name for (name,) in connection.execute(of_store, [table]).fetchall()}
+    values = {name: value for name, value in given.items() if name in columns}
+    replaced = ", ".join(f"${name} AS {name}" for name in values)
+    select = f"SELECT * REPLACE ({replaced})" if replaced else "SELECT *"
+    for name in sealed.files[table]:
+        # Reading takes a pattern, and a folder may be called anything.
+        file = literal(escape(str(sealed.folder / name)))
+        connection.execute(
+            f"INSERT INTO store.{table} BY NAME {select} FROM read_parquet({file})", values
+        )
+
+
+def _note(
+    connection: DuckDBPyConnection,
+    checksums: dict[str, Checksum],
+    *,
+    trace_id: int | None = None,
+    map_id: int | None = None,
+) -> None:
+    """Take down the checksums of what was inserted."""
+    for table, checksum in checksums.items():
+        connection.execute(
+            "INSERT INTO store.manifest VALUES (?, ?, ?, ?, ?)",
+            [trace_id, map_id, table, checksum.rows, checksum.value],
+        )
+
+
+def _config_id(connection: DuckDBPyConnection, identity: Identity) -> int:
+    """The number of the settings in the store, where they are now if they were not before."""
+    rows = connection.execute("SELECT config_id, digest FROM store.config").fetchall()
+    for number, digest in rows:
+        if digest == identity.settings_digest:
+            return number
+    new = max((number for number, _ in rows), default=0) + 1
+    connection.execute(
+        "INSERT INTO store.config VALUES (?, ?, ?)",
+        [new, identity.settings_digest, identity.settings],
+    )
+    return new
+
+
+def _map_id(connection: DuckDBPyConnection, sealed: Sealed) -> int | None:
+    """The number of the map in the store, where it is now with its nodes and edges if it was not before."""
+    digest = sealed.identity.map_digest
+    if not digest:
+        return None
+    rows = connection.execute("SELECT map_id, digest, name FROM store.map").fetchall()
+    for number, known, _ in rows:
+        if known == digest:
+            return number
+    new = max((number for number, _, _ in rows), default=0) + 1
+    wanted = plain(sealed.identity.map_name) or "map"
+    given = {"map_id": new, "name": free_name(wanted, {name for _, _, name in rows})}
+    for table in MAP_TABLES:
+        if table in sealed.files:
+            _insert(connection, sealed, table, given if table == "map" else {"map_id": new})
+    _note(connection, sealed.map_checksums, map_id=new)
+    return new
+
+
+_OWNED: Final = {
+    "trace_id": "trace_id = $trace_id",
+    "bucket": "bucket >= $trace_id << 18 AND bucket < ($trace_id + 1) << 18",
+    "frame_id": "frame_id >= $trace_id << 24 AND frame_id < ($trace_id + 1) << 24",
+}
+"""Column → condition on the rows of a trace; of a table that has several, the first counts."""
+
+_ORPHANS: Final = """
+DELETE FROM store.config WHERE config_id NOT IN (SELECT config_id FROM store.trace);
+DELETE FROM store.map WHERE map_id NOT IN (SELECT map_id FROM store.trace WHERE map_id IS NOT NULL);
+DELETE FROM store.map_node WHERE map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.map_reach WHERE map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.manifest WHERE map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM store.map);
+"""
+
+
+def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
+    """The tables of a store that hold rows of traces, each with the condition on the rows of ``$trace_id``."""
+    rows = connection.execute(
+        """
+        SELECT table_name, list(column_name) FROM duckdb_columns()
+        WHERE database_name = $1 AND schema_name = 'main' AND list_contains($2, table_name)
+        GROUP BY table_name ORDER BY table_name
+        """,
+        [database, [*shape.expected().tables]],  # others may have tables of their own there
+    ).fetchall()
+    for table, columns in rows:
+        found = next((column for column in _OWNED if column in columns), None)
+        if found is not None:
+            yield table, _OWNED[found]
+
+
+def remove(connection: DuckDBPyConnection, trace_id: int) -> None:
+    """Delete a trace from the attached store, with the settings and the map that no other trace has."""
+    _delete(connection, trace_id)
+    connection.execute(_ORPHANS)
+
+
+def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
+    for table, condition in list(owned(connection, "store")):
+        connection.execute(f"DELETE FROM store.{table} WHERE {condition}", {"trace_id": trace_id})
+
+
+_SORTED: Final = {
+    "state": "SELECT * FROM store.state ORDER BY is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
+    "lane_state": "SELECT * FROM store.lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
+    "lane_gap": "SELECT * FROM store.lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
+    "node": "SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM store.node GROUP BY ALL ORDER BY ALL",
+    "edge": """
+SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
+FROM store.edge GROUP BY ALL ORDER BY ALL""",
+    "frame": "SELECT * FROM store.frame ORDER BY frame_id",
+    "frame_class": "SELECT * FROM store.frame_class ORDER BY ALL",
+    "lane_role": "SELECT * FROM store.lane_role ORDER BY ALL",
+    "later_class": "SELECT * FROM store.later_class ORDER BY ALL",
+    "derived_node": "SELECT * FROM store.derived_node ORDER BY ALL",
+    "derived_edge": "SELECT * FROM store.derived_edge ORDER BY ALL",
+    "derived_gap": "SELECT * FROM store.derived_gap ORDER BY ALL",
+}
+"""The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
+
+
+def copy_sorted(connection: DuckDBPyConnection) -> None:
+    """Fill the empty store that is attached as ``fresh`` from the one attached as ``store``."""
+    tables = connection.execute(
+        "SELECT table_name FROM duckdb_tables() WHERE database_name = 'fresh'"
+    ).fetchall()
+    for (table,) in tables:
+        select = _SORTED.get(table, f"SELECT * FROM store.{table}")
+        connection.execute(f"DELETE FROM fresh.{table}")
+        connection.execute(f"INSERT INTO fresh.{table} BY NAME {select}")
+
+
+# What is added to traces that are in a store already: built aside, brought in by one transaction, noted ----
+
+_WINDOW = 1024
+"""Buckets of which a checksum is taken at once."""
+
+
+@contextmanager
+def writing(access: Access, *folders: Path) -> Generator[DuckDBPyConnection]:
+    """One transaction on a store, attached as ``store``; of files it sees those in the folders."""
+    with scratch(spill_folder()) as connection, access.writing(connection, *folders):
+        yield connection
+
+
+def add_files(
+    connection: DuckDBPyConnection, staging: Staging, files: dict[str, list[str]]
+) -> None:
+    """Insert the files that a staging sealed."""
+    for table, names in files.items():
+        for name in names:
+            file = literal(escape(str(staging.folder / name)))
+            connection.execute(
+                f"INSERT INTO store.{table} BY NAME SELECT * FROM read_parquet({file})"
+            )
+
+
+def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -> None:
+    """Take down what a trace has now in tables that change after it was published."""
+    for table in tables:
+        checksum = _checksum(connection, table, trace_id)
+        connection.execute(
+            'DELETE FROM store.manifest WHERE trace_id = ? AND "table" = ?', [trace_id, table]
+        )
+        if checksum.rows:
+            connection.execute(
+                "INSERT INTO store.manifest VALUES (?, NULL, ?, ?, ?)",
+                [trace_id, table, checksum.rows, checksum.value],
+            )
+
+
+def _checksum(connection: DuckDBPyConnection, table: str, trace_id: int) -> Checksum:
+    checksum = Checksum()
+    select = expressions(connection, table, "store")
+    for condition, values in _ranges(connection, table, trace_id):
+        rows = connection.execute(f"SELECT {select} FROM store.{table} WHERE {condition}", values)
+        checksum.add(rows.fetchnumpy())
+    return checksum
+
+
+def _ranges(
+    connection: DuckDBPyConnection, table: str, trace_id: int
+) -> Iterable[tuple[str, list[Any]]]:
+    """Conditions on the rows of a trace, each of so many as fit into memory."""
+    columns = connection.execute(
+        "SELECT column_name FROM duckdb_columns()"
+        " WHERE database_name = 'store' AND schema_name = 'main' AND table_name = ?",
+        [table],
+    ).fetchall()
+    bits = {"bucket": 0, "frame_id": FRAME_BITS}
+    column = next((name for name in bits if (name,) in columns), None)
+    if column is None:
+        return [("trace_id = ?", [trace_id])]
+    bit = bits[column]
+    low, high = trace_id << BUCKET_BITS, (trace_id + 1) << BUCKET_BITS
+    (last,) = connection.execute(
+        f"SELECT max({column} >> {bit}) FROM store.{table} WHERE {column} >= ? AND {column} < ?",
+        [low << bit, high << bit],
+    ).fetchall()[0]
+    end = low if last is None else last + 1
+    return [
+        (
+            f"{column} >= ? AND {column} < ?",
+            [first << bit, min(first + _WINDOW, end) << bit],
+        )
+        for first in range(low, end, _WINDOW)
+    ]

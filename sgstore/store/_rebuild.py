@@ -1,0 +1,348 @@
+"""Rebuilding: what is known of an old store, and a new file in its place.
+
+What is known of a store's traces, however old or altered it is: enough to make it anew.
+
+Only the tables that say which recordings there are, and with which settings they were read, are looked at; they
+have not changed since version 2. They must be tables, because a view could read anything.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import sgstore.store._create as schema
+import sgstore.store._schema as shape
+from sgstore.errors import StoreError
+from sgstore.quoting import quoted
+from sgstore.store._locking import Access, BusyError, Folder, spill_folder
+from sgstore.store._publish import copy_sorted
+from sgstore.store._staging import scratch
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
+
+@dataclass(frozen=True, slots=True)
+class OldTrace:
+    """A trace as a store has it; see :class:`sgstore.store._traces.StoredTrace`.
+
+    Attributes
+    ----------
+    imported : dict or None
+        How it was imported, if it came as graphs of another tool.
+    """
+
+    trace_id: int
+    name: str
+    path: Path
+    size: int
+    mtime_ns: int
+    digest: str
+    ego: str
+    since: float | None
+    until: float | None
+    map_id: int | None
+    period_ns: int
+    answers: tuple[str, ...]
+    settings: dict[str, Any]
+    imported: dict[str, Any] | None
+
+
+@dataclass(frozen=True, slots=True)
+class OldMap:
+    """A road map as a store has it; without a text if it is of named parts."""
+
+    name: str
+    digest: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class OldSet:
+    """A derived set of relations of some traces."""
+
+    name: str
+    settings: dict[str, Any]
+    traces: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Remains:
+    """What is known of a store.
+
+    Attributes
+    ----------
+    traces : tuple of OldTrace
+        In the order in which they came.
+    maps : dict
+        By their numbers.
+    sets : tuple of OldSet
+    abstractions : tuple of str
+        Those whose classes were asked for later.
+    others : tuple of str
+        Tables and views that are none of ours.
+    """
+
+    traces: tuple[OldTrace, ...]
+    maps: dict[int, OldMap]
+    sets: tuple[OldSet, ...]
+    abstractions: tuple[str, ...]
+    others: tuple[str, ...]
+
+
+def remains_of(path: Path) -> Remains:
+    """What is known of a store.
+
+    Raises
+    ------
+    StoreError
+        It is no store, or what is needed of it cannot be read.
+    """
+    access = Access(path, checked=False)
+    with access.reading() as connection:
+        return remains_in(connection, shape.database_of(connection), path)
+
+
+def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Remains:
+    """The same of a store that a connection has open under a name."""
+    if shape.about_store(connection, database) is None:
+        raise StoreError(f"{path}: a DuckDB database, but not a store")
+    reader = _TableReader(connection, database, path)
+    try:
+        return Remains(
+            traces=_traces(reader),
+            maps={
+                row["map_id"]: _map(row) for row in reader.rows("map", "map_id name digest text")
+            },
+            sets=_sets(reader),
+            abstractions=tuple(
+                sorted(
+                    {
+                        str(row["abstraction"])
+                        for row in reader.distinct("later_class", "abstraction")
+                    }
+                )
+            ),
+            others=tuple(shape.others(connection, database)),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StoreError(
+            f"{path}: what it says of its traces cannot be read ({error});"
+            " ingest its recordings into a new store"
+        ) from error
+
+
+class _TableReader:
+    """Rows of tables, if they are tables: nothing that the store may have made takes part."""
+
+    def __init__(self, connection: DuckDBPyConnection, database: str, path: Path) -> None:
+        self._connection = connection
+        self._database = database
+        self._path = path
+        self._tables = set(
+            connection.execute(
+                "SELECT table_name FROM system.main.duckdb_tables()"
+                " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
+                [database],
+            ).fetchall()
+        )
+
+    def rows(self, table: str, columns: str, *, needed: bool = False) -> list[dict[str, Any]]:
+        """All rows of a table; none if there is no such table and it is not needed."""
+        return self._asked(table, columns, "SELECT", needed=needed)
+
+    def distinct(self, table: str, columns: str) -> list[dict[str, Any]]:
+        """Its rows, equal ones once."""
+        return self._asked(table, columns, "SELECT DISTINCT", needed=False)
+
+    def _asked(self, table: str, columns: str, how: str, *, needed: bool) -> list[dict[str, Any]]:
+        if (table,) not in self._tables:
+            if needed:
+                raise StoreError(
+                    f"{self._path}: has no table {table!r}, so nothing is known of its recordings;"
+                    " ingest them into a new store"
+                )
+            return []
+        names = columns.split()
+        listed = ", ".join(map(quoted, names))
+        found = self._connection.execute(
+            f"{how} {listed} FROM {quoted(self._database)}.main.{quoted(table)}"
+        )
+        return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+
+
+_TRACE: Final = (
+    "trace_id name uri size mtime_ns digest ego since until map_id config_id"
+    " period_ns answers report ingested_at"
+)
+
+
+def _traces(reader: _TableReader) -> tuple[OldTrace, ...]:
+    settings = {
+        row["config_id"]: _object(row["settings"])
+        for row in reader.rows("config", "config_id settings", needed=True)
+    }
+    rows = reader.rows("trace", _TRACE, needed=True)
+    rows.sort(key=lambda row: (row["ingested_at"].isoformat(), str(row["name"])))
+    found = tuple(_trace(row, settings) for row in rows)
+    if len({one.name for one in found}) < len(found) or len({t.trace_id for t in found}) < len(
+        found
+    ):
+        raise ValueError("two traces have the same name or id")
+    return found
+
+
+def _trace(row: dict[str, Any], settings: dict[int, dict[str, Any]]) -> OldTrace:
+    report = _object(row["report"])
+    form = report.get("imported")
+    return OldTrace(
+        trace_id=int(row["trace_id"]),
+        name=_text(row["name"]),
+        path=Path(_text(row["uri"])),
+        size=int(row["size"]),
+        mtime_ns=int(row["mtime_ns"]),
+        digest=_text(row["digest"]),
+        ego=_text(row["ego"] or ""),
+        since=_seconds(row["since"]),
+        until=_seconds(row["until"]),
+        map_id=row["map_id"],
+        period_ns=int(row["period_ns"]),
+        answers=tuple(map(_text, row["answers"])),
+        settings=settings[row["config_id"]],
+        imported=None if form is None else {"form": _text(form), **report.get("import", {})},
+    )
+
+
+def _map(row: dict[str, Any]) -> OldMap:
+    return OldMap(_text(row["name"]), _text(row["digest"]), _text(row["text"] or ""))
+
+
+def _sets(reader: _TableReader) -> tuple[OldSet, ...]:
+    found: dict[tuple[str, str], list[int]] = {}
+    for row in reader.rows("derived", "name settings trace_id"):
+        found.setdefault((_text(row["name"]), _text(row["settings"])), []).append(row["trace_id"])
+    return tuple(
+        OldSet(name, _object(text), tuple(traces)) for (name, text), traces in sorted(found.items())
+    )
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"expected a text, found {value!r}")
+    return value
+
+
+def _seconds(value: object) -> float | None:
+    if value is None:
+        return None
+    if not isinstance(value, float) or not math.isfinite(value):
+        raise TypeError(f"expected seconds, found {value!r}")
+    return value
+
+
+def _object(text: object) -> dict[str, Any]:
+    value: Any = json.loads(_text(text))
+    if not isinstance(value, dict):
+        raise TypeError(f"expected an object of JSON, found {text!r}")
+    return {str(key): one for key, one in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+
+
+# A store that is written anew beside the old one, and then put in its place ---------------------
+
+
+def compact(path: Path, access: Access, memory: int) -> None:
+    """Write a store anew, sorted; see :meth:`StoreFile.compact`."""
+    refuse_others(path, access)
+    database = scratch(spill_folder(), memory=memory, threads=os.cpu_count() or 1)
+    with (
+        Folder(path) as beside,
+        database as connection,
+        access.attached(connection, beside.path),
+    ):
+        connection.execute("FORCE CHECKPOINT store")
+        schema.attach_empty(connection, beside.path / "store")
+        copy_sorted(connection)
+        connection.execute("DETACH fresh")
+        _replace(path, beside.path / "store")
+
+
+def settle(path: Path, access: Access, memory: int) -> None:
+    """Work in what a killed writer left beside a store; see :meth:`StoreFile.settle`."""
+    left = [path.with_name(f"{path.name}{ending}") for ending in (".wal", ".gate")]
+    if any(one.exists() for one in left):
+        database = scratch(spill_folder(), memory=memory)
+        with suppress(BusyError), database as connection, access.attached(connection):
+            connection.execute("CHECKPOINT store")
+
+
+def refuse_others(path: Path, access: Access) -> None:
+    """Refuse to write a store anew that holds tables or views of somebody else's.
+
+    Raises
+    ------
+    StoreError
+    """
+    with access.reading() as connection:
+        others = shape.others(connection, shape.database_of(connection))
+    if others:
+        raise StoreError(
+            f"{path}: cannot be written anew: what is none of sgstore's would be lost:"
+            f" {', '.join(others)}; move them to a file of their own first"
+        )
+
+
+def named_as(path: Path, old: Remains) -> None:
+    """Give traces and maps of a store the names that they have in another."""
+    access = Access(path)
+    with scratch(spill_folder()) as connection, access.writing(connection):
+        for trace in old.traces:
+            connection.execute(
+                "UPDATE store.trace SET name = ? WHERE trace_id = ?", [trace.name, trace.trace_id]
+            )
+        named = {one.digest: one.name for one in old.maps.values()}
+        if len(set(named.values())) == len(named):
+            held = connection.execute("SELECT map_id, digest, name FROM store.map").fetchall()
+            others = {name for _, digest, name in held if digest not in named}
+            for map_id, digest, _ in held:
+                if digest in named and named[digest] not in others:
+                    connection.execute(
+                        "UPDATE store.map SET name = ? WHERE map_id = ?", [named[digest], map_id]
+                    )
+
+
+def take_place(fresh: Path, path: Path, old: Remains) -> None:
+    """Put a store in the place of an old one, which nobody else has meanwhile.
+
+    Raises
+    ------
+    StoreError
+        Traces have come to the old one, or gone, since it was looked at.
+    """
+    access = Access(path, checked=False)
+    with scratch(spill_folder()) as connection, access.attached(connection):
+        if remains_in(connection, "store", path) != old:
+            raise StoreError(f"{path}: has changed while it was made anew; do it again")
+        connection.execute("FORCE CHECKPOINT store")
+        connection.execute("DETACH store")
+        _replace(path, fresh)
+
+
+def _replace(path: Path, fresh: Path) -> None:
+    """Put a file in the place of a store whose log was worked in.
+
+    Raises
+    ------
+    StoreError
+        There is a log beside one of them: that of the old one would be taken for the new one's, or the new
+        one's be lost.
+    """
+    for one in (path, fresh):
+        if one.with_name(f"{one.name}.wal").exists():
+            raise StoreError(f"{path}: left as it is: the log {one.name}.wal of {one} stays")
+    fresh.replace(path)

@@ -1,0 +1,377 @@
+"""Whether everything of ours in a store is as ``schema.sql`` makes it, whoever the file came from.
+
+A file that a stranger sends may hold a view in the place of a table, a macro that is called like a function,
+a trigger. So before anything is read of a store, its catalogue is compared with the one that ``schema.sql``
+makes: tables, types and views by their text, whatever version of DuckDB wrote it. What is somebody else's,
+under a name of its own, is left alone, and nothing of ours reads it.
+
+Nothing that a store says is trusted before: here are no functions and no names that it could define.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Final
+
+import duckdb
+
+from sgstore.errors import StoreError
+from sgstore.quoting import quoted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    Tokens = tuple[str, ...]
+
+
+_VIEWS: Final = "-- The public views "
+"""Where the views begin in ``schema.sql``."""
+
+_HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
+
+_TOKEN: Final = re.compile(
+    r"""(?P<gap>\s+|--[^\n]*)|(?P<text>'(?:[^']|'')*')|(?P<name>"(?:[^"]|"")*")
+    |(?P<number>\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)|(?P<word>\w+)|(?P<sign><>|!=|<=|>=|::|>>|<<|//|\|\||.)""",
+    re.VERBOSE | re.DOTALL,
+)
+_PLAIN: Final = re.compile(r'"[A-Za-z_]\w*"', re.ASCII)
+_TRUTH: Final = {"'t'": "true", "'f'": "false"}
+_SYSTEM: Final = frozenset({"information_schema", "pg_catalog", "system", "temp"})
+
+
+@cache
+def schema_sql() -> str:
+    """The text of ``schema.sql``: types, tables and views."""
+    return resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
+
+
+def tables_sql() -> str:
+    """The part of it that makes types and tables, for a segment: there a row is completed in several steps."""
+    return schema_sql().partition(_VIEWS)[0].replace(" NOT NULL", "")
+
+
+def schema_version() -> str:
+    """The version that the head of ``schema.sql`` says."""
+    found = _HEAD.match(schema_sql())
+    if found is None:
+        raise ValueError("the head of schema.sql says no version")
+    return found[1]
+
+
+@cache
+def schema_digest() -> str:
+    """SHA-256 of the statements of ``schema.sql``: it stays the same if comments change."""
+    made = ["\0".join(words) for words in _statements() if words[0] != "COMMENT"]
+    return hashlib.sha256("\n".join(made).encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What ``schema.sql`` makes, by name.
+
+    Attributes
+    ----------
+    tables, types : dict
+        The statements, as words that do not depend on who wrote them down.
+    views : dict
+        The texts of the views.
+    """
+
+    tables: dict[str, Tokens]
+    types: dict[str, Tokens]
+    views: dict[str, str]
+
+
+@cache
+def expected() -> Shape:
+    """What ``schema.sql`` makes."""
+    tables: dict[str, Tokens] = {}
+    types: dict[str, Tokens] = {}
+    views: dict[str, str] = {}
+    for words in _statements():
+        if words[:2] == ("CREATE", "TYPE"):
+            types[words[2]] = words[4:]
+        elif words[:2] == ("CREATE", "TABLE"):
+            tables[words[2]] = words
+        elif words[:2] == ("CREATE", "VIEW"):
+            views[words[2]] = " ".join(words[4:])
+    written = {name: tuple(_with_types(words, types)) for name, words in tables.items()}
+    return Shape(written, types, views)
+
+
+_written: dict[str, Tokens] = {}
+
+
+def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
+    """The views of ``schema.sql`` as this version of the database writes them down."""
+    if not _written:
+        views = expected().views
+        rows = connection.execute(
+            "SELECT system.main.json_deserialize_sql(system.main.json_serialize_sql(text))"
+            " FROM (SELECT unnest($1::VARCHAR[]) AS text)",
+            [list(views.values())],
+        ).fetchall()
+        for name, (sql,) in zip(views, rows, strict=True):
+            _written[name] = tuple(_words(f"CREATE VIEW {name} AS {sql}"))
+    return _written
+
+
+def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
+    """Refuse a database that is no store, one of another version, and one that somebody has altered.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+    database : str
+        The name under which the connection has the file.
+    path : Path
+
+    Raises
+    ------
+    StoreError
+    """
+    other = other_version(_about(connection, database, path))
+    if other:
+        raise StoreError(f"{path}: {other}; {_REMEDY}")
+    faults = altered(connection, database)
+    if faults:
+        more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+        raise StoreError(
+            f"{path}: not as sgstore made it, so nothing of it is read: {faults[0]}{more};"
+            f" 'sgstore verify' says all; {_REMEDY}"
+        )
+
+
+_REMEDY: Final = "'sgstore rebuild' makes it anew from its recordings"
+
+
+def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
+    """What :func:`check` would refuse, one by one; and the tables and views that are none of ours.
+
+    Raises
+    ------
+    StoreError
+        It is no store.
+    """
+    database = database_of(connection)
+    other = other_version(_about(connection, database, path))
+    wrong = [other] if other else altered(connection, database)
+    return wrong, tuple(others(connection, database))
+
+
+def database_of(connection: DuckDBPyConnection) -> str:
+    """The name under which a connection that opened a file has it."""
+    sql = "SELECT database_name FROM system.main.duckdb_databases() WHERE internal = false"
+    ((name,),) = connection.execute(sql).fetchall()
+    return name
+
+
+def _about(connection: DuckDBPyConnection, database: str, path: Path) -> dict[str, str]:
+    about = about_store(connection, database)
+    if about is None:
+        raise StoreError(
+            f"{path}: a DuckDB database, but not a store; expected a file that 'sgstore ingest' made"
+        )
+    return about
+
+
+def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str] | None:
+    """What a store says of itself: version and digest of its schema; ``None`` if it is no store."""
+    made = _made(connection, "tables", database).get("store_info")
+    if made is None:
+        return None
+    if _bare(made) != _bare(expected().tables["store_info"]):
+        return {}  # whatever it is, it is not read
+    rows = connection.execute(f"SELECT key, value FROM {quoted(database)}.main.store_info")
+    return {str(key): str(value) for key, value in rows.fetchall()}
+
+
+def other_version(about: dict[str, str]) -> str:
+    """What is to be said of a store whose schema is not this one; empty if it is."""
+    held, maker = (
+        about.get("schema_version", "unknown"),
+        about.get("created_by", "an unknown version"),
+    )
+    if held != schema_version():
+        reason = f"a store of version {held}, expected {schema_version()}"
+    elif about.get("schema_digest") != schema_digest():
+        reason = (
+            f"a store of version {held}, but with other tables or views than those of this sgstore"
+        )
+    else:
+        return ""
+    return f"{reason} (made by {maker}, this is sgstore {version('sgstore')})"
+
+
+def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
+    """What of ours in a store is not as ``schema.sql`` makes it, and what would take its place."""
+    shape = expected()
+    tables, views, types = (
+        _made(connection, what, database) for what in ("tables", "views", "types")
+    )
+    found = [*_differing("table", shape.tables, tables, views)]
+    found += _differing("view", _expected_views(connection), views, tables)
+    found += _differing("type", shape.types, types, {})
+    found += _shadowing(connection, database)
+    found += _attached(connection, database, shape)
+    return found
+
+
+def others(connection: DuckDBPyConnection, database: str) -> list[str]:
+    """Tables and views in a store that are none of ours, sorted."""
+    shape = expected()
+    ours = {("main", name) for name in (*shape.tables, *shape.views)}
+    rows: list[tuple[str, str]] = []
+    for what, column in (("tables", "table_name"), ("views", "view_name")):
+        rows += connection.execute(
+            f"SELECT schema_name, {column} FROM system.main.duckdb_{what}()"
+            " WHERE database_name = ? AND internal = false",
+            [database],
+        ).fetchall()
+    return sorted(
+        name if schema == "main" else f"{schema}.{name}"
+        for schema, name in rows
+        if (schema, name.lower()) not in ours
+    )
+
+
+# Words ------------------------------------------------------------------------------------------------------
+
+
+def _statements() -> Iterator[Tokens]:
+    """The statements of ``schema.sql``, as words."""
+    words: list[str] = []
+    for word in _words(schema_sql()):
+        if word == ";":
+            yield tuple(words)
+            words = []
+        else:
+            words.append(word)
+
+
+def _words(sql: str) -> list[str]:
+    """A statement as words: without comments, marks around plain names, and casts of constants."""
+    found: list[str] = []
+    for match in _TOKEN.finditer(sql):
+        word = match[0]
+        if match["gap"]:
+            continue
+        if match["name"] and _PLAIN.fullmatch(word):
+            word = word[1:-1]
+        elif match["number"] and not word.isdigit():
+            word = repr(float(word))
+        found.append(word)
+        if word == ")" and found[-6:-4] == ["CAST", "("] and found[-3] == "AS":
+            constant, kind = found[-4], found[-2]
+            if kind == "BOOLEAN" and constant in _TRUTH:
+                found[-6:] = [_TRUTH[constant]]
+            elif kind == "DOUBLE" and re.fullmatch(r"[\d.e+-]+", constant):
+                found[-6:] = [repr(float(constant))]
+    return found
+
+
+def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
+    """The words of a table, its types as the database writes them down: enumerations with all their values."""
+    before = ""
+    for number, word in enumerate(words):
+        # A type stands behind the name of a column, which may be called like it.
+        named = number > 3 and before not in {"(", ","}
+        yield from types[word] if named and word in types else (word,)
+        before = word
+
+
+def _bare(words: Tokens) -> Tokens:
+    """The words of a table without what was added to its columns since."""
+    return tuple(word for word in words if word not in {"NOT", "NULL"})
+
+
+# What is there ----------------------------------------------------------------------------------------------
+
+
+def _made(connection: DuckDBPyConnection, what: str, database: str) -> dict[str, Tokens]:
+    """The tables, views or types of the main schema, by their names in small letters."""
+    if what == "types":
+        rows = connection.execute(
+            "SELECT type_name, labels FROM system.main.duckdb_types()"
+            " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
+            [database],
+        ).fetchall()
+        return {name: tuple(_words(_enum(labels or ()))) for name, labels in rows}
+    one = what[:-1]
+    rows = connection.execute(
+        f"SELECT {one}_name, sql FROM system.main.duckdb_{what}()"
+        " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
+        [database],
+    ).fetchall()
+    return {
+        name.lower(): tuple(_words((sql or "").rstrip().removesuffix(";"))) for name, sql in rows
+    }
+
+
+def _enum(labels: tuple[str, ...]) -> str:
+    return f"ENUM({', '.join(_literal(label) for label in labels)})"
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _differing(
+    what: str, wanted: dict[str, Tokens], there: dict[str, Tokens], instead: dict[str, Tokens]
+) -> Iterator[str]:
+    """Objects that are missing, something else, or others than they should be."""
+    for name, words in wanted.items():
+        found = there.get(name)
+        if found is None:
+            gone = f"a {'view' if what == 'table' else 'table'}" if name in instead else "missing"
+            yield f"{what} {name!r} is {gone}"
+        elif found != words:
+            yield f"{what} {name!r} is not the one that sgstore makes"
+
+
+def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
+    """Macros and schemas that are called like what the database has itself."""
+    macros = connection.execute(
+        "SELECT function_name FROM system.main.duckdb_functions() WHERE database_name = ?",
+        [database],
+    ).fetchall()
+    if macros:
+        own = connection.execute(
+            "SELECT function_name FROM system.main.duckdb_functions() WHERE database_name = 'system'"
+        ).fetchall()
+        names = {name.lower() for (name,) in own}
+        for name in sorted({name for (name,) in macros if name.lower() in names}):
+            yield f"a macro takes the place of the function {name!r}"
+    schemas = connection.execute(
+        "SELECT schema_name FROM system.main.duckdb_schemas()"
+        " WHERE database_name = ? AND internal = false",
+        [database],
+    ).fetchall()
+    for (name,) in schemas:
+        if name.lower() in _SYSTEM:
+            yield f"there is a schema {name!r}"
+
+
+def _attached(connection: DuckDBPyConnection, database: str, shape: Shape) -> Iterator[str]:
+    """Triggers and indexes on tables of ours."""
+    for what in ("trigger", "index"):
+        plural = {"trigger": "triggers", "index": "indexes"}[what]
+        try:
+            rows = connection.execute(
+                f"SELECT schema_name, table_name, {what}_name FROM system.main.duckdb_{plural}()"
+                " WHERE database_name = ?",
+                [database],
+            ).fetchall()
+        except duckdb.CatalogException:  # DuckDB 1.5 has no triggers, and reads no store that has
+            continue
+        for schema, table, name in rows:
+            if schema == "main" and table.lower() in (*shape.tables, *shape.views):
+                yield f"table {table!r} has the {what} {name!r}"

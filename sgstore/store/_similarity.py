@@ -1,0 +1,222 @@
+"""Frames like one that is given: those whose graphs are the same in an abstraction, and then the most like."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from heapq import heappush, heapreplace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sgstore.abstractions import (
+    Abstraction,
+    Classes,
+    GraphFeatures,
+    abstraction_named,
+    of_frames,
+    without,
+)
+from sgstore.errors import AbstractionError
+from sgstore.store._graphs import Graphs
+from sgstore.store._traces import FrameRef, frame_named, stored_traces
+from sgstore.vocabulary import RELATION_ALIASES, RELATIONS, kinds_labelled, labels, suggestion
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.abstractions import Labelled
+    from sgstore.store._locking import Access
+    from sgstore.store._traces import StoredTrace
+
+
+@dataclass(frozen=True, slots=True)
+class SimilarFrames:
+    """Consecutive frames of a trace that are as like an example as each other, for the same reasons.
+
+    Attributes
+    ----------
+    frame : FrameRef
+        The first one.
+    frames : int
+        How many there are.
+    similarity : float
+        1 where all features are those of the example, 0 where none is; see
+        :mod:`sgstore.abstractions._features`.
+    same : bool or None
+        Whether the graphs are isomorphic: of the same class. ``None``: so symmetric that it was given up.
+    shared, missing, extra : dict of str to int
+        How often which features are there in both; in the example alone; in these frames alone.
+    """
+
+    frame: FrameRef
+    frames: int
+    similarity: float
+    same: bool | None
+    shared: dict[str, int]
+    missing: dict[str, int]
+    extra: dict[str, int]
+
+
+@dataclass(slots=True)
+class _FrameRun:
+    """Frames that follow one another with the same features, and the same class if they have all."""
+
+    key: tuple[Any, ...]
+    similarity: float
+    same: bool | None
+    trace: int
+    seq: int
+    frames: int
+    features: Counter[str]
+
+
+def frames_like(
+    access: Access, ref: int | str, name: str, ignored: Sequence[str], limit: int
+) -> list[SimilarFrames]:
+    """Runs of frames, the most like an example first, then in the order of the store.
+
+    Memory does not grow with the store: graphs are read window by window.
+
+    Parameters
+    ----------
+    access : Access
+    ref : int or str
+        The example, as :meth:`sgstore.store.StoreFile.frame` takes it.
+    name : str
+        The abstraction whose graphs are compared.
+    ignored : sequence of str
+        Labels and relations that do not count; see :func:`sgstore.abstractions._features.without`.
+    limit : int
+        How many runs to give.
+
+    Raises
+    ------
+    StoreError
+        There is no such frame.
+    AbstractionError
+        There is no such abstraction, or nothing of it is called as what is to be ignored.
+    """
+    abstraction, graphs = abstraction_named(name), Graphs()
+    with access.reading() as connection:
+        frame = frame_named(connection, ref)
+        _, seen = graphs.of_frames(connection, frame.frame_id, frame.frame_id)
+        whole = abstraction.function(seen)
+        _check(ignored, whole)
+        search = _RunSearch(without(whole, ignored), max(limit, 0))
+        traces = stored_traces(connection)
+        for number, trace in enumerate(traces):
+            for seq, block in _blocks(connection, graphs, trace, abstraction):
+                search.look(number, seq, without(block, ignored))
+        search.close()
+        return [_like(connection, run, traces, search.example) for run in search.best()]
+
+
+def _blocks(
+    connection: DuckDBPyConnection, graphs: Graphs, trace: StoredTrace, abstraction: Abstraction
+) -> Iterator[tuple[NDArray[np.int64], Labelled]]:
+    for seq, seen in graphs.of_trace(connection, trace.trace_id):
+        yield seq, abstraction.function(seen)
+
+
+class _RunSearch:
+    """The best runs so far, in a heap whose first is the worst of them."""
+
+    def __init__(self, example: Labelled, limit: int) -> None:
+        self.example = GraphFeatures.of(example).counts(0)
+        self._classes = Classes()
+        (self._class,) = self._classes.of(example)
+        self._limit = limit
+        self._heap: list[tuple[float, int, int, _FrameRun]] = []
+        self._last: _FrameRun | None = None
+
+    def look(self, trace: int, seq: NDArray[np.int64], graphs: Labelled) -> None:
+        """Take up the next frames of a trace."""
+        features = GraphFeatures.of(graphs)
+        likeness, digest = features.likeness(self.example), features.digests()
+        same: list[bool | None] = [False] * graphs.frames
+        complete = likeness == 1
+        if complete.any():
+            classes = self._classes.of(of_frames(graphs, complete))
+            for i in np.flatnonzero(complete).tolist():
+                same[i] = classes[i] == self._class if classes[i] and self._class else None
+        alike = (digest[1:] == digest[:-1]) & (np.diff(seq) == 1)
+        alike &= np.array([a is b for a, b in pairwise(same)], np.bool_)
+        starts = np.flatnonzero(np.append(True, ~alike))
+        for start, end in zip(starts.tolist(), [*starts.tolist()[1:], len(seq)], strict=True):
+            key = (trace, int(digest[start]), same[start])
+            last = self._last
+            if last is not None and last.key == key and last.seq + last.frames == seq[start]:
+                last.frames += end - start
+                continue
+            self.close()
+            counts = Counter[str]()
+            if self._wanted(float(likeness[start])):
+                counts = features.counts(start)
+            self._last = _FrameRun(
+                key,
+                float(likeness[start]),
+                same[start],
+                trace,
+                int(seq[start]),
+                end - start,
+                counts,
+            )
+
+    def close(self) -> None:
+        """The last run is over."""
+        run, self._last = self._last, None
+        if run is None or not self._wanted(run.similarity):
+            return
+        # Those that come later are worse, if they are as like.
+        entry = (run.similarity + (run.same is True), -run.trace, -run.seq, run)
+        if len(self._heap) < self._limit:
+            heappush(self._heap, entry)
+        elif entry > self._heap[0]:
+            heapreplace(self._heap, entry)
+
+    def _wanted(self, similarity: float) -> bool:
+        if len(self._heap) < self._limit:
+            return True
+        return bool(self._limit) and similarity + (similarity == 1) > self._heap[0][0]
+
+    def best(self) -> list[_FrameRun]:
+        """The best runs, the best one first."""
+        return [entry[-1] for entry in sorted(self._heap, key=lambda e: e[:-1], reverse=True)]
+
+
+def _like(
+    connection: DuckDBPyConnection,
+    run: _FrameRun,
+    traces: Sequence[StoredTrace],
+    example: Counter[str],
+) -> SimilarFrames:
+    frame = frame_named(connection, f"{traces[run.trace].name}#{run.seq}")
+    return SimilarFrames(
+        frame=frame,
+        frames=run.frames,
+        similarity=run.similarity,
+        same=run.same,
+        shared=_sorted(example & run.features),
+        missing=_sorted(example - run.features),
+        extra=_sorted(run.features - example),
+    )
+
+
+def _sorted(counts: Counter[str]) -> dict[str, int]:
+    return dict(sorted(counts.items()))
+
+
+def _check(ignored: Sequence[str], graphs: Labelled) -> None:
+    """Refuse what nothing is called: neither in the vocabulary nor in the example."""
+    known = {*RELATIONS, *RELATION_ALIASES, *graphs.labels, *labels()}
+    folds = {name.replace("_", "").lower() for name in known}
+    for name in ignored:
+        if name.replace("_", "").lower() not in folds and not kinds_labelled(name):
+            like = suggestion(name, sorted(known))
+            hint = f"; did you mean {like!r}?" if like else "; expected a label or a relation"
+            raise AbstractionError(f"nothing to ignore is called {name!r}{hint}")

@@ -1,0 +1,403 @@
+"""What identifies a trace in a store, what a store knows of it, and how people name it and its frames."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import StoreError
+from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
+from sgstore.store._rows import run
+from sgstore.vocabulary import natural, suggestion
+from sgstore.world import tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from datetime import datetime
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.config import Config, Payloads
+    from sgstore.roads import RoadMap
+    from sgstore.world import TraceInfo
+
+
+_TRACE_BITS: Final = 63 - BUCKET_BITS - FRAME_BITS
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What makes a trace the same trace, and its graphs the same graphs.
+
+    Attributes
+    ----------
+    trace_id : int
+        39 bits of a digest of the recording and its ego.
+    digest, ego : str
+        SHA-256 of the recording, and the simulator's id of the ego.
+    settings : str
+        The config as JSON, without its egos: the trace has one.
+    settings_digest : str
+        Of the settings, and of the mapping by which the recording is understood.
+    payloads : Payloads
+    map_digest, map_name : str
+        Empty without a map.
+    since, until : float or None
+        The part of the recording that is read; seconds since its first frame.
+    """
+
+    trace_id: int
+    digest: str
+    ego: str
+    settings: str
+    settings_digest: str
+    payloads: Payloads
+    map_digest: str
+    map_name: str
+    since: float | None = None
+    until: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        info: TraceInfo,
+        config: Config,
+        road_map: RoadMap | None,
+        part: tuple[float | None, float | None] = (None, None),
+    ) -> Identity:
+        """The identity of a recording, or of a part of it, that is read with a config and a map."""
+        settings = as_json(replace(config, ego="", egos=()).as_dict())
+        return cls(
+            trace_id=trace_id_of(info.digest, info.ego),
+            digest=info.digest,
+            ego=plain(info.ego),
+            settings=settings,
+            settings_digest=hashlib.sha256(f"{settings}{info.mapping}".encode()).hexdigest(),
+            payloads=config.payloads,
+            map_digest=road_map.digest if road_map else "",
+            map_name=plain(road_map.name) if road_map else "",
+            since=part[0],
+            until=part[1],
+        )
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Identity:
+        """The identity that plain values describe."""
+        from sgstore.config import Payloads  # many settings: not for who only reads a store
+
+        payloads: Any = Payloads(**values["payloads"])
+        return cls(**(values | {"payloads": payloads}))
+
+
+def trace_id_of(digest: str, ego: str) -> int:
+    """39 bits of the SHA-256 of a recording's digest and its ego's id: the same in every store."""
+    both = f"{digest}\0{ego}".encode("utf-8", "surrogatepass")
+    return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTrace:
+    """A trace in a store.
+
+    Attributes
+    ----------
+    trace_id : int
+    name : str
+        Unique in its store.
+    path : Path
+        The recording, when it was ingested.
+    size, mtime_ns : int
+        Of the recording then.
+    digest, flavour, ego : str
+        As in :class:`sgstore.world.TraceInfo`.
+    since, until : float or None
+        The part of the recording that was read, if not all of it; seconds since its first frame.
+    map : str
+        Name of its road map; empty without one.
+    frames : int
+    start_ns, end_ns : int
+        Simulation time of the first and of the last frame; ns.
+    period_ns : int
+        Median difference of consecutive frames; ns.
+    answers : tuple of str
+        Relations that it can answer.
+    report : dict
+        What reading it brought to light: :class:`sgstore.world.TraceReport`, and what was counted of entities,
+        jumps of the clock and gaps.
+    settings : dict
+        The config it was ingested with.
+    ingested_at : datetime
+        UTC.
+    version : str
+        Of sgstore then.
+    """
+
+    trace_id: int
+    name: str
+    path: Path
+    size: int
+    mtime_ns: int
+    digest: str
+    flavour: str
+    ego: str
+    since: float | None
+    until: float | None
+    map: str
+    frames: int
+    start_ns: int
+    end_ns: int
+    period_ns: int
+    answers: tuple[str, ...]
+    report: dict[str, Any]
+    settings: dict[str, Any]
+    ingested_at: datetime
+    version: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """All that is known of it, as plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRef:
+    """A frame in a store.
+
+    Attributes
+    ----------
+    frame_id, trace_id : int
+    trace : str
+        Name of the trace.
+    seq : int
+    time_ns, log_time_ns : int
+        Simulation time, and log time of its leading message; ns.
+    t : float
+        Since the trace began; s.
+    """
+
+    frame_id: int
+    trace_id: int
+    trace: str
+    seq: int
+    time_ns: int
+    log_time_ns: int
+    t: float
+
+
+_TRACES: Final = """
+SELECT t.trace_id, t.name, t.uri AS path, t.size, t.mtime_ns, t.digest, t.flavour,
+       coalesce(t.ego, '') AS ego, t.since, t.until, coalesce(m.name, '') AS map,
+       t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, t.config_id, t.ingested_at, t.version
+FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
+"""
+
+
+def stored_traces(connection: DuckDBPyConnection) -> tuple[StoredTrace, ...]:
+    """All traces of a store, by name in natural order."""
+    found = run(connection, _TRACES).dicts()
+    texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
+    try:
+        settings = {config_id: _object(text) for config_id, text in texts}
+        for row in found:
+            row["path"] = Path(row["path"])
+            row["answers"] = tuple(map(str, row["answers"]))
+            row["report"] = _object(row["report"])
+            row["settings"] = settings[row.pop("config_id")]
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"what the store says of its traces cannot be read: {error}") from error
+    return tuple(sorted((StoredTrace(**row) for row in found), key=lambda one: natural(one.name)))
+
+
+def _object(text: str) -> dict[str, Any]:
+    value: Any = json.loads(text)
+    if not isinstance(value, dict):
+        raise TypeError(f"expected an object of JSON, found {text[:80]!r}")
+    return value  # pyright: ignore[reportUnknownVariableType]
+
+
+def stored_name(
+    connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
+) -> str | None:
+    """The name under which a store has a trace, however it was read; ``None`` if it has it not.
+
+    Raises
+    ------
+    StoreError
+        It has another trace under its id.
+    """
+    sql = f"SELECT name, digest, coalesce(ego, '') FROM {catalog}trace WHERE trace_id = ?"
+    found = connection.execute(sql, [identity.trace_id]).fetchone()
+    if found is None:
+        return None
+    name, digest, ego = found
+    if (digest, ego) != (identity.digest, identity.ego):
+        raise StoreError(
+            f"its id {identity.trace_id} is taken by another trace, {name!r}, by chance; put one of them into a"
+            " store of its own"
+        )
+    return name
+
+
+def already_stored(
+    connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
+) -> str | None:
+    """The name under which a store has a trace; ``None`` if it has it not.
+
+    Raises
+    ------
+    StoreError
+        It has the trace with other settings or another map, or another trace under its id.
+    """
+    name = stored_name(connection, identity, catalog=catalog)
+    if name is None:
+        return None
+    (row,) = connection.execute(
+        f"""
+        SELECT c.digest, coalesce(m.digest, ''), t.since, t.until
+        FROM {catalog}trace t JOIN {catalog}config c ON c.config_id = t.config_id
+             LEFT JOIN {catalog}map m ON m.map_id = t.map_id
+        WHERE t.trace_id = ?
+        """,
+        [identity.trace_id],
+    ).fetchall()
+    settings, map_digest, *part = row
+    same = {
+        "with other settings": settings == identity.settings_digest,
+        "with another road map": map_digest == identity.map_digest,
+        "in another part": part == [identity.since, identity.until],
+    }
+    for how, holds in same.items():
+        if not holds:
+            raise StoreError(
+                f"already in the store as {name!r}, read {how}; to read it anew, remove it first or say --force"
+            )
+    return name
+
+
+def free_name(stem: str, taken: set[str]) -> str:
+    """A name that is not taken: the stem, or the stem with ``~2``, ``~3``, … behind it."""
+    name, count = stem, 1
+    while name in taken:
+        count += 1
+        name = f"{stem}~{count}"
+    return name
+
+
+_OF_TRACE: Final = re.compile(r"(?P<trace>.+)(?P<mark>[#@])(?P<where>[^#@]*)", re.DOTALL)
+_SECONDS: Final = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*s?\s*")
+
+
+def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
+    """Id and name of a trace by its name, its id, or a unique beginning of its name.
+
+    Raises
+    ------
+    StoreError
+        None or several are meant.
+    """
+    known = dict(connection.execute("SELECT name, trace_id FROM trace ORDER BY name").fetchall())
+    if ref in known:
+        return known[ref], ref
+    found = [name for name, trace_id in known.items() if str(trace_id) == ref]
+    found = found or [name for name in known if ref and name.startswith(ref)]
+    if len(found) == 1:
+        return known[found[0]], found[0]
+    if found:
+        raise StoreError(f"several traces begin with {ref!r}: {_listed(found)}")
+    like = suggestion(ref, known)
+    hint = f"did you mean {like!r}?" if like else f"there are: {_listed(list(known))}"
+    raise StoreError(f"no trace {ref!r}; {hint if known else 'the store is empty'}")
+
+
+def frame_named(connection: DuckDBPyConnection, ref: int | str) -> FrameRef:
+    """A frame by its id, ``TRACE#SEQ``, or ``TRACE@12.3s`` (the last frame at or before that time).
+
+    Raises
+    ------
+    StoreError
+        There is no such frame, or the text is none of these.
+    """
+    text = str(ref).strip()
+    if re.fullmatch(r"-?\d{1,19}", text):
+        found = _frame(connection, "f.frame_id = ?", [int(text)])
+        if found is None:
+            raise StoreError(f"no frame {text} in the store")
+        return found
+    parts = _OF_TRACE.fullmatch(text)
+    if parts is None:
+        raise StoreError(f"not a frame: {text!r}; expected a frame_id, TRACE#SEQ, or TRACE@12.3s")
+    trace_id, name = trace_named(connection, parts["trace"])
+    if parts["mark"] == "#":
+        return _frame_at_seq(connection, trace_id, name, parts["where"])
+    return _frame_at_time(connection, trace_id, name, parts["where"])
+
+
+def _frame_at_seq(connection: DuckDBPyConnection, trace_id: int, name: str, where: str) -> FrameRef:
+    if not re.fullmatch(r"\s*\d{1,9}\s*", where):
+        raise StoreError(f"not a frame of {name!r}: '#{where}'; expected a whole number, as in #12")
+    found = _frame(connection, "f.trace_id = ? AND f.seq = ?", [trace_id, int(where)])
+    if found is None:
+        raise StoreError(f"no frame #{int(where)} in {name!r}; {_range(connection, trace_id)}")
+    return found
+
+
+def _frame_at_time(
+    connection: DuckDBPyConnection, trace_id: int, name: str, where: str
+) -> FrameRef:
+    seconds = _SECONDS.fullmatch(where)
+    if seconds is None:
+        raise StoreError(f"not a time in {name!r}: '@{where}'; expected seconds, as in @12.3s")
+    after_ns = round(float(seconds[1]) * 1e9)
+    first, last = _extent(connection, trace_id)[2:]
+    row = connection.execute(
+        "SELECT period_ns FROM trace WHERE trace_id = ?", [trace_id]
+    ).fetchone()
+    tolerance = tolerance_ns((row[0] or 0) if row else 0)
+    found = None
+    if after_ns <= last - first + tolerance:
+        found = _frame(
+            connection,
+            "f.trace_id = ? AND f.time_ns - t.start_ns <= ? ORDER BY f.time_ns DESC, f.seq DESC LIMIT 1",
+            [trace_id, after_ns + tolerance],
+        )
+    if found is None:
+        raise StoreError(f"no frame at {seconds[1]} s in {name!r}; {_range(connection, trace_id)}")
+    return found
+
+
+def _frame(
+    connection: DuckDBPyConnection, condition: str, parameters: Sequence[object]
+) -> FrameRef | None:
+    row = connection.execute(
+        f"""
+        SELECT f.frame_id, f.trace_id, t.name, f.seq, f.time_ns, f.log_time_ns, (f.time_ns - t.start_ns) / 1e9
+        FROM frame f JOIN trace t ON t.trace_id = f.trace_id WHERE {condition}
+        """,
+        list(parameters),
+    ).fetchone()
+    return FrameRef(*row) if row else None
+
+
+def _extent(connection: DuckDBPyConnection, trace_id: int) -> tuple[int, int, int, int]:
+    """First and last seq, start and latest time of a trace."""
+    row = connection.execute(
+        """
+        SELECT min(f.seq), max(f.seq), any_value(t.start_ns), max(f.time_ns)
+        FROM frame f JOIN trace t ON t.trace_id = f.trace_id WHERE f.trace_id = ?
+        """,
+        [trace_id],
+    ).fetchone()
+    return row or (0, 0, 0, 0)
+
+
+def _range(connection: DuckDBPyConnection, trace_id: int) -> str:
+    first, last, start, end = _extent(connection, trace_id)
+    return f"it has frames #{first} … #{last}, 0 s … {(end - start) / 1e9:g} s"
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(repr(name) for name in names[:8])
+    return shown if len(names) <= 8 else f"{shown}, … ({len(names)} in all)"

@@ -1,0 +1,433 @@
+"""Whether a store is as it was published: rows by their checksums, masks, and what rows refer to.
+
+Reading a table also makes the database verify the checksums of its blocks.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import sgstore.store._schema as shape
+from sgstore.config import from_dict
+from sgstore.errors import SgstoreError, StoreError
+from sgstore.store._locking import Access, translated
+from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP
+from sgstore.store._publish import MAP_TABLES, owned
+from sgstore.store._staging import Checksum, expressions
+from sgstore.store._traces import stored_traces
+from sgstore.world import BUCKET_FRAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.store._traces import StoredTrace
+
+
+STEP: Final = 64
+"""Buckets whose rows are in memory at once: 3,840 frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something in a store that is not as it should be.
+
+    Attributes
+    ----------
+    trace : str
+        Name of the trace; empty where it concerns no single one.
+    check : str
+        ``schema``, ``rows``, ``masks``, ``frames``, ``references``, ``map``, ``payloads``.
+    detail : str
+        What is wrong.
+    """
+
+    trace: str
+    check: str
+    detail: str
+
+
+@dataclass(slots=True)
+class Verification:
+    """What came of looking through a store.
+
+    Attributes
+    ----------
+    traces, rows, recordings : int
+        How many traces and rows were looked at, and how many recordings were hashed.
+    faults : list of Fault
+    others : tuple of str
+        Tables and views in it that are none of ours; they are not looked at.
+    """
+
+    traces: int = 0
+    rows: int = 0
+    recordings: int = 0
+    faults: list[Fault] = field(default_factory=list[Fault])
+    others: tuple[str, ...] = ()
+
+
+_RULES: Final[tuple[tuple[str, str, str], ...]] = (
+    (
+        "masks",
+        "an edge holds in no frame, or in frames that the trace does not have",
+        """
+        SELECT e.bucket >> 18 FROM edge e LEFT JOIN bucket b ON b.bucket = e.bucket
+        WHERE b.bucket IS NULL OR e.mask = 0 OR (e.mask & ~b.valid) <> 0""",
+    ),
+    (
+        "masks",
+        "a static node is present in no frame, or in frames that the trace does not have",
+        """
+        SELECT n.bucket >> 18 FROM node n LEFT JOIN bucket b ON b.bucket = n.bucket
+        WHERE b.bucket IS NULL OR n.mask = 0 OR (n.mask & ~b.valid) <> 0""",
+    ),
+    (
+        "masks",
+        "a bucket does not have the frames that it says, or joins others than follow one another",
+        f"""
+        SELECT coalesce(b.trace_id, f.trace_id)
+        FROM bucket b FULL JOIN (
+          SELECT bucket, any_value(trace_id) AS trace_id, bit_or(one) AS valid,
+                 bit_or(CASE WHEN step BETWEEN 0 AND {LONGEST_STEP} THEN one ELSE 0 END) AS joined
+          FROM (SELECT f.bucket, f.trace_id, t.period_ns, 1::BIGINT << f.bit AS one,
+                       f.time_ns - lag(f.time_ns) OVER (PARTITION BY f.trace_id ORDER BY f.frame_id) AS step
+                FROM frame f LEFT JOIN trace t ON t.trace_id = f.trace_id)
+          GROUP BY bucket) f ON f.bucket = b.bucket
+        WHERE b.valid IS DISTINCT FROM f.valid OR b.trace_id IS DISTINCT FROM f.trace_id
+           OR b.joined IS DISTINCT FROM f.joined""",
+    ),
+    (
+        "frames",
+        "the frames are not as many as the trace says, or are not numbered from 0 without gaps",
+        """
+        SELECT t.trace_id FROM trace t LEFT JOIN (
+          SELECT trace_id, count(*) AS frames, count(DISTINCT seq) AS seqs, min(seq) AS first,
+                 max(seq) AS last
+          FROM frame GROUP BY trace_id) f ON f.trace_id = t.trace_id
+        WHERE coalesce(f.frames, 0) <> t.frames OR f.seqs <> t.frames OR f.first <> 0
+           OR f.last <> t.frames - 1""",
+    ),
+    (
+        "frames",
+        "a frame's id is not that of its trace and number",
+        """
+        SELECT trace_id FROM frame
+        WHERE bucket <> (trace_id << 18) + seq // 60 OR bit <> seq % 60 OR frame_id <> (bucket << 6) + bit""",
+    ),
+    (
+        "references",
+        "rows of a trace that is not in the store",
+        "SELECT f.trace_id FROM frame f WHERE f.trace_id NOT IN (SELECT trace_id FROM trace)",
+    ),
+    (
+        "references",
+        "settings or a map that are not in the store",
+        """
+        SELECT trace_id FROM trace
+        WHERE config_id NOT IN (SELECT config_id FROM config)
+           OR (map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM map))""",
+    ),
+    (
+        "references",
+        "a frame lies on another map than its trace",
+        "SELECT f.trace_id FROM frame f JOIN trace t ON t.trace_id = f.trace_id"
+        " WHERE f.map_id IS DISTINCT FROM t.map_id",
+    ),
+    (
+        "references",
+        "an ego is no entity of the trace",
+        "SELECT f.trace_id FROM frame f WHERE f.ego IS NOT NULL AND NOT EXISTS"
+        " (SELECT 1 FROM entity e WHERE e.trace_id = f.trace_id AND e.node_id = f.ego)",
+    ),
+    (
+        "references",
+        "a state belongs to no entity or no frame, or has another kind than its entity",
+        """
+        SELECT s.frame_id >> 24 FROM state s
+        LEFT JOIN entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id
+        LEFT JOIN frame f ON f.frame_id = s.frame_id
+        WHERE e.kind IS DISTINCT FROM s.kind OR f.frame_id IS NULL""",
+    ),
+    (
+        "references",
+        "an entity lies in a lane that its map does not have, or is none of the trace",
+        """
+        SELECT l.frame_id >> 24 FROM lane_state l
+        LEFT JOIN trace t ON t.trace_id = l.frame_id >> 24
+        LEFT JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = l.node_id
+        LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = l.lane
+        WHERE e.kind IS DISTINCT FROM l.kind OR m.node_id IS NULL""",
+    ),
+    *(
+        (
+            "references",
+            f"an edge {way} what is no entity of the trace or no part of its map, or of another kind",
+            f"""
+            SELECT e.bucket >> 18 FROM (SELECT DISTINCT bucket, {end} AS node, {end}_kind AS kind FROM edge) e
+            LEFT JOIN trace t ON t.trace_id = e.bucket >> 18
+            LEFT JOIN entity n ON n.trace_id = t.trace_id AND n.node_id = e.node
+            LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = e.node
+            WHERE coalesce(n.kind, m.kind) IS DISTINCT FROM e.kind""",
+        )
+        for end, way in (("src", "comes from"), ("dst", "leads to"))
+    ),
+    (
+        "references",
+        "a static node is no entity of the trace and no part of its map, or of another kind",
+        """
+        SELECT k.bucket >> 18 FROM node k
+        LEFT JOIN trace t ON t.trace_id = k.bucket >> 18
+        LEFT JOIN entity n ON n.trace_id = t.trace_id AND n.node_id = k.node_id
+        LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = k.node_id
+        WHERE coalesce(n.kind, m.kind) IS DISTINCT FROM k.kind""",
+    ),
+    (
+        "references",
+        "a payload is of no channel or of no frame",
+        """
+        SELECT p.trace_id FROM payload p
+        LEFT JOIN channel c ON c.trace_id = p.trace_id AND c.channel_id = p.channel_id
+        LEFT JOIN frame f ON f.bucket = p.bucket AND f.bit = p.bit
+        WHERE c.channel_id IS NULL OR f.frame_id IS NULL""",
+    ),
+    (
+        "map",
+        "an edge of a map leads to what is no part of it",
+        """
+        SELECT NULL FROM map_edge e
+        LEFT JOIN map_node a ON a.map_id = e.map_id AND a.node_id = e.src
+        LEFT JOIN map_node b ON b.map_id = e.map_id AND b.node_id = e.dst
+        WHERE a.kind IS DISTINCT FROM e.src_kind OR b.kind IS DISTINCT FROM e.dst_kind""",
+    ),
+    (
+        "map",
+        "a way along lanes of a map leads to what is no lane of it",
+        """
+        SELECT NULL FROM map_reach r
+        LEFT JOIN map_node a ON a.map_id = r.map_id AND a.node_id = r.src
+        LEFT JOIN map_node b ON b.map_id = r.map_id AND b.node_id = r.dst
+        WHERE a.kind IS DISTINCT FROM 'lane' OR b.kind IS DISTINCT FROM 'lane'""",
+    ),
+)
+"""What is looked at, what is wrong where a statement gives rows, and that statement: ids of traces at fault."""
+
+
+def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
+    """Look through a store that may have been altered so that it cannot be opened.
+
+    If its tables and views are not those that sgstore makes, that is all that is said: nothing is read of them.
+
+    Parameters
+    ----------
+    path : str or Path
+    recordings : bool
+        As :meth:`StoreFile.verify` takes it.
+
+    Raises
+    ------
+    StoreError
+        There is no such file, or it is no store.
+    """
+    from sgstore.store._file import StoreFile
+
+    place = Path(path)
+    access = Access(place, checked=False)
+    with access.reading() as connection:
+        wrong, others = shape.looked_at(connection, place)
+    if wrong:
+        return Verification(faults=[Fault("", "schema", one) for one in wrong], others=others)
+    found = StoreFile(place).verify(recordings=recordings)
+    found.others = others
+    return found
+
+
+def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
+    """Look through a store.
+
+    What the database cannot read becomes a fault.
+
+    Raises
+    ------
+    StoreError
+        What it says of its traces cannot be read.
+    """
+
+    def attempt(check: Callable[[], Iterable[Fault]]) -> list[Fault]:
+        try:
+            with translated(path):
+                return list(check())
+        except StoreError as error:
+            return [Fault("", "rows", str(error))]
+
+    found = Verification()
+    traces = {trace.trace_id: trace for trace in stored_traces(connection)}
+    found.traces = len(traces)
+    published = _published(connection)
+    found.faults += attempt(partial(_odd, connection))
+    for trace in traces.values():
+        found.faults += attempt(partial(_rows, connection, trace, published, found))
+    found.faults += attempt(partial(_maps, connection, published, found))
+    names = {trace_id: trace.name for trace_id, trace in traces.items()}
+    for rule in _RULES:
+        found.faults += attempt(partial(_broken, connection, names, *rule))
+    return found
+
+
+def damage(connection: DuckDBPyConnection, path: Path) -> str:
+    """What is wrong with a store, if anything is: the first fault that is found."""
+    try:
+        found = verify(connection, path)
+    except SgstoreError as error:
+        return str(error)
+    return f"{found.faults[0].trace} {found.faults[0].detail}".strip() if found.faults else ""
+
+
+def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
+    """Rows that belong to no trace and to no map: settings, names, bits."""
+    for number, text in connection.execute("SELECT config_id, settings FROM config").fetchall():
+        try:
+            from_dict(json.loads(text))
+        except (SgstoreError, ValueError, TypeError, AttributeError) as error:
+            yield Fault("", "references", f"settings {number} cannot be read: {error}")
+    for table, column in (
+        ("trace", "name"),
+        ("trace", "trace_id"),
+        ("config", "config_id"),
+        ("map", "map_id"),
+    ):
+        sql = f"SELECT {column} FROM {table} GROUP BY {column} HAVING count(*) > 1"
+        for (value,) in connection.execute(sql).fetchall():
+            yield Fault("", "references", f"table {table} has {column} {value!r} more than once")
+    bits = connection.execute("SELECT bit, m FROM bits ORDER BY bit, m").fetchall()
+    if bits != [(bit, 1 << bit) for bit in range(BUCKET_FRAMES)]:
+        yield Fault("", "rows", "table bits does not hold the bits of a mask")
+
+
+def verify_recordings(
+    connection: DuckDBPyConnection, digest_of: Callable[[Path], str]
+) -> Verification:
+    """Hash the recordings of all traces again."""
+    found = Verification()
+    known: dict[Path, str | SgstoreError] = {}
+    for trace in stored_traces(connection):
+        if trace.path not in known:
+            try:
+                known[trace.path] = digest_of(trace.path)
+            except SgstoreError as error:
+                known[trace.path] = error
+        digest = known[trace.path]
+        if isinstance(digest, SgstoreError):
+            found.faults.append(Fault(trace.name, "payloads", str(digest)))
+        elif digest != trace.digest:
+            reason = f"{trace.path}: not the file that was ingested; ingest it anew"
+            found.faults.append(Fault(trace.name, "payloads", reason))
+    found.traces, found.recordings = len(stored_traces(connection)), len(known)
+    return found
+
+
+_Published = dict[tuple[str, int], dict[str, Checksum]]
+
+
+def _published(connection: DuckDBPyConnection) -> _Published:
+    """The manifest: ("trace" or "map", id) → table → checksum."""
+    sql = 'SELECT trace_id, map_id, "table", rows, checksum FROM manifest'
+    published: _Published = {}
+    for trace_id, map_id, table, rows, value in connection.execute(sql).fetchall():
+        key = ("map", map_id) if trace_id is None else ("trace", trace_id)
+        published.setdefault(key, {})[table] = Checksum(rows, value)
+    return published
+
+
+def _rows(
+    connection: DuckDBPyConnection, trace: StoredTrace, published: _Published, found: Verification
+) -> Iterator[Fault]:
+    """Tables of a trace whose rows are not those that were published."""
+    manifest = published.get(("trace", trace.trace_id), {})
+    if not manifest:
+        yield Fault(trace.name, "rows", "nothing is noted of what was published of it")
+    tables = {table for (whose, _), of in published.items() if whose == "trace" for table in of}
+    for table, condition in list(owned(connection, _database(connection))):
+        if table in tables:
+            checksum = _checksum(connection, table, condition, trace)
+            found.rows += checksum.rows
+            if checksum != manifest.get(table, Checksum()):
+                yield Fault(trace.name, "rows", _difference(table, checksum, manifest.get(table)))
+
+
+def _difference(table: str, now: Checksum, then: Checksum | None) -> str:
+    rows = then.rows if then else 0
+    if now.rows != rows:
+        return f"table {table} has {now.rows} rows of it; {rows} were published"
+    return f"table {table} holds other values than were published"
+
+
+def _checksum(
+    connection: DuckDBPyConnection, table: str, condition: str, trace: StoredTrace
+) -> Checksum:
+    checksum = Checksum()
+    select = expressions(connection, table, _database(connection))
+    for where, values in _ranges(connection, table, condition, trace):
+        rows = connection.execute(f"SELECT {select} FROM {table} WHERE {where}", values)
+        checksum.add(rows.fetchnumpy())
+    return checksum
+
+
+def _ranges(
+    connection: DuckDBPyConnection, table: str, condition: str, trace: StoredTrace
+) -> Iterator[tuple[str, dict[str, int]]]:
+    """Conditions on the rows of a trace, each of so many as fit into memory."""
+    sql = (
+        "SELECT column_name FROM duckdb_columns()"
+        " WHERE table_name = ? AND schema_name = 'main' AND database_name = ?"
+    )
+    names = {n for (n,) in connection.execute(sql, [table, _database(connection)]).fetchall()}
+    column = next((name for name in ("bucket", "frame_id") if name in names), None)
+    if column is None:
+        yield condition, {"trace_id": trace.trace_id}
+        return
+    bits = FRAME_BITS if column == "frame_id" else 0
+    first = trace.trace_id << BUCKET_BITS
+    behind = first + -(-trace.frames // BUCKET_FRAMES)
+    # In the last range, behind the last frame, there should be nothing.
+    starts = [*range(first, behind, STEP), behind, (trace.trace_id + 1) << BUCKET_BITS]
+    for low, high in pairwise(starts):
+        values = {"low": low << bits, "high": high << bits}
+        yield f"{column} >= $low AND {column} < $high", values
+
+
+def _maps(
+    connection: DuckDBPyConnection, published: _Published, found: Verification
+) -> Iterator[Fault]:
+    """Road maps that are not those that were published."""
+    for map_id, name in connection.execute("SELECT map_id, name FROM map").fetchall():
+        manifest = published.get(("map", map_id), {})
+        for table in MAP_TABLES:
+            checksum = Checksum()
+            select = expressions(connection, table, _database(connection))
+            sql = f"SELECT {select} FROM {table} WHERE map_id = ?"
+            checksum.add(connection.execute(sql, [map_id]).fetchnumpy())
+            found.rows += checksum.rows
+            if checksum != manifest.get(table, Checksum()):
+                difference = _difference(table, checksum, manifest.get(table))
+                yield Fault("", "map", f"map {name!r}: {difference}")
+
+
+def _broken(
+    connection: DuckDBPyConnection, names: dict[int, str], check: str, wrong: str, sql: str
+) -> Iterator[Fault]:
+    grouped = f"SELECT trace_id, count(*) FROM ({sql}) AS found(trace_id) GROUP BY ALL ORDER BY ALL"
+    for trace_id, count in connection.execute(grouped).fetchall():
+        name = "" if trace_id is None else names.get(trace_id, str(trace_id))
+        yield Fault(name, check, f"{wrong} ({count} times)")
+
+
+def _database(connection: DuckDBPyConnection) -> str:
+    (name,) = connection.execute("SELECT current_database()").fetchall()[0]
+    return name

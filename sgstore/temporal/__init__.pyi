@@ -1,0 +1,29 @@
+# The face of this package: what others may import from it.
+
+from ._checks import CheckRun as CheckRun
+from ._checks import Verdict as Verdict
+from ._formula import Formula as Formula
+from ._formula import formula_of as formula_of
+from ._matches import TemporalMatches as TemporalMatches
+from ._monitor import Monitor as Monitor
+from ._monitor import opened as opened
+from ._progression import OnlineFormula as OnlineFormula
+from ._sequence_monitor import FrameTime as FrameTime
+from ._sequence_monitor import MonitorEvent as MonitorEvent
+from ._signals import evaluate as evaluate
+from ._signals import prefix_verdicts as prefix_verdicts
+
+__all__ = [
+    "CheckRun",
+    "Formula",
+    "FrameTime",
+    "Monitor",
+    "MonitorEvent",
+    "OnlineFormula",
+    "TemporalMatches",
+    "Verdict",
+    "evaluate",
+    "formula_of",
+    "opened",
+    "prefix_verdicts",
+]

@@ -1,0 +1,658 @@
+"""The monitor of one ``CHECK``, frame by frame.
+
+What a check still asks of one binding: states that are shared by all bindings that are in the same.
+
+A state is made once and compared by identity. What follows a state and a letter is remembered, where time does
+not matter in it, so most bindings of most checks take one look into a table a frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from sgstore.errors import QueryError
+from sgstore.lang.ir import Query, Result
+from sgstore.matches import Interval
+from sgstore.temporal._checks import Level, Verdict, Witness, folded_values, innermost, levels_of
+from sgstore.temporal._formula import TRUE, And, Formula, Since, looks_ahead, propositions
+from sgstore.temporal._plan import Plan
+from sgstore.temporal._progression import Past, Progression, ProgressionFrame, Term, Tick, least
+from sgstore.temporal._query_cache import BindingTable, Partial, Valuation
+from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
+from sgstore.temporal._verdicts import (
+    CERTAINLY_TRUE,
+    FALSE,
+    PRESUMABLY_FALSE,
+    PRESUMABLY_TRUE,
+    STATUS,
+    always_true,
+    bounded,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang.ir import BoundCheck, BoundQuantifier
+    from sgstore.temporal._query_cache import Key, QueryCache
+    from sgstore.temporal._signal_state import Memory, StreamClock
+    from sgstore.world import Bools
+
+    Keys = NDArray[np.int64]
+    Span = tuple[FrameTime, FrameTime]
+
+
+NEVER: Final = 1 << 62
+"""Later than any frame."""
+
+REMEMBERED: Final = 100_000
+"""Steps that are remembered before they are begun anew."""
+
+Duties = tuple["frozenset[Term] | Term | None", ...]
+"""For each part of a formula: what is open of an ``ALWAYS`` at former frames, or what is open of another."""
+
+
+class ObligationState:
+    """What is still to be shown, and what operators of the past keep.
+
+    Attributes
+    ----------
+    word : str
+        ``begins``: the formula is asked from the next frame on; ``open``; ``broken``; ``kept``: it is true,
+        whatever comes.
+    past : Past
+    duties : Duties
+    timeless : bool
+        Whether no time is kept in it.
+    following : dict of int to ObligationStep
+        What is remembered of steps, by letter.
+    staying : dict of int to (int, int, int, int)
+        Of letters that change nothing: the guards that are true, the last time (ns) and number of a frame
+        of which that is known, and with which tolerance of times (ns).
+    """
+
+    __slots__ = ("__weakref__", "duties", "following", "past", "staying", "timeless", "word")
+
+    def __init__(self, word: str, past: Past, duties: Duties) -> None:
+        self.word, self.past, self.duties = word, past, duties
+        timed = any(term.timed for term in self.terms) or any(entries for _, entries in past)
+        self.timeless = not timed
+        self.following: dict[int, ObligationStep] = {}
+        self.staying: dict[int, tuple[int, int, int, int]] = {}
+
+    @property
+    def terms(self) -> list[Term]:
+        """All that is open."""
+        found = [term for term, _ in self.past]
+        found += [term for _, entries in self.past for *_, term in entries]
+        for duty in self.duties:
+            found += [duty] if isinstance(duty, Term) else duty or ()
+        return found
+
+    @property
+    def ended(self) -> bool:
+        """Whether the formula is true if no frame follows."""
+        if self.word in {"broken", "begins"}:
+            return self.word == "begins"
+        open_terms = [d for duty in self.duties if duty for d in _open(duty)]
+        return all(term.ended for term in open_terms)
+
+
+@dataclass(frozen=True, slots=True)
+class ObligationStep:
+    """What a frame makes of a state.
+
+    Attributes
+    ----------
+    state : ObligationState
+    started, ended : bool
+        Whether a violation begins, or ends, with this frame.
+    guards : int
+        Which guards are true in this frame, a bit each.
+    """
+
+    state: ObligationState
+    started: bool
+    ended: bool
+    guards: int
+
+
+class Automaton:
+    """A formula, what resets it, and conditions of single frames that are looked at beside it.
+
+    Parameters
+    ----------
+    formula : Formula
+    reset : Formula, optional
+        Looks at nothing later than the frame.
+    guards : sequence of Formula
+        Of single frames.
+    bits : mapping of str to int
+        The bit of each proposition in letters.
+
+    Attributes
+    ----------
+    begun : ObligationState
+        Before the first frame.
+    mask : int
+        The bits that matter.
+    """
+
+    def __init__(
+        self,
+        formula: Formula,
+        reset: Formula | None,
+        guards: Sequence[Formula],
+        bits: Mapping[str, int],
+    ) -> None:
+        whole = And((formula, reset or TRUE, *guards))
+        self._progression = Progression(whole)
+        assert isinstance(self._progression.formula, And)  # noqa: S101 - it was made so
+        first, second, *rest = self._progression.formula.operands
+        self._reset = second if reset is not None else None
+        self._guards = tuple(rest)
+        self._parts = tuple(map(_part, _conjuncts(first)))
+        self._bits = {name: bits[name] for name in sorted(propositions(whole))}
+        self.mask = sum(self._bits.values())
+        self._states: WeakValueDictionary[tuple[str, Past, Duties], ObligationState] = (
+            WeakValueDictionary()
+        )
+        self._remembered: dict[ObligationState, None] = {}
+        self._steps = 0
+        self.begun = self._state("begins", self._progression.begun, ())
+
+    def step(
+        self,
+        state: ObligationState,
+        letter: int,
+        tick: Tick,
+        seen: dict[tuple[ObligationState, int], ObligationStep],
+    ) -> ObligationStep:
+        """What a frame makes of a state.
+
+        Parameters
+        ----------
+        state : ObligationState
+        letter : int
+            The propositions that are true, a bit each; no others than those of :attr:`mask`.
+        tick : Tick
+        seen : dict
+            What this frame has made of other states already; it is kept by whoever tells frames.
+        """
+        found = state.following.get(letter) or seen.get((state, letter))
+        if found is None and letter in state.staying:
+            guards, time, number, tolerance = state.staying[letter]
+            known = tick.time <= time and tick.number <= number
+            if known and tick.tolerance == tolerance:
+                return ObligationStep(state, started=False, ended=False, guards=guards)
+        if found is None:
+            found = self._step(state, letter, tick)
+            if found.state is state and not (state.timeless or found.started or found.ended):
+                until = self._until(state, tick)
+                state.staying[letter] = (found.guards, *until, tick.tolerance)
+            if state.timeless and found.state.timeless:
+                self._remember(state, letter, found)
+            else:
+                seen[state, letter] = found
+        return found
+
+    def _until(self, state: ObligationState, tick: Tick) -> tuple[int, int]:
+        """Up to which time and number no bound that is open in a state begins or ends."""
+        bounds = [begun for term in state.terms for begun in term.bounds()]
+        for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
+            if isinstance(part, Since):
+                kept = ((n if part.bound.frames else t) for t, n, _ in entries)
+                bounds += [(part.bound, since) for since in kept]
+        last = [NEVER, NEVER]
+        for written, since in bounds:
+            bound = written.widened(tick.tolerance)
+            now = tick.number if bound.frames else tick.time
+            ends = [since + bound.low - 1]
+            ends += [] if bound.high is None else [since + bound.high]
+            last[bound.frames] = min([last[bound.frames], *(end for end in ends if end >= now)])
+        return last[False], last[True]
+
+    def _remember(self, state: ObligationState, letter: int, step: ObligationStep) -> None:
+        if self._steps == REMEMBERED:
+            for known in self._remembered:
+                known.following.clear()
+            self._remembered.clear()
+            self._steps = 0
+        self._steps += 1
+        self._remembered[state] = None
+        state.following[letter] = step
+
+    def _state(self, word: str, past: Past, duties: Duties) -> ObligationState:
+        key = word, past, duties
+        found = self._states.get(key)
+        if found is None:
+            found = self._states[key] = ObligationState(*key)
+        return found
+
+    def _step(self, state: ObligationState, letter: int, tick: Tick) -> ObligationStep:
+        named = {name: bool(letter & bit) for name, bit in self._bits.items()}
+        frame = ProgressionFrame(self._progression, state.past, named, tick)
+        true = self._progression.terms.true
+        guards = sum(
+            1 << number for number, guard in enumerate(self._guards) if frame.now(guard) is true
+        )
+        word, duties, started = state.word, state.duties, False
+        if word in {"begins", "open"}:
+            word, duties = self._moved(state, frame)
+            started = word == "broken"
+        ended = False
+        if word == "broken" and self._reset is not None and frame.now(self._reset) is true:
+            word, ended = "begins", True
+        # Of what will not change any more the past does not matter either, but to guards.
+        past = self._progression.begun if self._lasts(word) and not self._guards else frame.past()
+        return ObligationStep(self._state(word, past, duties), started, ended, guards)
+
+    def _lasts(self, word: str) -> bool:
+        return word == "kept" or (word == "broken" and self._reset is None)
+
+    def final(self, state: ObligationState, counted: int) -> bool:
+        """Whether no frame changes a state any more, if so many guards were true in some frame."""
+        return self._lasts(state.word) and counted == (1 << len(self._guards)) - 1
+
+    def _moved(self, state: ObligationState, frame: ProgressionFrame) -> tuple[str, Duties]:
+        terms = self._progression.terms
+        first = state.word == "begins"
+        duties: list[frozenset[Term] | Term | None] = []
+        for number, (always, part) in enumerate(self._parts):
+            before = None if first else state.duties[number]
+            if always:
+                assert before is None or isinstance(before, frozenset)  # noqa: S101 - it was made so
+                found = {frame.resolved(term) for term in before or ()} | {frame.now(part)}
+                if terms.false in found:
+                    return "broken", ()
+                found.discard(terms.true)
+                duties.append(frozenset(least(found)))
+            else:
+                assert before is None or isinstance(before, Term)  # noqa: S101 - it was made so
+                term = frame.now(part) if before is None else frame.resolved(before)
+                if term is terms.false:
+                    return "broken", ()
+                duties.append(term)
+        if all(duty is terms.true for duty in duties):
+            return "kept", ()
+        return "open", tuple(duties)
+
+
+def _open(duty: frozenset[Term] | Term) -> Sequence[Term]:
+    return (duty,) if isinstance(duty, Term) else tuple(duty)
+
+
+def _conjuncts(formula: Formula) -> list[Formula]:
+    if isinstance(formula, And):
+        return [part for operand in formula.operands for part in _conjuncts(operand)]
+    return [formula]
+
+
+def _part(formula: Formula) -> tuple[bool, Formula]:
+    """A formula as it is watched: what must be true at each frame, each by itself; or whole."""
+    body = always_true(formula)
+    if body is None or not bounded(body):
+        return False, formula
+    return True, body
+
+
+# One ``CHECK``, frame by frame ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _CheckEntry:
+    """What is known of a binding.
+
+    Attributes
+    ----------
+    state : ObligationState
+    counted : int
+        Guards that were true in some frame, a bit each.
+    since : FrameTime or None
+        From when on the check is violated.
+    over : tuple of (Moment, FrameTime)
+        Violations that have ended.
+    memory : Memory
+        What values over time need of former frames.
+    final : bool
+        Whether no frame changes it any more.
+    """
+
+    state: ObligationState
+    counted: int
+    since: FrameTime | None
+    over: tuple[Span, ...]
+    memory: Memory
+    final: bool = False
+
+
+def _same(one: _CheckEntry, other: _CheckEntry) -> bool:
+    return (
+        one.state is other.state
+        and one.counted == other.counted
+        and one.since is other.since
+        and one.over == other.over
+        and one.memory == other.memory
+    )
+
+
+class CheckMonitor:
+    """A check, while a trace comes.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    questions : QueryCache
+        What is asked of each frame; those of the check become part of them.
+    pulse : StreamClock
+        Told of each frame before this is.
+    compat : bool
+        Whether the check is violated in each frame with which the trace, if it ended there, would violate it;
+        as SGSM reports it.
+
+    Raises
+    ------
+    QueryError
+        What is to be known at once depends on later frames.
+    """
+
+    def __init__(
+        self, check: BoundCheck, questions: QueryCache, pulse: StreamClock, *, compat: bool = False
+    ) -> None:
+        self._check, self._pulse, self._compat = check, pulse, compat
+        self._last: FrameTime | None = None
+        self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
+        whole = Query(check.scope, Result(), check.relations, check.injective, check.ego)
+        whole = replace(whole, unknown_is_false=check.unknown_is_false)
+        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
+        plan = Plan(whole, frozenset(self._variables), absent)
+        formula = plan.formula(check.formula)
+        reset = None
+        if check.reset is not None and not compat:
+            reset = plan.formula(check.reset)
+        if check.gaps == "unknown":
+            raise QueryError(
+                f"USING GAPS unknown of {check.name} is a question about what was recorded",
+                hint="a monitor sees every frame that there is; leave it out, or ask a store",
+            )
+        if reset is not None and looks_ahead(reset):
+            raise QueryError(
+                f"RESET WHEN of {check.name} looks ahead",
+                hint="a monitor begins anew in the next frame, so what resets it must be known by then",
+            )
+        guards = {q: plan.formula(q.where) for q in check.quantifiers if q.where is not None}
+        self._guards: dict[BoundQuantifier, int] = {q: 1 << n for n, q in enumerate(guards)}
+        self._letters = Valuation(
+            plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
+        )
+        bits = self._letters.bits
+        self._automaton = Automaton(formula, reset, tuple(guards.values()), bits)
+        strangers = _CheckEntry(self._automaton.begun, 0, None, (), self._letters.begun)
+        self._known = BindingTable(self._letters.lattice, strangers)
+        self._questions = questions
+        nodes = check.scope.nodes.items()
+        self._domains = {key: questions.met(node.kinds) for key, node in nodes}
+        self._kinds = {node.kinds for _, node in nodes}
+        self._told: dict[Key, tuple[int, int]] = {}
+        self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
+
+    @property
+    def name(self) -> str:
+        """Of the check."""
+        return self._check.name
+
+    # Frame by frame
+
+    def step(self, here: FrameTime) -> list[MonitorEvent]:
+        """A frame has come, and the questions were asked of it: what is known from it on."""
+        known = self._known
+        found = {row: entry for row, entry in known.held.items() if entry.final}
+        left = (row for row in known.held if row not in found) if found else known.held
+        letters, memories = self._letters.read(left, self._remembered)
+        changed: list[Partial] = []
+        seen: dict[tuple[ObligationState, int], ObligationStep] = {}
+        tick, automaton, mask = self._pulse.tick, self._automaton, self._automaton.mask
+        stepped = self._as_sgsm if self._compat else _stepped
+        for row, letter in letters.items():
+            before = known.of(row)
+            if before.final:
+                found[row] = before
+                continue
+            step = automaton.step(before.state, letter & mask, tick, seen)
+            entry = stepped(before, step, here, memories.get(row, ()))
+            if entry is not before:
+                changed.append(row)
+                if automaton.final(entry.state, entry.counted):
+                    entry = replace(entry, memory=(), final=True)
+            found[row] = entry
+        known.keep(found, _same)
+        self._last = here
+        if not self._immediate:
+            return []
+        return list(self._events(here, changed))
+
+    def _as_sgsm(
+        self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
+    ) -> _CheckEntry:
+        """What is known of a binding that is violated as long as the trace may not end."""
+        since, over = entry.since, entry.over
+        if not step.state.ended:
+            since = since or here
+        elif since is not None:
+            since, over = None, (*over, (since, self._last or here))
+        counted = entry.counted | step.guards
+        found = _CheckEntry(step.state, counted, since, over, memory)
+        return entry if _same(entry, found) else found
+
+    def _remembered(self, row: Partial) -> Memory | None:
+        entry = self._known.of(row)
+        return None if entry.final else entry.memory
+
+    # What is known
+
+    def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
+        """What is told of bindings of which something else is known than before; of all, if somebody is new."""
+        rows = list(self._known.held) if self._kinds & self._questions.fresh else changed
+        for row in rows:
+            entry = self._known.of(row)
+            if entry.since is None and not entry.over:
+                continue
+            for key in self._covered(row, entry):
+                begun, ended = self._told.get(key, (0, 0))
+                spans = entry.over if entry.since is None else (*entry.over, (entry.since, None))
+                if (begun, ended) == (len(spans), len(entry.over)) or not self._counts(key, entry):
+                    continue
+                self._told[key] = len(spans), len(entry.over)
+                for number in range(ended, len(spans)):
+                    start, end = spans[number]
+                    if number >= begun:
+                        yield self._event("violated", here, key, start, start)
+                    if end is not None:
+                        yield self._event("kept again", here, key, start, end)
+
+    def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
+        """The bindings of entities that were met of which no more is known than this."""
+        if None not in row:
+            yield row  # type: ignore[misc]
+            return
+        keys: list[Partial] = [()]
+        for node, name in zip(row, self._variables, strict=True):
+            some = self._domains[name] if node is None else (node,)
+            keys = [(*key, one) for key in keys for one in some]
+        for key in keys:
+            if self._known.of(key) is entry:
+                yield key  # type: ignore[misc]
+
+    def _counts(self, key: Key, entry: _CheckEntry) -> bool:
+        """Whether a binding is one that the check is about."""
+        if entry.counted != (1 << len(self._guards)) - 1:
+            return False
+        if any(n not in self._domains[v] for n, v in zip(key, self._variables, strict=True)):
+            return False
+        return not self._check.injective or (
+            len(set(key)) == len(key) and not any(node in self._others for node in key)
+        )
+
+    @property
+    def _others(self) -> set[int]:
+        """What the nodes that no quantifier binds were: the egos."""
+        rest = [n for n in self._domains if n not in self._variables]
+        return {node for name in rest for node in self._domains[name]}
+
+    def _event(
+        self,
+        kind: str,
+        here: FrameTime,
+        key: Key,
+        start: FrameTime,
+        end: FrameTime,
+        *,
+        at_end: bool = False,
+    ) -> MonitorEvent:
+        nodes = dict(zip(self._variables, key, strict=True))
+        names = {name: self._domains[name][node] for name, node in nodes.items()}
+        return MonitorEvent(kind, self.name, here, start, end, nodes, names, at_end=at_end)
+
+    # The end
+
+    def status(self) -> str:
+        """What is known of the check, for the entities that were met: one of ``STATUS``."""
+        levels = self._levels()
+        bindings = innermost(levels)
+        return STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]
+
+    def _of(self, key: list[int]) -> _CheckEntry:
+        return self._known.of(tuple(key))
+
+    def _levels(self) -> list[Level]:
+        domains = {n: np.array(sorted(met), np.int64) for n, met in self._domains.items()}
+        size = len(self._variables)
+
+        def counts(
+            quantifier: BoundQuantifier, variables: tuple[str, ...], bindings: Keys
+        ) -> Bools:
+            bit = self._guards.get(quantifier, 0)
+            rest = (None,) * (size - len(variables))
+            told = [self._known.of((*key, *rest)).counted & bit == bit for key in bindings.tolist()]
+            return np.array(told, np.bool_)
+
+        apart = np.array(sorted(self._others), np.int64) if self._check.injective else None
+        return levels_of(self._check.quantifiers, domains, apart=apart, counts=counts)
+
+    def _folded_codes(self, levels: list[Level], entries: list[_CheckEntry]) -> int:
+        rows = [_code(entry, compat=self._compat) for entry in entries]
+        for number in range(len(levels) - 1, -1, -1):
+            level = levels[number]
+            every = level.word == "FORALL"
+            outer = len(levels[number - 1].bindings) if number else 1
+            joined = [CERTAINLY_TRUE if every else FALSE] * outer
+            for parent, row in zip(level.parents.tolist(), rows, strict=True):
+                joined[parent] = (min if every else max)(joined[parent], row)
+            rows = joined
+        return rows[0]
+
+    def finish(self, trace: str, last: FrameTime) -> tuple[Verdict, list[MonitorEvent]]:
+        """The trace has ended: the verdict, and what only the end makes known."""
+        levels = self._levels()
+        bindings = innermost(levels)
+        entries = [self._of(key) for key in bindings.tolist()]
+        # Of what SGSM reports every violation is told already: the last frame's, too.
+        weak = self._check.end == "weak" or self._compat
+        spans = [_spans(entry, last, weak=weak) for entry in entries]
+        truths = folded_values(levels, np.array([not one for one in spans], np.bool_))
+        holds = bool(truths[0][0])
+        verdict = "true" if holds else "false"
+        if self._check.end == "pending":
+            verdict = STATUS[self._folded_codes(levels, entries)]
+        if not levels:
+            own = tuple(_interval(trace, span, {}) for span in spans[0])
+            found = Verdict(self.name, trace, verdict, own)
+        else:
+            witnesses = self._witnesses(trace, levels, truths, spans)
+            violations: tuple[Interval, ...] = ()
+            if not holds:
+                every = {(i.start_seq, i.end_seq): i for w in witnesses for i in w.violations}
+                violations = tuple(every[key] for key in sorted(every))
+                violations = violations or (_interval(trace, (last, last), {}),)
+            found = Verdict(self.name, trace, verdict, violations, witnesses)
+        return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
+
+    def _at_end(
+        self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
+    ) -> Iterator[MonitorEvent]:
+        """Violations that were not told yet."""
+        if holds:
+            return
+        if not self._immediate:
+            yield MonitorEvent("violated", self.name, last, last, last, {}, {}, at_end=True)
+            return
+        for key, found in zip(bindings.tolist(), spans, strict=True):
+            begun, _ = self._told.get(tuple(key), (0, 0))
+            for start, _ in found[begun:]:
+                yield self._event("violated", last, tuple(key), start, start, at_end=True)
+
+    def _witnesses(
+        self,
+        trace: str,
+        levels: list[Level],
+        truths: list[Bools],
+        spans: list[list[Span]],
+    ) -> tuple[Witness, ...]:
+        """Those of the outermost quantifiers that are of one word."""
+        word = levels[0].word
+        depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
+        level, values = levels[depth - 1], truths[depth]
+        names = [n for q in self._check.quantifiers[:depth] for n in q.nodes]
+        found: list[Witness] = []
+        for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
+            nodes = dict(zip(names, level.bindings[row].tolist(), strict=True))
+            called = {name: self._domains[name][node] for name, node in nodes.items()}
+            inner = spans[row] if depth == len(levels) else []
+            violations = tuple(_interval(trace, span, called) for span in inner)
+            found.append(Witness(nodes, called, bool(values[row]), violations))
+        return tuple(found)
+
+
+def _stepped(
+    entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
+) -> _CheckEntry:
+    counted = entry.counted | step.guards
+    plain = not (step.started or step.ended or memory)
+    if plain and step.state is entry.state and counted == entry.counted:
+        return entry
+    since, over = entry.since, entry.over
+    if step.started:
+        since = here
+    if step.ended and since is not None:
+        since, over = None, (*over, (since, here))
+    return _CheckEntry(step.state, counted, since, over, memory)
+
+
+def _code(entry: _CheckEntry, *, compat: bool) -> int:
+    broken = entry.state.word == "broken"
+    if broken or (not compat and (entry.since is not None or entry.over)):
+        return FALSE
+    if entry.state.word == "kept":
+        return CERTAINLY_TRUE
+    return PRESUMABLY_TRUE if entry.state.ended else PRESUMABLY_FALSE
+
+
+def _spans(entry: _CheckEntry, last: FrameTime, *, weak: bool) -> list[Span]:
+    """The violations of a binding in a trace that has ended."""
+    found = list(entry.over)
+    if entry.since is not None:
+        found.append((entry.since, last))
+    elif not (weak or entry.state.ended):
+        found.append((last, last))
+    return found
+
+
+def _interval(trace: str, span: Span, names: Mapping[str, str]) -> Interval:
+    start, end = span
+    times = start.time_ns, end.time_ns, start.t, end.t
+    return Interval(trace, start.seq, end.seq, *times, end.seq - start.seq + 1, dict(names))

@@ -1,0 +1,593 @@
+"""``CHECK`` over a store: verdicts, violations and quantifiers.
+
+Which traces of a store do not know what a question needs, and why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from heapq import merge
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.lang import (
+    MOTION,
+    TOLD_WEATHER,
+    compared_in_check,
+    compile_checks,
+    entities,
+    of_check,
+    traces_of,
+    traces_with,
+)
+from sgstore.lang.ir import Query, Result
+from sgstore.matches import Interval, notes_in
+from sgstore.temporal._formula import tolerant
+from sgstore.temporal._offline import Ask, PlanValues, TraceReader, asks_of, traces
+from sgstore.temporal._plan import Plan
+from sgstore.temporal._verdicts import (
+    FALSE,
+    PRESUMABLY_TRUE,
+    STATUS,
+    Settled,
+    Violation,
+    within_bounds,
+)
+from sgstore.vocabulary import natural
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang import Attribute, Catalog, CheckInCatalog, Need
+    from sgstore.lang.ir import BoundQuantifier
+    from sgstore.store import StoreFile
+    from sgstore.world import Bools, Ints
+
+    Keys = NDArray[np.int64]
+    Statuses = NDArray[np.int8]
+
+
+def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[int, str]:
+    """The traces that do not know what is needed, by id, with the reason; what was found is remembered.
+
+    Parameters
+    ----------
+    file : StoreFile
+    catalog : Catalog
+    needs : iterable of Need
+    """
+    found: dict[int, list[str]] = {}
+    every = frozenset(trace.trace_id for trace in catalog.traces)
+    for need in needs:
+        key = catalog.name, need.kinds, need.attribute
+        if key not in catalog.lacks:
+            catalog.lacks[key] = every - _knowing(file, every, need)
+        for trace in catalog.lacks[key]:
+            found.setdefault(trace, []).append(need.reason)
+    return {trace: "; ".join(dict.fromkeys(reasons)) for trace, reasons in found.items()}
+
+
+def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[int]:
+    """The traces that know it, or have nothing of which it could be known."""
+    if need.kinds is None:
+        assert need.attribute is not None  # noqa: S101 - of a frame something is known
+        (word,) = need.attribute.columns.values()
+        rows = file.rows(TOLD_WEATHER, [f"(^|, ){word}=[^,]"]).values
+        return frozenset(trace for (trace,) in rows)
+
+    def having(attribute: Attribute | None, *, moving: bool = False) -> frozenset[int]:
+        assert need.kinds is not None  # noqa: S101 - it was looked at above
+        sql = traces_with(need.kinds, attribute, moving=moving)
+        return frozenset(trace for (trace,) in file.rows(sql).values)
+
+    known = having(need.attribute)
+    if need.attribute is None or known >= every:
+        return known
+    return known | ((every - known) - having(None, moving=need.attribute.name in MOTION))
+
+
+# Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """The bindings up to one quantifier.
+
+    Attributes
+    ----------
+    word : str
+        ``FORALL`` or ``FORSOME``.
+    bindings : (B, n) int64
+        Of the variables of this quantifier and of those before it.
+    parents : (B,) int64
+        The binding of the quantifiers before that each goes on from.
+    """
+
+    word: str
+    bindings: Keys
+    parents: Ints
+
+
+def innermost(levels: Sequence[Level]) -> Keys:
+    """(B, n): the bindings of all variables; without quantifiers the one of none."""
+    return levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+
+
+def levels_of(
+    quantifiers: Sequence[BoundQuantifier],
+    domains: Mapping[str, Ints],
+    *,
+    apart: Ints | None,
+    counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
+) -> list[Level]:
+    """The bindings of each quantifier, as they go on from one another.
+
+    Parameters
+    ----------
+    quantifiers : sequence of BoundQuantifier
+    domains : mapping of str to (E,) int64
+        The entities that each variable may be.
+    apart : (A,) int64, optional
+        What no variable may be, since different variables are different entities; ``None``: variables may be
+        the same.
+    counts : function
+        Of a quantifier, the variables so far and bindings of these: which of them count.
+    """
+    variables: tuple[str, ...] = ()
+    bindings, levels = np.zeros((1, 0), np.int64), list[Level]()
+    for quantifier in quantifiers:
+        parents = np.arange(len(bindings))
+        for node in quantifier.nodes:
+            domain = domains[node]
+            if apart is not None:
+                domain = domain[~np.isin(domain, apart)]
+            rows = np.repeat(np.arange(len(bindings)), len(domain))
+            added = np.tile(domain, len(bindings))
+            if apart is not None:
+                fresh = ~np.any(bindings[rows] == added[:, None], axis=1)
+                rows, added = rows[fresh], added[fresh]
+            bindings = np.column_stack((bindings[rows], added))
+            parents = parents[rows]
+            variables = (*variables, node)
+        kept = counts(quantifier, variables, bindings)
+        bindings, parents = bindings[kept], parents[kept]
+        levels.append(Level(quantifier.word, bindings, parents))
+    return levels
+
+
+def folded_values(levels: Sequence[Level], values: Bools) -> list[Bools]:
+    """What is true of the bindings of each level, the outermost first, before them all the one of none.
+
+    Parameters
+    ----------
+    levels : sequence of Level
+    values : (B,) bool
+        Of the bindings of the last level; without quantifiers (1,).
+    """
+    found = [values]
+    for number in range(len(levels) - 1, -1, -1):
+        level = levels[number]
+        outer = len(levels[number - 1].bindings) if number else 1
+        every = level.word == "FORALL"
+        joined = np.full(outer, every)
+        (np.logical_and if every else np.logical_or).at(joined, level.parents, found[0])
+        found.insert(0, joined)
+    return found
+
+
+# ``CHECK`` over a store: verdicts of its traces, where they are violated, and by whom -----------
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """Entities that a verdict is due to: of ``FORALL`` those that violate it, of ``FORSOME`` those that do not.
+
+    Attributes
+    ----------
+    nodes : dict of str to int
+        Node ids by variable.
+    names : dict of str to str
+        Their names.
+    holds : bool
+    violations : tuple of Interval
+        Where the check is violated for them.
+    """
+
+    nodes: Mapping[str, int]
+    names: Mapping[str, str]
+    holds: bool
+    violations: tuple[Interval, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What a check says of a trace.
+
+    Attributes
+    ----------
+    check, trace : str
+        Their names.
+    verdict : str
+        ``true`` or ``false``; with ``USING END pending`` also ``presumably_true``, ``presumably_false``; and
+        ``unknown`` of a trace that cannot answer it, or, with ``USING GAPS unknown``, if it depends on what
+        happened in a gap.
+    first_violation : Interval or None
+        The first of the violations.
+    violations : tuple of Interval
+        In order; of a check with quantifiers those of all its witnesses.
+    witnesses : tuple of Witness
+    status : (F,) int8 or None
+        If asked for: what was known at each frame, as places in :data:`sgstore.temporal._verdicts.STATUS`.
+    reason : str
+        Why the verdict is ``unknown``; else empty.
+    """
+
+    check: str
+    trace: str
+    verdict: str
+    violations: tuple[Interval, ...] = ()
+    witnesses: tuple[Witness, ...] = ()
+    status: Statuses | None = None
+    reason: str = ""
+
+    @property
+    def first_violation(self) -> Interval | None:
+        """Where the check is violated first; ``None``: nowhere."""
+        return self.violations[0] if self.violations else None
+
+    @property
+    def violated(self) -> bool:
+        """Whether the trace is known to violate the check."""
+        return self.verdict == "false"
+
+    @property
+    def statuses(self) -> tuple[str, ...]:
+        """The status at each frame in words, if it was asked for."""
+        return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
+
+
+class CheckRun:
+    """The checks of a text, ready to be asked of a store. Iterating asks: verdicts trace by trace.
+
+    Parameters
+    ----------
+    file : StoreFile
+    catalog : function
+        Gives what the store holds.
+    text : str
+        ``CHECK`` statements, with the predicates that they need.
+    parameters : mapping of str to value
+    sgsm_compat : bool
+        Whether a trace violates a check if any of its beginnings would, as SGSM reports, and not only if it
+        does itself. Violations are then the frames that such beginnings end with.
+    status : bool
+        Whether the status at each frame is told.
+
+    Raises
+    ------
+    QueryError
+        The text has no checks, or they have no meaning; it says where.
+    """
+
+    def __init__(
+        self,
+        file: StoreFile,
+        catalog: Callable[[], Catalog],
+        text: str,
+        parameters: Mapping[str, object],
+        *,
+        sgsm_compat: bool = False,
+        status: bool = False,
+    ) -> None:
+        self._file, self._catalog = file, catalog
+        self._text, self._parameters = text, parameters
+        self._compat, self._status = sgsm_compat, status
+        with file.snapshot():
+            self._checks = compile_checks(text, catalog(), parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the checks, in order."""
+        return tuple(one.check.name for one in self._checks)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What may be a mistake: texts that are compared with names, say, of which the store has none."""
+        with self._file.snapshot():
+            compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
+            found = dict.fromkeys(compared)
+            return notes_in(self._file, found, self._text, self._parameters)
+
+    def __iter__(self) -> Iterator[Verdict]:
+        with self._file.snapshot():
+            for one in compile_checks(self._text, self._catalog(), self._parameters):
+                check = _Check(self._file, one, compat=self._compat, status=self._status)
+                yield from check.verdicts()
+
+    def explain(self) -> str:
+        """What becomes of the checks: formulas over atoms, and what each atom is."""
+        parts = [_Check(self._file, one, compat=False, status=False).text() for one in self._checks]
+        return "\n\n".join(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class _BindingVerdict:
+    """What is known of one binding, or of a check without quantifiers."""
+
+    violations: tuple[Violation, ...] = ()
+    status: Statuses | None = None
+
+
+_NOTHING: Final = _BindingVerdict()
+
+
+class _Check:
+    """One check, while a store is asked."""
+
+    def __init__(self, file: StoreFile, one: CheckInCatalog, *, compat: bool, status: bool) -> None:
+        check = one.check
+        self._file, self._check, self._catalog = file, check, one.catalog
+        self._compat, self._want_status = compat, status
+        self._whole = Query(
+            check.scope,
+            Result(),
+            check.relations,
+            check.injective,
+            check.ego,
+            check.unknown_is_false,
+        )
+        self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
+        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
+        self._plan = Plan(self._whole, frozenset(self._variables), absent)
+        self._formula = self._plan.formula(check.formula)
+        self._reset = self._plan.formula(check.reset) if check.reset is not None else None
+        self._guards = {
+            number: self._plan.formula(quantifier.where)
+            for number, quantifier in enumerate(check.quantifiers)
+            if quantifier.where is not None
+        }
+        self._people: dict[int, dict[str, dict[int, str]]] = {}
+
+    def text(self) -> str:
+        """The check as it is asked."""
+        from sgstore.temporal._plan import plan_text  # for who asks
+
+        head = [f"---- {self._check.name}"]
+        head += [f"{q.word} {', '.join(q.nodes)}" for q in self._check.quantifiers]
+        return (
+            "\n".join(head)
+            + "\n"
+            + plan_text(self._plan, self._formula, self._reset, self._catalog)
+        )
+
+    def verdicts(self) -> Iterator[Verdict]:
+        """The verdict of each trace, by name of the trace."""
+        gaps = "bridge" if self._check.gaps == "bridge" else "break"
+        asks: dict[str, Ask] = asks_of(self._plan)
+        self._read_people()
+        lacks = lacking(self._file, self._catalog, of_check(self._check))
+        catalog = replace(self._catalog, unknowing=frozenset(lacks))
+        told = traces(self._file, catalog, self._whole, asks, gaps=gaps)
+        known = (self._verdict(trace) for trace in told if len(trace))
+        unknown = self._unknown(catalog, lacks)
+        yield from merge(known, unknown, key=lambda verdict: natural(verdict.trace))
+
+    def _unknown(self, catalog: Catalog, lacks: Mapping[int, str]) -> Iterator[Verdict]:
+        """The verdicts of the traces that cannot answer."""
+        _, left = traces_of(self._whole, catalog)
+        for facts in catalog.traces:
+            if facts.trace_id in left and self._check.ego in {None, facts.ego}:
+                missing = sorted(self._whole.relations - facts.answers)
+                reasons = [f"it knows nothing of {', '.join(missing)}"] if missing else []
+                reasons += [lacks[facts.trace_id]] if facts.trace_id in lacks else []
+                yield Verdict(self._check.name, facts.name, "unknown", reason="; ".join(reasons))
+
+    def _read_people(self) -> None:
+        """The entities that variables may be, with their names, by trace."""
+        for node in self._check.scope.nodes:
+            statement = entities(self._whole, node, self._catalog, None)
+            for trace, number, name in self._file.rows(statement.sql, statement.values).values:
+                self._people.setdefault(trace, {}).setdefault(node, {})[number] = name
+
+    def _verdict(self, trace: TraceReader) -> Verdict:
+        levels = self._levels(trace)
+        bindings = innermost(levels)
+        kinds, members = self._alike(trace, bindings)
+        values = np.zeros(len(kinds), np.bool_)
+        told = [_NOTHING] * len(kinds)
+        for low in range(0, len(kinds), trace.together):
+            part = slice(low, low + trace.together)
+            values[part], told[part] = self._evaluated(trace, kinds[part])
+        truths = folded_values(levels, values[members])
+        if self._check.gaps == "unknown" and trace.clock.gap_before.any():
+            least, most = self._bounds(trace, kinds)
+            ends = [folded_values(levels, end[members])[0][0] for end in (least, most)]
+            if ends[0] != ends[1]:
+                reason = "it depends on what happened in a gap"
+                return Verdict(self._check.name, trace.name, "unknown", reason=reason)
+        return self._reported(trace, levels, truths, [told[i] for i in members.tolist()])
+
+    def _bounds(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, Bools]:
+        """The verdict of some bindings, at least and at most, whatever happened in the gaps."""
+        parts: list[tuple[Bools, Bools]] = []
+        for low in range(0, len(bindings), trace.together):
+            some = bindings[low : low + trace.together]
+            columns = PlanValues(self._plan, trace, self._variables, some).columns(self._formula)
+            times, gaps = trace.clock.times, trace.clock.gap_before
+            lenient = tolerant(self._formula, trace.clock.tolerance)
+            parts.append(within_bounds(lenient, columns, times, gaps, len(some)))
+        nothing = np.zeros(0, np.bool_)
+        least = np.concatenate([nothing, *(part[0] for part in parts)])
+        return least, np.concatenate([nothing, *(part[1] for part in parts)])
+
+    def _levels(self, trace: TraceReader) -> list[Level]:
+        people = self._people.get(trace.trace_id, {})
+        domains = {
+            node: np.array(sorted(people.get(node, ())), np.int64)
+            for node in self._check.scope.nodes
+        }
+        others = [domains[n] for n in self._check.scope.nodes if n not in self._variables]
+        apart = np.concatenate([np.zeros(0, np.int64), *others])
+
+        def counts(
+            quantifier: BoundQuantifier, variables: tuple[str, ...], bindings: Keys
+        ) -> Bools:
+            guard = self._guards.get(self._check.quantifiers.index(quantifier))
+            if guard is None or not len(bindings):
+                return np.ones(len(bindings), np.bool_)
+            size = trace.together
+            parts = [
+                PlanValues(self._plan, trace, variables, bindings[low : low + size]).formula(guard)
+                for low in range(0, len(bindings), size)
+            ]
+            return np.concatenate([part.any(axis=1) for part in parts])
+
+        injective = self._check.injective
+        return levels_of(
+            self._check.quantifiers, domains, apart=apart if injective else None, counts=counts
+        )
+
+    def _alike(self, trace: TraceReader, bindings: Keys) -> tuple[Keys, Ints]:
+        """Bindings of which the same is true in every frame need but one evaluation.
+
+        Returns one binding of each sort, and the sort of each binding.
+        """
+        if not len(bindings):
+            return bindings, np.zeros(0, np.int64)
+        asks = asks_of(self._plan)
+        found: list[Ints] = []
+        for name, ask in asks.items():
+            columns = [self._variables.index(v) for v in ask.variables]
+            found.append(trace.relations[name].find(bindings[:, columns]))
+        if not found:
+            return bindings[:1], np.zeros(len(bindings), np.int64)
+        sorts = np.stack(found, axis=1)
+        _, first, members = np.unique(sorts, axis=0, return_index=True, return_inverse=True)
+        return bindings[first], members.reshape(-1)
+
+    def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, list[_BindingVerdict]]:
+        """The verdict of some bindings, and more of those that it is due to."""
+        values = PlanValues(self._plan, trace, self._variables, bindings)
+        columns = values.columns(self._formula)
+        truths = values.formula(self._formula)[:, 0].copy()
+        resets = values.formula(self._reset) if self._reset is not None else None
+        told: list[_BindingVerdict] = []
+        lenient = tolerant(self._formula, trace.clock.tolerance)
+        for row in range(len(bindings)):
+            needed = not truths[row] or self._compat or self._want_status
+            if not (needed or self._check.end == "pending"):
+                told.append(_NOTHING)
+                continue
+            own = {name: column[min(row, len(column) - 1)] for name, column in columns.items()}
+            settled = Settled(lenient, own, trace.clock.times)
+            reset = resets[row] if resets is not None else None
+            truths[row], one = self._one(settled, reset)
+            told.append(one)
+        return truths, told
+
+    def _one(self, settled: Settled, reset: Bools | None) -> tuple[bool, _BindingVerdict]:
+        weak = self._check.end == "weak"
+        wanted = self._compat or self._want_status or self._check.end == "pending"
+        status = settled.statuses() if wanted else None
+        if self._compat and status is not None:
+            broken = status < PRESUMABLY_TRUE
+            return not broken.any(), _BindingVerdict(tuple(_runs(broken)), status)
+        violations = tuple(settled.violations(reset, weak=weak))
+        holds = bool(settled.value[0])
+        if weak and not holds:
+            holds = not violations
+        return holds, _BindingVerdict(violations, status)
+
+    def _reported(
+        self,
+        trace: TraceReader,
+        levels: list[Level],
+        truths: list[Bools],
+        told: list[_BindingVerdict],
+    ) -> Verdict:
+        holds = bool(truths[0][0])
+        status = self._joined(levels, told, len(trace))
+        verdict = "true" if holds else "false"
+        if self._check.end == "pending" and status is not None:
+            verdict = STATUS[int(status[-1])]
+        if not levels:
+            own = tuple(_interval(trace, one, {}) for one in told[0].violations)
+            return Verdict(self._check.name, trace.name, verdict, own, (), self._kept(status))
+        witnesses = self._witnesses(trace, levels, truths, told)
+        if holds:
+            violations: tuple[Interval, ...] = ()
+        else:
+            every = {(i.start_seq, i.end_seq): i for w in witnesses for i in w.violations}
+            violations = tuple(every[key] for key in sorted(every))
+            if not violations:
+                violations = (_interval(trace, Violation(len(trace) - 1, len(trace) - 1), {}),)
+        return Verdict(
+            self._check.name, trace.name, verdict, violations, witnesses, self._kept(status)
+        )
+
+    def _kept(self, status: Statuses | None) -> Statuses | None:
+        return status if self._want_status else None
+
+    def _witnesses(
+        self,
+        trace: TraceReader,
+        levels: list[Level],
+        truths: list[Bools],
+        told: list[_BindingVerdict],
+    ) -> tuple[Witness, ...]:
+        """Those of the outermost quantifiers that are of one word."""
+        word = levels[0].word
+        depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
+        level, values = levels[depth - 1], truths[depth]
+        names = [n for q in self._check.quantifiers[:depth] for n in q.nodes]
+        people = self._people.get(trace.trace_id, {})
+        found: list[Witness] = []
+        for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
+            nodes = dict(zip(names, level.bindings[row].tolist(), strict=True))
+            called = {name: people[name][node] for name, node in nodes.items()}
+            inner = told[row].violations if depth == len(levels) else ()
+            violations = tuple(_interval(trace, one, called) for one in inner)
+            found.append(Witness(nodes, called, bool(values[row]), violations))
+        return tuple(found)
+
+    def _joined(
+        self, levels: list[Level], told: list[_BindingVerdict], frames: int
+    ) -> Statuses | None:
+        """The status of the whole check at each frame, of those of its bindings."""
+        if not (self._want_status or self._check.end == "pending"):
+            return None
+        rows = [one.status for one in told if one.status is not None]
+        for number in range(len(levels) - 1, -1, -1):
+            level = levels[number]
+            every = level.word == "FORALL"
+            outer = len(levels[number - 1].bindings) if number else 1
+            empty = len(STATUS) - 1 if every else FALSE
+            joined = [np.full(frames, empty, np.int8) for _ in range(outer)]
+            for parent, row in zip(level.parents.tolist(), rows, strict=True):
+                both = np.minimum if every else np.maximum
+                joined[parent] = both(joined[parent], row)
+            rows = joined
+        return rows[0]
+
+
+def _runs(flags: Bools) -> Iterator[Violation]:
+    edges = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+    for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        yield Violation(start, end - 1)
+
+
+def _interval(trace: TraceReader, of: Violation, names: Mapping[str, str]) -> Interval:
+    return Interval(
+        trace.name,
+        int(trace.numbers[of.start]),
+        int(trace.numbers[of.end]),
+        int(trace.times[of.start]),
+        int(trace.times[of.end]),
+        trace.seconds(of.start),
+        trace.seconds(of.end),
+        of.end - of.start + 1,
+        dict(names),
+    )

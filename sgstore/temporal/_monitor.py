@@ -1,0 +1,442 @@
+"""The online monitor, and its sources of frames.
+
+Where the frames of a monitor come from: a recording as if it were live, or a running CARLA.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+from sgstore.config import Config
+from sgstore.errors import QueryError, TraceError
+from sgstore.lang import (
+    Catalog,
+    FrameView,
+    RelationScope,
+    TraceFacts,
+    bind_checks,
+    bind_query,
+    of_check,
+    of_query,
+    parse,
+)
+from sgstore.lang.syntax import CheckClause, Define, MatchClause, Parameter
+from sgstore.map_files import Maps, lost_lanes
+from sgstore.readers import on_map, open_trace
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.step import GcPaused, Replay
+from sgstore.temporal._check_monitor import CheckMonitor
+from sgstore.temporal._checks import Verdict
+from sgstore.temporal._query_cache import NodeNames, QueryCache, Wanted
+from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
+from sgstore.temporal._signal_state import StreamClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.graph import SceneGraph
+    from sgstore.lang.ir import BoundCheck, Query
+    from sgstore.lang.syntax import Statement
+    from sgstore.roads import RoadMap
+    from sgstore.step import Frame
+
+
+LIVE: Final = "carla://"
+PORT: Final = 2000
+"""Where a CARLA server listens by default."""
+
+
+@dataclass(slots=True)
+class FrameSource:
+    """Frames one after the other, and the map that they lie on.
+
+    Attributes
+    ----------
+    name : str
+    road_map : RoadMap or None
+    frames : iterator of Frame
+        Of a running simulator it does not end.
+    warnings : list of str
+        What is odd; more comes while frames are read.
+    losses : list of str
+        What could not be read.
+    """
+
+    name: str
+    road_map: RoadMap | None
+    frames: Iterator[Frame]
+    warnings: list[str] = field(default_factory=list[str])
+    losses: list[str] = field(default_factory=list[str])
+
+
+@contextmanager
+def opened(
+    source: str, config: Config, *, road_map: Path | None = None, ego: str = ""
+) -> Generator[FrameSource]:
+    """A recording, or ``carla://host:port``.
+
+    Parameters
+    ----------
+    source : str
+    config : Config
+    road_map : Path, optional
+        For a recording that carries no map of its own, as ingest takes it.
+    ego : str
+        Id, role or name of the ego; empty: as the recording says.
+
+    Raises
+    ------
+    TraceError
+        It cannot be read, or there is no server.
+    MapError
+        The map cannot be read.
+    """
+    if source.startswith(LIVE):
+        yield _live(source, ego)
+        return
+    path = Path(source)
+    with open_trace(path, ego=ego or config.ego) as trace:
+        found, warnings = Maps(road_map, config.signs).of(trace.info)
+        on_map(trace, found)
+        told = FrameSource(path.stem, found, iter(()), warnings)
+        told.losses += [loss.reason for loss in lost_lanes(trace.info, found)]
+
+        def frames() -> Iterator[Frame]:
+            replay = Replay()
+            for block in trace.blocks():
+                yield from replay.frames(block)
+            told.warnings += trace.report.warnings
+            told.losses += [loss.reason for loss in trace.report.losses]
+
+        told.frames = frames()
+        yield told
+
+
+def _live(source: str, ego: str) -> FrameSource:
+    from sgstore.readers import (
+        LiveWorld,
+        connect,  # a large package: only for who asks
+    )
+
+    try:
+        where = urlsplit(source)
+        host, port = where.hostname or "localhost", where.port or PORT
+    except ValueError as error:
+        raise TraceError(f"{source}: {error}; expected {LIVE}host:port") from error
+    live = LiveWorld(connect(host, port).get_world(), ego)
+    told = FrameSource(live.map_name, live.road_map, iter(()))
+
+    def frames() -> Iterator[Frame]:
+        while True:
+            live.world.wait_for_tick()
+            frame = live.frame()
+            told.warnings[:] = live.warnings
+            yield frame
+
+    told.frames = frames()
+    return told
+
+
+# The loop of a monitor: frame in, graph made, questions asked, checks and patterns told ---------
+
+
+class Monitor:
+    """Checks and patterns over one trace that is going on.
+
+    Parameters
+    ----------
+    text : str
+        ``CHECK`` and ``MATCH`` statements, with the predicates that they need.
+    road_map : RoadMap, optional
+    config : Config, optional
+    on_event : callable, optional
+        Is told every event as soon as it is known.
+    parameters : mapping of str to value, optional
+        Values of ``$name``.
+    trace : str
+        What the trace is called in verdicts.
+    period_s : float, optional
+        Time between two frames, from which gaps are told; by default the median of those seen.
+    called : str or sequence of str
+        What a pattern is called in events; of several each has a number as well, or a name of its own.
+    sgsm_compat : bool
+        Whether a check is violated in each frame with which the trace, if it ended there, would violate it; as
+        :meth:`sgstore.query.Store.check` has it. Nothing resets such a violation.
+
+    Attributes
+    ----------
+    generator : SceneGraphGenerator
+        What makes the graphs; its last ones are those of the last step.
+    names : tuple of str
+        Of the checks and patterns.
+
+    Raises
+    ------
+    QueryError
+        The text has no meaning, or is about what cannot be known while a trace goes on; it says where.
+
+    Notes
+    -----
+    A check that names a relation which the graphs cannot have (of lanes, without a map) has the verdict
+    ``unknown``, a pattern none.
+    """
+
+    def __init__(  # noqa: PLR0913 - most have names
+        self,
+        text: str,
+        road_map: RoadMap | None = None,
+        config: Config | None = None,
+        *,
+        on_event: Callable[[MonitorEvent], object] | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        trace: str = "online",
+        period_s: float | None = None,
+        called: str | Sequence[str] = "pattern",
+        sgsm_compat: bool = False,
+    ) -> None:
+        config = config or Config()
+        self.generator = SceneGraphGenerator(road_map, config)
+        self.trace = trace
+        self._on_event = on_event
+        answers = frozenset(self.generator.answers)
+        reach = RelationScope.of(config.as_dict())
+        catalog = Catalog(traces=(TraceFacts(0, trace, "", answers, reach),))
+        checks, queries = _bound(text, catalog, parameters or {})
+        self._egos: list[str] = []
+        self._questions: list[QueryCache] = []
+        self._pulse = StreamClock(None if period_s is None else round(period_s * 1e9))
+        self._last: FrameTime | None = None
+        self._watches: list[tuple[int, CheckMonitor, _PendingEvents]] = []
+        self._unknown: dict[str, str] = {}
+        for check in checks:
+            if check.relations <= answers or check.unknown_is_false:
+                ego, questions = self._of_ego(check.ego)
+                watch = CheckMonitor(check, questions, self._pulse, compat=sgsm_compat)
+                self._watches.append((ego, watch, _PendingEvents(Wanted(of_check(check)))))
+            else:
+                missing = ", ".join(sorted(check.relations - answers))
+                self._unknown[check.name] = f"it knows nothing of {missing}"
+        self._follows: list[tuple[int, SequenceMonitor, _PendingEvents]] = []
+        for name, query in zip(_names(called, len(queries)), queries, strict=True):
+            if query.relations <= answers or query.unknown_is_false:
+                ego, questions = self._of_ego(query.ego)
+                waiting = _PendingEvents(Wanted(of_query(query) if query.steps else ()))
+                self._follows.append(
+                    (ego, SequenceMonitor(name, query, questions, self._pulse), waiting)
+                )
+        told = (follow.name for _, follow, _ in self._follows)
+        self.names = (*(check.name for check in checks), *told)
+
+    def _of_ego(self, ego: str | None) -> tuple[int, QueryCache]:
+        """The number of an ego, and what is asked of its graphs."""
+        if (ego or "") not in self._egos:
+            self._egos.append(ego or "")
+            self._questions.append(QueryCache())
+        number = self._egos.index(ego or "")
+        return number, self._questions[number]
+
+    def step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
+        """The next frame: what is known from it on.
+
+        Raises
+        ------
+        ValueError
+            The frame contradicts itself, as :meth:`sgstore.sgg.SceneGraphGenerator.steps` says; it is as if it
+            had not been given.
+        """
+        with GcPaused():  # the graphs are let go within
+            return self._step(frame)
+
+    def _step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
+        return self.look(self.generator.steps(frame, self._egos or [""]), classed=True)
+
+    def look(
+        self, graphs: Sequence[SceneGraph], *, classed: bool = False
+    ) -> tuple[MonitorEvent, ...]:
+        """The graphs of the next frame, of whoever makes them: what is known from it on.
+
+        Parameters
+        ----------
+        graphs : sequence of SceneGraph
+            One for each of :attr:`egos`.
+        classed : bool
+            Whether they are the last ones of :attr:`generator`, which can then be asked for their classes.
+        """
+        return self._tell(*self._ask(graphs, classed=classed))
+
+    def _ask(
+        self, graphs: Sequence[SceneGraph], *, classed: bool = False
+    ) -> tuple[FrameTime, list[NodeNames]]:
+        """Ask all questions of the graphs of a frame."""
+        self._pulse.step(graphs[0].time_ns)
+        tick, start = self._pulse.tick, self._pulse.start
+        here = FrameTime(tick.number, tick.time, (tick.time - start) / 1e9)
+        people: list[NodeNames] = []
+        for number, (graph, questions) in enumerate(zip(graphs, self._questions, strict=False)):
+            view = self._view(graph, here, number if classed else None)
+            people.append(NodeNames(view))
+            questions.ask(view, people[-1])
+        return here, people
+
+    def _tell(self, here: FrameTime, people: list[NodeNames]) -> tuple[MonitorEvent, ...]:
+        """Tell checks and patterns the answers."""
+        self._last = here
+        found: list[MonitorEvent] = []
+        for ego, watch, waiting in self._watches:
+            found += waiting.passed(watch.step(here), here, people[ego])
+        for ego, follow, waiting in self._follows:
+            found += waiting.passed(follow.step(here, people[ego]), here, people[ego])
+        return self._told(found)
+
+    def _view(self, graph: SceneGraph, here: FrameTime, number: int | None) -> FrameView:
+        frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
+        trace = {"id": 0, "name": self.trace}
+        if number is None:
+            return FrameView(graph, frame, trace)
+        classes = partial(self.generator.class_of, number=number)
+        return FrameView(graph, frame, trace, classes, partial(self.generator.roles_of, number))
+
+    def _told(self, events: list[MonitorEvent]) -> tuple[MonitorEvent, ...]:
+        if self._on_event is not None:
+            for event in events:
+                self._on_event(event)
+        return tuple(events)
+
+    @property
+    def egos(self) -> tuple[str, ...]:
+        """The ids of the egos whose graphs are looked at; empty: the ego of the frame."""
+        return tuple(self._egos)
+
+    @property
+    def status(self) -> dict[str, str]:
+        """What is known of each check so far: ``true``, ``false``, ``presumably_true``, ``presumably_false``.
+
+        The latter are what the verdict would be if the trace ended now. ``unknown``: it cannot be told.
+        """
+        known = {
+            watch.name: "unknown" if waiting.reason else watch.status()
+            for _, watch, waiting in self._watches
+        }
+        return known | dict.fromkeys(self._unknown, "unknown")
+
+    def run(
+        self, frames: Iterable[Frame], *, duration_s: float | None = None
+    ) -> tuple[Verdict, ...]:
+        """Watch frames one after the other, until they end, or Ctrl-C ends it: the verdicts.
+
+        Parameters
+        ----------
+        frames : iterable of Frame
+        duration_s : float, optional
+            How much simulation time is watched; by default all.
+        """
+        try:
+            for frame in frames:
+                self.step(frame)
+                if self._last is not None and duration_s is not None and self._last.t >= duration_s:
+                    break
+        except KeyboardInterrupt:
+            pass  # what was seen until then has its verdicts
+        return self.finish()
+
+    def finish(self) -> tuple[Verdict, ...]:
+        """The trace has ended: the verdicts of all checks, as a store has them of the recorded trace."""
+        if self._last is None:
+            return ()
+        verdicts: list[Verdict] = []
+        events: list[MonitorEvent] = []
+        unknown = dict(self._unknown)
+        for _, watch, waiting in self._watches:
+            if waiting.reason:
+                unknown[watch.name] = waiting.reason
+                continue
+            verdict, late = watch.finish(self.trace, self._last)
+            verdicts.append(verdict)
+            events += late
+        for _, follow, waiting in self._follows:
+            if not waiting.reason:
+                events += follow.finish(self._last)
+        self._told(events)
+        told = (Verdict(n, self.trace, "unknown", reason=why) for n, why in unknown.items())
+        return (*verdicts, *told)
+
+
+@dataclass(slots=True)
+class _PendingEvents:
+    """Events that wait until the trace has shown what they need: till then they may be of what nobody knows."""
+
+    wanted: Wanted
+    events: list[MonitorEvent] = field(default_factory=list[MonitorEvent])
+    reason: str = ""
+
+    def passed(
+        self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
+    ) -> list[MonitorEvent]:
+        """What is told in a frame, of what was found up to it."""
+        if not self.wanted.open:
+            return found
+        self.wanted.look(people)
+        self.reason = self.wanted.reason
+        self.events += found
+        if self.reason:
+            return []
+        told, self.events = [replace(event, told=here) for event in self.events], []
+        return told
+
+
+def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
+    """What so many patterns are called."""
+    if isinstance(called, str):
+        return [called] if count == 1 else [f"{called} {i + 1}" for i in range(count)]
+    if len(called) != count:
+        raise ValueError(f"{len(called)} names for {count} patterns")
+    return called
+
+
+def _bound(
+    text: str, catalog: Catalog, parameters: Mapping[str, Any]
+) -> tuple[list[BoundCheck], list[Query]]:
+    """The checks and the patterns of a text."""
+    statements = parse(text)
+    written = [one for one in statements if not isinstance(one, MatchClause)]
+    named = {name for one in statements for name in _parameters(one)}
+    unused = sorted(set(parameters) - named)
+    if unused:
+        hint = f"it would be written ${unused[0]}"
+        raise QueryError(f"the text has no parameter '{unused[0]}'", hint=hint)
+
+    def given(some: Sequence[Statement]) -> dict[str, Any]:
+        names = {name for one in some for name in _parameters(one)}
+        return {name: value for name, value in parameters.items() if name in names}
+
+    checks: list[BoundCheck] = []
+    if any(isinstance(one, CheckClause) for one in written) or not any(
+        isinstance(one, MatchClause) for one in statements
+    ):
+        bound = bind_checks(text, written, lambda _: catalog, given(written))
+        checks = [one.check for one in bound]
+    defined: list[Statement] = []
+    queries: list[Query] = []
+    for one in statements:
+        if isinstance(one, Define):
+            defined.append(one)
+        elif isinstance(one, MatchClause):
+            queries.append(bind_query(text, [*defined, one], catalog, given([*defined, one])))
+    return checks, queries
+
+
+def _parameters(part: object) -> Iterator[str]:
+    """The names of the parameters in a part of a text."""
+    if isinstance(part, Parameter):
+        yield part.name
+    elif isinstance(part, tuple | list):
+        for item in part:  # pyright: ignore[reportUnknownVariableType]
+            yield from _parameters(item)  # pyright: ignore[reportUnknownArgumentType]
+    elif is_dataclass(part):
+        for one in fields(part):
+            yield from _parameters(getattr(part, one.name))

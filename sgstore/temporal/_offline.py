@@ -1,0 +1,424 @@
+"""Relations and signals of whole traces, read from the store.
+
+Where something holds in one trace: bindings, and for each the frames; looked up many at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang import (
+    CLOCK,
+    CLOCK_OF_TRACES,
+    EXTENTS,
+    TRACE_OF_BUCKET,
+    TRACES,
+    in_order,
+    relation,
+    traces_of,
+)
+from sgstore.matches import Windows
+from sgstore.store import trace_of
+from sgstore.temporal._formula import Formula, propositions, tolerant
+from sgstore.temporal._signals import Clock, SignalColumn, SignalValues, evaluate_rows
+from sgstore.vocabulary import RELATIONS
+from sgstore.world import longest_step_ns, tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang import Catalog, Window
+    from sgstore.lang.ir import Bound, Query
+    from sgstore.store import StoreFile
+    from sgstore.temporal._plan import Plan, Signal, Test
+    from sgstore.world import Bools, Ints
+
+    Keys = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """Bindings and frames.
+
+    Attributes
+    ----------
+    keys : (K, n) int64
+        The bindings, each once, in ascending order.
+    starts : (K + 1,) int64
+        Where the frames of each begin.
+    frames : (R,) int64
+        Numbers of frames, ascending for each binding.
+    values : tuple of (R,) arrays
+        What was asked of each match; masked where it is unknown.
+    """
+
+    keys: Keys
+    starts: Ints
+    frames: Ints
+    values: tuple[Any, ...] = ()
+
+    @classmethod
+    def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> Relation:
+        """From rows in any order; of rows with the same binding and frame one is kept.
+
+        Parameters
+        ----------
+        frames : (R,) int64
+        keys : (R, n) int64
+        values : sequence of (R,) arrays
+        """
+        order = np.lexsort((frames, *keys.T[::-1]))
+        frames, keys = frames[order], keys[order]
+        new = np.ones(len(frames), np.bool_)
+        new[1:] = np.any(keys[1:] != keys[:-1], axis=1)
+        fresh = new.copy()
+        fresh[1:] |= frames[1:] != frames[:-1]
+        if not fresh.all():
+            order, frames, keys, new = order[fresh], frames[fresh], keys[fresh], new[fresh]
+        first = np.flatnonzero(new)
+        starts = np.append(first, len(frames))
+        return cls(keys[first], starts, frames, tuple(value[order] for value in values))
+
+    def find(self, wanted: Keys) -> Ints:
+        """(B,) the place of each of some bindings (B, n) among the keys; -1: it is not there."""
+        if not len(self.keys) or not len(wanted):
+            return np.full(len(wanted), -1)
+        if not wanted.shape[1]:
+            return np.zeros(len(wanted), np.int64)
+        both = np.concatenate((self.keys, wanted))
+        _, codes = np.unique(both, axis=0, return_inverse=True)
+        codes = codes.reshape(-1)
+        place = np.full(int(codes.max()) + 1, -1)
+        place[codes[: len(self.keys)]] = np.arange(len(self.keys))
+        return place[codes[len(self.keys) :]]
+
+    def rows_of(self, places: Ints) -> tuple[Ints, Ints]:
+        """The rows of some keys: for each, which of the places it belongs to, and its number here."""
+        known = np.flatnonzero(places >= 0)
+        first, end = self.starts[places[known]], self.starts[places[known] + 1]
+        counts = end - first
+        owner = np.repeat(known, counts)
+        offset = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
+        return owner, np.repeat(first, counts) + offset
+
+    def flags(self, places: Ints, length: int) -> Bools:
+        """(B, length) in which frames each of some keys holds; -1 holds in none."""
+        found = np.zeros((len(places), length), np.bool_)
+        owner, rows = self.rows_of(places)
+        found[owner, self.frames[rows]] = True
+        return found
+
+    def column(self, places: Ints, length: int, number: int = 0) -> SignalColumn:
+        """A value in each frame for some keys."""
+        told = self.values[number]
+        plain = np.ma.getdata(told)
+        kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
+        values = np.zeros((len(places), length), kind)
+        if plain.dtype.kind == "O":
+            values[:] = ""
+        known = np.zeros((len(places), length), np.bool_)
+        owner, rows = self.rows_of(places)
+        at = owner, self.frames[rows]
+        values[at] = plain[rows]
+        known[at] = ~np.ma.getmaskarray(told)[rows]
+        if kind is np.float64:
+            known &= ~np.isnan(values)
+        return SignalColumn(values, known)
+
+
+# Traces as a plan needs them: the clock, and the relations of atoms and signals, several traces a question
+# ------------------------------------------------------------------------------------------------
+
+WORDS: Final = np.array(sorted(RELATIONS))
+"""Relations in alphabetical order."""
+
+CELLS: Final = 4_000_000
+"""Bindings times frames that are worked on at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A relation that is asked of a store.
+
+    Attributes
+    ----------
+    query : Query
+        The pattern.
+    variables : tuple of str
+        Keys of its nodes that are bound: the columns of the relation's keys.
+    values : tuple of Bound
+        Asked of each match.
+    edges : tuple of str
+        Keys of its edges that are bound: further columns of the keys, places in :data:`WORDS`.
+    first : bool
+        Whether these are no columns, and of matches that differ in them alone the one counts whose relations
+        come first.
+    """
+
+    query: Query
+    variables: tuple[str, ...]
+    values: tuple[Bound, ...] = ()
+    edges: tuple[str, ...] = ()
+    first: bool = False
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it asks nothing, and so holds in every frame."""
+        scope = self.query.scope
+        return not (scope.nodes or scope.edges or scope.where)
+
+
+@dataclass(slots=True)
+class TraceReader:
+    """One trace while it is looked at.
+
+    Attributes
+    ----------
+    trace_id : int
+    name : str
+    frame_ids, numbers, times, log_times : (F,) int64
+        Of its frames: ids, numbers (``seq``), simulation times and log times; ns.
+    start : int
+        Simulation time from which seconds are counted; ns.
+    clock : Clock
+    relations : dict of str to Relation
+    """
+
+    trace_id: int
+    name: str
+    frame_ids: Ints
+    numbers: Ints
+    times: Ints
+    log_times: Ints
+    start: int
+    clock: Clock
+    relations: dict[str, Relation] = field(default_factory=dict[str, Relation])
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    @property
+    def together(self) -> int:
+        """How many bindings are worked on at once, in all frames."""
+        return max(CELLS // max(len(self), 1), 1)
+
+    def seconds(self, frame: int) -> float:
+        """The time of a frame since the trace began."""
+        return float(self.times[frame] - self.start) / 1e9
+
+
+class PlanValues:
+    """The values of a plan's formulas and tests in one trace, for some bindings.
+
+    Parameters
+    ----------
+    plan : Plan
+    trace : TraceReader
+    variables : tuple of str
+        What the columns of the bindings are.
+    bindings : (B, n) int64
+    """
+
+    def __init__(
+        self, plan: Plan, trace: TraceReader, variables: tuple[str, ...], bindings: Keys
+    ) -> None:
+        self._plan, self._trace = plan, trace
+        self._variables, self._bindings = variables, bindings
+        self._atoms: dict[str, Bools] = {}
+
+    def formula(self, formula: Formula) -> Bools:
+        """(B, F) where a formula is true."""
+        columns, clock = self.columns(formula), self._trace.clock
+        lenient = tolerant(formula, clock.tolerance)
+        return evaluate_rows(lenient, columns, clock.times, len(self._bindings))
+
+    def columns(self, formula: Formula) -> dict[str, Bools]:
+        """The propositions of a formula: (B, F), or (1, F) where a proposition is the same for all."""
+        return {name: self._proposition(name) for name in propositions(formula)}
+
+    def _proposition(self, name: str) -> Bools:
+        if name in self._plan.tests:
+            found = self.test(self._plan.tests[name]).true
+            shape = len(found), len(self._trace)
+            return np.broadcast_to(found, shape)
+        if name not in self._atoms:
+            found = self._trace.relations[name]
+            places = found.find(self._projected(self._plan.atoms[name].variables))
+            self._atoms[name] = found.flags(places, len(self._trace))
+        return self._atoms[name]
+
+    def test(self, test: Test) -> SignalColumn:
+        """The value of a test."""
+
+        def condition(expression: Bound) -> Bools:
+            return self.formula(test.formulas[expression])
+
+        clock = self._trace.clock
+        return SignalValues(test, clock, self._signal, condition, self._proposition).column()
+
+    def _signal(self, signal: Signal) -> SignalColumn:
+        found = self._trace.relations[signal.name]
+        places = found.find(self._projected(signal.variables))
+        return found.column(places, len(self._trace))
+
+    def _projected(self, variables: tuple[str, ...]) -> Keys:
+        if not variables:
+            return np.zeros((1, 0), np.int64)
+        return self._bindings[:, [self._variables.index(name) for name in variables]]
+
+
+def asks_of(plan: Plan) -> dict[str, Ask]:
+    """What a plan needs of a store, by the names of its atoms and signals."""
+    atoms = {name: Ask(atom.query, atom.variables) for name, atom in plan.atoms.items()}
+    signals = {
+        name: Ask(signal.query, signal.variables, (signal.value,), signal.edges, first=True)
+        for name, signal in plan.signals.items()
+    }
+    return atoms | signals
+
+
+def traces(
+    file: StoreFile,
+    catalog: Catalog,
+    whole: Query,
+    asks: Mapping[str, Ask],
+    *,
+    gaps: str = "break",
+    within: Window | None = None,
+) -> Iterator[TraceReader]:
+    """The traces that can answer a query, in order of the catalog, with the relations that are asked.
+
+    They are read a few at a time, the more the fewer rows they have, so that memory does not grow with a store.
+
+    Parameters
+    ----------
+    file : StoreFile
+        It stays as it is while this runs.
+    catalog : Catalog
+    whole : Query
+        Says which traces are asked.
+    asks : mapping of str to Ask
+        By name.
+    gaps : str
+        Whether a gap ends a run: ``break``, ``bridge``.
+    within : Window, optional
+        Buckets of whole traces; by default all.
+    """
+    extents = in_order(file.rows(EXTENTS).values, catalog)
+    if within is not None:
+        extents = [one for one in extents if _lies_in(one[0], within)]
+    steps = Windows(extents, whole_traces=True)
+    for window in steps:
+        found, steps.rows = read(file, catalog, whole, asks, window or within, gaps=gaps)
+        yield from found
+        del found
+
+
+def read(
+    file: StoreFile,
+    catalog: Catalog,
+    whole: Query,
+    asks: Mapping[str, Ask],
+    window: Window | None,
+    *,
+    gaps: str,
+) -> tuple[list[TraceReader], int]:
+    """The traces of a window of whole traces, as :func:`traces` gives them; and how many rows were read."""
+    about = {row[0]: row[1:] for row in file.rows(TRACES).values}
+    chosen, left = traces_of(whole, catalog)
+    asked = (set(about) if chosen is None else chosen) - left
+    found = _clocks(file, about, asked, window, gaps)
+    rows = sum(_relate(file, catalog, name, ask, window, found) for name, ask in asks.items())
+    ordered = (trace.trace_id for trace in catalog.traces)
+    return [found[trace] for trace in ordered if trace in found], rows
+
+
+def _lies_in(bucket: int, window: Window) -> bool:
+    traces = window.traces
+    inside = window.low <= bucket < window.high
+    return inside and (traces is None or bucket >> TRACE_OF_BUCKET in traces)
+
+
+def _clocks(
+    file: StoreFile,
+    about: Mapping[int, Sequence[Any]],
+    asked: set[int],
+    window: Window | None,
+    gaps: str,
+) -> dict[int, TraceReader]:
+    low, high = (window.low << 6, window.high << 6) if window else (0, (1 << 63) - 1)
+    sql, values = CLOCK, (low, high)
+    if window and window.traces is not None:
+        sql, values = CLOCK_OF_TRACES, (low, high, list(window.traces))
+    clock = {name: np.ma.getdata(c) for name, c in file.arrays(sql, values).items()}
+    ids = clock["frame_id"].astype(np.int64)
+    found: dict[int, TraceReader] = {}
+    for trace_id, rows in _by_trace(ids):
+        if trace_id not in asked:
+            continue
+        name, start, period = about[trace_id]
+        numbers, times, logs = (
+            clock[column][rows].astype(np.int64) for column in ("seq", "time_ns", "log_time_ns")
+        )
+        longest, tolerance = longest_step_ns(period), tolerance_ns(period)
+        ticks = Clock.of(_ascending(times), numbers, period, longest, tolerance)
+        if gaps == "bridge":
+            ticks = replace(ticks, runs=np.zeros_like(ticks.runs))
+        found[trace_id] = TraceReader(trace_id, name, ids[rows], numbers, times, logs, start, ticks)
+    return found
+
+
+def _relate(
+    file: StoreFile,
+    catalog: Catalog,
+    name: str,
+    ask: Ask,
+    window: Window | None,
+    found: Mapping[int, TraceReader],
+) -> int:
+    """Ask one relation, and give each trace its part."""
+    if ask.everywhere:
+        for trace in found.values():
+            every = np.arange(len(trace))
+            trace.relations[name] = Relation.of(every, np.zeros((len(trace), 0), np.int64))
+        return 0
+    bound = {*ask.variables, *ask.edges}
+    statement = relation(ask.query, catalog, window, ask.values, bound)
+    arrays = file.arrays(statement.sql, statement.values)
+    ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
+    columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
+    columns += [np.searchsorted(WORDS, np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
+    keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
+    values = [arrays[f":{number}"] for number in range(len(ask.values))]
+    told = len(ask.variables) if ask.first else keys.shape[1]
+    order = np.lexsort((*keys.T[told:][::-1], ids))
+    keys = keys[:, :told]
+    ids, keys, values = ids[order], keys[order], [value[order] for value in values]
+    parts = dict(_by_trace(ids))
+    nothing = slice(0, 0)
+    for trace in found.values():
+        rows = parts.get(trace.trace_id, nothing)
+        frames = np.searchsorted(trace.frame_ids, ids[rows])
+        trace.relations[name] = Relation.of(frames, keys[rows], [value[rows] for value in values])
+    return len(ids)
+
+
+def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
+    """The traces of frames in order, and which of them are theirs."""
+    if not len(ids):
+        return []
+    owners = trace_of(ids)
+    starts = np.flatnonzero(np.diff(owners, prepend=-1))
+    ends = np.append(starts[1:], len(ids))
+    return [(int(owners[a]), slice(int(a), int(z))) for a, z in zip(starts, ends, strict=True)]
+
+
+def _ascending(times: Ints) -> Ints:
+    """Times that ascend, where a recording's stand still or go back: a nanosecond later than the one before."""
+    ticks = np.arange(len(times))
+    return np.maximum.accumulate(times - ticks) + ticks if len(times) else times

@@ -1,0 +1,513 @@
+"""Evaluation plans: temporal expressions as formulas over atoms, and their text.
+
+From bound expressions that look at several frames to formulas over atoms: the one form that is evaluated.
+
+A :class:`Plan` has all that an expression, or several of one statement, need of single frames, once each:
+
+* an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a query of its own:
+  its matches say in which frames, and for which entities, it is true. A store answers it by SQL; in memory
+  :class:`sgstore.lang._search.Matcher` does, with the same ``query``.
+* a **signal** is a value of one frame, of the same kind: a query, and the value that is asked of its matches.
+  An edge variable stands for the edges of its relations from its source to its destination in that frame: a
+  condition is true if it is of one of these, a value is that of the one whose relation comes first in the
+  alphabet. So bindings speak of nodes only, and the ends of an edge are among them.
+* a **test** is an expression over values of several frames, in which ``prev``, ``delta``, ``run_length``,
+  ``since_true`` and ``age`` stand over signals and formulas.
+
+In a :class:`~sgstore.temporal._formula.Formula` of the plan, a proposition is the name of an atom or of a test.
+
+**What is unknown is false, where time begins.** An atom that is NULL is false; so is one that speaks of an
+entity that is absent (or true, where ``ABSENT AS TRUE`` says so). Logic outside of atoms has two values. Which
+part of a condition becomes an atom is chosen for speed: its value is that of its smallest conditions, each
+being true or false.
+
+For whoever evaluates a plan frame by frame (a monitor): for each frame, ask each atom for its matches, project
+them to ``variables``, and step a formula for each binding with ``letter[name] = projection in matches``. Of an
+entity that was never seen all atoms are false that have it among their variables, so one engine that has seen
+none can be copied when it comes. Values of signals at former frames are kept as far back as ``delta`` looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Final
+
+import sgstore.temporal._formula as f
+from sgstore.lang import Type, relation, unnumbered_text, value_text
+from sgstore.lang import ir as b
+from sgstore.temporal._formula import (
+    And,
+    Bound,
+    Formula,
+    Next,
+    Not,
+    Or,
+    Previous,
+    Proposition,
+    Since,
+    TruthConstant,
+    Until,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.lang import Catalog, SqlStatement
+    from sgstore.lang.ir import BoundHold, Length, StepLink
+
+
+_CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
+_KNOWN: Final = frozenset({"IS NULL", "IS NOT NULL"})
+FALSE: Final = b.Value(value=False, type=Type.boolean)
+TRUE: Final = b.Value(value=True, type=Type.boolean)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Atom:
+    """A condition on one frame.
+
+    Attributes
+    ----------
+    name : str
+        The proposition.
+    query : Query
+        Its nodes and the condition; matches say where it is true.
+    variables : tuple of str
+        Those of its nodes that a binding speaks of, in order; the others (the ego) are only asked to exist.
+    """
+
+    name: str
+    query: b.Query
+    variables: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signal:
+    """A value of one frame: the one column of ``query``; ``variables`` as of :class:`Atom`.
+
+    ``edges`` are the keys of the edges that it speaks of: of matches that differ in these alone, the one counts
+    whose relations come first in the alphabet.
+    """
+
+    name: str
+    query: b.Query
+    variables: tuple[str, ...]
+    value: b.Bound
+    edges: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Test:
+    """An expression over values of several frames.
+
+    Attributes
+    ----------
+    name : str
+        The proposition, if it is a condition.
+    expression : Bound
+        Constants, operations and courses; other parts are the values of ``signals``.
+    variables : tuple of str
+    signals : dict of Bound to Signal
+        By the part of the expression that each is.
+    formulas : dict of Bound to Formula
+        Of the conditions within ``run_length`` and ``since_true``.
+    presence : dict of str to str
+        Node → the atom that says where it is, for ``age``.
+    """
+
+    name: str
+    expression: b.Bound
+    variables: tuple[str, ...]
+    signals: dict[b.Bound, Signal] = field(default_factory=dict[b.Bound, Signal])
+    formulas: dict[b.Bound, f.Formula] = field(default_factory=dict[b.Bound, f.Formula])
+    presence: dict[str, str] = field(default_factory=dict[str, str])
+
+    __test__ = False  # it is no test of pytest's
+
+
+@dataclass(slots=True)
+class Plan:
+    """What some expressions need of single frames.
+
+    Parameters
+    ----------
+    whole : Query
+        The statement: settings and relations are taken from it, and of its scope the nodes and edges.
+    bound : frozenset of str
+        Keys of the nodes that a binding speaks of.
+    absent : frozenset of str
+        Those of which conditions are true where they are absent.
+
+    Attributes
+    ----------
+    atoms, signals, tests : dict of str to Atom, Signal, Test
+        By name.
+    """
+
+    whole: b.Query
+    bound: frozenset[str]
+    absent: frozenset[str] = frozenset()
+    atoms: dict[str, Atom] = field(default_factory=dict[str, Atom])
+    signals: dict[str, Signal] = field(default_factory=dict[str, Signal])
+    tests: dict[str, Test] = field(default_factory=dict[str, Test])
+    _names: dict[str, str] = field(default_factory=dict[str, str])
+
+    def formula(self, expression: b.Bound) -> f.Formula:
+        """The formula of a condition; atoms and tests that it needs become part of the plan."""
+        if b.is_temporal(expression):
+            return self._over_time(expression)
+        things = self._things(expression)
+        split = isinstance(expression, b.Operation) and bool(things & self._manifold)
+        if self._guarded(expression) == things and not things & self.absent and not split:
+            return self._atom(expression, things)
+        return self._logic(expression)
+
+    @property
+    def _manifold(self) -> frozenset[str]:
+        """Keys of the edges of which several may join two nodes in a frame: each condition is of any one."""
+        edges = self.whole.scope.edges
+        return frozenset(edge.key for edge in edges if len(edge.relations) > 1)
+
+    def _things(self, expression: b.Bound) -> frozenset[str]:
+        """Keys of the nodes and edges that an expression speaks of, the ends of these edges among them."""
+        edges = b.edges_of(expression)
+        ends = (
+            e for edge in self.whole.scope.edges if edge.key in edges for e in (edge.src, edge.dst)
+        )
+        return b.nodes_of(expression) | edges | frozenset(ends)
+
+    def _guarded(self, expression: b.Bound) -> frozenset[str]:
+        """What must be there, or a condition on one frame is false, its smallest ones being false then."""
+        match expression:
+            case b.Operation("AND", operands):
+                return frozenset().union(*map(self._guarded, operands))
+            case b.Operation("OR" | "XOR", operands):
+                return frozenset.intersection(*map(self._guarded, operands))
+            case b.Operation("NOT" | "IMPLIES"):
+                return frozenset()
+            case _:
+                return self._things(expression)
+
+    def _over_time(self, expression: b.Bound) -> f.Formula:
+        match expression:
+            case b.Tense(word=word, operands=operands):
+                bound = f.Bound(expression.low, expression.high, expression.frames)
+                return _TENSES[word](tuple(self.formula(operand) for operand in operands), bound)
+            case b.SignalCall(word="exists_now", operand=operand):
+                return self.present(next(iter(b.nodes_of(operand))))
+            case b.Operation(word=word) if word in _CONNECTIVES:
+                return self._logic(expression)
+            case _:
+                return self._lapsing(self.test(expression).name, self._things(expression))
+
+    def _logic(self, expression: b.Bound) -> f.Formula:
+        match expression:
+            case b.Operation("AND", operands):
+                return f.And(tuple(map(self.formula, self._merged(operands))))
+            case b.Operation(word, operands) if word in _CONNECTIVES:
+                return f.LOGIC[word](*map(self.formula, operands))
+            case b.Value(value=value):
+                return f.TruthConstant(value is True)
+            case _:
+                return self._atom(expression, self._things(expression))
+
+    def _merged(self, operands: tuple[b.Bound, ...]) -> list[b.Bound]:
+        """Conditions that are all to be true, with those that others guard made one with them.
+
+        What speaks of no more entities than another condition, which is false where one of these is absent, is
+        asked together with it: one question finds few, where each alone might find many.
+        """
+        flat = [part for operand in operands for part in _flat(operand)]
+        if self.absent:
+            return flat
+        nodes = {id(part): self._things(part) for part in flat}
+        apart = self._manifold
+        plain = [p for p in flat if not (b.is_temporal(p) or nodes[id(p)] & apart)]
+        leaders = [p for p in plain if nodes[id(p)] and self._guarded(p) == nodes[id(p)]]
+        leaders.sort(key=lambda part: -len(nodes[id(part)]))
+        groups: list[tuple[frozenset[str], list[b.Bound]]] = []
+        for part in leaders:
+            group = next((g for g in groups if nodes[id(part)] <= g[0]), None)
+            if group is None:
+                groups.append((nodes[id(part)], [part]))
+            else:
+                group[1].append(part)
+        rest = [part for part in flat if not any(part is leader for leader in leaders)]
+        alone: list[b.Bound] = []
+        for part in rest:
+            group = next((g for g in groups if nodes[id(part)] <= g[0]), None)
+            if group is None or not any(part is one for one in plain):
+                alone.append(part)
+            else:
+                group[1].append(part)
+        return [_all(parts) for _, parts in groups] + alone
+
+    def present(self, node: str) -> f.Formula:
+        """That a node is there."""
+        return self._atom(TRUE, frozenset({node}))
+
+    def _atom(self, expression: b.Bound, things: frozenset[str]) -> f.Formula:
+        if isinstance(expression, b.Value) and not things:
+            return f.TruthConstant(expression.value is True)
+        key = unnumbered_text(expression) + f" of {sorted(things)}"
+        name = self._names.get(key)
+        if name is None:
+            name = self._names[key] = f"a{len(self.atoms) + 1}"
+            where = () if expression == TRUE else tuple(_flat(_two_valued(expression)))
+            self.atoms[name] = Atom(name, self._query(things, where), self._variables(things))
+        return self._lapsing(name, frozenset() if expression == TRUE else things)
+
+    def _lapsing(self, name: str, things: Iterable[str]) -> f.Formula:
+        """A proposition, or that a node is absent of which conditions are true then."""
+        lapses = [f.Not(self.present(node)) for node in sorted(self.absent & set(things))]
+        return f.Or((f.Proposition(name), *lapses)) if lapses else f.Proposition(name)
+
+    def test(self, expression: b.Bound) -> Test:
+        """An expression over values of several frames, of any type."""
+        key = "=" + unnumbered_text(expression)
+        name = self._names.get(key)
+        if name is None:
+            name = self._names[key] = f"t{len(self.tests) + 1}"
+            test = Test(name, expression, self._variables(self._things(expression)))
+            self.tests[name] = test
+            self._measure(expression, test)
+        return self.tests[name]
+
+    def _measure(self, expression: b.Bound, test: Test) -> None:
+        match expression:
+            case b.SignalCall(word="run_length" | "since_true", operand=operand):
+                test.formulas[operand] = self.formula(operand)
+            case b.SignalCall(word="age" | "exists_now", operand=operand):
+                node = next(iter(b.nodes_of(operand)))
+                present = self._atom(TRUE, frozenset({node}))
+                assert isinstance(present, f.Proposition)  # noqa: S101 - it speaks of a node
+                test.presence[node] = present.name
+            case b.Tense():
+                test.formulas[expression] = self.formula(expression)
+            case b.SignalCall(operand=operand):
+                test.signals[operand] = self._signal(operand)
+            case b.Operation(operands=operands) if b.is_temporal(expression):
+                for operand in operands:
+                    self._measure(operand, test)
+            case b.Value() | b.Choices() | b.StepTime():
+                pass
+            case _:
+                test.signals[expression] = self._signal(expression)
+
+    def _signal(self, value: b.Bound) -> Signal:
+        things, edges = self._things(value), tuple(sorted(b.edges_of(value)))
+        key = ":" + unnumbered_text(value) + f" of {sorted(things)}"
+        name = self._names.get(key)
+        if name is None:
+            name = self._names[key] = f"s{len(self.signals) + 1}"
+            query = self._query(things, ())
+            self.signals[name] = Signal(name, query, self._variables(things), value, edges)
+        return self.signals[name]
+
+    def _variables(self, things: frozenset[str]) -> tuple[str, ...]:
+        return tuple(sorted(things & self.bound))
+
+    def _query(self, things: frozenset[str], where: tuple[b.Bound, ...]) -> b.Query:
+        known = self.whole.scope
+        own = {k: replace(known.nodes[k], role="named") for k in sorted(things) if k in known.nodes}
+        edges = tuple(replace(edge, named=True) for edge in known.edges if edge.key in things)
+        pairs = combinations(own, 2) if self.whole.injective else ()
+        scope = b.Scope(own, {}, edges, where, frozenset(pairs))
+        return b.Query(
+            scope,
+            b.Result(),
+            self.whole.relations,
+            self.whole.injective,
+            self.whole.ego,
+            self.whole.unknown_is_false,
+        )
+
+
+def _flat(expression: b.Bound) -> list[b.Bound]:
+    if isinstance(expression, b.Operation) and expression.word == "AND":
+        return [part for operand in expression.operands for part in _flat(operand)]
+    return [expression]
+
+
+def _all(parts: list[b.Bound]) -> b.Bound:
+    return parts[0] if len(parts) == 1 else b.Operation("AND", tuple(parts), Type.boolean)
+
+
+def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # noqa: PLR0911 - a case each
+    """A condition on one frame whose smallest conditions are false where they are unknown.
+
+    Where it is only asked whether all of some conditions are true, nothing need be done: unknown is not true.
+    """
+    match expression:
+        case b.Operation("AND", operands):
+            parts = tuple(_two_valued(operand, outermost=outermost) for operand in operands)
+            return b.Operation("AND", parts, Type.boolean)
+        case b.Operation("OR", operands) if outermost:
+            parts = tuple(_two_valued(operand) for operand in operands)
+            return b.Operation("OR", parts, Type.boolean)
+        case b.Operation(word, operands) if word in _CONNECTIVES:
+            parts = tuple(_two_valued(operand, outermost=False) for operand in operands)
+            return b.Operation(word, parts, Type.boolean)
+        case b.BlockValue(word="EXISTS") | b.LabelTest():
+            return expression
+        case b.Operation(word=word) if word in _KNOWN:
+            return expression
+        case b.Value(value=None):
+            return FALSE
+        case _ if outermost or isinstance(expression, b.Value):
+            return expression
+        case _ if _never_unknown(expression):
+            return expression
+        case _:
+            return b.Operation("coalesce", (expression, FALSE), Type.boolean)
+
+
+def _never_unknown(expression: b.Bound) -> bool:
+    """Whether it compares a number of matches with a constant, which is known always."""
+    match expression:
+        case b.Operation(operands=(b.BlockValue(word="COUNT"), b.Value(value=value))):
+            return value is not None
+        case _:
+            return False
+
+
+# Operators --------------------------------------------------------------------------------------------------
+
+
+_Operands = tuple[f.Formula, ...]
+_Operator = Callable[[_Operands, f.Bound], f.Formula]
+
+
+def _one(make: Callable[[f.Formula, f.Bound], f.Formula]) -> _Operator:
+    def operator(operands: _Operands, bound: f.Bound) -> f.Formula:
+        return make(operands[0], bound)
+
+    return operator
+
+
+def _two(make: Callable[[f.Formula, f.Formula, f.Bound], f.Formula]) -> _Operator:
+    def operator(operands: _Operands, bound: f.Bound) -> f.Formula:
+        return make(operands[0], operands[1], bound)
+
+    return operator
+
+
+def _next(operand: f.Formula, _: f.Bound) -> f.Formula:
+    return f.Next(operand)
+
+
+def _weak_next(operand: f.Formula, _: f.Bound) -> f.Formula:
+    return f.Next(operand, weak=True)
+
+
+def _previous(operand: f.Formula, _: f.Bound) -> f.Formula:
+    return f.Previous(operand)
+
+
+_TENSES: Final[dict[str, _Operator]] = {
+    "ALWAYS": _one(f.always),
+    "EVENTUALLY": _one(f.eventually),
+    "HISTORICALLY": _one(f.historically),
+    "ONCE": _one(f.once),
+    "NEXT": _one(_next),
+    "WEAKNEXT": _one(_weak_next),
+    "PREVIOUS": _one(_previous),
+    "UNTIL": _two(f.Until),
+    "SINCE": _two(f.Since),
+    "RELEASE": _two(f.release),
+}
+
+
+# Formulas and plans as text, for ``explain`` ----------------------------------------------------
+
+
+def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
+    """A formula as one would write it, with the names of its propositions."""
+    match formula:
+        case TruthConstant(value=value):
+            return str(value).upper()
+        case Proposition(name=name):
+            return name
+        case Not(operand=Not(operand=operand)):
+            return formula_text(operand)
+        case Not(operand=operand):
+            return f"NOT {formula_text(operand)}"
+        case And(operands=operands):
+            return "(" + " AND ".join(map(formula_text, operands)) + ")"
+        case Or(operands=operands):
+            return "(" + " OR ".join(map(formula_text, operands)) + ")"
+        case Next(operand=operand, weak=weak):
+            return f"{'WEAK' * weak}NEXT {formula_text(operand)}"
+        case Previous(operand=operand):
+            return f"PREVIOUS {formula_text(operand)}"
+        case Until(left=left, right=right, bound=bound):
+            return f"({formula_text(left)} UNTIL{bound_text(bound)} {formula_text(right)})"
+        case Since(left=left, right=right, bound=bound):
+            return f"({formula_text(left)} SINCE{bound_text(bound)} {formula_text(right)})"
+
+
+def bound_text(bound: Bound) -> str:
+    """A bound; nothing for one that is none."""
+    if bound == Bound():
+        return ""
+    ends = [_length(bound.low, bound), "INF" if bound.high is None else _length(bound.high, bound)]
+    return f"[{', '.join(ends)}]"
+
+
+def _length(amount: int, bound: Bound) -> str:
+    return f"{amount}frames" if bound.frames else f"{amount / 1e9:g}s"
+
+
+def plan_text(
+    plan: Plan, formula: Formula, reset: Formula | None, catalog: Catalog | None = None
+) -> str:
+    """A plan: the formula, and what each of its propositions is; with a catalog, also the SQL of the atoms."""
+    lines = [f"formula {formula_text(formula)}"]
+    lines += [f"reset {formula_text(reset)}"] if reset is not None else []
+    lines += needs_text(plan, catalog)
+    return "\n".join(lines)
+
+
+def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
+    """What a plan needs of single frames, a line each; with a catalog, also the SQL."""
+    lines: list[str] = []
+    for atom in plan.atoms.values():
+        where = " AND ".join(value_text(part) for part in atom.query.scope.where) or "TRUE"
+        lines.append(f"atom {atom.name}({', '.join(atom.variables)}) = {where}")
+        lines += [] if catalog is None else sql_text(relation(atom.query, catalog, None))
+    for signal in plan.signals.values():
+        told = value_text(signal.value)
+        lines.append(f"signal {signal.name}({', '.join(signal.variables)}) = {told}")
+        if catalog is not None:
+            lines += sql_text(relation(signal.query, catalog, None, (signal.value,)))
+    for test in plan.tests.values():
+        lines.append(
+            f"test {test.name}({', '.join(test.variables)}) = {value_text(test.expression)}"
+        )
+    return lines
+
+
+def sql_text(statement: SqlStatement) -> list[str]:
+    """A statement, indented, with the values that it binds."""
+    lines = [f"    {line}" for line in statement.sql.splitlines()]
+    return lines + [f"    ${n} = {value!r}" for n, value in enumerate(statement.values, start=1)]
+
+
+def hold_text(hold: BoundHold) -> str:
+    """How long a step must last."""
+    inclusive = " INCLUSIVE" if hold.inclusive else ""
+    return f"for {hold.comparison} {length_text(hold.length)}{inclusive}"
+
+
+def link_text(link: StepLink) -> str:
+    """When a step comes after the one before."""
+    after = f" after {length_text(link.after)}" if link.after else ""
+    within = f" within {length_text(link.within)}" if link.within else ""
+    return f"{link.kind}{after}{within}"
+
+
+def length_text(length: Length) -> str:
+    """A length of time."""
+    return f"{length.amount}frames" if length.frames else f"{length.amount / 1e9:g}s"

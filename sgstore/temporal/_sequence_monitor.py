@@ -1,0 +1,681 @@
+"""The monitor of one ``MATCH`` or sequence, frame by frame, and its events.
+
+What a monitor tells.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import TextSpan
+from sgstore.lang.ir import BoundStep, Query, Result, Scope, StepLink
+from sgstore.temporal._formula import And, Formula
+from sgstore.temporal._plan import Plan
+from sgstore.temporal._progression import Past, Progression, ProgressionFrame, Term
+from sgstore.temporal._query_cache import BindingTable, Partial, Valuation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from sgstore.lang.ir import BoundHold
+    from sgstore.temporal._query_cache import Key, NodeNames, QueryCache
+    from sgstore.temporal._signal_state import Memory, StreamClock
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTime:
+    """A frame of the trace that is watched.
+
+    Attributes
+    ----------
+    seq : int
+        Its number, from 0.
+    time_ns : int
+        Simulation time.
+    t : float
+        Seconds since the first frame.
+    """
+
+    seq: int
+    time_ns: int
+    t: float
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorEvent:
+    """Something that is known from a frame on.
+
+    Attributes
+    ----------
+    kind : str
+        ``violated``: a check is, from ``start`` on; ``kept again``: that has ended with ``end``; ``found``: a
+        pattern is.
+    name : str
+        Of the check, or of the pattern.
+    told : FrameTime
+        The frame that made it known.
+    start, end : Moment
+        The frames that it is about: of a violation that lasts both are its first; of a sequence those of its
+        first and of its last step.
+    nodes : mapping of str to int
+        Node ids by variable.
+    names : mapping of str to str
+        Their names.
+    steps : tuple of FrameTime
+        Of a sequence: the frame of each step that happens.
+    at_end : bool
+        Whether only the end of the trace made it a violation.
+    """
+
+    kind: str
+    name: str
+    told: FrameTime
+    start: FrameTime
+    end: FrameTime
+    nodes: Mapping[str, int]
+    names: Mapping[str, str]
+    steps: tuple[FrameTime, ...] = ()
+    at_end: bool = False
+
+
+# Where a step of a sequence holds, frame by frame: its pattern, its other conditions, its duration ----
+
+Needs = bool | tuple[tuple[Partial, Term], ...]
+"""Whether conditions hold, or what of them must still be shown: for some binding one of these."""
+
+NEVER: Final = 1 << 62
+"""Later than any frame."""
+
+
+@dataclass(slots=True)
+class Run:
+    """Frames one after the other, without a gap, in which a step holds.
+
+    Attributes
+    ----------
+    number : int
+        The number of its first frame.
+    last : int
+        The number of its last frame so far.
+    over : bool
+        Whether the next frame is not part of it.
+    """
+
+    number: int
+    last: int
+    over: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StepFrame:
+    """A frame in which a step holds.
+
+    Attributes
+    ----------
+    number, time : int
+        Of the frame; ns.
+    gap : bool
+        Whether a gap lies before it.
+    run : Run
+    """
+
+    number: int
+    time: int
+    gap: bool
+    run: Run
+
+
+@dataclass(slots=True)
+class _PendingFrame:
+    """A frame of which it is not known yet whether the step's conditions hold."""
+
+    number: int
+    time: int
+    gap: bool
+    holds: Needs
+
+
+@dataclass(slots=True)
+class StepState:
+    """A step and one binding.
+
+    Attributes
+    ----------
+    places : list of StepFrame
+        Those that are kept, ascending.
+    """
+
+    places: list[StepFrame] = field(default_factory=list[StepFrame])
+    _queue: deque[_PendingFrame] = field(default_factory=deque["_PendingFrame"])
+    _run: Run | None = None
+    _waiting: list[StepFrame] = field(default_factory=list[StepFrame])
+    _start: tuple[int, int] = (0, 0)
+    _fits: bool = True
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is remembered."""
+        return not (self.places or self._queue or self._run)
+
+    @property
+    def oldest(self) -> int:
+        """The first frame of the runs of which something is kept or may come; :data:`NEVER`: there are none."""
+        runs = [place.run.number for place in self.places[:1]]
+        runs += [self._run.number] if self._run is not None else []
+        return min([*runs, self.undecided])
+
+    @property
+    def undecided(self) -> int:
+        """The number of the first frame that may still turn out to be a place; :data:`NEVER`: none so far."""
+        if self._waiting:
+            return self._waiting[0].number
+        return self._queue[0].number if self._queue else NEVER
+
+    def ask(self, number: int, time: int, *, gap: bool, holds: Needs) -> None:
+        """The next frame, and what its conditions still need."""
+        self._queue.append(_PendingFrame(number, time, gap, holds))
+
+    @property
+    def open(self) -> list[Needs]:
+        """What frames still need, the earliest first."""
+        return [asked.holds for asked in self._queue]
+
+    def decide(
+        self, needs: list[Needs], hold: BoundHold | None, period: int, tolerance: int
+    ) -> None:
+        """What those frames need now: who needs nothing any more is a place, or is none."""
+        for asked, need in zip(self._queue, needs, strict=True):
+            asked.holds = need
+        while self._queue and isinstance(self._queue[0].holds, bool):
+            asked = self._queue.popleft()
+            if self._run is not None and (asked.gap or not asked.holds):
+                self._end(hold, period, tolerance)
+            if asked.holds:
+                self._extend(asked, hold, period, tolerance)
+
+    def _extend(
+        self, asked: _PendingFrame, hold: BoundHold | None, period: int, tolerance: int
+    ) -> None:
+        if self._run is None:
+            self._run = Run(asked.number, asked.number)
+            self._start = asked.number, asked.time
+            self._fits = hold is None
+        self._run.last = asked.number
+        place = StepFrame(asked.number, asked.time, asked.gap, self._run)
+        if self._fits:
+            self.places.append(place)
+            return
+        self._waiting.append(place)
+        if (
+            hold is not None
+            and hold.comparison in {">=", ">"}
+            and self._long(hold, period, tolerance)
+        ):
+            self._fits = True
+            self._flush()
+
+    def _flush(self) -> None:
+        self.places += self._waiting
+        self._waiting = []
+
+    def _long(self, hold: BoundHold, period: int, tolerance: int) -> bool:
+        """Whether the run is as long as is asked."""
+        assert self._run is not None  # noqa: S101 - there is one
+        last = self._waiting[-1]
+        length = last.time - self._start[1] + (period if hold.inclusive else 0)
+        if hold.length.frames:
+            length = last.number - self._start[0] + 1
+        return hold.fits(length, tolerance)
+
+    def _end(self, hold: BoundHold | None, period: int, tolerance: int) -> None:
+        if self._waiting and hold is not None and self._long(hold, period, tolerance):
+            self._flush()
+        self._waiting = []
+        if self._run is not None:
+            self._run.over = True
+        self._run = None
+
+    def finish(self, hold: BoundHold | None, period: int, tolerance: int) -> None:
+        """The trace has ended."""
+        told = [n if isinstance(n, bool) else any(t.ended for _, t in n) for n in self.open]
+        self.decide([*told], hold, period, tolerance)
+        self._end(hold, period, tolerance)
+
+
+Binding = dict[str, int]
+"""What variables are bound to."""
+
+
+def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]) -> Binding | None:
+    """A binding and another one together; ``None`` if they differ, or what must differ does not."""
+    both = dict(one)
+    for name, node in zip(names, key, strict=True):
+        known = both.get(name)
+        if known is None:
+            if name in apart and any(n == node for v, n in one.items() if v in apart):
+                return None
+            both[name] = node
+        elif known != node:
+            return None
+    return both
+
+
+# One ``MATCH``, frame by frame: a pattern of one frame, or a sequence ---------------------------
+
+FAILED: Final = "failed"
+OPEN: Final = "open"
+Ways = tuple[StepFrame, ...] | str
+"""The places of the steps from one on; :data:`FAILED`: there are none; :data:`OPEN`: it is not known yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class _SequenceEntry:
+    past: Past
+    memory: Memory
+
+
+class SequenceMonitor:
+    """A pattern, while a trace comes.
+
+    Parameters
+    ----------
+    name : str
+    query : Query
+    questions : QueryCache
+        What is asked of each frame; those of the pattern become part of them.
+    pulse : StreamClock
+        Told of each frame before this is.
+    """
+
+    def __init__(self, name: str, query: Query, questions: QueryCache, pulse: StreamClock) -> None:
+        self.name, self._query = name, query
+        self._questions, self._pulse = questions, pulse
+        one = BoundStep(query.scope, (), None, absent=False, span=TextSpan(0, 0))
+        self._steps: Sequence[BoundStep] = query.steps or (one,)
+        self._named = _named(query)
+        self._edges = tuple(edge.key for edge in query.scope.edges if edge.named)
+        self._asks = [self._ask(step) for step in self._steps]
+        self._conditions = _Conditions(query, self._steps, questions, pulse)
+        self._columns = [self._projected(number) for number in range(len(self._steps))]
+        self._held: list[dict[Key, StepState]] = [{} for _ in self._steps]
+        self._apart = frozenset(self._named) if query.injective else frozenset[str]()
+        self._told: dict[tuple[int, ...], int] = {}
+        self._over: set[tuple[int, ...]] = set()
+        self._names: dict[int, str] = {}
+        self._ended = False
+        self._happen = [n for n, step in enumerate(self._steps) if not step.absent]
+
+    def _ask(self, step: BoundStep) -> tuple[int, tuple[str, ...]]:
+        """The question of a step, and the variables of its answers."""
+        scope = step.scope
+        kept = set(scope.nodes) if step.when else set(self._named)
+        variables = tuple(sorted(kept & set(scope.nodes)))
+        edges = tuple(sorted(edge.key for edge in scope.edges if edge.named))
+        edges = () if step.absent else edges
+        query = replace(self._query, scope=scope, result=Result(), steps=(), links=())
+        return self._questions.add(query, variables, None, edges), (*variables, *edges)
+
+    # Frame by frame
+
+    def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
+        """A frame has come, and the questions were asked of it: what is known from it on."""
+        self._conditions.step()
+        tick, gap = self._pulse.tick, self._pulse.gap and self._query.gaps != "bridge"
+        for number in range(len(self._steps)):
+            now = self._now(number)
+            held = self._held[number]
+            for key in now:
+                if key not in held:
+                    held[key] = StepState()
+                    self._names |= {n: people.name(n) for n in key if n in people}
+            for key, one in held.items():
+                one.ask(tick.number, tick.time, gap=gap, holds=now.get(key, False))
+            self._decide(number)
+        return self._found(here)
+
+    def _now(self, number: int) -> dict[Key, Needs]:
+        """The bindings in which a step's pattern is found, and what its conditions still need."""
+        question, variables = self._asks[number]
+        places = [variables.index(name) for name in self._columns[number]]
+        answers = self._questions.answers[question]
+        if not self._steps[number].when:
+            return dict.fromkeys((tuple(key[p] for p in places) for key in answers), True)
+        found: defaultdict[Key, list[tuple[Partial, Term]]] = defaultdict(list)
+        for key in answers:
+            row = self._conditions.row(dict(zip(variables, key, strict=True)))
+            term = self._conditions.now(number, row)
+            found[tuple(key[p] for p in places)].append((row, term))
+        return {key: settled(needs) for key, needs in found.items()}
+
+    def _projected(self, number: int) -> tuple[str, ...]:
+        variables = self._asks[number][1]
+        return tuple(n for n in variables if n in self._named or n in self._edges)
+
+    def _decide(self, number: int) -> None:
+        hold, period = self._steps[number].hold, self._pulse.period
+        tolerance = self._pulse.tick.tolerance
+        for key, one in list(self._held[number].items()):
+            *before, latest = one.open
+            needs = [self._conditions.resolved(need) for need in before]
+            one.decide([*needs, latest], hold, period, tolerance)
+            if one.idle:
+                del self._held[number][key]
+
+    # Matches
+
+    def _found(self, here: FrameTime) -> list[MonitorEvent]:
+        found: list[MonitorEvent] = []
+        if all(self._held[number] for number in self._happen):
+            for binding in self._bindings({}, self._happen):
+                found += self._matches(binding, here)
+        self._forget()
+        return found
+
+    def _bindings(self, binding: Binding, steps: list[int]) -> Iterator[Binding]:
+        """Bindings of all steps together, each of which has places."""
+        if not steps:
+            yield binding
+            return
+        for key, held in self._agreeing(steps[0], binding):
+            if held.places:
+                both = joined(binding, self._columns[steps[0]], key, self._apart)
+                if both is not None:
+                    yield from self._bindings(both, steps[1:])
+
+    def _agreeing(self, number: int, binding: Binding) -> list[tuple[Key, StepState]]:
+        """The bindings of a step that may agree with another one."""
+        names, held = self._columns[number], self._held[number]
+        if all(name in binding for name in names):
+            key = tuple(binding[name] for name in names)
+            return [(key, held[key])] if key in held else []
+        known = [(place, binding[name]) for place, name in enumerate(names) if name in binding]
+        return [
+            (key, one)
+            for key, one in held.items()
+            if all(key[place] == node for place, node in known)
+        ]
+
+    def _matches(self, binding: Binding, here: FrameTime) -> Iterator[MonitorEvent]:
+        held = self._of(0, binding)
+        key = tuple(binding[name] for name in sorted(binding))
+        waiting: int | None = None
+        for place in held.places if held is not None else ():
+            run = place.run.number
+            if run <= self._told.get(key, -1) or run == waiting or key in self._over:
+                continue
+            ways = self._ways(0, place, binding)
+            if ways == OPEN:
+                waiting = run
+            elif isinstance(ways, tuple):
+                self._told[key] = run
+                if self._query.policy == "first":
+                    self._over.add(key)
+                yield self._event(binding, ways, here)
+
+    def _of(self, number: int, binding: Binding) -> StepState | None:
+        return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
+
+    def _ways(self, at: int, place: StepFrame, binding: Binding) -> Ways:
+        """The places of the steps from one on, the first of which is given."""
+        steps, following = self._steps, at + 1
+        if following == len(steps):
+            return (place,)
+        link, absent = self._query.links[at], None
+        if steps[following].absent:
+            absent = self._of(following, binding) or StepState()
+            if following + 1 == len(steps):
+                return self._unfollowed(place, link, absent)
+            link, following = self._query.links[following], following + 1
+        held = self._of(following, binding)
+        stop = (
+            next((a.number for a in absent.places if a.number > place.number), NEVER)
+            if absent
+            else NEVER
+        )
+        found = self._reached(place, link, held, stop)
+        latest = self._query.policy == "longest"
+        open_end = not self._closed(place, link, held, stop)
+        if latest and open_end:
+            return OPEN
+        for other in reversed(found) if latest else found:
+            if absent is not None and absent.undecided < other.number:
+                return OPEN
+            rest = self._ways(following, other, binding)
+            if rest != FAILED:
+                return rest if isinstance(rest, str) else (place, *rest)
+        return OPEN if open_end else FAILED
+
+    def _reached(
+        self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
+    ) -> list[StepFrame]:
+        """The places of the next step that a link allows."""
+        found = [p for p in held.places if p.number <= stop] if held is not None else []
+        first = place.number
+        match link.kind:
+            case "while":
+                return [p for p in found if p.number == first]
+            case "immediately":
+                return [p for p in found if p.number == first + 1 and not p.gap]
+            case "until":
+                last = place.run.last
+                return [
+                    p
+                    for p in found
+                    if first < p.number <= last or (p.number == last + 1 > first and not p.gap)
+                ]
+            case "then":
+                by = self._pulse.tick.tolerance
+                return [p for p in found if p.number > first and _within(link, place, p, by)]
+
+    def _closed(  # noqa: PLR0911 - a case each
+        self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
+    ) -> bool:
+        """Whether no further place of the next step can come that a link allows."""
+        if self._ended:
+            return True
+        tick = self._pulse.tick
+        undecided = min(held.undecided if held is not None else NEVER, tick.number + 1)
+        if stop < undecided:
+            return True
+        match link.kind:
+            case "while":
+                return undecided > place.number
+            case "immediately":
+                return undecided > place.number + 1
+            case "until":
+                return place.run.over and undecided > place.run.last + 1
+            case "then":
+                within = link.within
+                if within is None:
+                    return False
+                if within.frames:
+                    return undecided > place.number + within.amount
+                beyond = tick.time >= place.time + within.amount + tick.tolerance
+                return beyond and (held is None or held.undecided == NEVER)
+
+    def _unfollowed(self, place: StepFrame, link: StepLink, absent: StepState) -> Ways:
+        plain = replace(link, kind="then", after=None)
+        if self._reached(place, plain, absent, NEVER):
+            return FAILED
+        return (place,) if self._closed(place, plain, absent, NEVER) else OPEN
+
+    def _event(
+        self, binding: Binding, ways: tuple[StepFrame, ...], here: FrameTime
+    ) -> MonitorEvent:
+        steps = tuple(self._moment(place) for place in ways)
+        nodes = {name: node for name, node in binding.items() if name in self._named}
+        names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
+        return MonitorEvent("found", self.name, here, steps[0], steps[-1], nodes, names, steps)
+
+    def _moment(self, place: StepFrame) -> FrameTime:
+        return FrameTime(place.number, place.time, (place.time - self._pulse.start) / 1e9)
+
+    # What is kept
+
+    def _forget(self) -> None:
+        """Let go of the places that no match can have any more."""
+        first = self._held[0]
+        for key, one in first.items():
+            if one.places:
+                one.places = self._kept(key, one.places)
+        oldest = min(
+            (
+                min([one.undecided, *(place.number for place in one.places[:1])])
+                for one in first.values()
+            ),
+            default=NEVER,
+        )
+        if self._told:
+            runs = min((one.oldest for one in first.values()), default=NEVER)
+            self._told = {key: run for key, run in self._told.items() if run >= runs}
+        for held in self._held[1:]:
+            for one in held.values():
+                while one.places and one.places[0].number <= min(
+                    oldest - 1, self._pulse.tick.number - 2
+                ):
+                    one.places.pop(0)
+
+    def _kept(self, key: Key, places: list[StepFrame]) -> list[StepFrame]:
+        if not self._query.links:
+            return [p for p in places if p.number >= self._pulse.tick.number]
+        link, absent = self._query.links[0], self._steps[1].absent
+        open_ended = link.kind == "until" or (link.kind == "then" and link.within is None)
+        if open_ended and not absent and self._query.policy != "longest":
+            # Whatever follows a later frame of a run follows its first one.
+            runs: dict[int, StepFrame] = {}
+            for place in places:
+                runs.setdefault(place.run.number, place)
+            places = list(runs.values())
+        binding = dict(zip(self._columns[0], key, strict=True))
+        return [place for place in places if self._alive(0, binding, place)]
+
+    def _alive(  # noqa: PLR0911 - a case each
+        self, at: int, binding: Binding, place: StepFrame
+    ) -> bool:
+        """Whether it is still open what follows a place."""
+        following = at + 1
+        if following == len(self._steps):
+            return False
+        link = self._query.links[at]
+        if self._steps[following].absent:
+            if any(held.undecided < NEVER for _, held in self._agreeing(following, binding)):
+                return True
+            following += 1
+            if following == len(self._steps):
+                return not self._closed(place, replace(link, kind="then", after=None), None, NEVER)
+            link = self._query.links[at + 1]
+        if not self._closed(place, link, None, NEVER):
+            return True
+        for key, held in self._agreeing(following, binding):
+            if not self._closed(place, link, held, NEVER):
+                return True
+            both = {**dict(zip(self._columns[following], key, strict=True)), **binding}
+            if any(
+                self._alive(following, both, other)
+                for other in self._reached(place, link, held, NEVER)
+            ):
+                return True
+        return False
+
+    def finish(self, here: FrameTime) -> list[MonitorEvent]:
+        """The trace has ended: what only that makes known."""
+        self._ended = True
+        for number, held in enumerate(self._held):
+            for one in held.values():
+                tick = self._pulse.tick
+                one.finish(self._steps[number].hold, self._pulse.period, tick.tolerance)
+        return self._found(here)
+
+
+def _named(query: Query) -> tuple[str, ...]:
+    return tuple(
+        sorted(
+            key for key, node in query.scope.nodes.items() if node.role == "named" or query.steps
+        )
+    )
+
+
+def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) -> bool:
+    """Whether another place is as much later as a link asks; times have a tolerance, in ns."""
+    later = {True: other.number - place.number, False: other.time - place.time}
+    slack = {True: 0, False: tolerance}
+    after, within = link.after, link.within
+    if after is not None and later[after.frames] < after.amount - slack[after.frames]:
+        return False
+    return within is None or later[within.frames] <= within.amount + slack[within.frames]
+
+
+class _Conditions:
+    """The conditions of steps that look at other frames."""
+
+    def __init__(
+        self, query: Query, steps: Sequence[BoundStep], questions: QueryCache, pulse: StreamClock
+    ) -> None:
+        nodes = {key: node for step in reversed(steps) for key, node in step.scope.nodes.items()}
+        edges = tuple(edge for step in steps for edge in step.scope.edges)
+        scope = Scope(nodes, {}, edges, (), frozenset())
+        whole = replace(query, scope=scope, result=Result(), steps=(), links=())
+        plan = Plan(whole, frozenset(nodes))
+        when = [And(tuple(map(plan.formula, step.when))) for step in steps]
+        self._progression = Progression(And(tuple(when)))
+        whole_formula = self._progression.formula
+        assert isinstance(whole_formula, And)  # noqa: S101 - it was made so
+        self._when: tuple[Formula, ...] = whole_formula.operands
+        self._asked = [bool(step.when) for step in steps]
+        told = [*plan.atoms.values(), *plan.signals.values()]
+        self._variables = tuple(sorted({name for one in told for name in one.variables}))
+        bridge = query.gaps == "bridge"
+        self._letters = Valuation(plan, self._variables, questions, pulse, bridge=bridge)
+        self._pulse = pulse
+        self._known = BindingTable(
+            self._letters.lattice, _SequenceEntry(self._progression.begun, self._letters.begun)
+        )
+        self._frames: dict[Partial, ProgressionFrame] = {}
+
+    def step(self) -> None:
+        """A frame has come, and the questions were asked of it."""
+        if not any(self._asked):
+            return
+        known = self._known
+        letters, memories = self._letters.read(known.held, lambda row: known.of(row).memory)
+        shared: dict[tuple[Past, int], ProgressionFrame] = {}
+        entries: dict[Partial, _SequenceEntry] = {}
+        self._frames = {}
+        for row, letter in letters.items():
+            past = known.of(row).past
+            if (past, letter) not in shared:
+                named = {n: bool(letter & self._letters.bits[n]) for n in self._progression.names}
+                shared[past, letter] = ProgressionFrame(
+                    self._progression, past, named, self._pulse.tick
+                )
+            frame = self._frames[row] = shared[past, letter]
+            entries[row] = _SequenceEntry(frame.past(), memories.get(row, ()))
+        known.keep(entries, lambda one, other: one == other)
+
+    def row(self, nodes: Binding) -> Partial:
+        """What the conditions are told of a binding."""
+        return tuple(nodes.get(name) for name in self._variables)
+
+    def now(self, number: int, row: Partial) -> Term:
+        """What the conditions of a step need, of a binding in this frame."""
+        return self._frame(row).now(self._when[number])
+
+    def resolved(self, needs: Needs) -> Needs:
+        """What conditions of a former frame need, with what this one shows."""
+        if isinstance(needs, bool):
+            return needs
+        return settled([(row, self._frame(row).resolved(term)) for row, term in needs])
+
+    def _frame(self, row: Partial) -> ProgressionFrame:
+        frames = self._frames
+        return next(frames[w] for w in self._letters.lattice.wider(row) if w in frames)
+
+
+def settled(needs: list[tuple[Partial, Term]]) -> Needs:
+    """Whether one of some conditions holds, or which of them may."""
+    if any(term.word == "true" for _, term in needs):
+        return True
+    left = tuple((row, term) for row, term in needs if term.word != "false")
+    return left or False

@@ -1,0 +1,393 @@
+"""Values over time frame by frame: what ``prev``, ``delta``, ``run_length``, ``since_true`` and ``age`` keep.
+
+The twin of :mod:`sgstore.temporal._signals`: the same numbers, of one frame at a time, for many bindings at
+once. What a binding must remember is a value that nobody changes in place, so that a binding that is new goes
+on from what is remembered of those that were never seen.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import QueryError
+from sgstore.lang import FUTURE
+from sgstore.lang import ir as b
+from sgstore.temporal._progression import Progression, ProgressionFrame, Tick
+from sgstore.temporal._signals import NS, Clock, SignalColumn, SignalValues, is_angle
+from sgstore.world import longest_step_ns, tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from sgstore.temporal._plan import Plan, Signal, Test
+    from sgstore.world import Bools
+
+
+TIMES: Final = 1001
+"""Times between frames of which the median is taken, the latest ones."""
+
+Memory = tuple[Any, ...]
+"""What a binding remembers: for each course, and each condition in one, what it needs of former frames."""
+
+
+class StreamClock:
+    """The frames that came so far, as far back as somebody looks.
+
+    Parameters
+    ----------
+    period_ns : int, optional
+        The time between two frames; by default the median of those seen before, the last :data:`TIMES` of them.
+
+    Attributes
+    ----------
+    tick : Tick
+        The last frame.
+    start : int
+        The time of the first frame; ns.
+    gap : bool
+        Whether a gap lies before the last frame.
+    """
+
+    def __init__(self, period_ns: int | None = None) -> None:
+        self._period = period_ns
+        self._spans: deque[int] = deque()
+        self._sorted: list[int] = []
+        self.tick = Tick(0, -1)
+        self.start = 0
+        self.gap = False
+
+    @property
+    def period(self) -> int:
+        """The time between two frames; ns. 0 before there are two."""
+        if self._period is not None:
+            return self._period
+        return self._sorted[(len(self._sorted) - 1) // 2] if self._sorted else 0
+
+    def step(self, time_ns: int) -> None:
+        """The next frame; one that is not later than the one before counts as a nanosecond later."""
+        last = self.tick
+        if last.number < 0:
+            self.start = time_ns
+        else:
+            time_ns = max(time_ns, last.time + 1)
+            span = time_ns - last.time
+            self.gap = bool(self.period) and span > longest_step_ns(self.period)
+            if self._period is None:
+                self._remember(span)
+        self.tick = Tick(time_ns, last.number + 1, tolerance_ns(self.period))
+
+    def _remember(self, span: int) -> None:
+        if len(self._spans) == TIMES:
+            del self._sorted[bisect_left(self._sorted, self._spans.popleft())]
+        self._spans.append(span)
+        insort(self._sorted, span)
+
+
+class SignalState:
+    """The tests of a plan, frame by frame.
+
+    Parameters
+    ----------
+    plan : Plan
+    pulse : StreamClock
+        Told of each frame before this is.
+    bridge : bool
+        Whether gaps do not matter.
+
+    Raises
+    ------
+    QueryError
+        The value of a test depends on later frames.
+    """
+
+    def __init__(self, plan: Plan, pulse: StreamClock, *, bridge: bool = False) -> None:
+        self.plan, self.pulse, self._bridge = plan, pulse, bridge
+        self.places: dict[b.Bound, int] = {}
+        self.conditions: dict[b.Bound, Progression] = {}
+        for test in plan.tests.values():
+            for part in b.walk(test.expression):
+                if isinstance(part, b.Tense) and part.word in FUTURE:
+                    raise QueryError(
+                        f"{part.word} stands where its value must be known at once, and it looks ahead",
+                        hint="join conditions by AND, OR, NOT, IMPLIES",
+                    )
+                if isinstance(part, b.SignalCall):
+                    self.places.setdefault(part, len(self.places))
+            for condition, formula in test.formulas.items():
+                self.conditions[condition] = Progression(formula)
+        self._frames: deque[tuple[int, int]] = deque()  # times and numbers since the last gap
+        deltas = [c for c in self.places if isinstance(c, b.SignalCall) and c.word == "delta"]
+        self._back = max((c.by for c in deltas if not c.frames), default=0)
+        self._many = max((c.by for c in deltas if c.frames), default=0)
+
+    @property
+    def begun(self) -> Memory:
+        """What is remembered before the first frame."""
+        pasts = (progression.begun for progression in self.conditions.values())
+        return (*(None for _ in self.places), *pasts)
+
+    def step(self) -> None:
+        """A frame has come, and the pulse has been told."""
+        tick = self.pulse.tick
+        if self.gap:
+            self._frames.clear()
+        self._frames.append((tick.time, tick.number))
+        while len(self._frames) > self._many + 1 and self._frames[1][0] <= tick.time - self._back:
+            self._frames.popleft()
+
+    @property
+    def gap(self) -> bool:
+        """Whether a gap lies before this frame."""
+        return self.pulse.gap and not self._bridge
+
+    @property
+    def oldest(self) -> int:
+        """The number of the first frame that is still looked back to."""
+        return self._frames[0][1]
+
+    def there(self, course: b.SignalCall) -> int:
+        """The number of the frame that ``delta`` compares this one with; -1: there is none."""
+        tick = self.pulse.tick
+        if course.frames:
+            number = tick.number - course.by
+            return number if number >= self.oldest else -1
+        found = -1
+        for time, number in self._frames:
+            if time > tick.time - course.by + tick.tolerance:
+                break
+            found = number
+        return found
+
+    def values(
+        self,
+        memories: Sequence[Memory],
+        atom: Callable[[str], Bools],
+        signal: Callable[[Signal], SignalColumn],
+    ) -> tuple[dict[str, SignalColumn], list[Memory]]:
+        """The values of all tests in this frame for some bindings, and what these remember from now on.
+
+        Parameters
+        ----------
+        memories : sequence of B
+        atom : function
+            (B,) where the atom of that name is true.
+        signal : function
+            The values of a signal: (B, 1).
+
+        Returns
+        -------
+        tests : dict of str to SignalColumn
+            (B, 1), or (1, 1), by name.
+        memories : list of B
+        """
+        now = _Now(self, memories, atom, signal)
+        tests = {name: now.test(test) for name, test in self.plan.tests.items()}
+        return tests, now.memories()
+
+
+class _Now:
+    """One frame of some bindings, while it is worked out."""
+
+    def __init__(
+        self,
+        courses: SignalState,
+        memories: Sequence[Memory],
+        atom: Callable[[str], Bools],
+        signal: Callable[[Signal], SignalColumn],
+    ) -> None:
+        self._all, self._atom, self.signal = courses, atom, signal
+        self._tick = courses.pulse.tick
+        self.tolerance = self._tick.tolerance
+        places = len(courses.places)
+        columns = list(zip(*memories, strict=True)) or [()] * len(courses.begun)
+        self._old = dict(zip(courses.places, columns, strict=False))
+        self._pasts = dict(zip(courses.conditions, columns[places:], strict=True))
+        self._new: dict[b.Bound, list[Any]] = {}
+        self._kept: dict[b.Bound, list[Any]] = {}
+        self._tests: dict[str, SignalColumn] = {}
+        self._courses: dict[b.Bound, SignalColumn] = {}
+        self._flags: dict[b.Bound, Bools] = {}
+        self._rows = len(memories)
+
+    def memories(self) -> list[Memory]:
+        """What the bindings remember from now on."""
+        columns = [self._new[course] for course in self._all.places]
+        columns += [self._kept[condition] for condition in self._all.conditions]
+        return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
+
+    def test(self, test: Test) -> SignalColumn:
+        """The value of a test."""
+        if test.name not in self._tests:
+            self._tests[test.name] = _Momentary(test, self).column()
+        return self._tests[test.name]
+
+    def proposition(self, name: str) -> Bools:
+        """(B,) where an atom, or a test, is true."""
+        if name in self._all.plan.tests:
+            return np.broadcast_to(self.test(self._all.plan.tests[name]).true[:, 0], self._rows)
+        return self._atom(name)
+
+    def condition(self, condition: b.Bound) -> Bools:
+        """(B,) where a condition within a test is true."""
+        if condition in self._flags:
+            return self._flags[condition]
+        progression = self._all.conditions[condition]
+        letters = [self.proposition(name).tolist() for name in progression.names]
+        known: dict[tuple[Any, ...], tuple[bool, Any]] = {}
+        found: list[tuple[bool, Any]] = []
+        for past, *letter in zip(self._pasts[condition], *letters, strict=True):
+            key = past, *letter
+            if key not in known:
+                named = dict(zip(progression.names, letter, strict=True))
+                frame = ProgressionFrame(progression, past, named, self._tick)
+                value = frame.now(progression.formula) is progression.terms.true
+                known[key] = value, frame.past()
+            found.append(known[key])
+        self._kept[condition] = [past for _, past in found]
+        self._flags[condition] = np.array([value for value, _ in found], np.bool_)
+        return self._flags[condition]
+
+    def course(self, course: b.SignalCall, test: Test) -> SignalColumn:
+        """The value of a course."""
+        if course not in self._courses:
+            self._courses[course] = self._course(course, test)
+        return self._courses[course]
+
+    def _course(self, course: b.SignalCall, test: Test) -> SignalColumn:
+        match course.word:
+            case "prev" | "delta":
+                column = self.signal(test.signals[course.operand])
+                known = np.broadcast_to(column.known[:, 0], self._rows).tolist()
+                values = np.broadcast_to(column.values[:, 0], self._rows).tolist()
+                now = [value if told else None for value, told in zip(values, known, strict=True)]
+                return (
+                    self._prev(course, now) if course.word == "prev" else self._delta(course, now)
+                )
+            case "run_length" | "since_true":
+                flags = self.condition(course.operand).tolist()
+                if course.word == "run_length":
+                    return self._run_length(course, flags)
+                return self._since_true(course, flags)
+            case word:
+                (node,) = b.nodes_of(course.operand)
+                seen = self.proposition(test.presence[node])
+                first: list[int | None] = [
+                    old if old is not None or not flag else self._tick.time
+                    for old, flag in zip(self._old[course], seen.tolist(), strict=True)
+                ]
+                self._new[course] = first
+                if word == "exists_now":
+                    return column_of(seen.tolist())
+                now = self._tick.time
+                ages = zip(first, seen.tolist(), strict=True)
+                return column_of(
+                    [(now - f) / NS if flag and f is not None else None for f, flag in ages]
+                )
+
+    def _prev(self, course: b.SignalCall, now: list[Any]) -> SignalColumn:
+        here, gap = self._tick.number, self._all.gap
+        self._new[course] = [None if value is None else (here, value) for value in now]
+        known = (None if gap or o is None or o[0] != here - 1 else o[1] for o in self._old[course])
+        return column_of(list(known))
+
+    def _delta(self, course: b.SignalCall, now: list[Any]) -> SignalColumn:
+        there, turns = self._all.there(course), is_angle(course.operand)
+        told: list[float | None] = []
+        kept: list[_Trail | None] = []
+        for old, value in zip(self._old[course], now, strict=True):
+            trail = _moved(old, value, self._tick.number, self._all.oldest)
+            kept.append(trail)
+            before = (
+                next((point for point in trail[1] if point[0] == there), None) if trail else None
+            )
+            if value is None or before is None or trail is None:
+                told.append(None)
+                continue
+            change = value - before[1]
+            if turns:
+                total, chain = trail[0][2:]
+                change = total - before[2] if chain <= there else _wrapped(change)
+            told.append(change)
+        self._new[course] = kept
+        return column_of(told)
+
+    def _run_length(self, course: b.SignalCall, flags: list[bool]) -> SignalColumn:
+        tick, gap = self._tick, self._all.gap
+        self._new[course] = [
+            (old if old is not None and not gap else tick) if flag else None
+            for old, flag in zip(self._old[course], flags, strict=True)
+        ]
+        return column_of([self._length(course, start, 1) for start in self._new[course]])
+
+    def _since_true(self, course: b.SignalCall, flags: list[bool]) -> SignalColumn:
+        self._new[course] = [
+            self._tick if flag else old for old, flag in zip(self._old[course], flags, strict=True)
+        ]
+        known = self._new[course]
+        return column_of([None if at is None else self._length(course, at, 0) for at in known])
+
+    def _length(self, course: b.SignalCall, start: Tick | None, more: int) -> float:
+        if start is None:
+            return 0
+        if course.frames:
+            return self._tick.number - start.number + more
+        return (self._tick.time - start.time) / NS
+
+
+class _Momentary(SignalValues):
+    """The value of a test in one frame."""
+
+    def __init__(self, test: Test, now: _Now) -> None:
+        def condition(expression: b.Bound) -> Bools:
+            return now.condition(expression)[:, None]
+
+        def present(name: str) -> Bools:
+            return now.proposition(name)[:, None]
+
+        nothing = np.zeros(0, np.int64)
+        clock = Clock(nothing, nothing, 0, now.tolerance)
+        super().__init__(test, clock, now.signal, condition, present)
+        self._now = now
+
+    def _course(self, course: b.SignalCall) -> SignalColumn:
+        return self._now.course(course, self._test)
+
+
+_Point = tuple[int, float, float, int]
+"""A frame in which a value was known: its number, the value, how far it had turned, since when it is known."""
+
+_Trail = tuple[_Point, tuple[_Point, ...]]
+"""The last frame in which a value was known, and those of them that are still looked back to."""
+
+
+def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:
+    """A trail with the value of one more frame."""
+    points = old[1] if old is not None else ()
+    if points and points[0][0] < oldest:
+        points = tuple(point for point in points if point[0] >= oldest)
+    if value is None:
+        return (old[0], points) if old is not None else None
+    total, chain = 0.0, here
+    if old is not None:
+        number, before, total, since = old[0]
+        if number == here - 1:
+            total, chain = total + _wrapped(value - before), since
+    point = here, value, total, chain
+    return point, (*points, point)
+
+
+def _wrapped(degrees: float) -> float:
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def column_of(values: list[Any]) -> SignalColumn:
+    """A value of each binding in one frame: (B, 1); ``None`` is not known."""
+    known = [value is not None for value in values]
+    like = next((value for value in values if value is not None), 0.0)
+    empty = "" if isinstance(like, str) else type(like)()
+    told = np.array([empty if value is None else value for value in values])
+    return SignalColumn(told[:, None], np.array(known, np.bool_)[:, None])

@@ -1,0 +1,673 @@
+"""Signals and formulas over whole traces, as columns.
+
+Formulas over whole traces: every operator at all frames at once, in linear time.
+
+A column is true or false at each frame; operators make columns of columns. An *until* looks for the next frame
+at which its right side holds, from where its bound begins, and compares it with the next one at which its left
+side fails.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang import ir as b
+from sgstore.temporal._formula import (
+    TRUE,
+    And,
+    Bound,
+    Formula,
+    Next,
+    Not,
+    Or,
+    Previous,
+    Proposition,
+    Since,
+    TruthConstant,
+    Until,
+    propositions,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from sgstore.temporal._plan import Signal, Test
+    from sgstore.world import Bools, Ints
+
+    Places = NDArray[np.int32 | np.int64]
+    Array = NDArray[Any]
+
+
+CELLS: Final = 4_000_000
+"""Frames times prefixes that are worked on at once."""
+
+
+def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
+    """Where a formula is true in a trace.
+
+    Parameters
+    ----------
+    formula : Formula
+    columns : mapping of str to (F,) bool
+        The propositions.
+    times : (F,) int64
+        Time stamps of the frames, ascending; ns.
+
+    Returns
+    -------
+    (F,) bool
+        The formula's value at each frame.
+
+    Raises
+    ------
+    ValueError
+        A proposition is missing, columns have different lengths, or times do not ascend.
+    """
+    table = PropositionTable.of(formula, columns, times)
+    if not len(times):
+        return np.zeros(0, np.bool_)
+    return table.whole(formula)
+
+
+def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
+    """Where a formula is true for each of several bindings in one trace.
+
+    Parameters
+    ----------
+    formula : Formula
+    columns : mapping of str to (B, F) bool, or (1, F)
+        The propositions for each binding; (1, F): the same for all.
+    times : (F,) int64
+        As in :func:`evaluate`; F is at least 1.
+    rows : int
+        B, the number of bindings.
+
+    Returns
+    -------
+    (B, F) bool
+    """
+    last = np.full((rows, 1), len(times) - 1)
+    return PropositionTable(columns, times).value(formula, last)
+
+
+def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
+    """The value of a formula at the first frame, if the trace ended at each of its frames in turn.
+
+    Parameters
+    ----------
+    formula, columns, times
+        As in :func:`evaluate`.
+
+    Returns
+    -------
+    (F,) bool
+        The verdict over the frames 0 … f. Time grows with the square of F; memory does not.
+    """
+    table = PropositionTable.of(formula, columns, times)
+    frames = len(times)
+    rows = max(CELLS // max(frames, 1), 1)
+    parts = [
+        table.value(formula, np.arange(start, min(start + rows, frames))[:, None])[:, 0]
+        for start in range(0, frames, rows)
+    ]
+    return np.concatenate([np.zeros(0, np.bool_), *parts])
+
+
+@dataclass(frozen=True, slots=True)
+class PropositionTable:
+    """The propositions of a trace. Values have a row for each end of it, ``last`` (R, 1); a column a frame.
+
+    Parameters
+    ----------
+    columns : mapping of str to (F,) bool
+    times : (F,) int64
+        Ascending; ns.
+    """
+
+    columns: Mapping[str, Bools]
+    times: Ints
+
+    @classmethod
+    def of(cls, formula: Formula, columns: Mapping[str, Bools], times: Ints) -> PropositionTable:
+        """The same, if it has what a formula asks; see :func:`evaluate`."""
+        missing = sorted(propositions(formula) - set(columns))
+        if missing:
+            raise ValueError(f"no column for the proposition {missing[0]!r}")
+        for name in propositions(formula):
+            if columns[name].shape != times.shape:
+                raise ValueError(f"{name} has shape {columns[name].shape}, expected {times.shape}")
+        if np.any(np.diff(times) <= 0):
+            raise ValueError("the times of the frames must ascend")
+        return cls(columns, times)
+
+    def whole(self, formula: Formula) -> Bools:
+        """(F,): the value at each frame of the whole trace, which has at least one."""
+        return self.value(formula, np.array([[len(self.times) - 1]]))[0]
+
+    def value(self, formula: Formula, last: Ints) -> Bools:  # noqa: PLR0911 - a case each
+        """(R, F): the value at each frame, for each end of the trace; meaningless behind the end."""
+        frames = len(self.times)
+        match formula:
+            case TruthConstant(value=value):
+                return np.full((len(last), frames), value)
+            case Proposition(name=name):
+                return np.broadcast_to(self.columns[name], (len(last), frames))
+            case Not(operand=operand):
+                return ~self.value(operand, last)
+            case And(operands=operands):
+                return np.logical_and.reduce([self.value(operand, last) for operand in operands])
+            case Or(operands=operands):
+                return np.logical_or.reduce([self.value(operand, last) for operand in operands])
+            case Next(operand=operand, weak=weak):
+                shifted = np.full((len(last), frames), weak)
+                shifted[:, :-1] = self.value(operand, last)[:, 1:]
+                return np.where(np.arange(frames) < last, shifted, weak)
+            case Previous(operand=operand):
+                shifted = np.zeros((len(last), frames), np.bool_)
+                shifted[:, 1:] = self.value(operand, last)[:, :-1]
+                return shifted
+            case Until(left=left, right=right, bound=bound):
+                kept = None if left == TRUE else self.value(left, last)
+                return self._until(kept, self.value(right, last), bound, last)
+            case Since(left=left, right=right, bound=bound):
+                kept = None if left == TRUE else self.value(left, last)
+                return self._since(kept, self.value(right, last), bound)
+
+    def _until(self, left: Bools | None, right: Bools, bound: Bound, last: Ints) -> Bools:
+        """``left`` is ``None`` where it is true always."""
+        frames = len(self.times)
+        behind = None if np.all(last == frames - 1) else np.arange(frames) > last
+        hit = _next(right if behind is None else right & ~behind)
+        start, end = self.window(bound, forward=True)
+        hit = hit if start is None else _at(hit, start)
+        true = hit <= (last if end is None else np.minimum(end, last))
+        if left is not None:
+            true &= hit <= _next(~left if behind is None else ~left & ~behind)
+        return true
+
+    def _since(self, left: Bools | None, right: Bools, bound: Bound) -> Bools:
+        hit = _last(right)
+        start, end = self.window(bound, forward=False)
+        hit = hit if start is None else _at(hit, start)
+        true = hit >= (0 if end is None else np.maximum(end, 0))
+        if left is not None:
+            true &= hit >= _last(~left)
+        return true
+
+    def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
+        """The first and the last frame that an operator looks at, from each frame, in its direction.
+
+        ``None``: this frame; and the last one that there is.
+        """
+        sign = 1 if forward else -1
+        near = far = None
+        here = self.frames
+        low, high = bound.low, bound.high
+        period = None if bound.frames else self._period
+        if bound.frames or period:
+            # Of a clock that goes evenly, too, it is enough to count.
+            unit = period or 1
+            near = here + sign * min(-(-low // unit), len(here)) if low else None
+            far = None if high is None else here + sign * min(high // unit, len(here))
+        elif forward:
+            near = np.searchsorted(self.times, _sum(self.times, low), "left") if low else None
+            if high is not None:
+                far = np.searchsorted(self.times, _sum(self.times, high), "right") - 1
+        else:
+            if low:
+                near = np.searchsorted(self.times, self.times - low, "right") - 1
+            if high is not None:
+                far = np.searchsorted(self.times, self.times - high, "left")
+        return near, far
+
+    @property
+    def frames(self) -> Places:
+        """(F,) the numbers of the frames."""
+        return _frames(len(self.times))
+
+    @property
+    def _period(self) -> int | None:
+        """The time between two frames, if it is always the same; ns."""
+        if len(self.times) < 2:
+            return None
+        period = int(self.times[1] - self.times[0])
+        return period if bool(np.all(np.diff(self.times) == period)) else None
+
+
+def _sum(times: Ints, by: int) -> Ints:
+    """Later times, where they can be told in 64 bits."""
+    return np.minimum(times, np.iinfo(np.int64).max - by) + by
+
+
+def _frames(frames: int) -> Places:
+    """Their numbers, in as few bytes as they need with some room."""
+    return np.arange(frames, dtype=np.int32 if frames < 1 << 29 else np.int64)
+
+
+def _next(flags: Bools) -> Places:
+    """(R, F): the first frame from each on where a flag is set; F where there is none."""
+    frames = flags.shape[1]
+    here = _frames(frames)
+    places = np.where(flags, here, here.dtype.type(frames))[:, ::-1]
+    return np.minimum.accumulate(places, axis=1)[:, ::-1]
+
+
+def _last(flags: Bools) -> Places:
+    """(R, F): the last frame up to each where a flag is set; -1 where there is none."""
+    here = _frames(flags.shape[1])
+    return np.maximum.accumulate(np.where(flags, here, here.dtype.type(-1)), axis=1)
+
+
+def _at(places: Places, frame: Places) -> Places:
+    """The places told at other frames; F and -1 where these are out of the trace, behind and before it."""
+    frames = places.shape[1]
+    inside = (frame >= 0) & (frame < frames)
+    told = places[:, np.clip(frame, 0, frames - 1)]
+    return np.where(inside, told, np.where(frame < 0, -1, frames))
+
+
+# Values over time as columns: ``prev``, ``delta``, ``run_length``, ``since_true``, ``age``, and terms of them
+# ------------------------------------------------------------------------------------------------
+# A :class:`SignalColumn` has a row for each binding and a column for each frame, and says where it is known.
+# Gaps in a recording are not bridged: behind one, ``prev`` and ``delta`` are unknown and runs begin anew.
+
+ANGLES: Final = frozenset(
+    {"heading", "pitch", "roll", "bearing", "rel_heading", "apparent_heading", "heading_error"}
+)
+"""Values that come round after 360 degrees."""
+
+NS: Final = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class SignalColumn:
+    """Values: (B, F), or (1, F) and (1, 1) for what is the same for all; and where they are known."""
+
+    values: Array
+    known: Bools
+
+    @property
+    def true(self) -> Bools:
+        """Where it is true; unknown is not."""
+        return self.known & self.values.astype(np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The frames of a trace.
+
+    Attributes
+    ----------
+    times : (F,) int64
+        Ascending; ns.
+    runs : (F,) int64
+        Number of the stretch without gaps that each frame is in.
+    period : int
+        Median time between two frames; ns.
+    tolerance : int
+        Times that differ by no more are the same; ns.
+    """
+
+    times: Ints
+    runs: Ints
+    period: int
+    tolerance: int = 0
+
+    @classmethod
+    def of(
+        cls, times: Ints, numbers: Ints, period: int, longest: float, tolerance: int = 0
+    ) -> Clock:
+        """A clock whose gaps are times of more than ``longest`` (ns), and numbers of frames left out."""
+        gaps = (np.diff(times) > longest) | (np.diff(numbers) != 1)
+        runs = np.concatenate(([0], np.cumsum(gaps)))[: len(times)]
+        return cls(times, runs, period, tolerance)
+
+    @property
+    def gap_before(self) -> Bools:
+        """(F,) whether a gap ends at a frame; nothing comes before the first one."""
+        return np.concatenate(([False], np.diff(self.runs) != 0))[: len(self.times)]
+
+
+class SignalValues:
+    """The value of a test for some bindings.
+
+    Parameters
+    ----------
+    test : Test
+    clock : Clock
+    signal : function
+        Gives the values of a signal.
+    condition : function
+        Gives the value of a condition within the test: (B, F) bool.
+    present : function
+        Gives where the atom of that name is true: (B, F) bool.
+    """
+
+    def __init__(
+        self,
+        test: Test,
+        clock: Clock,
+        signal: Callable[[Signal], SignalColumn],
+        condition: Callable[[b.Bound], Bools],
+        present: Callable[[str], Bools],
+    ) -> None:
+        self._test, self._clock = test, clock
+        self._signal, self._condition, self._present = signal, condition, present
+
+    def column(self, expression: b.Bound | None = None) -> SignalColumn:
+        """The value of an expression of the test, the whole one by default."""
+        if expression is None:
+            expression = self._test.expression
+        if expression in self._test.signals:
+            return self._signal(self._test.signals[expression])
+        match expression:
+            case b.Value(value=value):
+                known = np.full((1, 1), value is not None)
+                return SignalColumn(np.full((1, 1), 0 if value is None else value), known)
+            case b.SignalCall():
+                return self._course(expression)
+            case b.Tense():
+                return _certain(self._condition(expression))
+            case b.Operation():
+                return self._operation(expression)
+            case _:
+                raise TypeError(f"{expression} has no value over time")
+
+    def _course(self, course: b.SignalCall) -> SignalColumn:
+        match course.word:
+            case "prev":
+                return self._back(self.column(course.operand), 1)
+            case "delta":
+                return self._delta(course)
+            case "run_length":
+                return self._run_length(self._condition(course.operand), frames=course.frames)
+            case "since_true":
+                return self._since(self._condition(course.operand), frames=course.frames)
+            case "age":
+                return self._age(self._seen(course))
+            case _:
+                return _certain(self._seen(course))
+
+    def _seen(self, course: b.SignalCall) -> Bools:
+        (node,) = b.nodes_of(course.operand)
+        return self._present(self._test.presence[node])
+
+    def _back(self, column: SignalColumn, by: int | Ints) -> SignalColumn:
+        """The values some frames before, unknown where there are none or a gap lies between."""
+        frames = len(self._clock.times)
+        here = np.arange(frames)
+        there = here - by if isinstance(by, int) else by
+        inside = np.clip(there, 0, None)
+        runs = self._clock.runs
+        told = (there >= 0) & (runs[inside] == runs)
+        values = np.broadcast_to(column.values, (len(column.values), frames))
+        known = np.broadcast_to(column.known, (len(column.known), frames))
+        return SignalColumn(values[:, inside], known[:, inside] & told)
+
+    def _delta(self, course: b.SignalCall) -> SignalColumn:
+        now, times = self.column(course.operand), self._clock.times
+        by: int | Ints = course.by
+        if not course.frames:
+            then = times - course.by + self._clock.tolerance
+            by = np.minimum(np.searchsorted(times, then, "right") - 1, np.arange(len(times)))
+        before = self._back(now, by)
+        known = now.known & before.known
+        change = np.where(known, now.values, 0.0) - np.where(known, before.values, 0.0)
+        if not is_angle(course.operand):
+            return SignalColumn(change, known)
+        return SignalColumn(self._turned(now, by, change), known)
+
+    def _turned(self, now: SignalColumn, by: int | Ints, change: Array) -> Array:
+        """How far something turned, all the way round if it did; the short way where it was not seen."""
+        frames = len(self._clock.times)
+        there = np.arange(frames) - by if isinstance(by, int) else by
+        there = np.clip(there, 0, None)
+        both = now.known[:, 1:] & now.known[:, :-1]
+        steps = np.where(both, _wrapped(np.diff(np.where(now.known, now.values, 0.0))), 0.0)
+        sums, unseen = (_summed(part) for part in (steps, ~both))
+        whole = unseen == unseen[:, there]
+        return np.where(whole, sums - sums[:, there], _wrapped(change))
+
+    def _run_length(self, flags: Bools, *, frames: bool) -> SignalColumn:
+        """How long a condition has held up to each frame: number of frames, or s from the first of them."""
+        here = np.arange(flags.shape[1])
+        first = flags.copy()
+        first[:, 1:] = flags[:, 1:] & (~flags[:, :-1] | self._clock.gap_before[1:])
+        start = np.maximum.accumulate(np.where(first, here, 0), axis=1)
+        times = self._clock.times
+        length = here - start + 1 if frames else (times - times[start]) / NS
+        return _certain(np.where(flags, length, 0))
+
+    def _since(self, flags: Bools, *, frames: bool) -> SignalColumn:
+        here = np.arange(flags.shape[1])
+        last = np.maximum.accumulate(np.where(flags, here, -1), axis=1)
+        times = self._clock.times
+        ago = here - last if frames else (times - times[np.clip(last, 0, None)]) / NS
+        return SignalColumn(ago, last >= 0)
+
+    def _age(self, seen: Bools) -> SignalColumn:
+        first = np.argmax(seen, axis=1)
+        times = self._clock.times
+        return SignalColumn((times - times[first][:, None]) / NS, seen)
+
+    def _operation(self, operation: b.Operation) -> SignalColumn:
+        if operation.word == "IN":
+            return self._membership(operation)
+        if operation.word == "=~":
+            return self._regex(operation)
+        parts = [self.column(operand) for operand in operation.operands]
+        if operation.word in _LOGIC:
+            return _LOGIC[operation.word](parts)
+        tolerant = operation.word in _TOLERANT and _of_time(operation)
+        with np.errstate(all="ignore"):
+            if tolerant:
+                by = self._clock.tolerance / NS
+                one, other = (part.values for part in parts)
+                values = _TOLERANT[operation.word](one, other, by)
+                return SignalColumn(values, _everywhere([part.known for part in parts]))
+            values, defined = _FUNCTIONS[operation.word](*(part.values for part in parts))
+        known = _everywhere([part.known for part in parts])
+        return SignalColumn(values, known & defined)
+
+    def _membership(self, operation: b.Operation) -> SignalColumn:
+        operand, choices = operation.operands
+        assert isinstance(choices, b.Choices)  # noqa: S101 - the binder built it so
+        found = self.column(operand)
+        items = [item.value for item in choices.items]
+        same = [found.values == item for item in items]
+        if not same:
+            return _certain(np.zeros(found.values.shape, np.bool_))
+        return SignalColumn(np.logical_or.reduce(same), found.known)
+
+    def _regex(self, operation: b.Operation) -> SignalColumn:
+        text, pattern = operation.operands
+        assert isinstance(pattern, b.Value)  # noqa: S101 - the binder built it so
+        found, wanted = self.column(text), re.compile(str(pattern.value))
+        words, places = np.unique(
+            np.where(found.known, found.values, "").astype(str), return_inverse=True
+        )
+        flags = np.array([wanted.fullmatch(word) is not None for word in words], np.bool_)
+        return SignalColumn(flags[places].reshape(found.values.shape), found.known)
+
+
+def is_angle(value: b.Bound) -> bool:
+    """Whether a value comes round after 360 degrees."""
+    match value:
+        case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
+            return attribute.name in ANGLES
+        case b.PairNumber(function=function):
+            return function in ANGLES
+        case _:
+            return False
+
+
+def _of_time(operation: b.Operation) -> bool:
+    """Whether a comparison is of how long something lasts, or is ago, in seconds."""
+    parts = (part for operand in operation.operands for part in b.walk(operand))
+    return any(isinstance(p, b.SignalCall) and p.word in _TIMES and not p.frames for p in parts)
+
+
+_TIMES: Final = frozenset({"run_length", "since_true", "age"})
+
+
+def _certain(values: Array) -> SignalColumn:
+    return SignalColumn(values, np.ones((1, 1), np.bool_))
+
+
+def _everywhere(flags: list[Bools]) -> Bools:
+    """Where all are true."""
+    return np.asarray(np.logical_and.reduce(np.broadcast_arrays(*flags)), np.bool_)
+
+
+def _wrapped(degrees: Array) -> Array:
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def _summed(steps: Array) -> Array:
+    return np.concatenate((np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)), axis=1)
+
+
+# Operations -------------------------------------------------------------------------------------------------
+
+
+def _null_test(parts: list[SignalColumn]) -> SignalColumn:
+    return _certain(~parts[0].known)
+
+
+def _known_test(parts: list[SignalColumn]) -> SignalColumn:
+    return _certain(parts[0].known)
+
+
+def _coalesce(parts: list[SignalColumn]) -> SignalColumn:
+    found = parts[-1]
+    for part in reversed(parts[:-1]):
+        found = SignalColumn(
+            np.where(part.known, part.values, found.values), part.known | found.known
+        )
+    return found
+
+
+def _and(parts: list[SignalColumn]) -> SignalColumn:
+    true = _everywhere([part.true for part in parts])
+    false = ~_everywhere([~(part.known & ~part.true) for part in parts])
+    return SignalColumn(true, true | false)
+
+
+def _not(parts: list[SignalColumn]) -> SignalColumn:
+    return SignalColumn(~parts[0].true, parts[0].known)
+
+
+def _or(parts: list[SignalColumn]) -> SignalColumn:
+    return _not([_and([_not([part]) for part in parts])])
+
+
+def _xor(parts: list[SignalColumn]) -> SignalColumn:
+    odd = np.logical_xor.reduce(np.broadcast_arrays(*(part.true for part in parts)))
+    return SignalColumn(odd, _everywhere([part.known for part in parts]))
+
+
+def _implies(parts: list[SignalColumn]) -> SignalColumn:
+    return _or([_not(parts[:1]), parts[1]])
+
+
+_LOGIC: Final[Mapping[str, Callable[[list[SignalColumn]], SignalColumn]]] = {
+    "AND": _and,
+    "OR": _or,
+    "NOT": _not,
+    "XOR": _xor,
+    "IMPLIES": _implies,
+    "IS NULL": _null_test,
+    "IS NOT NULL": _known_test,
+    "coalesce": _coalesce,
+}
+
+
+def _total(function: Callable[..., Any]) -> Callable[..., tuple[Array, Any]]:
+    """A function that is defined everywhere."""
+
+    def defined(*values: Array) -> tuple[Array, Any]:
+        return function(*values), True
+
+    return defined
+
+
+def _divided(a: Array, by: Array) -> tuple[Array, Array]:
+    fits = np.asarray(by) != 0
+    return np.divide(a, np.where(fits, by, 1)), fits
+
+
+def _remainder(a: Array, by: Array) -> tuple[Array, Array]:
+    fits = np.asarray(by) != 0
+    return np.fmod(a, np.where(fits, by, 1)), fits
+
+
+def _root(a: Array) -> tuple[Array, Array]:
+    fits = np.asarray(a) >= 0
+    return np.sqrt(np.where(fits, a, 0)), fits
+
+
+def _rounded(a: Array) -> Array:
+    return np.copysign(np.floor(np.abs(a) + 0.5), a)
+
+
+def _least(*values: Array) -> Array:
+    return np.minimum.reduce(np.broadcast_arrays(*values))
+
+
+def _greatest(*values: Array) -> Array:
+    return np.maximum.reduce(np.broadcast_arrays(*values))
+
+
+def _of_texts(function: Callable[..., Any]) -> Callable[..., tuple[Array, Any]]:
+    def defined(*values: Array) -> tuple[Array, Any]:
+        return function(*(np.asarray(value).astype(str) for value in values)), True
+
+    return defined
+
+
+def _contains(text: Array, part: Array) -> Array:
+    return np.char.find(text, part) >= 0
+
+
+_TOLERANT: Final[Mapping[str, Callable[[Array, Array, float], Array]]] = {
+    "=": lambda one, other, by: np.abs(one - other) <= by,
+    "<>": lambda one, other, by: np.abs(one - other) > by,
+    "<": lambda one, other, by: one < other - by,
+    "<=": lambda one, other, by: one <= other + by,
+    ">": lambda one, other, by: one > other + by,
+    ">=": lambda one, other, by: one >= other - by,
+}
+"""Comparisons of times, those that differ by no more than a tolerance being the same."""
+
+_FUNCTIONS: Final[Mapping[str, Callable[..., tuple[Array, Any]]]] = {
+    "=": _total(np.equal),
+    "<>": _total(np.not_equal),
+    "<": _total(np.less),
+    "<=": _total(np.less_equal),
+    ">": _total(np.greater),
+    ">=": _total(np.greater_equal),
+    "+": _total(np.add),
+    "-": _total(np.subtract),
+    "*": _total(np.multiply),
+    "/": _divided,
+    "%": _remainder,
+    "negative": _total(np.negative),
+    "abs": _total(np.abs),
+    "sqrt": _root,
+    "floor": _total(np.floor),
+    "ceil": _total(np.ceil),
+    "round": _total(_rounded),
+    "min": _total(_least),
+    "max": _total(_greatest),
+    "lower": _of_texts(np.char.lower),
+    "upper": _of_texts(np.char.upper),
+    "STARTS WITH": _of_texts(np.char.startswith),
+    "ENDS WITH": _of_texts(np.char.endswith),
+    "CONTAINS": _of_texts(_contains),
+}

@@ -1,0 +1,233 @@
+"""Parts of a trace: from a time, up to a time, at a lower rate. Frames that are left are numbered anew."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import TraceError
+from sgstore.world import TOLERANCE_NS, Entities, FrameBlock, MessageRefs, States
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.world import Bools, Ints
+
+
+MAX_MESSAGES: Final = 200_000
+"""References of messages that wait for a block to be full."""
+
+_SLACK_NS: Final = TOLERANCE_NS
+"""How early a frame may come and still be that of its step: simulators round their clocks; ns."""
+_SLACK: Final = _SLACK_NS / 1e9
+"""The same in seconds: how far a frame may miss the ends of the part. The median period is not known yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class TracePart:
+    """Which frames of a trace are read.
+
+    Attributes
+    ----------
+    since, until : float or None
+        From the first frame at or after ``since``, up to the last one before the first frame that comes after
+        ``until``; seconds since the first frame of the recording.
+    rate : float
+        Frames of a second: the first at or after each step of 1/rate. 0: all.
+    """
+
+    since: float | None = None
+    until: float | None = None
+    rate: float = 0.0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is all of the trace."""
+        return self == TracePart()
+
+    def blocks(self, blocks: Iterator[FrameBlock], size: int) -> Iterator[FrameBlock]:
+        """The frames of the part, ``size`` at a time; the last block, and those with many messages, have fewer.
+
+        Entities keep their node ids, and those that appear only in frames that are left out stay known.
+
+        Raises
+        ------
+        TraceError
+            No frame is in the part.
+        """
+        if self.is_whole:
+            yield from blocks
+            return
+        clock = _Clock(self)
+        waiting, given = _KeptFrames(), 0
+        for block in blocks:
+            kept = clock.kept(block.time_ns)
+            happened = tuple(event for event in block.events if clock.within(event.time_ns))
+            waiting.add(replace(block, events=happened), kept)
+            full = len(waiting) if waiting.messages > MAX_MESSAGES else len(waiting) // size * size
+            if full:
+                yield waiting.take(full, given)
+                given += full
+            if clock.over:
+                break
+        if len(waiting):
+            yield waiting.take(len(waiting), given)
+        elif not given:
+            raise TraceError(f"no frame of it is in the part: it goes from 0 s to {clock.last:g} s")
+
+
+class _Clock:
+    """Which of the frames are kept, one block after another."""
+
+    def __init__(self, part: TracePart) -> None:
+        self._part = part
+        self._zero: int | None = None
+        self._step = -1
+        self._begun = part.since is None
+        self.last = 0.0
+        self.over = False
+
+    def within(self, time_ns: int) -> bool:
+        """Whether something that happened at a time happened in the part, once frames up to it were seen."""
+        since = (time_ns - (self._zero or 0)) / 1e9
+        part = self._part
+        return (
+            (part.since or -math.inf) - _SLACK
+            <= since
+            <= (math.inf if part.until is None else part.until) + _SLACK
+        )
+
+    def kept(self, time_ns: Ints) -> Bools:
+        """Whether each frame is kept."""
+        part = self._part
+        self._zero = int(time_ns[0]) if self._zero is None else self._zero
+        since = (time_ns - self._zero) / 1e9
+        self.last = float(since[-1])
+        kept = np.ones(len(since), np.bool_)
+        if part.rate:
+            slack = (time_ns - self._zero + _SLACK_NS) / 1e9
+            step = np.floor(slack * part.rate).astype(np.int64)
+            # Also where the clock runs back: another step is another frame.
+            kept = step != np.concatenate([[self._step], step[:-1]])
+            self._step = int(step[-1])
+        start = 0
+        if not self._begun:
+            found = np.flatnonzero(since >= (part.since or 0) - _SLACK)
+            self._begun = bool(len(found))
+            start = int(found[0]) if len(found) else len(kept)
+            kept[:start] = False
+        if part.until is not None:
+            # Of a clock that runs back before the part begins nothing is over.
+            beyond = start + np.flatnonzero(since[start:] > part.until + _SLACK)
+            self.over = bool(len(beyond))
+            kept[int(beyond[0]) if len(beyond) else len(kept) :] = False
+        return kept
+
+
+class _KeptFrames:
+    """Frames that were kept and not given yet, and what came with them."""
+
+    def __init__(self) -> None:
+        self._blocks: list[FrameBlock] = []
+        self._frames = 0
+        self.messages = 0
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def add(self, block: FrameBlock, kept: Bools) -> None:
+        if not self._frames:  # no frame refers to messages that long before
+            self._blocks = [_without_messages(one) for one in self._blocks]
+            self.messages = 0
+        self._blocks.append(_selected(block, kept))
+        self._frames += int(kept.sum())
+        self.messages += len(block.messages)
+
+    def take(self, count: int, first: int) -> FrameBlock:
+        """The first frames as one block, with all messages, entities and events that came so far."""
+        whole = _joined(self._blocks)
+        now = _sliced(whole, 0, count)
+        rest = _sliced(whole, count, len(whole))
+        self._blocks = [_only_frames(_without_messages(rest))]
+        self._frames -= count
+        self.messages = 0
+        return replace(now, seq=first + np.arange(count))
+
+
+def _selected(block: FrameBlock, kept: Bools) -> FrameBlock:
+    if kept.all():
+        return block
+    rows = np.flatnonzero(np.repeat(kept, np.diff(block.offsets)))
+    counts = np.diff(block.offsets)[kept]
+    return replace(
+        block,
+        seq=block.seq[kept],
+        time_ns=block.time_ns[kept],
+        log_time_ns=block.log_time_ns[kept],
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        states=block.states.take(rows),
+        ego=block.ego[kept],
+    )
+
+
+def _sliced(block: FrameBlock, start: int, stop: int) -> FrameBlock:
+    kept = np.zeros(len(block), np.bool_)
+    kept[start:stop] = True
+    return _selected(block, kept)
+
+
+def _joined(blocks: list[FrameBlock]) -> FrameBlock:
+    first = blocks[0]
+    if len(blocks) == 1:
+        return first
+    shifts = np.cumsum([0, *(len(block.states) for block in blocks)])
+    offsets = [block.offsets[:-1] + shift for block, shift in zip(blocks, shifts, strict=False)]
+    return FrameBlock(
+        seq=_chained([block.seq for block in blocks]),
+        time_ns=_chained([block.time_ns for block in blocks]),
+        log_time_ns=_chained([block.log_time_ns for block in blocks]),
+        offsets=np.concatenate([*offsets, shifts[-1:]]).astype(np.int64),
+        states=_stacked(States, [block.states for block in blocks]),
+        ego=_chained([block.ego for block in blocks]),
+        entities=_entities([block.entities for block in blocks]),
+        scenery=_stacked(States, [block.scenery for block in blocks]),
+        messages=_stacked(MessageRefs, [block.messages for block in blocks]),
+        events=tuple(event for block in blocks for event in block.events),
+    )
+
+
+def _entities(parts: list[Entities]) -> Entities:
+    parts = [part for part in parts if len(part)] or parts[:1]
+    joined: dict[str, Any] = {"first": parts[0].first}
+    for column in fields(Entities)[1:]:
+        values = [getattr(part, column.name) for part in parts]
+        is_array = isinstance(values[0], np.ndarray)
+        joined[column.name] = (
+            _chained(values) if is_array else tuple(v for one in values for v in one)
+        )
+    return Entities(**joined)
+
+
+def _stacked(kind: Any, parts: list[Any]) -> Any:
+    return kind(*(_chained([getattr(p, f.name) for p in parts]) for f in fields(kind)))
+
+
+def _chained(parts: list[Any]) -> Any:
+    return np.concatenate(parts)
+
+
+def _without_messages(block: FrameBlock) -> FrameBlock:
+    messages = block.messages
+    none = {f.name: getattr(messages, f.name)[:0] for f in fields(MessageRefs)}
+    return replace(block, messages=MessageRefs(**none))
+
+
+def _only_frames(block: FrameBlock) -> FrameBlock:
+    entities = block.entities
+    none: dict[str, Any] = {f.name: getattr(entities, f.name)[:0] for f in fields(Entities)[1:]}
+    nowhere = block.scenery.take(np.zeros(0, np.intp))
+    first = entities.first + len(entities)
+    return replace(block, entities=Entities(first=first, **none), scenery=nowhere, events=())

@@ -1,0 +1,244 @@
+"""The package as people get it: ``python packages.py wheel`` and ``python packages.py versions``.
+
+``wheel`` (``make test-wheel``) builds the wheel, installs it into an environment of its own, and runs the short
+tests there: nothing is imported from the checkout. ``versions`` (``make test-versions``) installs it twice,
+with the lowest and with the highest versions of other packages that ``pyproject.toml`` allows, and runs ingest,
+verify, find and check under both: the answers must be the same.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[1]
+RECORDING = Path("sample") / "town.mcap"
+"""In the package of a checkout only: a wheel is without it (``sgstore/demo.py`` says why)."""
+
+NOT_SHIPPED = ("__pycache__", RECORDING.parent.name)
+
+SHORT = (
+    "test_cli_errors.py",
+    "test_config.py",
+    "test_geometry.py",
+    "test_graph.py",
+    "test_lang_parser.py",
+    "test_lang_sql.py",
+    "test_query.py",
+    "test_schema.py",
+    "test_store.py",
+    "test_views.py",
+)
+"""Files of tests that ask for most of what is shipped beside the code, and take seconds."""
+
+VERBS: tuple[tuple[str, ...], ...] = (
+    ("verify", "town.sgstore", "--payloads"),
+    ("info", "town.sgstore", "--json"),
+    ("find", "town.sgstore", "--json", "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) RETURN v, e.speed"),
+    (
+        "find",
+        "town.sgstore",
+        "--json",
+        "MATCH (e:Ego), (v:Car) WHERE dist(e, v) < 9 RETURN COUNT(*)",
+    ),
+    ("patterns", "run", "town.sgstore", "jaywalking", "--json"),
+    ("check", "town.sgstore", "-p", "phi1", "--json"),
+    ("sql", "town.sgstore", "SELECT relation, count(*) FROM edges GROUP BY ALL ORDER BY ALL"),
+)
+"""What each version is asked after it made its store."""
+
+VARIES = {"seconds", "ingested_at", "file", "path", "uri", "sgstore", "duckdb", "bytes", "size"}
+"""Of a trace: when and where it was read, and how large its store is."""
+
+
+def shipped() -> set[str]:
+    """The files of the package in this checkout that a wheel must hold."""
+    package = REPOSITORY / "sgstore"
+    files = (path.relative_to(REPOSITORY) for path in package.rglob("*") if path.is_file())
+    return {file.as_posix() for file in files if not set(NOT_SHIPPED) & set(file.parts)}
+
+
+def build(folder: Path, *, isolated: bool) -> Path:
+    """The wheel of this checkout, built in a copy of it: what an earlier build left is not taken up.
+
+    Parameters
+    ----------
+    folder : Path
+        Where it is put.
+    isolated : bool
+        Whether pip fetches what builds it; otherwise that is what is installed here.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        copy = Path(name) / "sgstore"
+        copy.mkdir()
+        for file in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copy(REPOSITORY / file, copy)
+        shutil.copytree(
+            REPOSITORY / "sgstore", copy / "sgstore", ignore=shutil.ignore_patterns("__pycache__")
+        )
+        how = () if isolated else ("--no-build-isolation",)
+        pip("wheel", "--no-deps", *how, "--wheel-dir", str(folder), str(copy))
+    (wheel,) = folder.glob("sgstore-*.whl")
+    return wheel
+
+
+def pip(*arguments: str) -> None:
+    """Run pip."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", *arguments]
+    subprocess.run(command, check=True)
+
+
+def environment(folder: Path, *packages: str) -> Path:
+    """An environment with packages and nothing else; its folder of programs.
+
+    Parameters
+    ----------
+    folder : Path
+        Where it is made.
+    *packages : str
+        What pip is told to install.
+    """
+    # Without a pip of its own: that takes seconds, and not every machine can make one.
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    pip("--python", str(folder / "bin" / "python"), "install", *packages)
+    return folder / "bin"
+
+
+def project() -> dict[str, Any]:
+    """What ``pyproject.toml`` says of the project."""
+    return tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def lowest() -> list[str]:
+    """The lower bound of each package that is needed, as constraints.
+
+    Raises
+    ------
+    ValueError
+        One of them has none.
+    """
+    found: list[str] = []
+    for needed in project()["dependencies"]:
+        told = re.match(r"([\w.-]+)>=([\d.]+)", needed)
+        if told is None:
+            raise ValueError(f"{needed}: no lower bound")
+        found.append(f"{told[1]}=={told[2]}")
+    return found
+
+
+def try_wheel(folder: Path) -> None:
+    """Run the short tests from an installed wheel, in a folder without the package.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        A test fails.
+    AssertionError
+        What was tested is not what was installed.
+    """
+    wheel = build(folder, isolated=True)
+    needs = ("pytest>=8.3", "pytest-xdist>=3.6", "hypothesis>=6.100", "polars>=1")
+    programs = environment(folder / "env", f"{wheel}[viz,arrow]", *needs)
+    where = [str(programs / "python"), "-c", "import sgstore; print(sgstore.__path__[0])"]
+    (folder / "copy").mkdir()
+    shown = subprocess.run(where, check=True, capture_output=True, text=True, cwd=folder / "copy")
+    package = Path(shown.stdout.strip())
+    assert package.is_relative_to(folder / "env"), package
+    (package / RECORDING).parent.mkdir()
+    shutil.copy(REPOSITORY / "sgstore" / RECORDING, package / RECORDING)
+    for name in ("tests", "docs", "bench", "samples"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(REPOSITORY / name, folder / "copy" / name, ignore=ignored)
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(REPOSITORY / name, folder / "copy")
+    tests = [f"tests/{name}" for name in SHORT]
+    command = [str(programs / "pytest"), "-q", "-n", "2", "--dist", "loadfile", *tests]
+    data = os.environ.get("SGSTORE_DATA") or str((REPOSITORY / "../shared/data").resolve())
+    subprocess.run(
+        [*command, "-p", "no:cacheprovider"],
+        check=True,
+        cwd=folder / "copy",
+        env={**os.environ, "SGSTORE_DATA": data},
+    )
+
+
+def try_versions(folder: Path) -> None:
+    """Ask the same of the lowest and of the highest versions.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        A verb fails.
+    AssertionError
+        The answers differ.
+    """
+    wheel = build(folder, isolated=True)
+    constraints = folder / "lowest.txt"
+    constraints.write_text("\n".join(lowest()), encoding="utf-8")
+    low = environment(folder / "low", str(wheel), "--constraint", str(constraints))
+    high = environment(folder / "high", str(wheel))
+    for programs in (low, high):
+        own = folder / f"of-{programs.parent.name}"
+        own.mkdir()
+        asked(programs, own, "ingest", "town.sgstore", str(REPOSITORY / "sgstore" / RECORDING))
+    # Each reads what both made.
+    found = {
+        f"{programs.parent.name} asks the store of {made}": [
+            plain(asked(programs, folder / f"of-{made}", *verb)) for verb in VERBS
+        ]
+        for programs in (low, high)
+        for made in ("low", "high")
+    }
+    first, *others = found
+    for other in others:
+        for verb, one, two in zip(VERBS, found[first], found[other], strict=True):
+            assert one == two, f"sgstore {' '.join(verb)}\n{first}: {one}\n{other}: {two}"
+    for programs in (low, high):
+        print(f"{programs.parent.name}: {', '.join(versions(programs))}")
+
+
+def asked(programs: Path, folder: Path, *verb: str) -> str:
+    """What a verb of an environment prints."""
+    command = [str(programs / "sgstore"), *verb]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=folder)
+    if done.returncode:
+        print(f"{programs.parent.name}: sgstore {' '.join(verb)}\n{done.stdout}{done.stderr}")
+        done.check_returncode()
+    return done.stdout
+
+
+def plain(text: str) -> Any:
+    """What was printed, without what differs from run to run, and numbers rounded: sums have any order."""
+    if not text.startswith(("[", "{")):
+        return text
+    return _plain(json.loads(text))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items() if key not in VARIES}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    return float(f"{value:.9g}") if isinstance(value, float) else value
+
+
+def versions(programs: Path) -> list[str]:
+    """Packages of an environment that ``pyproject.toml`` names, with their versions."""
+    names = {constraint.partition("==")[0] for constraint in lowest()}
+    of = ["--python", str(programs / "python"), "list", "--format=json"]
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *of]
+    listed = subprocess.run(command, check=True, capture_output=True, text=True)
+    return [f"{p['name']} {p['version']}" for p in json.loads(listed.stdout) if p["name"] in names]
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as scratch:
+        {"wheel": try_wheel, "versions": try_versions}[sys.argv[1]](Path(scratch))

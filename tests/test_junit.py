@@ -1,0 +1,116 @@
+"""``check --junit``: the verdicts as build servers read them."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as Xml
+
+import pytest
+from recordings import drive
+
+from sgstore.cli import run
+from sgstore.ingest import ingest
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RULES = """
+CHECK slow: ALWAYS ego.speed < 3;
+CHECK alone: FORALL (p:Person) ALWAYS dist(ego, p) > 5;
+CHECK there: EVENTUALLY ego.speed >= 0;
+CHECK laned: EVENTUALLY EXISTS {(:Ego)-[:isIn]->(:Lane)}
+"""
+
+
+@pytest.fixture(scope="module")
+def store(town_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two traces; one of them has no road map, and a name that no XML can hold as it is."""
+    folder = tmp_path_factory.mktemp("junit")
+    ingest(town_store, [drive(folder / "a \x07<b> & 'c'.mcap", frames=11)])
+    (folder / "rules.sgql").write_text(RULES)
+    return town_store
+
+
+@pytest.fixture(scope="module")
+def written(
+    store: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[dict], Xml.Element]:
+    """The verdicts as ``--json`` prints them, and the file of the same run."""
+    folder = tmp_path_factory.mktemp("written")
+    command = ["check", str(store), "-e", RULES, "--junit", str(folder / "checks.xml")]
+    assert run([*command, "--json", "-o", str(folder / "checks.json")]) == 0
+    return json.loads((folder / "checks.json").read_text()), Xml.parse(
+        folder / "checks.xml"
+    ).getroot()
+
+
+def said(case: Xml.Element) -> str:
+    kinds = [child.tag for child in case]
+    return {"": "true", "failure": "false", "skipped": "unknown"}["".join(kinds)]
+
+
+def test_every_verdict_is_a_test_case_of_the_suite_of_its_check(
+    written: tuple[list[dict], Xml.Element],
+) -> None:
+    verdicts, root = written
+    cases = {(suite.get("name"), case.get("name")): said(case) for suite in root for case in suite}
+
+    assert {*cases.values()} == {"true", "false", "unknown"}
+    assert cases == {
+        (v["check"], v["trace"].replace("\x07", "\\x07")): v["verdict"] for v in verdicts
+    }
+    reasons = {v["reason"] for v in verdicts if v["verdict"] == "unknown"}
+    told = {skipped.get("message") for skipped in root.iter("skipped")}
+    assert None not in reasons
+    assert told == reasons
+    assert [suite.get("name") for suite in root] == ["slow", "alone", "there", "laned"]
+
+
+def test_numbers_of_suites_are_those_of_their_cases(
+    written: tuple[list[dict], Xml.Element],
+) -> None:
+    _, root = written
+    for element in (root, *root):
+        cases = [said(case) for case in element.iter("testcase")]
+        assert element.get("tests") == str(len(cases))
+        assert element.get("failures") == str(cases.count("false"))
+        assert element.get("skipped") == str(cases.count("unknown"))
+
+
+def test_a_failure_says_where_and_by_whom(written: tuple[list[dict], Xml.Element]) -> None:
+    verdicts, root = written
+    for verdict in verdicts:
+        if verdict["verdict"] != "false" or verdict["trace"] != "town":
+            continue
+        case = root.find(f"*[@name='{verdict['check']}']/*[@name='town']/failure")
+        assert case is not None
+        assert case.text is not None
+        lines = case.text.splitlines()
+        assert len(lines) == len(verdict["violations"]) > 0
+        for line, one in zip(lines, verdict["violations"], strict=True):
+            assert line.startswith(
+                f"town#{one['start_seq']}-{one['end_seq']}, {one['start']:.3f} to "
+            )
+        assert ("person" in case.text) == (verdict["check"] == "alone")
+
+
+def test_the_exit_code_and_what_is_printed_stay_as_they_are(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["check", str(store), "-e", RULES, "--require"]
+    assert run(command) == 4
+    alone = capsys.readouterr()
+
+    assert run([*command, "--junit", str(tmp_path / "checks.xml")]) == 4
+    assert capsys.readouterr() == alone
+
+
+def test_a_file_that_cannot_be_written_is_an_error_and_leaves_the_old(
+    store: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "old.xml").write_text("old")
+
+    assert run(["check", str(store), "-e", RULES, "--junit", str(tmp_path / "no" / "x.xml")]) == 1
+    assert run(["check", str(store), "-e", "CHECK", "--junit", str(tmp_path / "old.xml")]) == 2
+    assert (tmp_path / "old.xml").read_text() == "old"

@@ -1,0 +1,64 @@
+"""What people get who install it: what is in the wheel, and what it says that it needs."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import zipfile
+from typing import TYPE_CHECKING
+
+import packages
+import pytest
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+IMPORTED_AS = {"google": "protobuf", "PIL": "pillow", "pytest": None}
+"""Packages whose modules have another name; of pytest only the plugin is, and pytest loads it."""
+
+NEEDED = sorted(
+    {
+        *packages.project()["dependencies"],
+        *(n for extra in packages.project()["optional-dependencies"].values() for n in extra),
+    }
+)
+"""What ``pyproject.toml`` names: what is always installed, and the extras."""
+
+
+def imported() -> set[str]:
+    """Names of packages outside of the standard library that a file of ours imports, at its top or later."""
+    found: set[str] = set()
+    for path in (packages.REPOSITORY / "sgstore").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                found |= {node.module.partition(".")[0]}
+    found -= {*sys.stdlib_module_names, "sgstore"}
+    return {name for module in found if (name := IMPORTED_AS.get(module, module))}
+
+
+def test_the_wheel_holds_what_the_checkout_holds(tmp_path: Path) -> None:
+    wheel = packages.build(tmp_path, isolated=False)
+
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name for name in archive.namelist() if name.startswith("sgstore/")}
+
+    assert held == packages.shipped()
+
+
+@pytest.mark.parametrize("needed", NEEDED)
+def test_every_package_that_is_needed_has_bounds(needed: str) -> None:
+    name = re.match(r"[\w.-]+", needed)[0]
+    lower = re.search(r"[>=]=([\d.]+)", needed)
+    upper = re.search(r"(?:<|==)([\d.]+)", needed)
+
+    assert lower
+    # A major version of it each quarter, and what we use has not changed in any.
+    assert upper or name == "pyarrow"
+
+
+def test_every_package_that_is_imported_is_named_as_needed() -> None:
+    named = {re.match(r"[\w-]+", needed)[0].replace("-", "_") for needed in NEEDED}
+    assert {name.replace("-", "_") for name in imported()} <= named

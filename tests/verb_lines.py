@@ -1,0 +1,153 @@
+"""A command line for every verb, and a process that runs many of them with streams of all kinds.
+
+As a program it reads a list of ``[arguments, condition]`` as JSON and answers for each, a line of JSON: exit
+code, length of stdout, and stderr. Each runs in a process of its own, forked from one that imported all.
+"""
+
+from __future__ import annotations
+
+import atexit
+import io
+import json
+import os
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+from typing import Any
+
+PATTERN = "MATCH (e:Ego)-[:visible]->(v:Vehicle)"
+CAMERA = "/ego/camera/front/image"
+LINES: dict[str, list[str]] = {
+    "ingest": ["{new}", "{recording}", "--until", "1s"],
+    "info": ["{store}"],
+    "doctor": ["{recording}"],
+    "import": ["{new}", "{graphs}", "--format", "csv"],
+    "verify": ["{store}", "--json"],
+    "remove": ["{copy}", "town"],
+    "rebuild": ["{short}"],
+    "derive": ["{store}", "--json"],
+    "map": ["{recording}"],
+    "config": [],
+    "find": ["{store}", PATTERN, "--format", "csv"],
+    "why-not": ["{store}", "town#3", "MATCH (e:Ego) WHERE e.speed > 300"],
+    "like": ["{store}", "town#264"],
+    "translate": ["{sgl}"],
+    "sql": ["{store}", "SELECT * FROM frames"],
+    "check": ["{store}", "-e", "CHECK ALWAYS ego.speed < 3"],
+    "monitor": ["{recording}", "-e", "CHECK ALWAYS ego.speed < 3", "--duration", "1s"],
+    "timeline": ["{store}", PATTERN],
+    "patterns list": [],
+    "patterns show": ["cut_in"],
+    "patterns run": ["{store}", "cut_in"],
+    "coverage classes": ["{store}", "--limit", "0"],
+    "coverage of": ["{store}", "--by", "{store}"],
+    "coverage novel": ["{store}", "--not-in", "{store}:MATCH (e:Ego) WHERE e.speed > 5"],
+    "coverage venn": ["{store}", "{store}"],
+    "coverage growth": ["{store}"],
+    "coverage combos": ["{store}"],
+    "coverage spec": ["{store}", "--slots", "{slots}"],
+    "coverage windows": ["{store}"],
+    "coverage explain": ["{store}:MATCH (e:Ego) WHERE e.speed > 5", "--vs", "{store}"],
+    "coverage failures": ["--train", "{store}", "--test", "{store}", "--outcomes", "{outcomes}"],
+    "select": ["{store}", "--minimal"],
+    "diff": ["{store}", "{store}", "--json"],
+    "lock verify": ["{lock}", "{store}", "--no-payloads", "--format", "json"],
+    "lock list": ["{lock}"],
+    "lock union": ["{lock}", "{lock}", "-o", "{new}.lock"],
+    "lock intersect": ["{lock}", "{lock}", "-o", "{new}.lock"],
+    "lock minus": ["{lock}", "{lock}", "-o", "{new}.lock"],
+    "payload": ["{store}", "town#264", CAMERA],
+    "show": ["{store}", "town#264", "--camera", "none", "-o", "{new}.png"],
+    "export": ["{store}", "MATCH (e:Ego) WHERE e.speed > 9", "--to", "{new}.clips"],
+    "demo": ["{new}.demo"],
+    "record": ["{new}.mcap"],
+}
+"""What is given to each verb; the names in braces are files."""
+
+
+def verbs(command: Any, path: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Every verb of the command line with its command."""
+    below = getattr(command, "commands", None)
+    if below is None:
+        return {" ".join(path): command}
+    return {k: v for name, one in below.items() for k, v in verbs(one, (*path, name)).items()}
+
+
+def _take(condition: str, kept: Path) -> None:
+    """The streams of a process that was started so; what Python makes of them is made here."""
+    out, err = (
+        os.open(f"{kept}{end}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC) for end in ("", ".err")
+    )
+    if condition == "stdout full":
+        out = os.open("/dev/full", os.O_WRONLY)
+    if condition == "stderr full":
+        err = os.open("/dev/full", os.O_WRONLY)
+    if condition == "reader gone":
+        reader, out = os.pipe()
+        os.close(reader)
+    os.dup2(out, 1)
+    os.dup2(err, 2)
+    sys.stdout = io.TextIOWrapper(io.FileIO(1, "w", closefd=False), "utf-8", write_through=True)
+    sys.stderr = io.TextIOWrapper(io.FileIO(2, "w", closefd=False), "utf-8", write_through=True)
+    if condition == "stdout closed":
+        os.close(1)
+        sys.stdout = None
+    if condition == "stderr closed":
+        os.close(2)
+        sys.stderr = None
+    if condition == "stdin closed":
+        os.close(0)
+        sys.stdin = None
+
+
+def _child(arguments: list[str], condition: str, kept: Path) -> int:
+    from sgstore import cli
+
+    _take(condition, kept)
+    sys.argv = ["sgstore", *arguments]
+    try:
+        cli.main()
+    except SystemExit as end:
+        code = end.code
+    except BaseException:  # noqa: BLE001
+        Path(f"{kept}.err").write_text(traceback.format_exc())
+        return 99
+    for stream in (sys.stdout, sys.stderr):  # as Python does at its end
+        try:
+            stream.flush()
+        except Exception:  # noqa: BLE001
+            Path(f"{kept}.err").write_text(traceback.format_exc())
+            return 120
+    return code if isinstance(code, int) else 0
+
+
+def main() -> None:
+    """Run what stdin says."""
+    import duckdb  # noqa: F401
+    import matplotlib.figure  # noqa: F401
+
+    import sgstore.cli
+    import sgstore.draw._stored
+    import sgstore.exporters._labels
+    import sgstore.ingest
+    import sgstore.query
+
+    sgstore.cli.application()
+    kept = Path(tempfile.mkdtemp()) / "out"
+    for arguments, condition in json.load(sys.stdin):
+        child = os.fork()
+        if not child:
+            code = 98
+            try:
+                code = _child(arguments, condition, kept)
+            finally:
+                atexit._run_exitfuncs()
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        out, err = (Path(f"{kept}{end}").read_bytes() for end in ("", ".err"))
+        print(json.dumps([code, len(out), err.decode(errors="replace")]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
