@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen
+.PHONY: help demo test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -13,6 +13,7 @@ help:
 	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
 	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
 	@echo "make lint    format, lint and types only"
+	@echo "make house   figures of the code, each beside its target: files, lines, classes, circles, what a find runs"
 	@echo "make bench   print speeds and sizes, each beside a baseline measured in the same run"
 	@echo "make fuzz    look at 100,000 recordings, texts and stores that were hurt on purpose (about an hour)"
 	@echo "make fuzz-queries  ask 5,000 random queries of a store of 300 traces (an hour; FUZZ_STORE=FILE keeps the store)"
@@ -80,6 +81,9 @@ fuzz-queries: $(VENV)/.dev
 
 frozen: $(VENV)/.dev
 	$(BIN)/python tests/frozen.py
+
+house: $(VENV)/.dev
+	@$(BIN)/python tests/house.py --walk
 
 kill: $(VENV)/.dev
 	$(BIN)/python tests/killing.py 200
