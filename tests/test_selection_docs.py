@@ -48,7 +48,9 @@ def test_the_program_of_the_page_prints_a_bound_below_its_cost(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    program = next(p for p in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "SelectionSpec" in p)
+    program = next(
+        p for p in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "SelectionSpec" in p
+    )
 
     exec(compile(program, "selection.md", "exec"), {})
     cost, bound, at_random = map(float, capsys.readouterr().out.splitlines()[0].split())
