@@ -297,7 +297,7 @@ def windows(store):
     from sgstore.store._graphs import Graphs
 
     (trace,) = store.info()
-    with store.file._access.reading() as connection:
+    with store.file.access.reading() as connection:
         yield from Graphs().of_trace(connection, trace.trace_id)
 
 

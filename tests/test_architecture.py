@@ -164,11 +164,6 @@ CIRCLES = (
     {"lang._catalog", "lang._needs", "lang.ir"},
     {"lang._results", "lang._sql_frames"},
     {"mcap._bag", "mcap._reader"},
-    {
-        *("store._catalog", "store._classes", "store._derive", "store._file", "store._graphs"),
-        *("store._locking", "store._payloads", "store._publish", "store._rows"),
-        *("store._similarity", "store._staging", "store._traces", "store._verify", "store._write"),
-    },
 )
 """Files that import one another, types and imports inside functions included: these are to be untied."""
 

@@ -17,7 +17,6 @@ import numpy as np
 from sgstore.abstractions import abstraction_named
 from sgstore.store._frames import seq_of, trace_of
 from sgstore.store._graphs import Graphs
-from sgstore.store._locking import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -251,7 +250,7 @@ class FrameSpans:
 
     def __init__(self, file: StoreFile, abstraction: str) -> None:
         self.abstraction = abstraction_named(abstraction)
-        self._access = Access(file.path)
+        self._access = file.access
         self._graphs = Graphs()
 
     def labelled(self, first: int, last: int) -> tuple[NDArray[np.int64], GraphColumns, Labelled]:

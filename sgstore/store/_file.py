@@ -64,6 +64,12 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+def _damage(connection: DuckDBPyConnection, path: Path) -> str:
+    from sgstore.store._verify import damage  # only where something is wrong
+
+    return damage(connection, path)
+
+
 class StoreFile:
     """A store, by its path. It is opened only while something is asked of it or published to it.
 
@@ -99,7 +105,9 @@ class StoreFile:
         self.path = Path(path)
         self.tables = tables
         self._memory = most = memory or default_memory()
-        self._access = Access(self.path, memory=most, wait_s=wait_s, tables=tables, spill=spill)
+        self.access = Access(
+            self.path, memory=most, wait_s=wait_s, tables=tables, spill=spill, diagnose=_damage
+        )
         self._scenes = Scenes()
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
@@ -428,7 +436,7 @@ class StoreFile:
             Relations that they can hold.
         """
         identity = Identity.of(info, config, road_map)
-        return Segment(self.path, info, identity, road_map, answers, access=self._access)
+        return Segment(self.path, info, identity, road_map, answers, access=self.access)
 
     def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
         """Bring a trace into the store, in one transaction.
@@ -449,7 +457,7 @@ class StoreFile:
         StoreError
             The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
         """
-        return publish_in(self._access, sealed, replace=replace)
+        return publish_in(self.access, sealed, replace=replace)
 
     def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
         """The name under which the store has the trace of a segment; ``None`` if it has it not.
@@ -492,7 +500,7 @@ class StoreFile:
         """
         with self._reading():
             gone = {trace.trace_id: trace for trace in map(self.trace, traces)}
-        with scratch(spill_folder()) as connection, self._access.writing(connection):
+        with scratch(spill_folder()) as connection, self.access.writing(connection):
             for trace_id in gone:
                 remove(connection, trace_id)
         return tuple(gone.values())
@@ -501,7 +509,7 @@ class StoreFile:
     def abstracted(self) -> Abstracted:
         """Frames as abstractions have them, and their classes."""
         if self._abstracted is None:
-            self._abstracted = Abstracted(self.path, self._access)
+            self._abstracted = Abstracted(self.path, self.access)
         return self._abstracted
 
     def like(
@@ -511,12 +519,12 @@ class StoreFile:
         from sgstore.store._similarity import frames_like
 
         with translated(self.path):
-            return frames_like(self._access, ref, abstraction, ignored, limit)
+            return frames_like(self.access, ref, abstraction, ignored, limit)
 
     @property
     def deriving(self) -> Deriving:
         """Sets of relations that were derived from the states."""
-        return Deriving(self.path, self._access)
+        return Deriving(self.path, self.access)
 
     def verify(self, *, recordings: bool = False) -> Verification:
         """Look whether everything is as it was published.
@@ -526,23 +534,16 @@ class StoreFile:
         recordings : bool
             Whether the recordings are hashed again, too: each is read as a whole.
         """
-        import sgstore.store._verify as verifying
-        from sgstore.mcap import digest_of
+        from sgstore.store._verify import verify_store
 
-        with self._reading() as connection:
-            found = verifying.verify(connection, self.path)
-            if recordings:
-                again = verifying.verify_recordings(connection, digest_of)
-                found.recordings = again.recordings
-                found.faults += again.faults
-        return found
+        return verify_store(self.access, recordings=recordings)
 
     def settle(self) -> None:
         """Work in what a writer that was killed left beside the store: it is safe, but no longer at rest.
 
         Nothing is done if there is nothing, or if others keep the store for too long.
         """
-        anew.settle(self.path, self._access, self._memory)
+        anew.settle(self.path, self.access, self._memory)
 
     def compact(self) -> None:
         """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
@@ -556,11 +557,11 @@ class StoreFile:
             Others keep the store for too long, there is no room for a second one, or somebody else's tables are
             in it, too: they would be lost.
         """
-        anew.compact(self.path, self._access, self._memory)
+        anew.compact(self.path, self.access, self._memory)
 
     def refuse_others(self) -> None:
         """Raise a StoreError if there are tables or views of somebody else's: compacting would lose them."""
-        anew.refuse_others(self.path, self._access)
+        anew.refuse_others(self.path, self.access)
 
     @contextmanager
     def _answered(
@@ -585,10 +586,10 @@ class StoreFile:
                 found = asked()
             except EngineError:
                 stack.close()
-                if not self._access.restart():
+                if not self.access.restart():
                     raise
                 found = asked()
             yield found
 
     def _reading(self) -> AbstractContextManager[DuckDBPyConnection]:
-        return self._access.reading()
+        return self.access.reading()

@@ -25,7 +25,7 @@ from sgstore.quoting import literal
 from sgstore.store._joins import tables_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Callable, Generator
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -314,6 +314,9 @@ class Access:
     checked : bool
         Whether whatever is no store as ``schema.sql`` makes it is refused. To be left out only by who looks for
         what is wrong with it, and reads nothing before.
+    diagnose : callable, optional
+        Returns what is wrong with the store, empty if nothing is. It is asked where our own code could make
+        nothing of what it read.
     """
 
     def __init__(
@@ -325,9 +328,11 @@ class Access:
         tables: UserTables | None = None,
         checked: bool = True,
         spill: int = 0,
+        diagnose: Callable[[DuckDBPyConnection, Path], str] | None = None,
     ) -> None:
         self.path = path
         self._checked = checked
+        self._diagnose = diagnose
         self._tables = tables
         self._memory = memory or default_memory()
         self._spill = spill or SPILL
@@ -369,16 +374,16 @@ class Access:
                 self._leave(connection)
 
     def _damage(self, connection: DuckDBPyConnection, error: Exception) -> str:
-        """What is wrong with the store where our own code could make nothing of what it read."""
+        """The fault of the store by which our own code failed; empty if it failed for another reason."""
+        if self._diagnose is None:
+            return ""
         trace = error.__traceback__
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next
         where = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
         if where == __name__ or not where.startswith(("sgstore.", "json", "numpy")):
             return ""  # the fault of who called us
-        from sgstore.store._verify import damage  # only where something is wrong
-
-        return damage(connection, self.path)
+        return self._diagnose(connection, self.path)
 
     def restart(self) -> bool:
         """Close the file after a fault of DuckDB; it is opened anew without what may be at fault.

@@ -235,16 +235,27 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
     StoreError
         There is no such file, or it is no store.
     """
-    from sgstore.store._file import StoreFile
-
     place = Path(path)
     access = Access(place, checked=False)
     with access.reading() as connection:
         wrong, others = shape.looked_at(connection, place)
     if wrong:
         return Verification(faults=[Fault("", "schema", one) for one in wrong], others=others)
-    found = StoreFile(place).verify(recordings=recordings)
+    found = verify_store(Access(place, diagnose=damage), recordings=recordings)
     found.others = others
+    return found
+
+
+def verify_store(access: Access, *, recordings: bool = False) -> Verification:
+    """Look through a store; see :meth:`StoreFile.verify`."""
+    from sgstore.mcap import digest_of
+
+    with access.reading() as connection:
+        found = verify(connection, access.path)
+        if recordings:
+            again = verify_recordings(connection, digest_of)
+            found.recordings = again.recordings
+            found.faults += again.faults
     return found
 
 
