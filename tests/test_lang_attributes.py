@@ -12,11 +12,11 @@ from sgstore.lang._catalog import (
     ENV_ATTRIBUTES,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
+    PAIR_FUNCTIONS,
     TRACE_ATTRIBUTES,
     DisplayUnit,
 )
 from sgstore.lang._evaluate import evaluator
-from sgstore.lang._functions import PAIR_FUNCTIONS
 from sgstore.lang.ir import FrameAttribute, NodeAttribute, TraceAttribute
 from sgstore.vocabulary import MAP_KINDS
 

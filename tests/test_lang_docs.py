@@ -13,7 +13,8 @@ from test_lang_golden import CATALOG
 import sgstore.lang._catalog as catalog
 from sgstore.errors import QueryError
 from sgstore.lang import compile_checks, compile_query, patterns
-from sgstore.lang._functions import FUNCTIONS, PAIR_FUNCTIONS
+from sgstore.lang._catalog import PAIR_FUNCTIONS
+from sgstore.lang._functions import FUNCTIONS
 from sgstore.lang.library import predicates
 from sgstore.vocabulary import KINDS, RELATIONS
 

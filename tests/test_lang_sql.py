@@ -16,8 +16,7 @@ import sgstore.lang._rewrite as rewrite
 from sgstore.errors import QueryError
 from sgstore.geometry import pair_numbers
 from sgstore.lang import EXTENTS, Compiled, SqlStatement, Window, bind_query, compile_query, parse
-from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
-from sgstore.lang._functions import PAIR_FUNCTIONS
+from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_FUNCTIONS, DisplayUnit
 from sgstore.matches import FIRST_WINDOW, Windows
 
 NUMBERS = {

@@ -8,6 +8,7 @@ from ._bind import bind_query as bind_query
 from ._bind_temporal import FUTURE as FUTURE
 from ._catalog import Attribute as Attribute
 from ._catalog import Catalog as Catalog
+from ._catalog import RelationScope as RelationScope
 from ._catalog import TableFacts as TableFacts
 from ._catalog import TraceFacts as TraceFacts
 from ._catalog import Triple as Triple
@@ -37,7 +38,6 @@ from ._external import with_places as with_places
 from ._humanize import for_people as for_people
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
-from ._needs import RelationScope as RelationScope
 from ._needs import of_check as of_check
 from ._needs import of_query as of_query
 from ._parse import joined as joined
@@ -46,12 +46,12 @@ from ._patterns import Pattern as Pattern
 from ._patterns import node_of_kind as node_of_kind
 from ._patterns import pattern_of as pattern_of
 from ._plan import TRACE_OF_BUCKET as TRACE_OF_BUCKET
+from ._plan import Gathered as Gathered
 from ._plan import Window as Window
 from ._plan import in_order as in_order
 from ._plan import traces_of as traces_of
 from ._results import CONSTANTS as CONSTANTS
 from ._results import EXTENTS as EXTENTS
-from ._results import Gathered as Gathered
 from ._results import SqlStatement as SqlStatement
 from ._results import about_frame as about_frame
 from ._rewrite import rewritten as rewritten

@@ -14,19 +14,14 @@ from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
-from sgstore.lang._bind_expressions import (
-    bind,
-    condition,
-    edge_attribute,
-    node_attribute,
-    parameter,
-)
-from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled
+from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
+from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
 from sgstore.lang._catalog import Catalog, Type
-from sgstore.lang._functions import FUNCTIONS
+from sgstore.lang._functions import FUNCTIONS, call
 from sgstore.lang._symbols import (
     RESERVED,
     THE_EGO,
+    Binders,
     ScopeBuilder,
     Session,
     Symbol,
@@ -78,7 +73,7 @@ def bind_query(
     QueryError
         Types do not fit, or a part has no meaning where it stands.
     """
-    session = Session(text, parameters)
+    session = Session(text, parameters, _BINDERS)
     session.ask(catalog)
     match = _only_match(statements, session)
     settings = chosen(match.settings, session, catalog)
@@ -307,7 +302,26 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
     for pattern, key in pending:
         _inline(pattern, key, names)
     if block.where is not None:
-        names.scope.where += conjuncts(condition(block.where, names))
+        names.scope.where += conjuncts(names.condition(block.where))
+
+
+def _block(e: s.BlockExpression, names: SymbolTable) -> b.BlockValue:
+    session, inner = names.session, names.block()
+    bind_block(e.block, inner)
+    value = inner.number(e.value) if e.value is not None else None
+    kind = Type.boolean if e.word == "EXISTS" else Type.number
+    session.blocks += 1
+    return b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
+
+
+_BINDERS: Final[Binders] = {
+    **BINDERS,
+    s.BlockExpression: _block,
+    s.Call: call,
+    s.Duration: timespan,
+    s.Temporal: tense,
+}
+"""The binder of every kind of expression."""
 
 
 def conjuncts(expression: b.Bound) -> list[b.Bound]:
@@ -423,7 +437,7 @@ def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable
         attribute = attribute_of(key, prop.name, prop.name_span, names)
         names.scope.where.append(_equality(attribute, prop, names))
     if pattern.where is not None:
-        names.scope.where += conjuncts(condition(pattern.where, names))
+        names.scope.where += conjuncts(names.condition(pattern.where))
 
 
 def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:
@@ -431,7 +445,7 @@ def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bou
     inner = names.body({"": Symbol(value=attribute)})
     inner.parent = names
     span = TextSpan(prop.name_span.start, prop.value.span.end)
-    return condition(s.Comparison("=", s.Variable("", prop.name_span), prop.value, span), inner)
+    return inner.condition(s.Comparison("=", s.Variable("", prop.name_span), prop.value, span))
 
 
 def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
@@ -539,7 +553,7 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
 
 def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
     assert item.value is not None  # noqa: S101 - the form of the item says so
-    value = settled(bind(item.value, names), names.session)
+    value = settled(names.bind(item.value), names.session)
     if value.type is Type.list:
         names.session.refuse("a list cannot be returned", item.span)
     _refuse_mixed(value, item.value.span, names.session)
@@ -574,7 +588,7 @@ def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound |
         return value.name
     if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
         names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
-    found = settled(bind(value, replace(names, aliases=own)), names.session)
+    found = settled(replace(names, aliases=own).bind(value), names.session)
     _refuse_mixed(found, value.span, names.session)
     if isinstance(found, b.Value):
         hint = f"name a value, or one of: {', '.join(known)}"
@@ -654,7 +668,7 @@ def bind_checks(
     defined: dict[str, Define] = {}
     used: set[str] = set()
     for statement in statements:
-        session = Session(text, parameters, dict(defined), used=used)
+        session = Session(text, parameters, _BINDERS, dict(defined), used=used)
         if isinstance(statement, Define):
             defined[normalize_name(statement.name)] = statement
         elif isinstance(statement, MatchClause):
@@ -666,7 +680,7 @@ def bind_checks(
             if name in {one.check.name for one in found}:
                 session.refuse(f"two checks are called '{name}'", statement.span)
             found.append(CheckInCatalog(_check(statement, name, session, catalog), catalog))
-    session = Session(text, parameters, used=used)
+    session = Session(text, parameters, _BINDERS, used=used)
     if not found:
         session.refuse("nothing is checked", TextSpan(0, len(text)), "add CHECK ALWAYS …")
     refuse_unused(session)
@@ -680,10 +694,10 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
     scope = StepScope(session)
     names = SymbolTable(session, scope)
     quantifiers = tuple(_quantifier(one, names, scope) for one in written.quantifiers)
-    formula = settled(condition(written.formula, names), session)
+    formula = settled(names.condition(written.formula), session)
     reset = None
     if written.reset is not None:
-        reset = settled(condition(written.reset, names), session)
+        reset = settled(names.condition(written.reset), session)
     refuse_strange(session, catalog)
     return o.BoundCheck(
         name,
@@ -716,7 +730,7 @@ def _quantifier(
         keys.append(key)
     where = None
     if written.where is not None:
-        where = settled(condition(written.where, names), session)
+        where = settled(names.condition(written.where), session)
         if b.is_temporal(where):
             session.refuse(
                 "what restricts a quantifier looks at one frame",

@@ -20,13 +20,15 @@ from sgstore.lang._catalog import (
     Type,
     class_attribute,
 )
-from sgstore.lang._hints import TOLD, comparison_hint, condition_hint, hint_at
+from sgstore.lang._hints import TOLD, comparison_hint, hint_at
 from sgstore.lang._symbols import (
     CLASSES,
     RESERVED,
     TEXT_TESTS,
+    Binders,
     SymbolTable,
     abstraction_named,
+    call_hint,
     seen_in,
     text_test,
 )
@@ -51,38 +53,6 @@ MAX_NUMBER: Final = 1e300
 _ORDERED: Final = frozenset({"<", "<=", ">", ">="})
 
 
-def condition(expression: s.Expression, names: SymbolTable) -> b.Bound:
-    """A bound expression that is true, false or unknown.
-
-    Raises
-    ------
-    QueryError
-        It is something else.
-    """
-    found = bind(expression, names)
-    if found.type not in {Type.boolean, Type.null}:
-        written = names.session.text[expression.span.start : expression.span.end]
-        names.session.refuse(
-            f"expected a condition, but this is a {found.type.value}",
-            expression.span,
-            condition_hint(found.type, written),
-        )
-    return found
-
-
-def bind(expression: s.Expression, names: SymbolTable) -> b.Bound:
-    """A bound expression of any type.
-
-    Raises
-    ------
-    QueryNameError
-        It names what is not known.
-    QueryError
-        Its types do not fit together.
-    """
-    return _BINDERS[type(expression)](expression, names)
-
-
 # Values and names ---------------------------------------------------------------------------------
 
 
@@ -96,14 +66,6 @@ def _type_of(value: object) -> Type:
     if isinstance(value, bool):
         return Type.boolean
     return Type.text if isinstance(value, str) else Type.number
-
-
-def _timespan(e: s.Duration, _: SymbolTable) -> b.Value:
-    from sgstore.lang._bind_temporal import (
-        timespan,  # tenses hold expressions, and expressions tenses
-    )
-
-    return timespan(e)
 
 
 def _parameter(e: s.Parameter, names: SymbolTable) -> b.Bound:
@@ -258,8 +220,6 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
 
 def _no_attribute(name: str) -> str | None:
     """What a name is that is no attribute: a relation, a predicate; ``None``: no idea."""
-    from sgstore.lang._functions import call_hint  # calls hold expressions, and expressions calls
-
     if relation_named(name):
         return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
     return call_hint(name)
@@ -310,7 +270,7 @@ def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
 
 
 def _list(e: s.ListOf, names: SymbolTable) -> b.Choices:
-    items = [bind(item, names) for item in e.items]
+    items = [names.bind(item) for item in e.items]
     for item, written in zip(items, e.items, strict=True):
         if not isinstance(item, b.Value):
             names.session.refuse("a list holds constants and parameters only", written.span)
@@ -322,10 +282,10 @@ def _list(e: s.ListOf, names: SymbolTable) -> b.Choices:
 
 def _logic(e: s.Logic, names: SymbolTable) -> b.Operation:
     if e.word == "IMPLIES" and "=>" in _between(e.operands, names):
-        first = bind(e.operands[0], names)
+        first = names.bind(e.operands[0])
         if first.type is Type.number:
             names.session.refuse("=> is IMPLIES, between conditions", e.span, "at least is >=")
-    operands = tuple(condition(operand, names) for operand in e.operands)
+    operands = tuple(names.condition(operand) for operand in e.operands)
     return b.Operation(e.word, operands, Type.boolean)
 
 
@@ -335,7 +295,7 @@ def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
 
 
 def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
-    left, right = bind(e.left, names), bind(e.right, names)
+    left, right = names.bind(e.left), names.bind(e.right)
     if e.word in TEXT_TESTS:
         return text_test(e, left, right, names)
     _check_sides(e, left, right, names)
@@ -442,7 +402,7 @@ def _kind(word: str, span: TextSpan, names: SymbolTable) -> str | None:
 
 
 def _null_test(e: s.NullTest, names: SymbolTable) -> b.Operation:
-    operand = bind(e.operand, names)
+    operand = names.bind(e.operand)
     if operand.type in {Type.node, Type.list}:
         hint = "what may be absent is asked by EXISTS {…}" if operand.type is Type.node else None
         names.session.refuse(f"a {operand.type.value} is never NULL", e.operand.span, hint)
@@ -451,11 +411,11 @@ def _null_test(e: s.NullTest, names: SymbolTable) -> b.Operation:
 
 
 def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
-    operand = bind(e.operand, names)
+    operand = names.bind(e.operand)
     if isinstance(e.choices, s.Call) and normalize_name(e.choices.name) == CLASSES:
         found = _in_dataset(operand, e.choices, names)
         return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
-    choices = bind(e.choices, names)
+    choices = names.bind(e.choices)
     if not isinstance(choices, b.Choices):
         hint = "write IN ['a', 'b']"
         if isinstance(e.choices, s.Parameter):
@@ -486,7 +446,7 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
         or operand.attribute.unit is not DisplayUnit.classed
     ):
         session.refuse("only classes of frames are in it", e.span, "write frame.class IN …")
-    texts = [bind(argument, names) for argument in e.arguments]
+    texts = [names.bind(argument) for argument in e.arguments]
     words = [t.value for t in texts if isinstance(t, b.Value) and isinstance(t.value, str)]
     if not 1 <= len(words) == len(texts) <= 2:
         session.refuse(
@@ -506,27 +466,15 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
 # Numbers ------------------------------------------------------------------------------------------
 
 
-def number_of(expression: s.Expression, names: SymbolTable) -> b.Bound:
-    """A bound expression that is a number."""
-    found = bind(expression, names)
-    if found.type is not Type.number:
-        named = expression.name if isinstance(expression, s.Variable) else ""
-        hint = f"one of its attributes: {named}.speed" if found.type is Type.node else None
-        names.session.refuse(
-            f"expected a number, but this is a {found.type.value}", expression.span, hint
-        )
-    return found
-
-
 def _arithmetic(e: s.Arithmetic, names: SymbolTable) -> b.Bound:
-    result = number_of(e.first, names)
+    result = names.number(e.first)
     for sign, term in e.rest:
-        result = b.Operation(sign, (result, number_of(term, names)), Type.number)
+        result = b.Operation(sign, (result, names.number(term)), Type.number)
     return result
 
 
 def _negative(e: s.Negative, names: SymbolTable) -> b.Bound:
-    operand = number_of(e.operand, names)
+    operand = names.number(e.operand)
     if isinstance(operand, b.Value) and isinstance(operand.value, int | float):
         return b.Value(-operand.value, Type.number)
     return b.Operation("negative", (operand,), Type.number)
@@ -542,39 +490,11 @@ def _count_all(e: s.CountAll, names: SymbolTable) -> b.Aggregate:
     return b.Aggregate("count", None, distinct=False, type=Type.number)
 
 
-# Calls, blocks and time ----------------------------------------------------------------------------------
-
-
-def _call(e: s.Call, names: SymbolTable) -> b.Bound:
-    from sgstore.lang._functions import call  # calls hold expressions, and expressions calls
-
-    return call(e, names)
-
-
-def _block(e: s.BlockExpression, names: SymbolTable) -> b.BlockValue:
-    from sgstore.lang._bind import bind_block  # patterns hold expressions, and expressions patterns
-
-    session, inner = names.session, names.block()
-    bind_block(e.block, inner)
-    value = number_of(e.value, inner) if e.value is not None else None
-    kind = Type.boolean if e.word == "EXISTS" else Type.number
-    session.blocks += 1
-    return b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
-
-
-def _temporal(e: s.Temporal, names: SymbolTable) -> b.Bound:
-    from sgstore.lang._bind_temporal import tense  # as above
-
-    return tense(e, names)
-
-
-_BINDERS: Final[dict[type, Callable[[Any, SymbolTable], b.Bound]]] = {
+BINDERS: Final[Binders] = {
     s.Constant: _constant,
-    s.Duration: _timespan,
     s.Parameter: _parameter,
     s.Variable: _variable,
     s.AttributeOf: _attribute,
-    s.Call: _call,
     s.CountAll: _count_all,
     s.ListOf: _list,
     s.Logic: _logic,
@@ -583,6 +503,5 @@ _BINDERS: Final[dict[type, Callable[[Any, SymbolTable], b.Bound]]] = {
     s.Membership: _membership,
     s.Arithmetic: _arithmetic,
     s.Negative: _negative,
-    s.BlockExpression: _block,
-    s.Temporal: _temporal,
 }
+"""The binders of what this file is about; :mod:`~sgstore.lang._bind` adds those of calls, blocks and time."""

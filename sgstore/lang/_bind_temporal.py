@@ -16,7 +16,7 @@ from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
-from sgstore.lang._bind_expressions import bind, condition, number_of, parameter
+from sgstore.lang._bind_expressions import parameter
 from sgstore.lang._catalog import Type
 from sgstore.lang._parse import parse
 from sgstore.lang._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
@@ -46,7 +46,7 @@ def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
         It stands inside braces, its operands are no conditions, or its bound is none.
     """
     _refuse_in_block(e.word, e.span, names)
-    operands = tuple(condition(operand, names) for operand in e.operands)
+    operands = tuple(names.condition(operand) for operand in e.operands)
     if e.bound is None:
         return b.Tense(e.word, operands)
     if e.word in _UNBOUNDED:
@@ -95,7 +95,7 @@ def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
     return float(found[1]), found[2].lower()
 
 
-def timespan(e: s.Duration) -> b.Value:
+def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
     """A length of time as a number: of seconds, or of frames where such are counted."""
     if e.unit == "frames":
         return b.Value(e.amount, Type.number, unit="frames", span=e.span)
@@ -124,7 +124,7 @@ def course(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _previous(e: s.Call, names: SymbolTable) -> b.SignalCall:
-    value = bind(e.arguments[0], names)
+    value = names.bind(e.arguments[0])
     _refuse_nested(e, value, names)
     if value.type not in {Type.number, Type.text, Type.boolean}:
         names.session.refuse(f"prev() takes a value, not a {value.type.value}", e.arguments[0].span)
@@ -132,7 +132,7 @@ def _previous(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
-    value = number_of(e.arguments[0], names)
+    value = names.number(e.arguments[0])
     _refuse_nested(e, value, names)
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
@@ -150,7 +150,7 @@ def _since_true(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _of_past(e: s.Call, names: SymbolTable) -> b.Bound:
-    found = condition(e.arguments[0], names)
+    found = names.condition(e.arguments[0])
     ahead = next((p for p in b.walk(found) if isinstance(p, b.Tense) and p.word in FUTURE), None)
     if ahead is not None:
         names.session.refuse(
@@ -168,7 +168,7 @@ def _exists_now(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _node(e: s.Call, names: SymbolTable) -> b.NodeValue:
-    found = bind(e.arguments[0], names)
+    found = names.bind(e.arguments[0])
     if not isinstance(found, b.NodeValue):
         names.session.refuse(f"{e.name}() takes a node", e.arguments[0].span)
     return found
@@ -561,7 +561,7 @@ def _bind_step(
         if step.block.paths:
             bind_block(step.block, names)
         elif step.block.where is not None:
-            scope.where.append(condition(step.block.where, names))
+            scope.where.append(names.condition(step.block.where))
         where = [part for whole in scope.where for part in _settled_parts(whole, session)]
         hold = _hold(step.hold, names) if step.hold else None
     scope.where = [part for part in where if not b.is_temporal(part)]

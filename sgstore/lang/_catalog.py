@@ -29,8 +29,7 @@ from sgstore.vocabulary import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-    from sgstore.lang._needs import RelationScope
+    from typing import Self
 
 
 Triple = tuple[str, str, str]
@@ -508,6 +507,65 @@ TRACE_ATTRIBUTES: Final = _named(
     )
 )
 """Attributes of ``trace`` by folded name (table ``trace``)."""
+
+
+PAIR_FUNCTIONS: Final[Mapping[str, str]] = {
+    "dist": "distance between the centres, in space; m",
+    "gap": "shortest distance between the footprints; m",
+    "lon": "how far b's centre lies ahead of a's, in a's axes; m",
+    "lat": "how far b's centre lies to the left of a's, in a's axes; m",
+    "bearing": "direction of b's centre in a's axes, positive to the left; degrees",
+    "rel_heading": "b's heading less a's; degrees",
+    "lon_gap": "how far the footprints are apart along a's axis; 0 where they overlap in it; m",
+    "lat_gap": "how far the footprints are apart across a's axis; 0 where they overlap in it; m",
+    "apparent_heading": "b's heading less the direction from a to b: 0 is a tail, 180 a front; degrees",
+    "lane_dist": "from centre to centre along the lanes, negative where b is behind; m; NULL beyond 200 m",
+    "closing_speed": "how fast the centres approach one another; m/s",
+    "closing_time": "the gap at the closing speed; s; NULL where the centres do not approach",
+    "ttc": "time until the footprints touch if both keep their velocity; s; 0 where they overlap, NULL: never",
+    "headway": "time until a has come as far as b is now, from bumper to bumper; s; NULL if b is not ahead",
+    "rel_speed": "length of the difference of the velocities; m/s",
+}
+"""Functions of two entities a and b; NULL where a number is missing."""
+
+PAIR_NAMES: Final[Mapping[str, str]] = {
+    **{normalize_name(name): name for name in PAIR_FUNCTIONS},
+    "distance": "dist",
+    "thw": "headway",
+}
+"""The functions of two entities by folded name, aliases included."""
+
+
+@dataclass(frozen=True, slots=True)
+class RelationScope:
+    """Which pairs of entities are related, as :class:`sgstore.config.Pairs` says it.
+
+    Attributes
+    ----------
+    within, ego_within : float
+    ego, static : bool
+    kinds : tuple of pairs of str
+    between : str
+        What distances are measured between: :attr:`sgstore.config.Proximity.between`.
+    """
+
+    within: float = 25.0
+    ego: bool = True
+    static: bool = False
+    ego_within: float = 0.0
+    kinds: tuple[tuple[str, ...], ...] = ()
+    between: str = "centres"
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Self | None:
+        """As the settings of a trace have it; ``None`` where they do not say it."""
+        pairs = settings.get("pairs")
+        if pairs is None:
+            return None
+        kinds = tuple(tuple(labels) for labels in pairs["kinds"])
+        between = settings["proximity"]["between"]
+        names = ("within", "ego", "static", "ego_within")
+        return cls(**{name: pairs[name] for name in names}, kinds=kinds, between=between)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,8 +28,8 @@ from sgstore.lang._formulas import (
     nested,
 )
 from sgstore.lang._kinds import kind_conditions
-from sgstore.lang._plan import TRACE_OF_FRAME, Phases, SharedRelation
-from sgstore.lang._results import Gathered, SqlStatement, rows
+from sgstore.lang._plan import TRACE_OF_FRAME, Gathered, Phases, SharedRelation
+from sgstore.lang._results import SqlStatement, rows
 from sgstore.lang._rewrite import rewritten
 from sgstore.lang._sql_frames import PATTERN, Frames, Join, column_of
 from sgstore.lang._sql_masks import folded

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
-from sgstore.lang._bind_expressions import bind, number_of
-from sgstore.lang._catalog import NODE_ATTRIBUTES, Type
+from sgstore.lang._bind_temporal import course
+from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_FUNCTIONS, PAIR_NAMES, Type
 from sgstore.lang._hints import FUNCTIONS_TOLD
 from sgstore.lang._needs import in_range
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
@@ -16,29 +16,9 @@ from sgstore.lang.library import pattern_named, patterns, predicates
 from sgstore.vocabulary import ENTITY_KINDS, normalize_name, relation_named
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
 
-PAIR_FUNCTIONS: Final[Mapping[str, str]] = {
-    "dist": "distance between the centres, in space; m",
-    "gap": "shortest distance between the footprints; m",
-    "lon": "how far b's centre lies ahead of a's, in a's axes; m",
-    "lat": "how far b's centre lies to the left of a's, in a's axes; m",
-    "bearing": "direction of b's centre in a's axes, positive to the left; degrees",
-    "rel_heading": "b's heading less a's; degrees",
-    "lon_gap": "how far the footprints are apart along a's axis; 0 where they overlap in it; m",
-    "lat_gap": "how far the footprints are apart across a's axis; 0 where they overlap in it; m",
-    "apparent_heading": "b's heading less the direction from a to b: 0 is a tail, 180 a front; degrees",
-    "lane_dist": "from centre to centre along the lanes, negative where b is behind; m; NULL beyond 200 m",
-    "closing_speed": "how fast the centres approach one another; m/s",
-    "closing_time": "the gap at the closing speed; s; NULL where the centres do not approach",
-    "ttc": "time until the footprints touch if both keep their velocity; s; 0 where they overlap, NULL: never",
-    "headway": "time until a has come as far as b is now, from bumper to bumper; s; NULL if b is not ahead",
-    "rel_speed": "length of the difference of the velocities; m/s",
-}
-"""Functions of two entities a and b; NULL where a number is missing."""
-
-_PAIR_ALIASES: Final = {"distance": "dist", "thw": "headway"}
 _NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
 _EXTREME: Final = frozenset({"min", "max"})
 _AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
@@ -69,10 +49,6 @@ def call(e: s.Call, names: SymbolTable) -> b.Bound:
     if name in names.session.predicates:
         return _predicate(e, names)
     if name in _TEMPORAL:
-        from sgstore.lang._bind_temporal import (
-            course,  # it holds expressions, and expressions calls
-        )
-
         return course(e, names)
     if names.aggregates and name in _AGGREGATES and len(e.arguments) == 1:
         return _aggregate(name, e, names)
@@ -117,20 +93,6 @@ def _no_function(name: str) -> str | None:
     return None
 
 
-def call_hint(name: str) -> str | None:
-    """How a function or a predicate of that name is written; ``None`` if there is none."""
-    word = normalize_name(name)
-    if word in _AGGREGATES:
-        return None
-    found = predicates().get(word)
-    if found is not None:
-        formals = ", ".join(formal.name for formal in found.parameters)
-        return f"it is a predicate: {found.name}({formals})"
-    if word in _PAIRS:
-        return f"it is a function: {_PAIRS[word]}(a, b)"
-    return None
-
-
 def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
     if not low <= len(e.arguments) <= high:
         wanted = str(low) if low == high else f"{low} or more"
@@ -143,8 +105,8 @@ def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
 
 def _signature(name: str) -> str | None:
     """How a function of two entities, or a predicate of the library, is called, and what it is."""
-    if name in _PAIRS:
-        return f"{_PAIRS[name]}(a, b): {PAIR_FUNCTIONS[_PAIRS[name]]}"
+    if name in PAIR_NAMES:
+        return f"{PAIR_NAMES[name]}(a, b): {PAIR_FUNCTIONS[PAIR_NAMES[name]]}"
     found = predicates().get(name)
     if found is None:
         return None
@@ -154,13 +116,13 @@ def _signature(name: str) -> str | None:
 
 def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
     _expect(e, 2, 2, names)
-    function = _PAIRS[normalize_name(e.name)]
+    function = PAIR_NAMES[normalize_name(e.name)]
     keys = [_entity(function, argument, names) for argument in e.arguments]
     return b.PairNumber(function, keys[0], keys[1])
 
 
 def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
-    found = bind(argument, names)
+    found = names.bind(argument)
     if not isinstance(found, b.NodeValue):
         names.session.refuse(
             f"{function}() takes two entities", argument.span, f"write {function}(a, b)"
@@ -183,19 +145,19 @@ def _in_range(e: s.Call, names: SymbolTable) -> b.Bound:
 
 def _numeric(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 1, names)
-    return b.Operation(normalize_name(e.name), (number_of(e.arguments[0], names),), Type.number)
+    return b.Operation(normalize_name(e.name), (names.number(e.arguments[0]),), Type.number)
 
 
 def _extreme(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 2, 100, names)
     return b.Operation(
-        normalize_name(e.name), tuple(number_of(a, names) for a in e.arguments), Type.number
+        normalize_name(e.name), tuple(names.number(a) for a in e.arguments), Type.number
     )
 
 
 def _coalesce(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 100, names)
-    found = tuple(bind(argument, names) for argument in e.arguments)
+    found = tuple(names.bind(argument) for argument in e.arguments)
     types = {f.type for f in found} - {Type.null}
     if len(types) > 1 or types & {Type.node, Type.list}:
         names.session.refuse("coalesce() takes values of one type", e.span)
@@ -204,7 +166,7 @@ def _coalesce(e: s.Call, names: SymbolTable) -> b.Operation:
 
 def _known(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 1, names)
-    return b.Operation("IS NOT NULL", (bind(e.arguments[0], names),), Type.boolean)
+    return b.Operation("IS NOT NULL", (names.bind(e.arguments[0]),), Type.boolean)
 
 
 def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
@@ -222,7 +184,7 @@ def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
 
 def _text_function(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 1, names)
-    found = bind(e.arguments[0], names)
+    found = names.bind(e.arguments[0])
     if found.type is not Type.text:
         names.session.refuse(f"{e.name}() takes a text", e.arguments[0].span)
     return b.Operation(normalize_name(e.name), (found,), Type.text)
@@ -232,7 +194,7 @@ def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
     _expect(e, 0, 1, names)
     if not e.arguments:
         return class_count("RSV")
-    found = bind(e.arguments[0], names)
+    found = names.bind(e.arguments[0])
     if not isinstance(found, b.Value) or not isinstance(found.value, str):
         names.session.refuse(f"{e.name}() takes the name of an abstraction", e.arguments[0].span)
     return class_count(abstraction_named(found.value, e.arguments[0].span, names.session))
@@ -247,8 +209,8 @@ def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
 def _aggregate(name: str, e: s.Call, names: SymbolTable) -> b.Aggregate:
     inner = SymbolTable(names.session, names.scope, names.meanings, names.parent, aggregated=True)
     if name in {"avg", "sum"}:
-        return b.Aggregate(name, number_of(e.arguments[0], inner), distinct=False, type=Type.number)
-    operand = bind(e.arguments[0], inner)
+        return b.Aggregate(name, inner.number(e.arguments[0]), distinct=False, type=Type.number)
+    operand = inner.bind(e.arguments[0])
     if name == "count":
         return b.Aggregate(name, operand, e.distinct, Type.number)
     if operand.type not in {Type.number, Type.text}:
@@ -274,7 +236,7 @@ def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
     }
     session.calls.append(definition.name)
     try:
-        return bind(definition.body, names.body(meanings))
+        return names.body(meanings).bind(definition.body)
     except QueryError as error:
         reason = f"in {definition.name}(): {error.reason}"
         hint = error.hint or _signature(normalize_name(definition.name))
@@ -284,13 +246,12 @@ def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:
-    found = bind(argument, names)
+    found = names.bind(argument)
     return Symbol(node=found.node) if isinstance(found, b.NodeValue) else Symbol(value=found)
 
 
-_PAIRS: Final = {normalize_name(name): name for name in PAIR_FUNCTIONS} | _PAIR_ALIASES
 _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
-    **dict.fromkeys(_PAIRS, _pair),
+    **dict.fromkeys(PAIR_NAMES, _pair),
     **dict.fromkeys(_NUMERIC, _numeric),
     **dict.fromkeys(_EXTREME, _extreme),
     "classcount": _class_count,

@@ -10,10 +10,17 @@ nothing. ``in_range(a, b)`` is written in terms of distances and labels, so it i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Attribute, DisplayUnit, Type
+from sgstore.lang._catalog import (
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Attribute,
+    DisplayUnit,
+    RelationScope,
+    Type,
+)
 from sgstore.lang.ir import (
     ANY,
     EGO,
@@ -38,7 +45,6 @@ from sgstore.vocabulary import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from typing import Self
 
     from sgstore.lang._catalog import TraceFacts
     from sgstore.lang.ir import BoundCheck
@@ -47,38 +53,6 @@ if TYPE_CHECKING:
 _ENTITY: Final = ANY.only(frozenset(ENTITY_KINDS))
 _SIGNAL: Final = ANY.only(frozenset(SIGNALS))
 _VEHICLE: Final = ANY.only(frozenset(VEHICLES))
-
-
-@dataclass(frozen=True, slots=True)
-class RelationScope:
-    """Which pairs of entities are related, as :class:`sgstore.config.Pairs` says it.
-
-    Attributes
-    ----------
-    within, ego_within : float
-    ego, static : bool
-    kinds : tuple of pairs of str
-    between : str
-        What distances are measured between: :attr:`sgstore.config.Proximity.between`.
-    """
-
-    within: float = 25.0
-    ego: bool = True
-    static: bool = False
-    ego_within: float = 0.0
-    kinds: tuple[tuple[str, ...], ...] = ()
-    between: str = "centres"
-
-    @classmethod
-    def of(cls, settings: Mapping[str, Any]) -> Self | None:
-        """As the settings of a trace have it; ``None`` where they do not say it."""
-        pairs = settings.get("pairs")
-        if pairs is None:
-            return None
-        kinds = tuple(tuple(labels) for labels in pairs["kinds"])
-        between = settings["proximity"]["between"]
-        names = ("within", "ego", "static", "ego_within")
-        return cls(**{name: pairs[name] for name in names}, kinds=kinds, between=between)
 
 
 def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:

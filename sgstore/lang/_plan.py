@@ -6,7 +6,7 @@ Which condition of a scope is answered in which phase, and which nodes wait for 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import DisplayUnit
 from sgstore.lang._formulas import Leaf, leaves, nested
@@ -29,7 +29,7 @@ from sgstore.lang.ir import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.lang._catalog import Catalog
     from sgstore.lang._formulas import BoundValues, Select
@@ -42,6 +42,24 @@ class Window:
     low: int
     high: int
     traces: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """A table that a statement speaks of and the store has not: what was found otherwise.
+
+    Attributes
+    ----------
+    name : str
+    types : mapping of str to str
+        The type of each column in the database.
+    block : function
+        The columns of what is found in a window of whole traces.
+    """
+
+    name: str
+    types: Mapping[str, str]
+    block: Callable[[Window | None], list[list[Any]]]
 
 
 @dataclass(frozen=True, slots=True)

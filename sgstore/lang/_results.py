@@ -54,9 +54,9 @@ from sgstore.lang.ir import (
 from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
-    from sgstore.lang._plan import Window
+    from sgstore.lang._plan import Gathered, Window
 
 
 _TRACE_OF_NODE: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
@@ -203,24 +203,6 @@ _FRAME: Final = '":frame"'
 _TRACE: Final = '":trace"'
 _ROWS: Final = '":rows"'
 _T: Final = 'CAST({0} - ":trace"."start_ns" AS DOUBLE) / 1e9'
-
-
-@dataclass(frozen=True, slots=True)
-class Gathered:
-    """A table that a statement speaks of and the store has not: what was found otherwise.
-
-    Attributes
-    ----------
-    name : str
-    types : mapping of str to str
-        The type of each column in the database.
-    block : function
-        The columns of what is found in a window of whole traces.
-    """
-
-    name: str
-    types: Mapping[str, str]
-    block: Callable[[Window | None], list[list[Any]]]
 
 
 @dataclass(frozen=True, slots=True)

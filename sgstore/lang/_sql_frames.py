@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang._catalog import Attribute
     from sgstore.lang._formulas import BoundValues
-    from sgstore.lang._results import Gathered
+    from sgstore.lang._plan import Gathered
 
 
 _DEAR: Final = {"gap", "ttc", "closing_time"}

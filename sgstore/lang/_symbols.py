@@ -10,6 +10,7 @@ in a scope further in becomes an outer node of every scope between.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import combinations, product
@@ -17,16 +18,17 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import Attribute, DisplayUnit, Home, Type
-from sgstore.lang._hints import hint_at, variable_hint
+from sgstore.lang import syntax as s
+from sgstore.lang._catalog import PAIR_NAMES, Attribute, DisplayUnit, Home, Type
+from sgstore.lang._hints import condition_hint, hint_at, variable_hint
 from sgstore.lang.ir import EGO, Bound, Edge, Kinds, Node, Scope
+from sgstore.lang.library import predicates
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
     from sgstore.errors import TextSpan
-    from sgstore.lang import syntax as s
     from sgstore.lang._catalog import Catalog, TableFacts, TraceFacts
     from sgstore.lang.syntax import Define
 
@@ -47,6 +49,12 @@ class Symbol:
     value: Bound | None = None
 
 
+Binder = Callable[[Any, "SymbolTable"], Bound]
+"""The function that binds one kind of expression."""
+
+Binders = Mapping[type, Binder]
+
+
 @dataclass(slots=True)
 class Session:
     """What is common to the whole of a query while it is bound.
@@ -56,6 +64,9 @@ class Session:
     text : str
         The query, for messages.
     parameters : mapping of str to value
+    binders : mapping of type to Binder
+        The binder of each kind of expression. They are handed in, because calls, blocks and temporal operators
+        hold expressions, and expressions hold them.
     predicates : dict of str to Define
         By folded name.
     injective : bool
@@ -82,6 +93,7 @@ class Session:
 
     text: str
     parameters: Mapping[str, Any]
+    binders: Binders
     predicates: dict[str, Define] = field(default_factory=dict[str, "Define"])
     injective: bool = True
     used: set[str] = field(default_factory=set[str])
@@ -265,17 +277,69 @@ class SymbolTable:
         if self.session.calls:
             return f"{self.session.calls[-1]}() knows its parameters and ego only"
         elsewhere = name.lower() in self.session.keys
-        hint = variable_hint(name, self.visible(), elsewhere)
-        if hint is None:
-            from sgstore.lang._functions import call_hint  # calls hold names
+        return variable_hint(name, self.visible(), elsewhere) or call_hint(name)
 
-            hint = call_hint(name)
-        return hint
+    def bind(self, expression: s.Expression) -> Bound:
+        """Bind an expression of any type.
+
+        Raises
+        ------
+        QueryNameError
+            It names what is not known.
+        QueryError
+            Its types do not fit together.
+        """
+        return self.session.binders[type(expression)](expression, self)
+
+    def condition(self, expression: s.Expression) -> Bound:
+        """Bind an expression that is true, false or unknown.
+
+        Raises
+        ------
+        QueryError
+            It is something else.
+        """
+        found = self.bind(expression)
+        if found.type not in {Type.boolean, Type.null}:
+            written = self.session.text[expression.span.start : expression.span.end]
+            self.session.refuse(
+                f"expected a condition, but this is a {found.type.value}",
+                expression.span,
+                condition_hint(found.type, written),
+            )
+        return found
+
+    def number(self, expression: s.Expression) -> Bound:
+        """Bind an expression that is a number.
+
+        Raises
+        ------
+        QueryError
+            It is something else.
+        """
+        found = self.bind(expression)
+        if found.type is not Type.number:
+            named = expression.name if isinstance(expression, s.Variable) else ""
+            self.session.refuse(
+                f"expected a number, but this is a {found.type.value}",
+                expression.span,
+                f"one of its attributes: {named}.speed" if found.type is Type.node else None,
+            )
+        return found
 
     def visible(self) -> set[str]:
         """All names that may be used here, but those of frame and trace."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
         return outside | set(self.meanings)
+
+
+def call_hint(name: str) -> str | None:
+    """Say how a function of two entities or a predicate of that name is written; ``None`` if there is none."""
+    word = normalize_name(name)
+    if (found := predicates().get(word)) is not None:
+        formals = ", ".join(formal.name for formal in found.parameters)
+        return f"it is a predicate: {found.name}({formals})"
+    return f"it is a function: {PAIR_NAMES[word]}(a, b)" if word in PAIR_NAMES else None
 
 
 # Datasets in queries: traces whose names are alike, or a table of one's own that says which -----
