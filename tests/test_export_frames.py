@@ -262,7 +262,7 @@ def test_a_message_of_foxgloves_is_read_by_the_schema_in_the_file() -> None:
     channel = Channel(1, "/t", "protobuf", {}, 1)
 
     def of(name: str) -> Callable[[bytes], Any]:
-        return sensor_of(channel, Schema(1, foxglove.schema(), "protobuf", f"foxglove.{name}"))
+        return sensor_of(channel, Schema(1, foxglove.schema(name), "protobuf", f"foxglove.{name}"))
 
     points = np.array(
         [(1, 2, 3, 4), (5, 6, 7, 8)], [(n, "<f4") for n in ("x", "y", "z", "intensity")]
@@ -427,7 +427,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
     def put(recorder: Recorder, topic: str, name: str, time: float, data: bytes) -> None:
         if topic not in recorder.channels:
-            writer, schema = recorder.writer, foxglove.schema()
+            writer, schema = recorder.writer, foxglove.schema(name)
             number = writer.register_schema(f"foxglove.{name}", "protobuf", schema)
             recorder.channels[topic] = writer.register_channel(topic, "protobuf", number)
         recorder.write(recorder.channels[topic], time, data)
@@ -573,7 +573,7 @@ def test_messages_that_are_hurt_at_random_are_read_or_refused() -> None:
         "foxglove": (
             sensor_of(
                 Channel(1, "/t", "protobuf", {}, 1),
-                Schema(1, foxglove.schema(), "protobuf", "foxglove.PointCloud"),
+                Schema(1, foxglove.schema("PointCloud"), "protobuf", "foxglove.PointCloud"),
             ),
             foxglove.cloud(np.ones(3, [("x", "<f4"), ("y", "<u4")]), 5, "lidar"),
         ),

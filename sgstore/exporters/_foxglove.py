@@ -1,8 +1,10 @@
 """Conversion to Foxglove messages: sensor data and scene graphs.
 
-What sensors measured → messages of Foxglove's types, which Foxglove, Lichtblick and our own reader show.
-
-Pictures are PNG. What is neither a picture nor points is JSON.
+Foxglove, Lichtblick and the reader of this package show them. Pictures are PNG; a measurement that is neither
+a picture nor points is JSON. In a scene graph entities are boxes with their names, parts of the map are dots,
+edges are lines from centre to centre; those of one relation are one thing, so that a viewer can show and hide
+them. Each message replaces the one before it. Places are those of the scene graph: metres, in the axes of the
+road map.
 
 Source: foxglove-sdk, schemas (public lists of fields).
 """
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,10 +29,7 @@ from sgstore.exporters._sensors import png
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import numpy as np
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from numpy.typing import NDArray
 
     from sgstore.graph import SceneGraph
@@ -54,71 +54,91 @@ _TYPES: Final = {
     " distortion_model=4:string D=5:double* K=6:double* R=7:double* P=8:double* frame_id=9:string",
     "PointCloud": "timestamp=1:Timestamp frame_id=2:string pose=3:Pose point_stride=4:fixed32"
     " fields=5:PackedElementField* data=6:bytes",
+    "Point3": "x=1:double y=2:double z=3:double",
+    "Color": "r=1:double g=2:double b=3:double a=4:double",
+    "KeyValuePair": "key=1:string value=2:string",
+    "ArrowPrimitive": "pose=1:Pose shaft_length=2:double shaft_diameter=3:double head_length=4:double"
+    " head_diameter=5:double color=6:Color",
+    "CubePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
+    "SpherePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
+    "CylinderPrimitive": "pose=1:Pose size=2:Vector3 bottom_scale=3:double top_scale=4:double color=5:Color",
+    "LinePrimitive": "type=1:LinePrimitive.Type pose=2:Pose thickness=3:double scale_invariant=4:bool"
+    " points=5:Point3* color=6:Color colors=7:Color* indices=8:fixed32*",
+    "TriangleListPrimitive": "pose=1:Pose points=2:Point3* color=3:Color colors=4:Color* indices=5:fixed32*",
+    "TextPrimitive": "pose=1:Pose billboard=2:bool font_size=3:double scale_invariant=4:bool color=5:Color"
+    " text=6:string",
+    "ModelPrimitive": "pose=1:Pose scale=2:Vector3 color=3:Color override_color=4:bool url=5:string"
+    " media_type=6:string data=7:bytes",
+    "SceneEntityDeletion": "timestamp=1:Timestamp type=2:SceneEntityDeletion.Type id=3:string",
+    "SceneEntity": "timestamp=1:Timestamp frame_id=2:string id=3:string lifetime=4:Duration"
+    " frame_locked=5:bool metadata=6:KeyValuePair* arrows=7:ArrowPrimitive* cubes=8:CubePrimitive*"
+    " spheres=9:SpherePrimitive* cylinders=10:CylinderPrimitive* lines=11:LinePrimitive*"
+    " triangles=12:TriangleListPrimitive* texts=13:TextPrimitive* models=14:ModelPrimitive*",
+    "SceneUpdate": "deletions=1:SceneEntityDeletion* entities=2:SceneEntity*",
 }
 """Fields of the messages, ``name=number:type``, with * if repeated; each after those that it needs."""
 _ENUMS: Final = {
     "PackedElementField.NumericType": "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64",
+    "LinePrimitive.Type": "LINE_STRIP LINE_LOOP LINE_LIST",
+    "SceneEntityDeletion.Type": "MATCHING_ID ALL",
 }
 """Their enumerations, by owner and name, numbered from 0."""
 _NUMERIC_OF: Final = {"f4": 7, "f8": 8, "u4": 5, "i4": 6, "u1": 1}
 
 IMAGE, CALIBRATION, CLOUD = "CompressedImage", "CameraCalibration", "PointCloud"
+SCENE: Final = "SceneUpdate"
 
 
-def schema() -> bytes:
-    """The descriptors of all messages, as an MCAP file carries them."""
-    return _file().SerializeToString()
+def schema(name: str) -> bytes:
+    """Return the descriptors of a message and of all that it needs, as an MCAP file carries them."""
+    return _descriptors(name).SerializeToString()
 
 
 @cache
-def _file() -> descriptor_pb2.FileDescriptorSet:
-    return descriptors(_TYPES, _ENUMS)
-
-
-def descriptors(
-    types: Mapping[str, str], enums: Mapping[str, str]
-) -> descriptor_pb2.FileDescriptorSet:
-    """Descriptors of messages of Foxglove's, and of what of Google's they need.
-
-    Parameters
-    ----------
-    types : mapping
-        Name → fields, ``name=number:type``, with * if repeated; each after those that it needs.
-    enums : mapping
-        ``Owner.Name`` → words, numbered from 0.
-    """
-    needed = " ".join(types.values())
-    used = [file for name, file in _GOOGLE.items() if f":{name}" in needed]
-    google = [descriptor_pb2.FileDescriptorProto.FromString(file.serialized_pb) for file in used]
+def _descriptors(name: str) -> descriptor_pb2.FileDescriptorSet:
+    """Descriptors of a message, of the messages that it is made of, and of Google's files for them."""
+    kinds = {one: set(re.findall(r":(\w+)", fields)) for one, fields in _TYPES.items()}
+    needed, found = set[str](), {name}
+    while found:
+        needed |= found
+        found = set[str]().union(*(kinds.get(one, ()) for one in found)) - needed
+    google = [
+        descriptor_pb2.FileDescriptorProto.FromString(file.serialized_pb)
+        for one, file in _GOOGLE.items()
+        if one in needed
+    ]
     file = descriptor_pb2.FileDescriptorProto(
         name="foxglove.proto",
         package="foxglove",
         syntax="proto3",
         dependency=[file.name for file in google],
     )
-    for name, items in types.items():
-        message = file.message_type.add(name=name)
-        for item in items.split():
-            label, _, rest = item.partition("=")
-            number, _, kind = rest.partition(":")
-            field = message.field.add(name=label, number=int(number))
-            field.label = _FIELD.LABEL_REPEATED if kind.endswith("*") else _FIELD.LABEL_OPTIONAL
-            _set_type(field, kind.removesuffix("*"), enums)
-        for name_of, words in enums.items():
-            owner, _, own = name_of.partition(".")
-            if owner == name:
-                enum = message.enum_type.add(name=own)
-                for number, word in enumerate(words.split()):
-                    enum.value.add(name=word, number=number)
+    for one in _TYPES:
+        if one in needed:
+            _add_message(file.message_type.add(name=one))
     return descriptor_pb2.FileDescriptorSet(file=[*google, file])
 
 
-def _set_type(
-    field: descriptor_pb2.FieldDescriptorProto, kind: str, enums: Mapping[str, str]
-) -> None:
+def _add_message(message: descriptor_pb2.DescriptorProto) -> None:
+    """Fill in the fields and enumerations of a message, by its name."""
+    for item in _TYPES[message.name].split():
+        label, _, rest = item.partition("=")
+        number, _, kind = rest.partition(":")
+        field = message.field.add(name=label, number=int(number))
+        field.label = _FIELD.LABEL_REPEATED if kind.endswith("*") else _FIELD.LABEL_OPTIONAL
+        _set_type(field, kind.removesuffix("*"))
+    for name_of, words in _ENUMS.items():
+        owner, _, own = name_of.partition(".")
+        if owner == message.name:
+            enum = message.enum_type.add(name=own)
+            for number, word in enumerate(words.split()):
+                enum.value.add(name=word, number=number)
+
+
+def _set_type(field: descriptor_pb2.FieldDescriptorProto, kind: str) -> None:
     if kind in _SCALARS:
         field.type = _SCALARS[kind]
-    elif kind in enums:
+    elif kind in _ENUMS:
         field.type, field.type_name = _FIELD.TYPE_ENUM, f".foxglove.{kind}"
     else:
         package = "google.protobuf" if kind in _GOOGLE else "foxglove"
@@ -127,14 +147,9 @@ def _set_type(
 
 @cache
 def message_type(name: str) -> type[Any]:
-    """The class of a message."""
-    return class_of(_file(), name)
-
-
-def class_of(files: descriptor_pb2.FileDescriptorSet, name: str) -> type[Any]:
-    """The class of a message that descriptors describe."""
+    """Return the class of a message."""
     pool = descriptor_pool.DescriptorPool()
-    for file in files.file:
+    for file in _descriptors(name).file:
         pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
 
@@ -195,48 +210,9 @@ def stamp(message: Any, time_ns: int) -> None:
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
 
 
-# Scene graphs → ``foxglove.SceneUpdate``: what Foxglove, Lichtblick and Rerun draw in their views of space
-# ------------------------------------------------------------------------------------------------
-# Entities are boxes with their names, parts of the map are dots, edges are lines from centre to centre, those
-# of one relation one thing to be drawn, so that a viewer can show and hide them. Each message takes the place
-# of the one before it. Places are those of the scene graph: metres, in the axes of the road map.
-#
-# Source: foxglove-sdk, schemas ``SceneUpdate``, ``SceneEntity`` and what they are made of.
-
-NAME: Final = "foxglove.SceneUpdate"
 AXES: Final = "map"
-"""What the axes of all scene graphs are called: as CARLA's bridge and most ROS systems call the world."""
+"""Name of the axes of all scene graphs: as CARLA's bridge and most ROS systems call the world."""
 
-_SCENE_TYPES: Final = {
-    "Vector3": "x=1:double y=2:double z=3:double",
-    "Quaternion": "x=1:double y=2:double z=3:double w=4:double",
-    "Point3": "x=1:double y=2:double z=3:double",
-    "Pose": "position=1:Vector3 orientation=2:Quaternion",
-    "Color": "r=1:double g=2:double b=3:double a=4:double",
-    "KeyValuePair": "key=1:string value=2:string",
-    "ArrowPrimitive": "pose=1:Pose shaft_length=2:double shaft_diameter=3:double head_length=4:double"
-    " head_diameter=5:double color=6:Color",
-    "CubePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
-    "SpherePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
-    "CylinderPrimitive": "pose=1:Pose size=2:Vector3 bottom_scale=3:double top_scale=4:double color=5:Color",
-    "LinePrimitive": "type=1:LinePrimitive.Type pose=2:Pose thickness=3:double scale_invariant=4:bool"
-    " points=5:Point3* color=6:Color colors=7:Color* indices=8:fixed32*",
-    "TriangleListPrimitive": "pose=1:Pose points=2:Point3* color=3:Color colors=4:Color* indices=5:fixed32*",
-    "TextPrimitive": "pose=1:Pose billboard=2:bool font_size=3:double scale_invariant=4:bool color=5:Color"
-    " text=6:string",
-    "ModelPrimitive": "pose=1:Pose scale=2:Vector3 color=3:Color override_color=4:bool url=5:string"
-    " media_type=6:string data=7:bytes",
-    "SceneEntityDeletion": "timestamp=1:Timestamp type=2:SceneEntityDeletion.Type id=3:string",
-    "SceneEntity": "timestamp=1:Timestamp frame_id=2:string id=3:string lifetime=4:Duration"
-    " frame_locked=5:bool metadata=6:KeyValuePair* arrows=7:ArrowPrimitive* cubes=8:CubePrimitive*"
-    " spheres=9:SpherePrimitive* cylinders=10:CylinderPrimitive* lines=11:LinePrimitive*"
-    " triangles=12:TriangleListPrimitive* texts=13:TextPrimitive* models=14:ModelPrimitive*",
-    "SceneUpdate": "deletions=1:SceneEntityDeletion* entities=2:SceneEntity*",
-}
-_SCENE_ENUMS: Final = {
-    "LinePrimitive.Type": "LINE_STRIP LINE_LOOP LINE_LIST",
-    "SceneEntityDeletion.Type": "MATCHING_ID ALL",
-}
 _ALL, _LINE_LIST = 1, 2
 
 Colour = tuple[float, float, float, float]
@@ -276,24 +252,9 @@ TEXT: Final = 12.0
 """Size of names; pixels."""
 
 
-def scene_schema() -> bytes:
-    """The descriptors of the message, as an MCAP file carries them."""
-    return _files().SerializeToString()
-
-
-@cache
-def _files() -> FileDescriptorSet:
-    return descriptors(_SCENE_TYPES, _SCENE_ENUMS)
-
-
-@cache
-def _scene_update() -> type[Any]:
-    return class_of(_files(), "SceneUpdate")
-
-
 def message(graph: SceneGraph, log_time_ns: int) -> bytes:
     """A scene graph as a message; a node without a place is not drawn, nor are its edges."""
-    update = _scene_update()()
+    update = message_type(SCENE)()
     gone = update.deletions.add(type=_ALL)
     stamp(gone, log_time_ns)
     places = {node: _place(about) for node, about in graph.nodes.items()}

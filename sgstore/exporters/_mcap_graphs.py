@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from sgstore.exporters._labels import Export
-    from sgstore.exporters._mcap_writer import McapWriter
+    from sgstore.exporters._mcap_writer import ClipWriter
     from sgstore.graph import SceneGraph
 
 
@@ -134,10 +134,10 @@ class Added:
         graphs, labels = _as_json(GRAPH_SCHEMA), _as_json(LABEL_SCHEMA)
         kinds = [_Kind(LABELS, "sgstore.Labels", "jsonschema", labels, "json")]
         if export.with_graph:
-            scene = foxglove_scene.scene_schema()
+            scene = foxglove_scene.schema(foxglove_scene.SCENE)
             kinds = [
                 _Kind(GRAPH, "sgstore.SceneGraph", "jsonschema", graphs, "json"),
-                _Kind(SCENE, foxglove_scene.NAME, "protobuf", scene, "protobuf"),
+                _Kind(SCENE, "foxglove.SceneUpdate", "protobuf", scene, "protobuf"),
             ]
         self._kinds = kinds
 
@@ -196,7 +196,7 @@ class Added:
 class Waiting:
     """Messages that wait until it is their turn among others, in order of log time."""
 
-    def __init__(self, writer: McapWriter, messages: Iterable[Message]) -> None:
+    def __init__(self, writer: ClipWriter, messages: Iterable[Message]) -> None:
         self._writer = writer
         self._messages = iter(messages)
         self._next = next(self._messages, None)
@@ -213,7 +213,7 @@ class Waiting:
 
     def _write(self, message: Message) -> None:
         channel, sequence, time_ns, data = message
-        self._writer.message(channel, sequence, time_ns, time_ns, memoryview(data))
+        self._writer.message(channel, sequence, time_ns, time_ns, data)
         self._next = next(self._messages, None)
 
 

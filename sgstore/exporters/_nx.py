@@ -1,9 +1,13 @@
-"""Export for networkx: node-link JSON and GraphML.
+"""Export for networkx: node-link JSON, a graph a line, and GraphML, a file a frame.
 
-The scene graphs of many frames, as records, read from the store a window at a time.
+For each clip there are ``CLIP.jsonl``, which ``networkx.node_link_graph(json.loads(line), edges="edges")``
+reads, and a folder ``CLIP`` of ``000123.graphml``, one for each frame, by its number in the trace. A graph's
+attributes say which frame it is, and have its labels as ``label_NAME``; what is not known is left out.
+Without an abstraction nodes are node ids with all that is known of them; with one they are names, with
+``base_class``.
 
-The same graphs as :meth:`sgstore.query.Store.graph` gives, for a fraction of the cost: five questions for
-a whole window and not for each frame.
+Graphs are read from the store a window of frames at a time, with five questions for each window: the same
+graphs as :meth:`sgstore.query.Store.graph` gives, for a fraction of the cost.
 """
 
 from __future__ import annotations
@@ -12,7 +16,6 @@ import json
 import math
 import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING, Any, Final
-from xml.sax.saxutils import escape, quoteattr
 
 import networkx as nx
 
@@ -113,17 +116,6 @@ def _attributes(
     return known
 
 
-# Scene graphs for networkx: node-link JSON, a graph a line, and GraphML, a file a frame ---------
-# For each clip there are ``CLIP.jsonl``, which ``networkx.node_link_graph(json.loads(line), edges="edges")``
-# reads, and a folder ``CLIP`` of ``000123.graphml``, one for each frame, by its number in the trace. A graph's
-# attributes say which frame it is, and have its labels as ``label_NAME``; what is not known is left out.
-# Without an abstraction nodes are node ids with all that is known of them; with one they are names, with
-# ``base_class``.
-
-_XML: Final = '<?xml version="1.0" encoding="utf-8"?>\n<graphml xmlns="http://graphml.graphdrawing.org/xmlns">'
-_KINDS: Final = {bool: "boolean", int: "long", float: "double"}
-
-
 def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write the graphs of all frames, each of which is read again by networkx."""
     spans: FrameSpans | None = None
@@ -210,46 +202,28 @@ def _drop_unknown(about: dict[str, Any]) -> None:
 
 
 def _write_graphml(graph: Graph, file: Path) -> None:
-    """Write a graph as GraphML, and read it again: nodes, edges and their relations.
-
-    Source: GraphML primer, "attributes"; names of types as networkx and Gephi read them.
-    """
-    keys: dict[tuple[str, str], str] = {}
-    body = [*_data(graph.graph, "graph", keys)]
+    """Write a graph as GraphML, and read it again: nodes, edges and their relations."""
+    drawn: Graph = nx.MultiDiGraph(**_drawable(graph.graph))
     for node, about in graph.nodes(data=True):
-        body += [f"<node id={quoteattr(str(node))}>", *_data(about, "node", keys), "</node>"]
+        drawn.add_node(node, **_drawable(about))
     for src, dst, key, about in graph.edges(keys=True, data=True):
-        ends = f"source={quoteattr(str(src))} target={quoteattr(str(dst))}"
-        body += [f"<edge {ends} id={_attribute(key)}>", *_data(about, "edge", keys), "</edge>"]
-    head = [
-        f'<key id="{thing}.{name}" for="{thing}" attr.name="{name}" attr.type="{kind}"/>'
-        for (thing, name), kind in keys.items()
-    ]
-    start = [_XML, *head, '<graph edgedefault="directed">']
-    file.write_text("\n".join([*start, *body, "</graph>", "</graphml>", ""]), encoding="utf-8")
+        drawn.add_edge(src, dst, _readable(str(key)), **_drawable(about))
+    nx.write_graphml_xml(drawn, file, infer_numeric_types=True)
     try:
         node_type = int if all(isinstance(node, int) for node in graph) else str
         again: Graph = nx.read_graphml(file, node_type=node_type, force_multigraph=True)
     except (nx.NetworkXException, ValueError, ET.ParseError) as error:
         raise ExportError(f"{file.name}: networkx cannot read it: {error}") from error
-    edges = {(a, b, _readable(str(key))) for a, b, key in graph.edges(keys=True)}
-    if set(again) != set(graph) or set(again.edges(keys=True)) != edges:
+    if set(again) != set(graph) or set(again.edges(keys=True)) != set(drawn.edges(keys=True)):
         raise ExportError(f"{file.name}: networkx reads another graph than was written")
 
 
-def _data(about: dict[str, Any], thing: str, keys: dict[tuple[str, str], str]) -> Iterator[str]:
-    """Attributes of a thing; those that are new, with their type, are noted."""
-    for name, value in about.items():
-        kind = _KINDS.get(type(value), "string")
-        known = keys.setdefault((thing, name), kind)
-        if {known, kind} == {"long", "double"}:
-            keys[thing, name] = "double"
-        text = str(value).lower() if kind == "boolean" else _readable(str(value))
-        yield f'<data key="{thing}.{name}">{escape(text)}</data>'
-
-
-def _attribute(text: Any) -> str:
-    return quoteattr(_readable(str(text)))
+def _drawable(about: dict[str, Any]) -> dict[str, Any]:
+    """Attributes as GraphML has them: numbers, truth values, and texts for everything else."""
+    return {
+        name: value if isinstance(value, (bool, int, float)) else _readable(str(value))
+        for name, value in about.items()
+    }
 
 
 def _readable(text: str) -> str:

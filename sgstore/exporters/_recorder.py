@@ -6,17 +6,17 @@ The file is written aside and takes its name when it is finished; memory does no
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
-from mcap.records import Channel, Schema
+from mcap.writer import Writer
 
 import sgstore.exporters._foxglove as foxglove
 import sgstore.exporters._osi_messages as osi_messages
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import tool
-from sgstore.exporters._mcap_writer import McapWriter
 from sgstore.readers import SensorCloud, SensorPicture
 
 if TYPE_CHECKING:
@@ -98,10 +98,12 @@ class Recorder:
             raise ExportError(f"{self._aside}: {reason}") from error
         except OSError as error:
             raise ExportError(f"{self._aside}: {error.strerror or error}") from error
-        self._writer = McapWriter(self._stream, "", tool(), "zstd")
+        self._writer = Writer(self._stream, enable_data_crcs=True)
+        self._writer.start("", tool())
         self._describe(sensors or {})
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
         self._osi = osi_messages.OsiFrames()
         self._map = (map_text, map_name)
         self._times: tuple[int, int] | None = None
@@ -173,18 +175,17 @@ class Recorder:
                 self._aside.unlink()
         except OSError as error:
             raise ExportError(f"{self._aside}: {error.strerror or error}") from error
-        counts = {topic: self._writer.counts[number] for topic, number in self._channels.items()}
         start, end = self._times or (0, 0)
-        self.written = Written(self._to, self._frames, counts, start, end)
+        self.written = Written(self._to, self._frames, dict(self._counts), start, end)
 
     def _describe(self, sensors: dict[str, str]) -> None:
         version = ".".join(map(str, osi_messages.VERSION))
         names = ("version", "min_osi_version", "max_osi_version")
-        self._writer.metadata("net.asam.osi.trace", dict.fromkeys(names, version))
-        self._writer.metadata("sgstore.record", {f"sensor.{k}": v for k, v in sensors.items()})
+        self._writer.add_metadata("net.asam.osi.trace", dict.fromkeys(names, version))
+        self._writer.add_metadata("sgstore.record", {f"sensor.{k}": v for k, v in sensors.items()})
 
     def _write_foxglove(self, topic: str, name: str, time_ns: int, data: bytes) -> None:
-        self._write(topic, (f"foxglove.{name}", PROTOBUF, foxglove.schema()), time_ns, data)
+        self._write(topic, (f"foxglove.{name}", PROTOBUF, foxglove.schema(name)), time_ns, data)
 
     def _write(
         self,
@@ -198,22 +199,19 @@ class Recorder:
             number = self._channels.get(topic)
             if number is None:
                 number = self._define(topic, schema, encoding)
-            sequence = self._writer.counts[number]
-            self._writer.message(number, sequence, time_ns, time_ns, memoryview(data))
+            self._writer.add_message(number, time_ns, data, time_ns, self._counts[topic])
+            self._counts[topic] += 1
         except OSError as error:
             raise ExportError(f"{self._aside}: {error.strerror or error}") from error
 
     def _define(self, topic: str, schema: tuple[str, str, bytes], encoding: str) -> int:
         name, schema_encoding, data = schema
         if name not in self._schemas:
-            self._schemas[name] = len(self._schemas) + 1
-            record = Schema(self._schemas[name], data, schema_encoding, name)
-            self._writer.define(record)
-        number = len(self._channels) + 1
-        about: dict[str, Any] = {}
+            self._schemas[name] = self._writer.register_schema(name, schema_encoding, data)
+        about: dict[str, str] = {}
         if name.startswith("osi3."):
             version = ".".join(map(str, osi_messages.VERSION))
             about = {"net.asam.osi.trace.channel.osi_version": version}
-        self._writer.define(Channel(number, topic, encoding, about, self._schemas[name]))
+        number = self._writer.register_channel(topic, encoding, self._schemas[name], about)
         self._channels[topic] = number
         return number
