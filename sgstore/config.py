@@ -22,6 +22,7 @@ from sgstore.vocabulary import (
     DIRECTIONS,
     ENTITY_KINDS,
     LANE_TYPES,
+    MAP_ONLY,
     PROXIMITY,
     RELATIONS,
     SIGNALS,
@@ -70,9 +71,6 @@ TIES: Final = ("ahead", "both", "carlasgg")
 JOINS: Final = ("nearest", "latest")
 ORIENTATIONS: Final = ("asam", "carla")
 ALL_EGOS: Final = "all"
-
-MAP_ONLY: Final = ("travelsTo", "laneChange", "opposes", "conflictsWith")
-"""Relations that hold among parts of a map alone: they come with the map and cannot be left out."""
 
 MOST_CORNERS: Final = 64
 MOST_LENGTH: Final = 100_000.0

@@ -309,10 +309,11 @@ class EdgeColumns(Sequence["EdgeRecord"]):
         rows = range(len(self))[index]
         if isinstance(rows, int):
             return self[rows : rows + 1][0]
-        columns = (self._src[index], self._relation[index], self._dst[index])
+        codes: list[int] = self._relation[index].tolist()
+        ends = (self._src[index].tolist(), self._dst[index].tolist())
         return [
             (src, RELATIONS[code], dst, self._about.get(row, {}))
-            for src, code, dst, row in zip(*(c.tolist() for c in columns), rows, strict=True)
+            for code, src, dst, row in zip(codes, *ends, rows, strict=True)
         ]
 
     def __eq__(self, other: object) -> bool:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
     IS_SIGNAL,
     NEAR,
-    RELATIONS,
     TOUCHING,
     BlockScene,
     Bodies,
@@ -38,6 +37,7 @@ from sgstore.relations import (
     StillPairs,
     contacts,
     contacts_of,
+    functions,
     gaps,
     gathered,
     joined_pairs,
@@ -45,12 +45,12 @@ from sgstore.relations import (
     of_kinds,
     pieces,
     related_pairs,
+    relations_under,
     renamed,
     waypoints_of,
 )
 from sgstore.step import Stepper
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY
-from sgstore.vocabulary import RELATIONS as VOCABULARY
+from sgstore.vocabulary import RELATIONS
 from sgstore.world import States
 
 if TYPE_CHECKING:
@@ -67,14 +67,6 @@ if TYPE_CHECKING:
 
     Rows = NDArray[np.intp]
     Gathered = tuple[tuple[Rows, Rows], Bools]
-
-MAP_RELATIONS: Final = frozenset(
-    {"isIn", "travelsTo", "laneChange", "opposes", "toLeftOf", "toRightOf", "conflictsWith"}
-)
-"""Relations among parts of a map. Every map answers them: where it has no such edge, there is none."""
-
-
-_OF_PAIRS: Final = frozenset({*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf"})
 
 
 class SceneGraphGenerator:
@@ -108,7 +100,10 @@ class SceneGraphGenerator:
         self._survey = (
             None if road_map is None else LaneContact(road_map, config.lanes.ahead, waypoints)
         )
-        self._families = tuple(f for f in RELATIONS if road_map is not None or not f.needs_map)
+        computed = relations_under(config)
+        computed = tuple(one for one in computed if road_map is not None or not one.needs_map)
+        self._functions = functions(computed)
+        self._of_pairs = frozenset(one.name for one in computed if one.of_pairs)
         self._extent = Extent(config.range, road_map)
         self._keeping = Keeping(config, road_map)
         self._kinds: Codes = np.zeros(0, np.int8)
@@ -117,13 +112,8 @@ class SceneGraphGenerator:
         self._parking = Parking()
         self._grounds: MapColumns | None = None
         self._classes = Classes()
-        self.answers = self._answers(road_map)
-
-    def _answers(self, road_map: RoadMap | None) -> tuple[str, ...]:
-        names = {name for family in self._families for name in family.names(self._config)}
-        of_map = MAP_RELATIONS if road_map is not None else frozenset[str]()
-        names = self._keeping.names(names, of_map)
-        return tuple(name for name in VOCABULARY if name in names)
+        names = self._keeping.names(computed, with_map=road_map is not None)
+        self.answers = tuple(name for name in RELATIONS if name in names)
 
     @property
     def parked(self) -> Codes:
@@ -260,11 +250,22 @@ class SceneGraphGenerator:
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground and self._keeping.present(ground.present)),
-            edges=self._keeping.edges(Edges.chained([f.edges(scene) for f in self._families])),
+            edges=self._keeping.edges(Edges.chained([edges(scene) for edges in self._functions])),
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
             gaps=self._keeping.gaps(gaps(bodies, ground)),
-            crowded=_crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}, self.answers),
+            crowded=self._crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}),
         )
+
+    def _crowded(
+        self, bodies: Bodies, over: Mapping[str, Bools]
+    ) -> tuple[tuple[str, int, int], ...]:
+        """The frames with too many pairs, and their bodies; none where no such relation is wanted."""
+        found: list[tuple[str, int, int]] = []
+        for what, frames in over.items():
+            wanted = {"overlaps"} if what == TOUCHING else self._of_pairs
+            rows = np.flatnonzero(frames & bool(wanted & set(self.answers))).tolist()
+            found += [(what, frame, int((bodies.frame == frame).sum())) for frame in rows]
+        return tuple(found)
 
     def step(self, frame: Frame) -> SceneGraph:
         """The scene graph of the next frame, for a client that owns the loop; the same as of a recording.
@@ -519,18 +520,6 @@ def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
     a, b = place[pairs[0]], place[pairs[1]]
     both = (a >= 0) & (b >= 0)
     return a[both], b[both]
-
-
-def _crowded(
-    bodies: Bodies, over: Mapping[str, Bools], answers: tuple[str, ...]
-) -> tuple[tuple[str, int, int], ...]:
-    """The frames with too many pairs, and how many bodies they have; none where no such relation is wanted."""
-    found: list[tuple[str, int, int]] = []
-    for what, frames in over.items():
-        wanted = "overlaps" in answers if what == TOUCHING else bool(_OF_PAIRS & set(answers))
-        rows = np.flatnonzero(frames & wanted).tolist()
-        found += [(what, frame, int((bodies.frame == frame).sum())) for frame in rows]
-    return tuple(found)
 
 
 def _ego_rows(frames: FrameBlock) -> Rows:

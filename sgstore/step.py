@@ -22,8 +22,8 @@ from sgstore.vocabulary import (
     LIGHT_STATE_CODE,
     LIGHT_STATES,
     MAP_KINDS,
+    MOST_RELATIONS,
     RELATION_CODE,
-    RELATIONS,
     SPECIALS,
     VEHICLE_LIGHTS,
     kind_named,
@@ -310,7 +310,7 @@ TRACE: Final = "online"
 """What the graphs of the online mode have for the name of a trace."""
 
 _IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
-_TELLS: Final = np.isin(np.arange(len(RELATIONS)), (_IS_IN, _LEADS, _FOLLOWS))
+_TELLS: Final = np.isin(np.arange(MOST_RELATIONS), (_IS_IN, _LEADS, _FOLLOWS))
 """Of each relation whether its edges may have attributes."""
 _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")

@@ -1,8 +1,8 @@
-"""Kinds, relations and the states of lights: the closed catalogue of names.
+"""Kinds, relations and the states of lights: the catalogue of names.
 
-A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Both are
-closed: a store holds these and no others, as enumerations whose order is the order here (the
-*code* of a name is its index). ``vocabulary.toml`` maps the type names of simulators to kinds; a
+A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Kinds are
+closed; relations are those of :mod:`sgstore.plugins`, and what stores and settings add (:func:`add_relation`).
+The *code* of a name is its index. ``vocabulary.toml`` maps the type names of simulators to kinds; a
 type that nothing maps becomes ``unknown``, never nothing.
 
 Names are compared without regard to case and underscores (``TrafficLight`` is ``traffic_light``);
@@ -14,13 +14,17 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from threading import Lock
 from typing import TYPE_CHECKING, Final
 
+from sgstore import plugins
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
 ENTITY_KINDS: Final = (
     "car",
@@ -78,29 +82,32 @@ SUPER_KINDS: Final[Mapping[str, tuple[str, ...]]] = {
 As a label ``Vehicle`` is every vehicle; as a kind, ``vehicle`` is one of which no more is told.
 """
 
+SIDES: Final = ("toLeftOf", "toRightOf")
+
 LABEL_ALIASES: Final[Mapping[str, str]] = {"pedestrian": "person", "walker": "person"}
 """Other words for a kind, as users of Scenic, CARLA and nuScenes know them."""
 
-PROXIMITY: Final = ("safety_hazard", "near_coll", "super_near", "very_near", "near", "visible")
-DIRECTIONS: Final = ("inDFrontOf", "inSFrontOf", "atSRearOf", "atDRearOf")
+OWN_RELATIONS: Final = tuple(plugins.RELATIONS.own)
+"""Relations of this package."""
 
-RELATIONS: Final = (
-    "isIn",
-    "travelsTo",
-    "laneChange",
-    "opposes",
-    "toLeftOf",
-    "toRightOf",
-    "conflictsWith",
-    "controlsTrafficOf",
-    "mayAffect",
-    *PROXIMITY,
-    *DIRECTIONS,
-    "leads",
-    "follows",
-    "overlaps",
-    "sees",
-)
+
+def _declared_in(file: str) -> tuple[str, ...]:
+    places = plugins.RELATIONS.own.items()
+    return tuple(name for name, place in places if place.startswith(f"sgstore.relations.{file}:"))
+
+
+PROXIMITY: Final = _declared_in("_proximity")
+"""Rungs of distance by their usual names, from the nearest to the farthest."""
+
+DIRECTIONS: Final = tuple(name for name in _declared_in("_bearing") if name not in SIDES)
+"""Sectors of bearing by their usual names, from ahead to behind."""
+
+MAP_ONLY: Final = _declared_in("_map")
+"""Relations that hold among parts of a map alone: they come with the map and cannot be left out."""
+
+_relations: Final = list(OWN_RELATIONS)
+RELATIONS: Final[Sequence[str]] = _relations
+"""All relations known so far. It grows, and what is in it keeps its place; see :func:`add_relation`."""
 
 RELATION_ALIASES: Final[Mapping[str, str]] = {
     "collides": "overlaps",
@@ -177,7 +184,8 @@ VEHICLE_LIGHTS: Final = (
 """Lights of a vehicle; the index is the bit of a light in a mask (hazard lights are left and right)."""
 
 KIND_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(KINDS)}
-RELATION_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(RELATIONS)}
+_relation_code: Final = {name: code for code, name in enumerate(RELATIONS)}
+RELATION_CODE: Final[Mapping[str, int]] = _relation_code
 LIGHT_STATE_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(LIGHT_STATES)}
 
 
@@ -189,6 +197,12 @@ def normalize_name(name: str) -> str:
 _RELATIONS_FOLDED: Final = {normalize_name(name): name for name in RELATIONS} | {
     normalize_name(alias): name for alias, name in RELATION_ALIASES.items()
 }
+_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
+_growing: Final = Lock()
+
+MOST_RELATIONS: Final = 63
+"""Relations that one process can know: a set of them is a 64-bit number."""
+
 _KINDS_FOLDED: Final = {normalize_name(name): name for name in KINDS}
 _LABELS_FOLDED: Final[Mapping[str, tuple[str, ...]]] = (
     {normalize_name(name): (name,) for name in KINDS}
@@ -197,8 +211,44 @@ _LABELS_FOLDED: Final[Mapping[str, tuple[str, ...]]] = (
 )
 
 
+def add_relation(name: str) -> int:
+    """Make a relation known in this process, and return its code.
+
+    Raises
+    ------
+    ValueError
+        It is no name, it is that of a label or, but for case and underscores, of another relation; or there are
+        too many.
+    """
+    with _growing:
+        if name in _relation_code:
+            return _relation_code[name]
+        if not _NAME.fullmatch(name):
+            raise ValueError(
+                f"{name!r} is no name: letters, digits and _, a letter first, 40 at most"
+            )
+        like = _RELATIONS_FOLDED.get(normalize_name(name)) or (name if kinds_labelled(name) else "")
+        if like:
+            what = "the label" if like == name else "the relation"
+            raise ValueError(f"{name!r} would be taken for {what} {like!r}")
+        if len(_relations) >= MOST_RELATIONS:
+            raise ValueError(f"there are {MOST_RELATIONS} relations, and no room for {name!r}")
+        _RELATIONS_FOLDED[normalize_name(name)] = name
+        _relations.append(name)
+        return _relation_code.setdefault(name, len(_relations) - 1)
+
+
+@cache
+def _add_plugins() -> None:
+    for name in plugins.RELATIONS.others():
+        with suppress(ValueError):  # it is refused where relations are computed
+            add_relation(name)
+
+
 def relation_named(name: str) -> str | None:
     """The relation that a user's name means, or ``None``."""
+    if normalize_name(name) not in _RELATIONS_FOLDED:
+        _add_plugins()  # looking for them takes a while
     return _RELATIONS_FOLDED.get(normalize_name(name))
 
 

@@ -20,7 +20,8 @@ PACKAGE = Path(__file__).parents[1] / "sgstore"
 # From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
 # one another, except that the files of one folder know each other.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "geometry", "processes", "quoting", "vocabulary"}),
+    frozenset({"errors", "geometry", "plugins", "processes", "quoting"}),
+    frozenset({"vocabulary"}),
     frozenset({"abstractions", "config", "files", "graph", "lang", "roads", "world"}),
     frozenset({"contrib", "mcap", "opendrive", "relations", "step", "trace_parts"}),
     frozenset({"draw", "map_files", "readers", "sgg"}),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgstore.config import Config, Direction, PairSettings, Proximity, RangeSettings
-from sgstore.relations import RELATIONS, BlockScene
-from sgstore.relations._bearing import SIDES
+from sgstore.relations import BlockScene, Relation, as_markdown, relations, relations_under
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY, SIGNALS, VEHICLES
-
-if TYPE_CHECKING:
-    from sgstore.relations._scene import RelationFamily
+from sgstore.vocabulary import DIRECTIONS, PROXIMITY, SIDES, SIGNALS, VEHICLES
 
 PI = math.pi
 TOWN = PaperMap(
@@ -34,8 +31,14 @@ TOWN = PaperMap(
     objects=(("s1", "traffic_light"),),
 )
 KINDS = ("car", "truck", "bicycle", "person", "prop", "traffic_light", "animal", "unknown")
-SYMMETRIC = set(PROXIMITY) | {"overlaps", "opposes", "conflictsWith"}
-family = pytest.mark.parametrize("family", RELATIONS, ids=lambda f: f.names(Config())[0])
+SYMMETRIC = {one.name for one in relations() if one.symmetric}
+Family = tuple[Relation, ...]
+FAMILIES = [
+    tuple(one for one in relations() if one.edges is edges)
+    for edges in dict.fromkeys(one.edges for one in relations() if one.edges)
+]
+"""Relations that are computed together."""
+family = pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family[0].name)
 
 
 def crowd(seed: int, count: int = 12, size: float = 40) -> list[Thing]:
@@ -73,11 +76,11 @@ def blurred(what: Thing, rng: np.random.Generator) -> Thing:
 
 
 def found(
-    things: list[Thing], family: RelationFamily, config: Config | None = None, town: PaperMap = TOWN
+    things: list[Thing], family: Family, config: Config | None = None, town: PaperMap = TOWN
 ) -> list[tuple[str, str, str]]:
     config = config or Config()
     graph = graph_of(frames(things), town, config)
-    names = family.names(config)
+    names = {one.name for one in family}
     return [edge for edge in edges(graph, 0, town) if edge[1] in names]
 
 
@@ -85,19 +88,17 @@ def found(
 
 
 @family
-def test_a_family_that_needs_a_map_says_so_where_there_is_none(family: RelationFamily) -> None:
+def test_a_family_that_needs_a_map_says_so_where_there_is_none(family: Family) -> None:
     nothing: Any = None
     scene = BlockScene(Config(), nothing, nothing, nothing, nothing, ground=None)
-    if family.needs_map:
+    if family[0].needs_map:
         with pytest.raises(ValueError, match=r"needs? a map"):
-            family.edges(scene)
+            family[0].edges(scene)
 
 
 @family
 @pytest.mark.parametrize("seed", range(10))
-def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(
-    family: RelationFamily, seed: int
-) -> None:
+def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(family: Family, seed: int) -> None:
     of = found(busy(seed), family)
 
     assert of
@@ -107,7 +108,7 @@ def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(
 
 @family
 @pytest.mark.parametrize("seed", range(10))
-def test_symmetric_relations_are_symmetric(family: RelationFamily, seed: int) -> None:
+def test_symmetric_relations_are_symmetric(family: Family, seed: int) -> None:
     of = {edge for edge in found(busy(seed), family) if edge[1] in SYMMETRIC}
 
     assert of == {(dst, relation, src) for src, relation, dst in of}
@@ -115,9 +116,7 @@ def test_symmetric_relations_are_symmetric(family: RelationFamily, seed: int) ->
 
 @family
 @pytest.mark.parametrize("seed", range(10))
-def test_relations_stay_when_the_world_is_moved_and_turned(
-    family: RelationFamily, seed: int
-) -> None:
+def test_relations_stay_when_the_world_is_moved_and_turned(family: Family, seed: int) -> None:
     rng = np.random.default_rng(seed)
     # A footprint without a heading lies along the x axis, however the world is turned.
     things = [t for t in busy(seed) if not math.isnan(t.heading)]
@@ -130,9 +129,7 @@ def test_relations_stay_when_the_world_is_moved_and_turned(
 
 @family
 @pytest.mark.parametrize("blocks", [1, 2, 7])
-def test_a_block_of_one_frame_gives_what_a_block_of_many_gives(
-    family: RelationFamily, blocks: int
-) -> None:
+def test_a_block_of_one_frame_gives_what_a_block_of_many_gives(family: Family, blocks: int) -> None:
     scenery = [t for t in crowd(0) if t.static]
     scenes = [
         [t for t in crowd(seed) if not t.static and t.kind == "car"][seed % 2 :] + scenery
@@ -148,23 +145,21 @@ def test_a_block_of_one_frame_gives_what_a_block_of_many_gives(
     ]
 
     of = [edges(part, i, TOWN, few.names) for part in parts for i in range(len(part))]
-    names = family.names(Config())
+    names = {one.name for one in family}
     assert [[e for e in frame if e[1] in names] for frame in of] == [
         [e for e in frame if e[1] in names] for frame in expected
     ]
 
 
-@family
-def test_a_family_gives_only_the_relations_it_names(family: RelationFamily) -> None:
+def test_only_relations_that_the_settings_ask_for_are_there() -> None:
     config = Config(
         proximity=Proximity(("near", "visible"), (9.0, 30.0)),
         direction=Direction(("inDFrontOf", "atDRearOf"), (90.0,)),
     )
     graph = graph_of(frames(busy(3)), TOWN, config)
-    named = {name for f in RELATIONS for name in f.names(config)}
+    asked = {one.name for one in relations_under(config) if one.edges}
 
-    assert {relation for _, relation, _ in edges(graph, 0, TOWN)} == named
-    assert set(family.names(config)) <= named
+    assert {relation for _, relation, _ in edges(graph, 0, TOWN)} == asked
 
 
 # Ends of intervals ------------------------------------------------------------------------------
@@ -587,3 +582,9 @@ def test_absurd_positions_are_related_to_nothing_and_disturb_nobody() -> None:
         ("b", "near_coll", "a"),
     ]
     assert together == alone
+
+
+def test_the_page_of_relations_is_made_from_their_declarations() -> None:
+    page = Path(__file__).parents[1] / "docs" / "relations.md"
+
+    assert page.read_text(encoding="utf-8") == as_markdown()

@@ -23,6 +23,7 @@ from sgstore.vocabulary import (
     ENTITY_KINDS,
     KIND_CODE,
     KINDS,
+    MOST_RELATIONS,
     PROXIMITY,
     RELATION_CODE,
     RELATIONS,
@@ -54,7 +55,8 @@ BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
 """Relations among entities that the literature has."""
 
 _SMALL: Final = np.array([kind in SCENERY for kind in KINDS])
-_BETWEEN: Final = np.array([name in BETWEEN_ENTITIES for name in RELATIONS])
+_BETWEEN: Final = np.zeros(MOST_RELATIONS, np.bool_)
+_BETWEEN[[RELATION_CODE[name] for name in BETWEEN_ENTITIES]] = True
 _ENTITY_KINDS: Final = len(ENTITY_KINDS)
 _LANE: Final = KIND_CODE["lane"]
 

@@ -40,7 +40,14 @@ from sgstore.abstractions._columns import (
     role_name,
 )
 from sgstore.abstractions._lanes import NAMELESS, OFF_ROAD, ego_lanes
-from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, RELATIONS
+from sgstore.vocabulary import (
+    ENTITY_KINDS,
+    KIND_CODE,
+    KINDS,
+    MOST_RELATIONS,
+    RELATION_CODE,
+    RELATIONS,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,7 +107,8 @@ _MAPS: Final = 4
 _EGO_LABEL: Final = len(KINDS)
 _KIND_LABELS: Final = (*KINDS, EGO)
 _IS_IN: Final = RELATION_CODE["isIn"]
-_ON_ROADS: Final = np.array([r in OF_JUNCTION and r not in BETWEEN_ENTITIES for r in RELATIONS])
+_ON_ROADS: Final = np.zeros(MOST_RELATIONS, np.bool_)
+_ON_ROADS[[RELATION_CODE[r] for r in OF_JUNCTION if r not in BETWEEN_ENTITIES]] = True
 
 
 def entities(seen: GraphColumns) -> Labelled:

@@ -13,6 +13,7 @@ import sgstore.draw._palette as palette
 from sgstore.draw._bodies import ROUND_KINDS, lamps
 from sgstore.draw._links import ego_lane, seen_from_ego
 from sgstore.draw._view import ARROW_SECONDS, SCENERY, clean
+from sgstore.relations import relations
 from sgstore.vocabulary import KINDS, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
@@ -172,8 +173,9 @@ def _link_entries(scene: DrawnFrame) -> list[Entry]:
 
 
 def _word_entries(words: Iterable[str]) -> list[Entry]:
-    known = [(word, text) for word, text in palette.MEANINGS.items() if word in set(words)]
-    return [Entry("word", f"{word}: {text}", is_long=True) for word, text in known]
+    met = set(words)
+    known = [one for one in relations() if one.legend and one.name in met]
+    return [Entry("word", f"{one.name}: {one.legend}", is_long=True) for one in known]
 
 
 def _lanes_called(names: list[str]) -> str:

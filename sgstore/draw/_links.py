@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from sgstore.draw._view import SCENERY, clean
-from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, PROXIMITY, RELATIONS
+from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, PROXIMITY, RELATIONS, SIDES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,7 +24,7 @@ Family = Literal["ego", "matched", "entity", "road", "mixed", "light"]
 _RANK: Final[Mapping[str, int]] = {name: rank for rank, name in enumerate(PROXIMITY)}
 _ALONG: Final = ("leads", "follows", "overlaps")
 _MET: Final = frozenset(ENTITY_KINDS) - SCENERY
-_ORDER: Final = (*PROXIMITY, *_ALONG, *DIRECTIONS, "toLeftOf", "toRightOf")
+_ORDER: Final = (*PROXIMITY, *_ALONG, *DIRECTIONS, *SIDES)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY
+from sgstore.vocabulary import PROXIMITY
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -160,21 +160,6 @@ CLOSENESS: Final[Mapping[str, tuple[str, float]]] = dict(
     )
 )
 """Colour and width (points) of the line for each proximity relation, the closest first."""
-
-MEANINGS: Final[Mapping[str, str]] = {
-    **dict(
-        zip(
-            DIRECTIONS,
-            ("ahead", "ahead, to the side", "behind, to the side", "behind"),
-            strict=True,
-        )
-    ),
-    "leads": "next one ahead along the lane",
-    "follows": "next one behind along the lane",
-    "overlaps": "footprints touch",
-    "mayAffect": "a signal that lies ahead on that lane",
-}
-"""What the relations mean that do not say so themselves, seen from the other end."""
 
 
 def lane_tint(lane_type: str) -> str:

@@ -402,7 +402,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
             edge.span,
             f"a relation stands behind a colon: -[:{edge.name}]->",
         )
-    relations = _relations(edge.label, session) if edge.label else b.ANY_RELATION
+    relations = _relations(edge.label, session) if edge.label else b.any_relation()
     if not relations:
         session.refuse(
             "no edge can have this label: an edge has one relation",
@@ -490,12 +490,12 @@ def _relations(label: s.LabelExpression, session: Session) -> frozenset[str]:
     result = operands[0]
     for operand in operands[1:]:
         result = result & operand if label.word == "&" else result | operand
-    return b.ANY_RELATION - result if label.word == "!" else result
+    return b.any_relation() - result if label.word == "!" else result
 
 
 def _related(label: s.Label, session: Session) -> frozenset[str]:
     if label.name == "%":
-        return b.ANY_RELATION
+        return b.any_relation()
     relation = relation_named(label.name)
     if relation is None:
         if kinds_labelled(label.name):

@@ -383,7 +383,7 @@ def _vocabulary(expression: b.Bound) -> tuple[str, ...]:
         case b.NodeAttribute(attribute=attribute) | b.FrameAttribute(attribute=attribute):
             return attribute.values
         case b.EdgeRelation():
-            return tuple(sorted(b.ANY_RELATION))
+            return tuple(sorted(b.any_relation()))
         case _:
             return ()
 

@@ -31,7 +31,6 @@ from sgstore.lang._rewrite import rewritten, unfold_paths
 from sgstore.lang._symbols import traces_in
 from sgstore.lang.ir import (
     ANY,
-    ANY_RELATION,
     FRAME_COLUMNS,
     Aggregate,
     BlockValue,
@@ -57,6 +56,7 @@ from sgstore.lang.ir import (
     Tense,
     TraceAttribute,
     Value,
+    any_relation,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
 from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS, normalize_name
@@ -222,7 +222,7 @@ def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record],
 
 def path_text(edge: Edge) -> str:
     """What a path of edges is called: ``isIn*1..3``, ``*2..4``."""
-    relations = "|".join(sorted(edge.relations)) if edge.relations != ANY_RELATION else ""
+    relations = "|".join(sorted(edge.relations)) if edge.relations != any_relation() else ""
     return f"{relations}*{edge.low}..{edge.high}"
 
 
@@ -333,7 +333,7 @@ def _scope(scope: Scope, indent: str) -> list[str]:
 def edge_text(edge: Edge) -> str:
     """An edge between the keys of its nodes."""
     some = [relation for relation in RELATIONS if relation in edge.relations]
-    label = "" if edge.relations == ANY_RELATION else f":{'|'.join(some)}"
+    label = "" if edge.relations == any_relation() else f":{'|'.join(some)}"
     times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
     arrow = "-" if edge.both else "->"
     return f"({edge.src})-[{label}{times}]{arrow}({edge.dst})"

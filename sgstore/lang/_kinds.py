@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang._catalog import DisplayUnit, Home
-from sgstore.lang.ir import ANY_RELATION, Bound, Operation, PairNumber, Scope
+from sgstore.lang.ir import Bound, Operation, PairNumber, Scope, any_relation
 from sgstore.quoting import literal
 from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
 
@@ -111,7 +111,7 @@ def edge_conditions(
     table = catalog.edges if moving else catalog.map_edges
     held = [triple for triple in table if triple[0] in edge.relations]
     conditions: list[str] = []
-    if edge.relations != ANY_RELATION:
+    if edge.relations != any_relation():
         relations = [relation for relation in RELATIONS if relation in edge.relations]
         conditions += [_one_of(f'{alias}."relation"', relations)]
     ends = (edge.dst, edge.src) if swapped else (edge.src, edge.dst)

@@ -129,7 +129,7 @@ class Writer:
 
     def _arrow(self, edge: b.Edge) -> str:
         some = [relation for relation in RELATIONS if relation in edge.relations]
-        label = "" if edge.relations == b.ANY_RELATION else ":" + "|".join(some)
+        label = "" if edge.relations == b.any_relation() else ":" + "|".join(some)
         times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
         name = self.edge_name(edge.key) if edge.named or edge.key in self._spoken_of else ""
         return f"-[{name}{label or (':%' if times else '')}{times}]{'-' if edge.both else '->'}"

@@ -57,7 +57,11 @@ class Kinds:
 
 ANY: Final = Kinds(frozenset(ENTITY_KINDS), frozenset(KINDS))
 EGO: Final = Kinds(frozenset(ENTITY_KINDS), frozenset())
-ANY_RELATION: Final = frozenset(RELATIONS)
+
+
+def any_relation() -> frozenset[str]:
+    """Return all relations that are known now: stores and settings may add some."""
+    return frozenset(RELATIONS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ from ._contact import contacts_of as contacts_of
 from ._extent import Areas as Areas
 from ._extent import EgoPoses as EgoPoses
 from ._extent import Extent as Extent
-from ._families import RELATIONS as RELATIONS
 from ._filters import Keeping as Keeping
 from ._filters import renamed as renamed
 from ._following import Parking as Parking
@@ -21,11 +20,18 @@ from ._pairs import near_pairs as near_pairs
 from ._pairs import of_kinds as of_kinds
 from ._pairs import pieces as pieces
 from ._pairs import related_pairs as related_pairs
+from ._registry import as_markdown as as_markdown
+from ._registry import functions as functions
+from ._registry import relations as relations
+from ._registry import relations_under as relations_under
 from ._scene import IS_SIGNAL as IS_SIGNAL
 from ._scene import BlockScene as BlockScene
 from ._scene import Bodies as Bodies
 from ._scene import MapContext as MapContext
+from ._scene import Relation as Relation
 from ._scene import Standing as Standing
+from ._scene import edges_between as edges_between
+from ._scene import edges_to_map as edges_to_map
 from ._waypoints import waypoints_of as waypoints_of
 
 __all__ = [
@@ -41,12 +47,16 @@ __all__ = [
     "MapContext",
     "NEAR",
     "Parking",
-    "RELATIONS",
+    "Relation",
     "Standing",
     "StillPairs",
     "TOUCHING",
+    "as_markdown",
     "contacts",
     "contacts_of",
+    "edges_between",
+    "edges_to_map",
+    "functions",
     "gaps",
     "gathered",
     "joined_pairs",
@@ -54,6 +64,8 @@ __all__ = [
     "of_kinds",
     "pieces",
     "related_pairs",
+    "relations",
+    "relations_under",
     "renamed",
     "waypoints_of",
 ]

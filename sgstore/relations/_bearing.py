@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.relations._pairs import if_related
-from sgstore.relations._scene import BlockScene, RelationFamily, edges_between
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.relations._scene import BlockScene, Relation, edges_between
+from sgstore.vocabulary import DIRECTIONS, RELATION_CODE, SIDES
 
 if TYPE_CHECKING:
     from sgstore.config import Config
@@ -32,12 +31,6 @@ NOISE: Final = 1e-6
 
 BESIDE: Final = 1e-3
 """What is not farther off the axis is neither left nor right; m."""
-
-SIDES: Final = ("toLeftOf", "toRightOf")
-
-
-def _direction_names(config: Config) -> tuple[str, ...]:
-    return if_related(config, config.direction.names)
 
 
 def _direction_edges(scene: BlockScene) -> Edges:
@@ -66,10 +59,6 @@ def _behind(bearing: Floats) -> Bools:
     return (aside > NOISE) | ((aside >= -NOISE) & (bearing < 0))
 
 
-def _side_names(config: Config) -> tuple[str, ...]:
-    return if_related(config, SIDES if config.direction.sides != "none" else ())
-
-
 def _side_edges(scene: BlockScene) -> Edges:
     if scene.config.direction.sides == "none":
         none = np.zeros(0, np.intp)
@@ -86,5 +75,32 @@ def _side_edges(scene: BlockScene) -> Edges:
     return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])
 
 
-DIRECTION = RelationFamily(_direction_names, needs_map=False, edges=_direction_edges)
-SIDE = RelationFamily(_side_names, needs_map=False, edges=_side_edges)
+def sector(name: str, legend: str = "") -> Relation:
+    """The relation of a sector, by its name."""
+
+    def asked(config: Config) -> bool:
+        return name in config.direction.names
+
+    doc = "b → a: the bearing of b, seen from a, lies in this sector of `[direction]`"
+    return Relation(
+        name=name, doc=doc, edges=_direction_edges, of_pairs=True, settings=asked, legend=legend
+    )
+
+
+IN_DIRECT_FRONT_OF, IN_SIDE_FRONT_OF, AT_SIDE_REAR_OF, AT_DIRECT_REAR_OF = map(
+    sector, DIRECTIONS, ("ahead", "ahead, to the side", "behind, to the side", "behind")
+)
+
+
+def _side(name: str, side: str) -> Relation:
+    return Relation(
+        name=name,
+        doc=f"b → a: b is to the {side} of a; lane → lane: its neighbour to the {side}",
+        edges=_side_edges,
+        of_map=True,
+        of_pairs=True,
+        settings=lambda config: config.direction.sides != "none",
+    )
+
+
+TO_LEFT_OF, TO_RIGHT_OF = map(_side, SIDES, ("left", "right"))

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import gap
-from sgstore.relations._pairs import if_related
-from sgstore.relations._scene import IS_SIGNAL, RelationFamily, edges_between, meeting
+from sgstore.relations._scene import IS_SIGNAL, Relation, edges_between, meeting, relates_pairs
 from sgstore.roads import STOREY
 
 if TYPE_CHECKING:
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.config import Config
     from sgstore.graph import Edges
     from sgstore.relations._scene import BlockScene, Bodies
     from sgstore.world import Bools, Floats
@@ -94,10 +92,6 @@ def _same_height(bodies: Bodies, a: Rows, b: Rows) -> Bools:
     return ~np.where(np.isnan(reach), bottoms > STOREY, apart > reach)
 
 
-def _names(config: Config) -> tuple[str, ...]:
-    return if_related(config, ("overlaps",))
-
-
 def _edges(scene: BlockScene) -> Edges:
     settings, (a, b) = scene.config.pairs, scene.contacts
     if not settings.within > 0:
@@ -107,4 +101,11 @@ def _edges(scene: BlockScene) -> Edges:
     return edges_between(scene, "overlaps", np.concatenate([a, b]), np.concatenate([b, a]))
 
 
-CONTACT = RelationFamily(_names, needs_map=False, edges=_edges)
+OVERLAPS = Relation(
+    name="overlaps",
+    doc="entity ↔ entity: their boxes meet, in the plane and in height: a collision, in a simulator",
+    edges=_edges,
+    symmetric=True,
+    settings=relates_pairs,
+    legend="footprints touch",
+)

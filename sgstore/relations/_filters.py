@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from sgstore.relations._registry import relations
 from sgstore.relations._scene import kinds_mask
 from sgstore.roads import first_sections
 from sgstore.vocabulary import KIND_CODE, KINDS, MAP_KINDS, RELATION_CODE, RELATIONS, kinds_labelled
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from sgstore.config import Config
     from sgstore.graph import Edges, LaneGaps, LaneStates
+    from sgstore.relations._scene import Relation
     from sgstore.roads import RoadMap
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Bools, Codes, Entities, Ints
 
-
-OF_LANES: Final = frozenset(
-    {"travelsTo", "laneChange", "opposes", "conflictsWith", "controlsTrafficOf", "mayAffect"}
-)
-"""Relations that have a lane at one end."""
 
 Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
 
@@ -51,9 +48,8 @@ class Keeping:
             kept -= set(MAP_KINDS)
         self._kinds = kinds_mask(tuple(sorted(kept)))
         self._without = frozenset(config.without)
-        self._impossible = (set() if "lane" in kept else OF_LANES) | (
-            set() if set(MAP_KINDS) & kept else {"isIn"}
-        )
+        self._no_lanes = "lane" not in kept
+        self._no_map = not set(MAP_KINDS) & kept
         dropped = [RELATION_CODE[name] for name in config.without]
         self._relations: Bools = np.ones(len(RELATIONS), np.bool_)
         self._relations[dropped] = False
@@ -79,9 +75,12 @@ class Keeping:
             used[parent[used[child]]] = True
         return kept & (used | ~(lane | road | junction))
 
-    def names(self, computed: set[str], of_map: frozenset[str]) -> set[str]:
+    def names(self, computed: Iterable[Relation], *, with_map: bool) -> set[str]:
         """The relations that graphs can hold, of those that are computed and those that come with a map."""
-        return ((computed - self._without) | of_map) - self._impossible
+        kept = {one.name for one in computed} - self._without
+        of_map = {one.name for one in relations() if one.of_map} if with_map else set[str]()
+        lost = {one.name for one in relations() if self._no_lanes and one.needs_lanes}
+        return (kept | of_map) - lost - ({"isIn"} if self._no_map else set())
 
     def entities(self, kind: Codes) -> Bools:
         """Whether entities of these kinds are kept."""

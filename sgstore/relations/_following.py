@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.graph import Edges, LaneGaps
-from sgstore.relations._scene import RelationFamily, edges_between, kinds_mask
+from sgstore.relations._scene import Relation, edges_between, kinds_mask
 from sgstore.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
@@ -184,10 +184,6 @@ def _same_lane(own: OwnLanes) -> list[Column]:
     return [(behind, behind + 1, own.along[behind + 1] - own.along[behind])]
 
 
-def _names(config: Config) -> tuple[str, ...]:
-    return ("leads", "follows") if config.lanes.ahead > 0 else ()
-
-
 def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
     """Who follows whom, by node ids, and the gaps."""
     none = np.zeros(0, np.intp)
@@ -205,7 +201,21 @@ def _edges(scene: BlockScene) -> Edges:
     )
 
 
-FOLLOWING = RelationFamily(_names, needs_map=True, edges=_edges)
+def _looks_ahead(config: Config) -> bool:
+    return config.lanes.ahead > 0
+
+
+LEADS, FOLLOWS = (
+    Relation(
+        name=name,
+        doc=f"vehicle → vehicle: the next one {where} along the lanes, with `gap`, from bumper to bumper",
+        edges=_edges,
+        needs_map=True,
+        settings=_looks_ahead,
+        legend=f"next one {where} along the lane",
+    )
+    for name, where in (("leads", "ahead"), ("follows", "behind"))
+)
 
 
 # Which vehicles are parked: what can be told only when all of a trace has been seen -------------

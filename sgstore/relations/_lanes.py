@@ -15,21 +15,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sgstore.graph import Edges
-from sgstore.relations._scene import BlockScene, RelationFamily, edges_to_map, joined
+from sgstore.relations._scene import BlockScene, Relation, edges_to_map, joined
 from sgstore.roads import OFF_ROAD
 from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
-    from sgstore.config import Config
     from sgstore.relations._scene import MapContext
     from sgstore.world import Ints
 
 
-def _lane_relations(config: Config) -> tuple[str, ...]:
-    return ("isIn",)
-
-
-def _lane_edges(scene: BlockScene) -> Edges:
+def _is_in(scene: BlockScene) -> Edges:
     ground = scene.ground
     if ground is None:
         raise ValueError("lanes need a map")
@@ -40,7 +35,14 @@ def _lane_edges(scene: BlockScene) -> Edges:
     return edges_to_map(scene, "isIn", rows, np.concatenate([standing.hits.lane, parts, nowhere]))
 
 
-LANES = RelationFamily(_lane_relations, needs_map=True, edges=_lane_edges)
+IS_IN = Relation(
+    name="isIn",
+    doc="an entity in a lane (with `overlap`, `lane_offset`, `heading_error`, `is_primary`, `along`), on a"
+    " crosswalk, or `off_road`; a lane in its road, a road in its junction",
+    edges=_is_in,
+    needs_map=True,
+    of_map=True,
+)
 
 
 # Which lanes signals apply to, and which lie upstream of them, as far as those lanes are in range ----
@@ -49,11 +51,7 @@ LANES = RelationFamily(_lane_relations, needs_map=True, edges=_lane_edges)
 # along the lanes, up to the distance that the settings look.
 
 
-def _names(config: Config) -> tuple[str, ...]:
-    return ("controlsTrafficOf", "mayAffect") if config.lanes.ahead > 0 else ("controlsTrafficOf",)
-
-
-def _edges(scene: BlockScene) -> Edges:
+def _signals(scene: BlockScene) -> Edges:
     ground = scene.ground
     if ground is None:
         raise ValueError("signals need a map")
@@ -83,4 +81,19 @@ def _of_map(ground: MapContext) -> Edges:
     return Edges(frame, code, signals[row], lanes[row])
 
 
-CONTROL = RelationFamily(_names, needs_map=True, edges=_edges)
+CONTROLS_TRAFFIC_OF = Relation(
+    name="controlsTrafficOf",
+    doc="signal → lane: a traffic light, or a sign of the map, for the lanes that it applies to",
+    edges=_signals,
+    needs_map=True,
+    needs_lanes=True,
+)
+MAY_AFFECT = Relation(
+    name="mayAffect",
+    doc="signal → lane: for these lanes, and those from which it lies ahead along the lanes",
+    edges=_signals,
+    needs_map=True,
+    needs_lanes=True,
+    settings=lambda config: config.lanes.ahead > 0,
+    legend="a signal that lies ahead on that lane",
+)

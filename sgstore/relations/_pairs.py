@@ -39,11 +39,6 @@ IS_VEHICLE: Final = kinds_mask(VEHICLES)
 NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
-def if_related(config: Config, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of relations of pairs: none where the config relates no pairs, so that nothing is known of them."""
-    return names if config.pairs.ego or config.pairs.within > 0 else ()
-
-
 def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halves]:
     """Each unordered pair of bodies that move, signals excepted, and are near enough to one another.
 

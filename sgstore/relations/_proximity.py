@@ -10,17 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.relations._pairs import if_related
-from sgstore.relations._scene import BlockScene, RelationFamily, edges_between
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.relations._scene import BlockScene, Relation, edges_between
+from sgstore.vocabulary import PROXIMITY, RELATION_CODE
 
 if TYPE_CHECKING:
     from sgstore.config import Config
     from sgstore.graph import Edges
-
-
-def _names(config: Config) -> tuple[str, ...]:
-    return if_related(config, config.proximity.names)
 
 
 def _edges(scene: BlockScene) -> Edges:
@@ -32,4 +27,14 @@ def _edges(scene: BlockScene) -> Edges:
     return edges_between(scene, codes[rung[on]], pairs.a[on], pairs.b[on])
 
 
-PROXIMITY = RelationFamily(_names, needs_map=False, edges=_edges)
+def rung(name: str) -> Relation:
+    """The relation of a rung, by its name."""
+
+    def asked(config: Config) -> bool:
+        return name in config.proximity.names
+
+    doc = "entity ↔ entity: the distance of the two lies in this rung of `[proximity]`"
+    return Relation(name=name, doc=doc, edges=_edges, symmetric=True, of_pairs=True, settings=asked)
+
+
+SAFETY_HAZARD, NEAR_COLL, SUPER_NEAR, VERY_NEAR, NEAR, VISIBLE = map(rung, PROXIMITY)

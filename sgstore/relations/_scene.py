@@ -6,7 +6,7 @@ Which intervals of a line meet: how candidates are found without looking at all 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -243,22 +243,60 @@ class BlockScene:
     ground: MapContext | None
 
 
-class RelationFamily(NamedTuple):
-    """Relations that are computed together.
+def always(config: Config) -> bool:
+    """Every config asks for it."""
+    return True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Relation:
+    """A relation: all that is to be said of it, in one place.
 
     Attributes
     ----------
-    names : function
-        The relations that it yields under a config.
+    name : str
+        Letters, digits and ``_``, a letter first; compared without regard to case and underscores.
+    doc : str
+        Its meaning, for tables: from what to what it leads, and when it holds.
+    edges : function, optional
+        The edges of a scene; pure. Relations that share a function are computed together, and it may yield
+        any of them. None: the relation comes with the map.
+    symmetric : bool
+        Whether each edge has its mirror image.
     needs_map : bool
-        Whether it knows nothing without a map. Then :attr:`BlockScene.ground` is not None.
-    edges : function
-        The edges of a scene; pure.
+        Whether nothing is known of it without a map. Otherwise :attr:`BlockScene.ground` may be None.
+    needs_lanes : bool
+        Whether it has a lane at one end, so that nothing is known of it where lanes are left out.
+    of_map : bool
+        Whether it holds among parts of a map, too; then every map answers it.
+    of_pairs : bool
+        Whether it holds between related pairs (:attr:`BlockScene.pairs`), so that nothing is known of it where
+        the settings relate none.
+    settings : function
+        Whether a config asks for it.
+    legend : str
+        A few words for the legend of a picture, seen from the other end; empty: the name says it.
     """
 
-    names: Callable[[Config], tuple[str, ...]]
-    needs_map: bool
-    edges: Callable[[BlockScene], Edges]
+    name: str
+    doc: str
+    edges: Callable[[BlockScene], Edges] | None = None
+    symmetric: bool = False
+    needs_map: bool = False
+    needs_lanes: bool = False
+    of_map: bool = False
+    of_pairs: bool = False
+    settings: Callable[[Config], bool] = always
+    legend: str = ""
+
+    def asked(self, config: Config) -> bool:
+        """Whether it is computed under a config, given a map if it needs one."""
+        return self.settings(config) and (not self.of_pairs or relates_pairs(config))
+
+
+def relates_pairs(config: Config) -> bool:
+    """Whether the settings relate any pairs; otherwise nothing is known of them."""
+    return config.pairs.ego or config.pairs.within > 0
 
 
 def edges_between(

@@ -21,14 +21,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import corners, wrapped
-from sgstore.relations._scene import IS_SIGNAL, RelationFamily, edges_between, meeting
+from sgstore.relations._scene import IS_SIGNAL, Relation, edges_between, meeting
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from sgstore.config import Config
     from sgstore.graph import Edges
     from sgstore.relations._scene import BlockScene, Bodies
     from sgstore.world import Bools, Floats, Ints
@@ -195,14 +194,15 @@ def _within(
     )
 
 
-def _names(config: Config) -> tuple[str, ...]:
-    return ("sees",) if config.sees else ()
-
-
 def _edges(scene: BlockScene) -> Edges:
     bodies, ego = scene.bodies, scene.ego
     rows = seen(bodies, ego) if scene.config.sees else np.zeros(0, np.intp)
     return edges_between(scene, "sees", ego[bodies.frame[rows]], rows)
 
 
-SIGHT = RelationFamily(_names, needs_map=False, edges=_edges)
+SEES = Relation(
+    name="sees",
+    doc="ego → entity: no other body hides it: its centre or a corner is in sight",
+    edges=_edges,
+    settings=lambda config: config.sees,
+)

@@ -16,7 +16,15 @@ from sgstore.lang.ir import Bound, Query, Result, Scope, SignalCall, StepTime, T
 from sgstore.matches import Matches
 from sgstore.store import BUCKET_BITS
 from sgstore.temporal._checks import lacking
-from sgstore.temporal._offline import WORDS, Ask, PlanValues, Relation, TraceReader, asks_of, traces
+from sgstore.temporal._offline import (
+    Ask,
+    PlanValues,
+    TimedRelation,
+    TraceReader,
+    asks_of,
+    traces,
+    words,
+)
 from sgstore.temporal._plan import Plan, formula_text, hold_text, link_text, needs_text, sql_text
 from sgstore.temporal._sequences import BindingLine, JoinedBindings, Leg, joined, matches_of
 
@@ -158,7 +166,7 @@ class Finder:
         ask = self._steps[number]
         return (*(n for n in ask.variables if n in self._kept), *ask.edges)
 
-    def _held(self, trace: TraceReader, line: BindingLine, number: int) -> Relation:
+    def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
         """Where a step holds: its pattern, its other conditions, and for as long as is asked."""
         step, ask = self._query.steps[number], self._steps[number]
         relation = trace.relations[f"step {number}"]
@@ -169,15 +177,15 @@ class Finder:
         keys, frames = relation.keys[owners[kept]], relation.frames[kept]
         columns = (*ask.variables, *ask.edges)
         keys = keys[:, [columns.index(name) for name in self._named(number)]]
-        relation = Relation.of(frames, keys)
+        relation = TimedRelation.of(frames, keys)
         if step.hold is None:
             return relation
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
         places = line.held(owners * line.stride + relation.frames, step.hold)
-        return Relation.of(line.frame(places), relation.keys[places // line.stride])
+        return TimedRelation.of(line.frame(places), relation.keys[places // line.stride])
 
     def _true(
-        self, trace: TraceReader, relation: Relation, ask: Ask, formula: Formula, owners: Ints
+        self, trace: TraceReader, relation: TimedRelation, ask: Ask, formula: Formula, owners: Ints
     ) -> Any:
         """Whether a formula is true in each row of a relation."""
         true = np.zeros(len(owners), np.bool_)
@@ -192,7 +200,7 @@ class Finder:
     def _tell_frames(
         self,
         trace: TraceReader,
-        relation: Relation,
+        relation: TimedRelation,
         places: tuple[Bound, ...],
         formulas: dict[Bound, Formula],
         found: _MatchCollector,
@@ -224,7 +232,7 @@ class Finder:
         self,
         trace: TraceReader,
         line: BindingLine,
-        held: list[Relation],
+        held: list[TimedRelation],
         part: JoinedBindings,
         places: tuple[Bound, ...],
         formulas: dict[Bound, Formula],
@@ -257,7 +265,7 @@ class Finder:
         found.values[-2].append(trace.frame_ids[frames[:, 0]].tolist())
         found.values[-1].append(trace.frame_ids[ends].tolist())
 
-    def _placed(self, line: BindingLine, relation: Relation, places: Ints) -> Ints:
+    def _placed(self, line: BindingLine, relation: TimedRelation, places: Ints) -> Ints:
         owner, rows = relation.rows_of(places)
         return owner * line.stride + relation.frames[rows]
 
@@ -344,8 +352,9 @@ class Finder:
         width = len(self._kept) + len(self._edges)
         keys = np.concatenate([np.zeros((0, width), np.int64), *found.bindings])
         nodes = {key: keys[:, number].tolist() for number, key in enumerate(self._kept)}
+        named = words()
         edges = {
-            key: WORDS[keys[:, len(self._kept) + number]].tolist()
+            key: named[keys[:, len(self._kept) + number]].tolist()
             for number, key in enumerate(self._edges)
         }
         values = [[item for part in parts for item in part] for parts in found.values]

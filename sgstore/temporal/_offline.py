@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Relation:
+class TimedRelation:
     """Bindings and frames.
 
     Attributes
@@ -63,7 +63,7 @@ class Relation:
     values: tuple[Any, ...] = ()
 
     @classmethod
-    def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> Relation:
+    def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
         """From rows in any order; of rows with the same binding and frame one is kept.
 
         Parameters
@@ -134,8 +134,11 @@ class Relation:
 # Traces as a plan needs them: the clock, and the relations of atoms and signals, several traces a question
 # ------------------------------------------------------------------------------------------------
 
-WORDS: Final = np.array(sorted(RELATIONS))
-"""Relations in alphabetical order."""
+
+def words() -> NDArray[np.str_]:
+    """Return all relations in alphabetical order."""
+    return np.array(sorted(RELATIONS))
+
 
 CELLS: Final = 4_000_000
 """Bindings times frames that are worked on at once."""
@@ -154,7 +157,7 @@ class Ask:
     values : tuple of Bound
         Asked of each match.
     edges : tuple of str
-        Keys of its edges that are bound: further columns of the keys, places in :data:`WORDS`.
+        Keys of its edges that are bound: further columns of the keys, places in :func:`words`.
     first : bool
         Whether these are no columns, and of matches that differ in them alone the one counts whose relations
         come first.
@@ -186,7 +189,7 @@ class TraceReader:
     start : int
         Simulation time from which seconds are counted; ns.
     clock : Clock
-    relations : dict of str to Relation
+    relations : dict of str to TimedRelation
     """
 
     trace_id: int
@@ -197,7 +200,7 @@ class TraceReader:
     log_times: Ints
     start: int
     clock: Clock
-    relations: dict[str, Relation] = field(default_factory=dict[str, Relation])
+    relations: dict[str, TimedRelation] = field(default_factory=dict[str, TimedRelation])
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -385,14 +388,14 @@ def _relate(
     if ask.everywhere:
         for trace in found.values():
             every = np.arange(len(trace))
-            trace.relations[name] = Relation.of(every, np.zeros((len(trace), 0), np.int64))
+            trace.relations[name] = TimedRelation.of(every, np.zeros((len(trace), 0), np.int64))
         return 0
     bound = {*ask.variables, *ask.edges}
     statement = relation(ask.query, catalog, window, ask.values, bound)
     arrays = file.arrays(statement.sql, statement.values)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
     columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
-    columns += [np.searchsorted(WORDS, np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
+    columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
     keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
     values = [arrays[f":{number}"] for number in range(len(ask.values))]
     told = len(ask.variables) if ask.first else keys.shape[1]
@@ -404,7 +407,9 @@ def _relate(
     for trace in found.values():
         rows = parts.get(trace.trace_id, nothing)
         frames = np.searchsorted(trace.frame_ids, ids[rows])
-        trace.relations[name] = Relation.of(frames, keys[rows], [value[rows] for value in values])
+        trace.relations[name] = TimedRelation.of(
+            frames, keys[rows], [value[rows] for value in values]
+        )
     return len(ids)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang.ir import BoundHold, Length
-    from sgstore.temporal._offline import Relation
+    from sgstore.temporal._offline import TimedRelation
     from sgstore.temporal._signals import Clock
     from sgstore.world import Bools, Ints
 
@@ -236,7 +236,7 @@ class JoinedBindings:
     bindings: Keys
     places: Ints
 
-    def parts(self, relations: Sequence[Relation]) -> Iterator[JoinedBindings]:
+    def parts(self, relations: Sequence[TimedRelation]) -> Iterator[JoinedBindings]:
         """The same in parts of which each has not too many rows."""
         if not len(self.bindings):
             return
@@ -250,13 +250,13 @@ class JoinedBindings:
 
 
 def joined(
-    relations: Sequence[tuple[tuple[str, ...], Relation]], apart: Collection[str]
+    relations: Sequence[tuple[tuple[str, ...], TimedRelation]], apart: Collection[str]
 ) -> JoinedBindings:
     """All bindings of some relations, each with its variables, that agree on what these share.
 
     Parameters
     ----------
-    relations : sequence of (variables, Relation)
+    relations : sequence of (variables, TimedRelation)
     apart : collection of str
         Variables of which no two may be the same.
     """
@@ -268,7 +268,10 @@ def joined(
 
 
 def _with(
-    found: JoinedBindings, variables: tuple[str, ...], relation: Relation, apart: Collection[str]
+    found: JoinedBindings,
+    variables: tuple[str, ...],
+    relation: TimedRelation,
+    apart: Collection[str],
 ) -> JoinedBindings:
     shared = [name for name in variables if name in found.variables]
     new = [name for name in variables if name not in found.variables]

@@ -1,0 +1,150 @@
+"""Registries of what can be added: readers, relations, abstractions, exporters.
+
+What this package has is listed here, name by name, with the place of its object; it is loaded when it is used.
+Other packages add theirs as entry points of the same groups (``pyproject.toml``)::
+
+    [project.entry-points."sgstore.relations"]
+    besides = "my_package.besides:BESIDES"
+
+A name of this package cannot be taken by another one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from importlib.metadata import EntryPoint
+
+    from sgstore.errors import SgstoreError
+
+
+def entry_points(group: str) -> Iterable[EntryPoint]:
+    """Entry points of a group, of all packages that are installed."""
+    from importlib import metadata  # looking for them takes a while, and most processes need none
+
+    return metadata.entry_points(group=group)
+
+
+@dataclass(frozen=True, slots=True)
+class Registry:
+    """Objects of one kind, by name: those of this package, then those of others.
+
+    Attributes
+    ----------
+    group : str
+        Group of entry points.
+    own : mapping
+        Name → place of the object, ``module:attribute``, in the order that counts.
+    what : str
+        What one of them is called in messages.
+    """
+
+    group: str
+    own: Mapping[str, str]
+    what: str
+    _loaded: dict[str, Any] = field(default_factory=dict[str, Any], compare=False)
+
+    def others(self) -> dict[str, EntryPoint]:
+        """Entry points of other packages, by name."""
+        found: dict[str, EntryPoint] = {}
+        for entry in entry_points(self.group):
+            if entry.name not in self.own:
+                found.setdefault(entry.name, entry)
+        return found
+
+    def load(self, name: str) -> Any:
+        """Return the object of this package that has a name."""
+        if name not in self._loaded:
+            module, _, attribute = self.own[name].partition(":")
+            self._loaded[name] = getattr(import_module(module), attribute)
+        return self._loaded[name]
+
+    def load_other(self, entry: EntryPoint, error: type[SgstoreError]) -> Any:
+        """Return the object of another package.
+
+        Raises
+        ------
+        SgstoreError
+            Of the type given: it cannot be loaded.
+        """
+        try:
+            return entry.load()
+        except Exception as fault:  # whatever its import does
+            reason = f"the {self.what} {entry.name!r} ({entry.value}) cannot be loaded: {fault!r}"
+            raise error(reason) from fault
+
+    def every(self, error: type[SgstoreError]) -> Iterator[tuple[str, Any]]:
+        """Yield all names and objects, those of this package first; see :meth:`load_other`."""
+        for name in self.own:
+            yield name, self.load(name)
+        for name, entry in self.others().items():
+            yield name, self.load_other(entry, error)
+
+
+def _in(package: str, **places: str) -> dict[str, str]:
+    return {name: f"sgstore.{package}.{place}" for name, place in places.items()}
+
+
+READERS: Final = Registry(
+    "sgstore.readers",
+    _in(
+        "readers",
+        osi="osi._trace:OsiTrace",
+        carla="carla._trace:CarlaTrace",
+        foxglove="foxglove._trace:FoxgloveTrace",
+    ),
+    "flavour",
+)
+"""Flavours of recordings, in the order in which they are asked."""
+
+RELATIONS: Final = Registry(
+    "sgstore.relations",
+    _in(
+        "relations",
+        isIn="_lanes:IS_IN",
+        travelsTo="_map:TRAVELS_TO",
+        laneChange="_map:LANE_CHANGE",
+        opposes="_map:OPPOSES",
+        toLeftOf="_bearing:TO_LEFT_OF",
+        toRightOf="_bearing:TO_RIGHT_OF",
+        conflictsWith="_map:CONFLICTS_WITH",
+        controlsTrafficOf="_lanes:CONTROLS_TRAFFIC_OF",
+        mayAffect="_lanes:MAY_AFFECT",
+        safety_hazard="_proximity:SAFETY_HAZARD",
+        near_coll="_proximity:NEAR_COLL",
+        super_near="_proximity:SUPER_NEAR",
+        very_near="_proximity:VERY_NEAR",
+        near="_proximity:NEAR",
+        visible="_proximity:VISIBLE",
+        inDFrontOf="_bearing:IN_DIRECT_FRONT_OF",
+        inSFrontOf="_bearing:IN_SIDE_FRONT_OF",
+        atSRearOf="_bearing:AT_SIDE_REAR_OF",
+        atDRearOf="_bearing:AT_DIRECT_REAR_OF",
+        leads="_following:LEADS",
+        follows="_following:FOLLOWS",
+        overlaps="_contact:OVERLAPS",
+        sees="_sight:SEES",
+    ),
+    "relation",
+)
+"""Relations. The first 23 are those of ``schema.sql``, in its order; a new one comes behind them."""
+
+ABSTRACTIONS: Final = Registry(
+    "sgstore.abstractions",
+    _in(
+        "abstractions",
+        E="_literature:entities",
+        EL="_literature:in_lanes",
+        ER="_literature:related",
+        RSV="_literature:road_scene",
+        junction="_literature:junction",
+        SG="_literature:whole",
+        roadscene2vec="_literature:roadscene2vec",
+    ),
+    "abstraction",
+)
+"""Abstractions: functions from columns of graphs to labelled graphs."""
