@@ -1,24 +1,23 @@
-"""Charts of coverage and selection.
+"""Charts of coverage and selection: sizes of classes by rank, growth, pairs of features, curves of selections.
 
-Charts: two axes, lines between them, and a key. What curves of coverage and of selections are drawn with.
+PNG or SVG by the ending of the file's name; the same numbers give the same bytes.
 """
 
 from __future__ import annotations
 
-import math
 from contextlib import contextmanager
-from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.draw._palette import EGO, FAINT_INK, INK, JUNCTION, ROAD_EDGE, RULE
+from sgstore.draw._palette import EGO, FAINT_INK, INK, JUNCTION, ROAD_EDGE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Mapping, Sequence
+    from collections.abc import Generator, Mapping, Sequence
     from pathlib import Path
 
+    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from sgstore.draw._page import Page
@@ -27,12 +26,11 @@ if TYPE_CHECKING:
 _WIDTH: Final = 560.0
 _HEIGHT: Final = 330.0
 _LEFT: Final = 62.0
+_RIGHT: Final = 24.0
 _BELOW: Final = 46.0
-_ABOVE: Final = 60.0
+_ABOVE: Final = 72.0
 _LETTER: Final = 3.9
 """Width of a letter of 7 points, about."""
-_KEY: Final = 5.2
-"""Width of a letter of the key, about; points."""
 
 CHOSEN: Final[Mapping[str, Any]] = {"color": ROAD_EDGE, "linewidth": 1.8}
 """Look of the line that a chart is about."""
@@ -44,43 +42,11 @@ AT_RANDOM: Final[Mapping[str, Any]] = {
 """Look of the line that it is compared with."""
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """Numbers along one side of a chart, as points of the page."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-    log: bool = False
-
-    def at(self, value: Any) -> NDArray[np.float64]:
-        """Where numbers stand."""
-        numbers = np.asarray(value, np.float64)
-        if self.log:
-            numbers = np.log10(np.maximum(numbers, 1e-12))
-            low, high = math.log10(self.low), math.log10(self.high)
-        else:
-            low, high = self.low, self.high
-        return self.start + (numbers - low) / max(high - low, 1e-12) * (self.end - self.start)
-
-    def ticks(self) -> list[float]:
-        """Round numbers on it, some five."""
-        if self.log:
-            first, last = math.floor(math.log10(self.low)), math.floor(math.log10(self.high) + 1e-9)
-            return [10.0**power for power in range(first, last + 1)]
-        raw = (self.high - self.low) / 5
-        step = 10.0 ** math.floor(math.log10(max(raw, 1e-12)))
-        step *= next(one for one in (1, 2, 5, 10) if one * step >= raw)
-        first = math.ceil(self.low / step)
-        return [step * i for i in range(first, math.floor(self.high / step + 1e-9) + 1)]
-
-
 @contextmanager
-def sheet(
+def _page(
     to: Path, title: str, below: str, width: float = _WIDTH, height: float = _HEIGHT
 ) -> Generator[Page]:
-    """A page with a title and a sentence, of at most two lines, under it; written when all is drawn.
+    """Give a page with a title and a sentence, of at most two lines, under it; write it when all is drawn.
 
     Raises
     ------
@@ -104,72 +70,38 @@ def sheet(
         page.save(to)
 
 
-def scales(
-    page: Page,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    *,
-    right: float = 24.0,
-    log: bool = False,
-) -> tuple[Scale, Scale]:
-    """The scales of a chart that fills a page. ``x``, ``y``: from, to; ``right``: room beside it, points."""
-    return (
-        Scale(*x, _LEFT, page.width - right, log),
-        Scale(*y, _BELOW, page.height - _ABOVE, log),
+@contextmanager
+def _chart(
+    to: Path, title: str, below: str, names: tuple[str, str], right: float = _RIGHT
+) -> Generator[Axes]:
+    """Give the axes of a chart that fills a page, with the names of its axes; see :func:`_page`."""
+    with _page(to, title, below) as page:
+        axes = page.plot(_LEFT, _BELOW, page.width - right, page.height - _ABOVE)
+        axes.set_xlabel(names[0], fontsize=8, color=INK, parse_math=False)
+        axes.set_ylabel(names[1], fontsize=8, color=INK, parse_math=False)
+        yield axes
+
+
+def _number_axes(axes: Axes) -> None:
+    """Write the numbers of both axes short (``25 k``), at round values, from 0 on."""
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=True))
+        axis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+
+
+def _key(axes: Axes) -> None:
+    """Explain the lines above the chart, where none of them passes."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize=7, labelcolor=INK, frameon=False
     )
 
 
-def written(value: float) -> str:
-    """A number of an axis, short: ``25k``."""
-    if value >= 10_000:
-        power = math.floor(math.log10(value) / 3)
-        return f"{value / 1000**power:g}{('', 'k', 'M', 'G', 'T')[min(power, 4)]}"
-    return f"{value:g}"
-
-
-def paint_axes(
-    page: Page,
-    x: Scale,
-    y: Scale,
-    names: tuple[str, str],
-    up: Callable[[float], str] = written,
-) -> None:
-    """The frame of a chart, with its numbers and what they are. ``up``: how numbers of ``y`` are written."""
-    for value in x.ticks():
-        at = float(x.at(value))
-        page.sheet.plot([at, at], [y.start, y.end], color=RULE, linewidth=0.6)
-        page.text(at, y.start - 11, written(value), ha="center", color=FAINT_INK)
-    for value in y.ticks():
-        at = float(y.at(value))
-        page.sheet.plot([x.start, x.end], [at, at], color=RULE, linewidth=0.6)
-        page.text(x.start - 5, at - 2.5, up(value), ha="right", color=FAINT_INK)
-    page.sheet.plot([x.start, x.end], [y.start, y.start], color=INK, linewidth=0.8)
-    page.sheet.plot([x.start, x.start], [y.start, y.end], color=INK, linewidth=0.8)
-    page.text((x.start + x.end) / 2, y.start - 28, names[0], ha="center", fontsize=8)
-    middle = (y.start + y.end) / 2
-    page.text(16, middle, names[1], fontsize=8, rotation=90, ha="center", va="center")
-
-
-def paint_key(
-    page: Page, x: Scale, y: Scale, entries: Sequence[tuple[str, Mapping[str, Any]]]
-) -> None:
-    """What the lines are, in the lower right corner; the first entry above."""
-    start = x.end - 40 - _KEY * max(len(text) for text, _ in entries)
-    low, high = y.start + 4, y.start + 6 + 14 * len(entries)
-    box = [start - 4, x.end - 2, x.end - 2, start - 4], [low, low, high, high]
-    page.sheet.fill(*box, color="white", linewidth=0, zorder=3)
-    for number, (text, look) in enumerate(reversed(entries)):
-        height = y.start + 12 + 14 * number
-        page.sheet.plot([start, start + 22], [height, height], zorder=4, **look)
-        page.text(start + 28, height - 2.5, text, zorder=4)
-
-
-# Coverage as pictures: sizes of classes by rank, growth, and which pairs of features occur together ----
-# PNG or SVG by the ending of the file's name; the same numbers give the same bytes.
-
-_RIGHT: Final = 62.0
-_CELL: Final = 11.0
 _GAP: Final = "#f5b877"
+_CELL: Final = 11.0
 MOST_FEATURES: Final = 120
 """Features that a matrix shows; of more, those with the most gaps."""
 
@@ -198,30 +130,31 @@ def draw_rank_sizes(
     MissingExtraError
         The packages for drawing are not installed.
     """
+    from matplotlib.ticker import EngFormatter, NullLocator, PercentFormatter
+
     once = sum(1 for size in sizes if size == 1)
     below = f"{len(sizes)} classes, {sum(sizes)} {unit}s; {once} classes come once"
-    with sheet(to, title, below) as page:
-        x, y = scales(
-            page, (1, max(len(sizes), 10)), (1, max(sizes[0], 10)), right=_RIGHT, log=True
-        )
-        paint_axes(page, x, y, ("rank of the class", f"{unit}s of the class"))
-        ranks = np.arange(1, len(sizes) + 1)
+    ranks = np.arange(1, len(sizes) + 1)
+    names = ("rank of the class", f"{unit}s of the class")
+    with _chart(to, title, below, names, right=62.0) as axes:
+        axes.loglog(ranks, sizes, color=ROAD_EDGE, linewidth=1.6, marker=".", markersize=2.5)
+        axes.set_xlim(1, max(len(sizes), 10))
+        axes.set_ylim(1, max(sizes[0], 10))
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(EngFormatter(sep=""))
+            axis.set_minor_locator(NullLocator())
         if len(cumulative):
-            _draw_share(page, x, Scale(0, 1, y.start, y.end), cumulative, unit)
-        page.sheet.plot(
-            x.at(ranks), y.at(sizes), color=ROAD_EDGE, linewidth=1.6, marker=".", markersize=2.5
-        )
-
-
-def _draw_share(page: Page, x: Scale, share: Scale, cumulative: Sequence[float], unit: str) -> None:
-    """The share that classes have together, with its own numbers to the right."""
-    ranks = np.arange(1, len(cumulative) + 1)
-    page.sheet.plot(x.at(ranks), share.at(cumulative), color=EGO, linewidth=1.4)
-    for value in (0.0, 0.25, 0.5, 0.75, 1.0):
-        page.text(x.end + 5, float(share.at(value)) - 2.5, f"{value:.0%}", color=EGO)
-    look = {"fontsize": 8, "color": EGO, "rotation": 90, "ha": "center", "va": "center"}
-    middle = (share.start + share.end) / 2
-    page.text(page.width - 12, middle, f"share of all {unit}s so far", **look)
+            share: Axes = axes.twinx()
+            share.plot(
+                ranks[: len(cumulative)], cumulative, color=EGO, linewidth=1.4, clip_on=False
+            )
+            share.set_ylim(0, 1)
+            share.set_ylabel(
+                f"share of all {unit}s so far", fontsize=8, color=EGO, parse_math=False
+            )
+            share.yaxis.set_major_formatter(PercentFormatter(1))
+            share.tick_params(length=0, labelsize=7, labelcolor=EGO)
+            share.spines[:].set_visible(False)
 
 
 def draw_growth(
@@ -251,17 +184,15 @@ def draw_growth(
     ExportError, MissingExtraError
         As in :func:`draw_rank_sizes`.
     """
-    with sheet(to, title, below) as page:
-        x, y = scales(page, (0, max(n)), (0, max(classes) * 1.05))
-        paint_axes(page, x, y, (f"{unit}s", "classes"))
-        known = [(one, value) for one, value in zip(n, at_random, strict=True) if value is not None]
-        key = [("as they came", CHOSEN)]
-        if known:
-            numbers, values = zip(*known, strict=True)
-            page.sheet.plot(x.at(numbers), y.at(values), **AT_RANDOM)
-            key.append((f"{unit}s at random", AT_RANDOM))
-        page.sheet.plot(x.at(n), y.at(classes), **CHOSEN)
-        paint_key(page, x, y, key)
+    with _chart(to, title, below, (f"{unit}s", "classes")) as axes:
+        axes.plot(n, classes, label="as they came", **CHOSEN)
+        values = np.array(at_random, np.float64)
+        if np.isfinite(values).any():
+            axes.plot(n, values, label=f"{unit}s at random", zorder=1.9, **AT_RANDOM)
+        axes.set_xlim(0, max(n))
+        axes.set_ylim(0, np.nanmax([*classes, *values]) * 1.05)
+        _number_axes(axes)
+        _key(axes)
 
 
 def draw_matrix(
@@ -295,6 +226,8 @@ def draw_matrix(
     -----
     Of more than :data:`MOST_FEATURES` features, those with the most gaps are shown, and the picture says so.
     """
+    from sgstore.draw._page import printable
+
     shown = np.arange(len(names))
     gaps = wanted & (frames == 0)
     pairs = np.triu(wanted, 1)
@@ -304,28 +237,20 @@ def draw_matrix(
         below += f"; the {MOST_FEATURES} of {len(names)} features with the most gaps"
     frames, gaps = frames[np.ix_(shown, shown)], gaps[np.ix_(shown, shown)]
     names = [names[i] for i in shown.tolist()]
+    names = [printable(name) for name in names]
     side = len(names) * _CELL
     label = 12 + 3.7 * max((len(name) for name in names), default=0)
-    with sheet(to, title, below, max(label + side + 30, 420), side + label + 90) as page:
-        left, bottom = label, 30.0
-        image = _colours(frames, gaps)
-        page.sheet.imshow(
-            image[::-1],
-            extent=(left, left + side, bottom, bottom + side),
-            aspect="auto",
-            interpolation="nearest",
-            origin="lower",
-        )
-        page.sheet.set_xlim(0, page.width)
-        page.sheet.set_ylim(0, page.height)
-        for row, name in enumerate(names):
-            at = bottom + side - (row + 0.5) * _CELL
-            page.text(left - 4, at - 2, name, ha="right", fontsize=6)
-            across = left + (row + 0.5) * _CELL
-            page.text(
-                across, bottom + side + 4, name, rotation=90, ha="center", va="bottom", fontsize=6
-            )
-        _key(page, left, gaps)
+    with _page(to, title, below, max(label + side + 30, 420), side + label + 90) as page:
+        axes = page.plot(label, 30.0, label + side, 30.0 + side)
+        axes.imshow(_colours(frames, gaps), interpolation="nearest", aspect="auto")
+        axes.grid(visible=False)
+        axes.spines[:].set_visible(False)
+        axes.xaxis.tick_top()
+        places = range(len(names))
+        look: dict[str, Any] = {"fontsize": 6, "color": INK, "parse_math": False}
+        axes.set_xticks(places, names, rotation=90, **look)
+        axes.set_yticks(places, names, **look)
+        _explain_colours(page, gaps)
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -340,29 +265,31 @@ def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.f
     return image
 
 
-def _key(page: Page, left: float, gaps: NDArray[np.bool_]) -> None:
-    """What the colours mean, below."""
+def _explain_colours(page: Page, gaps: NDArray[np.bool_]) -> None:
+    """Explain the colours below the matrix."""
+    from matplotlib.patches import Patch
+
     many = int(np.triu(gaps, 1).sum())
-    entries = (
-        ("#2b5491", "many frames have both"),
-        ("#edf1f6", "few"),
-        (_GAP, f"a gap: no frame has both ({many} pairs)"),
+    entries = {
+        "many frames have both": "#2b5491",
+        "few": "#edf1f6",
+        f"a gap: no frame has both ({many} pairs)": _GAP,
+    }
+    page.sheet.legend(
+        handles=[
+            Patch(facecolor=colour, edgecolor=JUNCTION, linewidth=0.4, label=text)
+            for text, colour in entries.items()
+        ],
+        loc="lower left",
+        bbox_to_anchor=(8, 4),
+        bbox_transform=page.sheet.transData,
+        ncols=3,
+        fontsize=6.5,
+        labelcolor=INK,
+        frameon=False,
+        handlelength=1.2,
+        handleheight=1.2,
     )
-    x = min(left, 40.0)
-    for colour, text in entries:
-        page.sheet.fill(
-            [x, x + 9, x + 9, x],
-            [10, 10, 19, 19],
-            facecolor=colour,
-            edgecolor=JUNCTION,
-            linewidth=0.4,
-        )
-        page.text(x + 13, 12, text, fontsize=6.5)
-        x += 26 + 3.6 * len(text)
-
-
-# What a selection keeps, as a picture: after each of its units, beside units in random order ----
-# PNG or SVG by the ending of the file's name; the same numbers give the same bytes.
 
 
 def draw_curve(
@@ -397,18 +324,20 @@ def draw_curve(
     MissingExtraError
         The packages for drawing are not installed.
     """
+    from matplotlib.ticker import MultipleLocator, PercentFormatter
+
     most, whole = max((row[0] for row in rows), default=1), max(total, 1)
     random = [(0, 0.0), *((row[0], row[3] / whole) for row in rows)]
     chosen = [(0, 0.0), *((row[0], row[1] / whole) for row in rows if row[1] is not None)]
-    with sheet(to, title, below) as page:
-        x, y = scales(page, (0, most), (0, 1))
-        paint_axes(page, x, y, (f"{unit}s", f"kept, of {total:,}"), up=lambda share: f"{share:.0%}")
-        for points, look in ((random, AT_RANDOM), (chosen, CHOSEN)):
-            numbers, shares = zip(*points, strict=True)
-            page.sheet.plot(x.at(numbers), y.at(shares), **look)
-        size, kept = chosen[-1]
-        end = float(x.at(size))
-        page.sheet.plot([end, end], [y.start, float(y.at(kept))], color=EGO, linewidth=1.0)
-        paint_key(
-            page, x, y, [(f"selected: {size:,} {unit}s", CHOSEN), (f"{unit}s at random", AT_RANDOM)]
-        )
+    with _chart(to, title, below, (f"{unit}s", f"kept, of {total:,}")) as axes:
+        axes.plot(*zip(*random, strict=True), label=f"{unit}s at random", **AT_RANDOM)
+        size, share = chosen[-1]
+        label = f"selected: {size:,} {unit}s"
+        axes.plot(*zip(*chosen, strict=True), label=label, **CHOSEN)
+        axes.vlines(size, 0, share, color=EGO, linewidth=1.0)
+        axes.set_xlim(0, most)
+        axes.set_ylim(0, 1)
+        _number_axes(axes)
+        axes.yaxis.set_major_locator(MultipleLocator(0.2))
+        axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+        _key(axes)

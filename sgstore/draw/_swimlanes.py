@@ -1,14 +1,11 @@
-"""Timelines: one lane per entity, as text or as a picture.
-
-Swim lanes: when what matches or is violated in a trace, one lane for each who; as text for a terminal.
-"""
+"""Timelines of matches and violations: one lane per entity, as text for a terminal or as a picture."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.draw._palette import EGO, FAINT_INK, GROUND, INK, ROAD_EDGE, RULE
+from sgstore.draw._palette import EGO, FAINT_INK, GROUND, INK, ROAD_EDGE
 from sgstore.lang import parse
 from sgstore.lang.syntax import CheckClause
 
@@ -31,13 +28,13 @@ NAME: Final = 36
 
 @dataclass(frozen=True, slots=True)
 class LaneSpan:
-    """When something holds, in s since the trace began.
+    """A time in which something holds, in s since the trace began.
 
     Attributes
     ----------
     start, end : float
     violation : bool
-        Whether it should not.
+        True if it should not hold.
     """
 
     start: float
@@ -47,7 +44,7 @@ class LaneSpan:
 
 @dataclass(slots=True)
 class Lane:
-    """What one line tells: a pattern or a check, and who.
+    """A line of a timeline: a pattern or a check, and the entities of it.
 
     Attributes
     ----------
@@ -68,7 +65,7 @@ class Lane:
 
     @property
     def label(self) -> str:
-        """What stands beside it."""
+        """Text beside the lane."""
         return " · ".join(part for part in (self.name, self.who) if part)
 
 
@@ -173,7 +170,7 @@ def lines_of(timeline: Timeline, letters: int = LETTERS) -> list[str]:
     head = f"{timeline.trace}  0 … {timeline.seconds:.1f} s"
     if not timeline.lanes:
         return [head, "  nothing"]
-    labels = [_cut(lane.label) for lane in timeline.lanes]
+    labels = [_cut(lane.label, NAME) for lane in timeline.lanes]
     width = max(map(len, labels))
     lines = [head]
     for label, lane in zip(labels, timeline.lanes, strict=True):
@@ -211,7 +208,7 @@ def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
 
 
 def _told(lane: Lane) -> str:
-    """How often, and for how long together."""
+    """Number of spans, and their time together."""
     if not lane.spans:
         return lane.verdict
     seconds = sum(end - start for start, end in _merged(lane.spans))
@@ -220,11 +217,9 @@ def _told(lane: Lane) -> str:
     return f"{what} {times}, {seconds:.1f} s"
 
 
-def _cut(label: str) -> str:
-    return label if len(label) <= NAME else f"{label[: NAME - 1]}…"
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"
 
-
-# Swim lanes of a trace as a picture: when what matches or is violated, one lane for each who ----
 
 MOST_LANES: Final = 400
 """Lanes that a picture shows; the title says of more."""
@@ -276,7 +271,7 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
     height = _TOP + sum(_ABOVE + lanes * _LANE + _BELOW for _, lanes in shown)
     with own_style():
         page = Page(_WIDTH, height)
-        _legend(page, height, sum(len(one.lanes) for one in timelines) - MOST_LANES)
+        _key(page, sum(len(one.lanes) for one in timelines) - MOST_LANES)
         top = height - _TOP
         for timeline, lanes in shown:
             _draw(page, timeline, lanes, top)
@@ -284,52 +279,59 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
         page.save(to)
 
 
-def _legend(page: Page, height: float, more: int) -> None:
-    x, y = 14.0, height - 20
-    for colour, word in ((ROAD_EDGE, "found"), (EGO, "violated")):
-        page.sheet.fill(
-            [x, x + 14, x + 14, x], [y, y, y + _BAR, y + _BAR], color=colour, linewidth=0
-        )
-        page.text(x + 19, y + 1.5, word, fontsize=8)
-        x += 76
+def _key(page: Page, more: int) -> None:
+    """Explain the colours above all lanes, and say how many lanes are not shown."""
+    from matplotlib.patches import Patch
+
+    handles = [Patch(color=ROAD_EDGE, label="found"), Patch(color=EGO, label="violated")]
     if more > 0:
-        page.text(x, y + 1.5, f"{more} more lanes are not shown", fontsize=8, color=FAINT_INK)
+        handles.append(Patch(visible=False, label=f"{more} more lanes are not shown"))
+    page.sheet.legend(
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(8, page.height - 6),
+        bbox_transform=page.sheet.transData,
+        ncols=3,
+        fontsize=8,
+        labelcolor=INK,
+        frameon=False,
+        handlelength=1.6,
+    )
 
 
 def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
-    start, end = _LEFT, _WIDTH - _RIGHT
-    seconds = max(timeline.seconds, 1e-9)
-    low, high = top - _ABOVE - lanes * _LANE, top - _ABOVE
+    """Draw the lanes of a trace below a height of the page."""
+    from matplotlib.ticker import MaxNLocator
+
+    from sgstore.draw._page import printable
+
     page.text(14, top - 18, timeline.trace[:80], fontsize=9, weight="bold")
-    for value in _ticks(timeline.seconds):
-        at = start + value / seconds * (end - start)
-        page.sheet.plot([at, at], [low, high], color=RULE, linewidth=0.6, zorder=1)
-        page.text(at, low - 11, f"{value:g} s", ha="center", color=FAINT_INK)
-    if not timeline.lanes:
-        page.text(start, high - 10, "nothing", color=FAINT_INK)
-    for number, lane in enumerate(timeline.lanes[:lanes]):
-        base = high - (number + 1) * _LANE + (_LANE - _BAR) / 2
-        label = lane.label if len(lane.label) <= _LETTERS else f"{lane.label[: _LETTERS - 1]}…"
-        page.text(start - 6, base + 1.8, label, ha="right", fontsize=7, color=INK)
-        _bar(page, (start, end), base, GROUND)
+    axes = page.plot(_LEFT, top - _ABOVE - lanes * _LANE, _WIDTH - _RIGHT, top - _ABOVE)
+    axes.spines[:].set_visible(False)
+    seconds = max(timeline.seconds, 1e-9)
+    axes.set_xlim(0, seconds)
+    axes.set_ylim(lanes - 0.5, -0.5)
+    axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 2, 5, 10]))
+    axes.xaxis.set_major_formatter("{x:g} s")
+    axes.grid(visible=False, axis="y")
+    shown = timeline.lanes[:lanes]
+    labels = [printable(_cut(lane.label, _LETTERS)) for lane in shown]
+    axes.set_yticks(range(len(shown)), labels, color=INK, parse_math=False)
+    if not shown:
+        page.write(axes, 0, 0, "nothing", color=FAINT_INK)
+    shortest = _LEAST / (_WIDTH - _RIGHT - _LEFT) * seconds
+    for row, lane in enumerate(shown):
+        across = (row - _BAR / _LANE / 2, _BAR / _LANE)
+        axes.broken_barh([(0, seconds)], across, color=GROUND, linewidth=0, zorder=0.4)
         if not lane.spans and lane.verdict == "unknown":
             said = f"cannot be told: {lane.reason}" if lane.reason else "cannot be told"
-            said = said if len(said) <= _REASON else f"{said[: _REASON - 1]}…"
-            page.text(start + 4, base + 1.8, said, fontsize=7, color=FAINT_INK)
-        for span in lane.spans:
-            a, z = (start + t / seconds * (end - start) for t in (span.start, span.end))
-            _bar(page, (a, max(z, a + _LEAST)), base, EGO if span.violation else ROAD_EDGE)
-
-
-def _bar(page: Page, ends: tuple[float, float], base: float, colour: str) -> None:
-    a, z = ends
-    box = [a, z, z, a], [base, base, base + _BAR, base + _BAR]
-    page.sheet.fill(*box, color=colour, linewidth=0, zorder=0.5 if colour == GROUND else 2)
-
-
-def _ticks(seconds: float) -> list[float]:
-    """Round times, some eight."""
-    step = next(
-        (s * 10**p for p in range(-3, 9) for s in (1, 2, 5) if seconds / (s * 10**p) <= 9), 1e9
-    )
-    return [round(number * step, 6) for number in range(int(seconds / step) + 1)]
+            page.write(
+                axes, seconds / 120, row, _cut(said, _REASON), va="center_baseline", color=FAINT_INK
+            )
+        for violation, colour in ((False, ROAD_EDGE), (True, EGO)):
+            spans = [
+                (one.start, max(one.end - one.start, shortest))
+                for one in lane.spans
+                if one.violation is violation
+            ]
+            axes.broken_barh(spans, across, color=colour, linewidth=0, zorder=2)
