@@ -22,6 +22,7 @@ from verb_lines import LINES, verbs
 import sgstore
 import sgstore.cli._process as ending
 import sgstore.store._locking as access
+import sgstore.store._rows as rows
 from sgstore.cli import application, run
 from sgstore.demo import RECORDING
 from sgstore.errors import SqlError
@@ -155,6 +156,13 @@ class TimeIsUpError(Exception):
     """What a caller's own handler raises."""
 
 
+def interrupt_readers() -> None:
+    """End whatever this process is asking of stores."""
+    for door in tuple(access._doors.values()):
+        for connection in tuple(door.cursors):
+            connection.interrupt()
+
+
 @pytest.mark.parametrize("face", ENDLESS_IN_PYTHON)
 def test_what_a_handler_of_signals_raises_ends_a_question_of_the_library(
     face: str, town_store: Path
@@ -163,7 +171,7 @@ def test_what_a_handler_of_signals_raises_ends_a_question_of_the_library(
         raise TimeIsUpError
 
     store = Store(town_store)
-    late = threading.Timer(20, access.interrupt_readers)
+    late = threading.Timer(20, interrupt_readers)
     before = signal.signal(signal.SIGALRM, up)
     late.start()
     try:
@@ -193,6 +201,44 @@ def test_a_handler_that_raises_nothing_changes_no_answer(town_store: Path) -> No
     (nodes,) = Store(town_store).sql("SELECT count(*) FROM nodes").values[0]
     assert came
     assert found.values[0][0] == 100 * nodes
+
+
+def test_one_thread_does_the_steps_of_all_questions_even_after_an_interruption(
+    town_store: Path,
+) -> None:
+    def up(*_: object) -> None:
+        raise TimeIsUpError
+
+    store = Store(town_store)
+    assert store.sql("SELECT 1").values == [(1,)]
+    threads = threading.active_count()
+    before = signal.signal(signal.SIGALRM, up)
+    try:
+        with store.file.snapshot():  # opened before: only a step is interrupted
+            signal.setitimer(signal.ITIMER_REAL, 0.5)
+            with pytest.raises(TimeIsUpError):
+                store.sql(PAIRS)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+    assert [store.sql(f"SELECT {n}").values for n in range(20)] == [[(n,)] for n in range(20)]
+    assert threading.active_count() == threads
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing is forked off here")
+def test_a_process_that_was_forked_off_asks_by_a_thread_of_its_own(town_store: Path) -> None:
+    assert Store(town_store).sql("SELECT 1").values == [(1,)]
+    child = os.fork()
+    if not child:
+        # DuckDB itself does not survive a fork; a step of Python shows whether anybody does the steps.
+        os._exit(rows.interruptible(None, lambda: 7))
+    late = threading.Timer(20, os.kill, (child, signal.SIGKILL))
+    late.start()
+    try:
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    finally:
+        late.cancel()
 
 
 def test_errors_of_the_database_and_other_threads_are_as_they_were(town_store: Path) -> None:

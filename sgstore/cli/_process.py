@@ -8,8 +8,8 @@ end, transactions are rolled back, and what was being written is removed. Here i
 An interruption that comes while Python runs a ``__del__`` or a callback of a weak reference is lost: Python
 reports it and goes on. :func:`_lost` hears of that and raises it again a moment later.
 
-Python heeds a signal only between its own steps, and one step of the database may take for ever. So a thread is
-woken by every signal, and interrupts the database if the signal is not heeded soon.
+Python heeds a signal only between its own steps. One step of the database may take for ever, so the main thread
+does none itself, but waits for a thread that does: see ``interruptible`` of :mod:`sgstore.store._rows`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ import io
 import os
 import signal
 import sys
-import threading
-import time
 from collections import namedtuple
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -38,8 +36,6 @@ INTERRUPTED: Final = 128 + 2
 _ENDS: Final = tuple(
     number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None)) is not None
 )
-_SOON_S: Final = 1.0
-"""How long Python may take to heed a signal; s."""
 _WORDS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
 """How the database tells of an interruption, which it turns into errors of its own."""
 
@@ -52,8 +48,6 @@ class _RunEnd:
     deadline_s: float = 0.0
     late: bool = False
     reported: Any = None
-    heeded: int = 0
-    """How many signals have been heeded by the handlers here."""
 
 
 _run = _RunEnd()
@@ -65,7 +59,6 @@ def heed_signals() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
     _hear_of_lost()
-    _wake_for_signals()
 
 
 def ignore_signals() -> None:
@@ -79,7 +72,6 @@ def ignore_signals() -> None:
 
 def _end(number: int, _frame: FrameType | None) -> None:
     _run.signal = number
-    _run.heeded += 1
     for other in _ENDS:  # whoever asks twice does not get less of what is to be undone
         signal.signal(other, signal.SIG_IGN)
     raise KeyboardInterrupt
@@ -88,25 +80,6 @@ def _end(number: int, _frame: FrameType | None) -> None:
 def _hear_of_lost() -> None:
     if sys.unraisablehook is not _lost:
         _run.reported, sys.unraisablehook = sys.unraisablehook, _lost
-
-
-def _wake_for_signals() -> None:
-    """Have a thread woken by each signal that comes to this process, which ends with its run."""
-    reader, waking = os.pipe()
-    os.set_blocking(waking, False)
-    threading.Thread(target=_interrupt, args=(reader,), daemon=True).start()
-    signal.set_wakeup_fd(waking, warn_on_full_buffer=False)
-
-
-def _interrupt(reader: int) -> None:
-    """Interrupt the database whenever a signal that ends the run is not heeded soon."""
-    ending, heeded = {signal.SIGINT, signal.SIGALRM, *_ENDS}, 0
-    while numbers := os.read(reader, 64):
-        time.sleep(_SOON_S)
-        access = sys.modules.get("sgstore.store._locking")  # without it nothing is asked
-        if access is not None and heeded == _run.heeded and ending.intersection(numbers):
-            access.interrupt_readers()
-        heeded = _run.heeded
 
 
 def _lost(report: Any) -> None:
@@ -120,7 +93,6 @@ def _lost(report: Any) -> None:
 
 
 def _again(_number: int, _frame: FrameType | None) -> None:
-    _run.heeded += 1
     raise KeyboardInterrupt
 
 
@@ -145,7 +117,6 @@ def clear_deadline() -> None:
 
 def _too_late(_number: int, _frame: FrameType | None) -> None:
     _run.late = True
-    _run.heeded += 1
     raise KeyboardInterrupt
 
 

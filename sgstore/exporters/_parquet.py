@@ -61,7 +61,7 @@ _CLIPS: Final = {
 def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write the tables, and read them again."""
     about = export.about()["clips"]
-    with ParquetTable(folder / "clips.parquet", _CLIPS) as clips:
+    with ParquetTable(folder / "clips.parquet", _CLIPS.items()) as clips:
         columns = {name: [clip.get(name) for clip in about] for name in _CLIPS}
         clips.add(columns | {"clip": list(range(1, len(about) + 1))})
     counts = {"clips": clips.rows}
@@ -74,7 +74,7 @@ def _write_table(export: Export, folder: Path, name: str) -> int:
     file = export.store.file
     kinds = _label_types(export) if name == "frames" else {}
     columns = {"clip": "INTEGER", **_types(file, TABLES[name]), **kinds}
-    with ParquetTable(folder / f"{name}.parquet", columns) as table:
+    with ParquetTable(folder / f"{name}.parquet", columns.items()) as table:
         for frames in export.windows():
             found = file.arrays(TABLES[name], frames.bounds)
             table.add(_of_clip(export, frames, found, kinds))

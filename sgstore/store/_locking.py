@@ -571,18 +571,6 @@ def _transaction(connection: DuckDBPyConnection) -> Generator[None]:
         connection.execute("CHECKPOINT store")
 
 
-def interrupt_readers() -> None:
-    """End whatever this process is asking of stores; called by another thread than those that ask.
-
-    A single step of the database, such as one over three tables without a join, may take for ever, and heeds
-    this alone.
-    """
-    for door in tuple(_doors.values()):
-        for connection in tuple(door.cursors):
-            with suppress(duckdb.Error):  # it was closed meanwhile
-                connection.interrupt()
-
-
 class BusyError(StoreError):
     """Others have the file."""
 

@@ -16,8 +16,9 @@ import threading
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 import duckdb
@@ -69,7 +70,7 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
         return step()
     task = _Task(step)
     try:
-        began = task.start()
+        began = _step_thread.begin(task)
         while began and not task.ended.wait(_LOOK_S):
             pass
     except BaseException:
@@ -83,7 +84,7 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
 
 
 class _Task(Generic[T]):
-    """A step in a thread of its own."""
+    """A step that another thread does."""
 
     def __init__(self, step: Callable[[], T]) -> None:
         self.ended = threading.Event()
@@ -93,15 +94,8 @@ class _Task(Generic[T]):
         self._found: list[T] = []
         self._error: BaseException | None = None
 
-    def start(self) -> bool:
-        """Begin; whether there is a thread for it."""
-        try:
-            threading.Thread(target=self._run, daemon=True).start()
-        except RuntimeError:  # no more threads may be had
-            return not self._taken()
-        return True
-
-    def _taken(self) -> bool:
+    def take(self) -> bool:
+        """Take the turn; ``False`` if it was taken."""
         try:
             self._turns.pop()
         except IndexError:
@@ -109,13 +103,13 @@ class _Task(Generic[T]):
         return True
 
     def is_over(self) -> bool:
-        """Whether the step has ended, or will never begin."""
-        if self._taken():
+        """Return whether the step has ended, or will never begin."""
+        if self.take():
             self.ended.set()
         return self.ended.is_set()
 
     def result(self) -> T:
-        """What the step returned, or else raised."""
+        """Return what the step returned, or raise what it raised."""
         try:
             if self._error is not None:
                 raise self._error
@@ -124,12 +118,13 @@ class _Task(Generic[T]):
             self.forget()
 
     def forget(self) -> None:
-        """Let go of what was found: an error refers to what refers to it, and so would hold the connection."""
+        """Let go of the result: an error refers to what refers to it, and so would hold the connection."""
         self._error = None
         self._found.clear()
 
-    def _run(self) -> None:
-        if not self._taken():
+    def run(self) -> None:
+        """Do the step, unless it is not wanted any more."""
+        if not self.take():
             return
         try:
             self._found.append(self._step())
@@ -137,6 +132,39 @@ class _Task(Generic[T]):
             self._error = error
         finally:
             self.ended.set()
+
+
+class _StepThread:
+    """The thread that does the steps of the main thread, one after another.
+
+    It lasts, because to start one takes longer than a short question.
+    """
+
+    def __init__(self) -> None:
+        self._tasks: SimpleQueue[_Task[Any]] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, task: _Task[Any]) -> bool:
+        """Hand over a task; ``False``: there can be no thread for it."""
+        # A process that was forked off has no thread, and its queue may be locked for ever.
+        if self._thread is None or not self._thread.is_alive():
+            self._tasks = SimpleQueue()
+            thread = threading.Thread(target=_do_all, args=(self._tasks,), daemon=True)
+            try:
+                thread.start()
+            except RuntimeError:  # no more threads may be had
+                return not task.take()
+            self._thread = thread
+        self._tasks.put(task)
+        return True
+
+
+def _do_all(tasks: SimpleQueue[_Task[Any]]) -> None:
+    while True:
+        tasks.get().run()  # not by a name, which would hold the connection until the next task
+
+
+_step_thread: Final = _StepThread()
 
 
 # What a statement gives: rows in memory, arrays, or a stream of rows ----------------------------
@@ -485,8 +513,13 @@ def arrow_file(source: Path, to: Path) -> None:
 
 
 def _columns(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[list[Any]]:
-    found = [list(values) for values in zip(*rows, strict=True)]
-    return found or [[] for _ in columns]
+    """Rows as columns. Some rows at a time: what was made together lies together in memory."""
+    found: list[list[Any]] = [[] for _ in columns]
+    rows = iter(rows)
+    while batch := list(islice(rows, BATCH)):
+        for values, more in zip(found, zip(*batch, strict=True), strict=True):
+            values.extend(more)
+    return found
 
 
 def _cell(value: Any) -> Any:
@@ -503,10 +536,15 @@ def _package(name: str, purpose: str, extra: str) -> Any:
         raise MissingExtraError(purpose, extra) from error
 
 
-# Columns → Parquet, block by block, by DuckDB, so that nobody needs another package for it ------
+# Columns or rows → Parquet, block by block, by DuckDB, so that nobody needs another package for it ----
 
 ROW_GROUP: Final = 122_880
 """Rows of a row group."""
+
+_TOGETHER: Final = 50_000
+"""Rows that are written at once, and tell the types of the columns where nobody else does."""
+
+_TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))
 
 
 class ParquetTable:
@@ -518,8 +556,13 @@ class ParquetTable:
     ----------
     to : Path
         The file; one that is there is replaced.
-    columns : mapping
-        Name → type as DuckDB has it: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``.
+    columns : iterable of (str, str)
+        Names, and types as DuckDB has them: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``.
+    enums : bool
+        Whether enumerations stay what they are. By default they become texts, because they would be
+        dictionaries, which not every reader of Parquet knows.
+    called : Path, optional
+        The file as errors call it; by default as it is.
 
     Attributes
     ----------
@@ -532,31 +575,41 @@ class ParquetTable:
         The file cannot be written.
     """
 
-    def __init__(self, to: Path, columns: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        to: Path,
+        columns: Iterable[tuple[str, str]],
+        *,
+        enums: bool = False,
+        called: Path | None = None,
+    ) -> None:
         self.rows = 0
         self._to = to
-        self._folder = ExitStack()
-        folder = self._folder.enter_context(working_folder("table"))
-        self._connection = duckdb.connect(str(folder / "rows.duckdb"))
-        self._connection.execute("SET threads = 1")  # so that row groups come in one order
-        # Enumerations would become dictionaries that not every reader of Parquet knows.
-        self._columns = {
-            name: "VARCHAR" if kind.startswith("ENUM") else kind for name, kind in columns.items()
-        }
-        named = ", ".join(f"{quoted(name)} {kind}" for name, kind in self._columns.items())
-        self._do(f"CREATE TABLE output ({named})")
+        self._called = called or to
+        kinds = [
+            (name, "VARCHAR" if kind.startswith("ENUM") and not enums else kind)
+            for name, kind in columns
+        ]
+        self._columns = tuple(name for name, _ in kinds)
+        named = ", ".join(f"{quoted(name)} {kind}" for name, kind in kinds)
+        with ExitStack() as stack, self._translated():
+            folder = stack.enter_context(working_folder("table"))
+            rows = duckdb.connect(str(folder / "rows.duckdb"))
+            self._connection = stack.enter_context(rows)
+            rows.execute("SET threads = 1")  # so that row groups come in one order
+            rows.execute(f"CREATE TABLE output ({named})")
+            self._open = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_exception: object) -> None:
-        try:
+        with self._open, self._translated():
             if kind is None:
                 to = literal(str(self._to))
-                self._do(f"COPY output TO {to} (FORMAT parquet, ROW_GROUP_SIZE {ROW_GROUP})")
-        finally:
-            self._connection.close()
-            self._folder.close()
+                self._connection.execute(
+                    f"COPY output TO {to} (FORMAT parquet, ROW_GROUP_SIZE {ROW_GROUP})"
+                )
 
     def add(self, columns: Mapping[str, NDArray[Any] | Sequence[Any]]) -> None:
         """Add rows.
@@ -571,53 +624,37 @@ class ParquetTable:
         ExportError
             A value does not fit the type of its column, or the disk is full.
         """
-        import numpy as np  # with the caller's arrays it is there already
+        self._add([columns[name] for name in self._columns])
 
-        data: dict[str, Any] = {}
-        for i, name in enumerate(self._columns):
-            values = columns[name]
-            if not isinstance(values, np.ndarray):
-                listed = np.empty(len(values), object)
+    def add_rows(self, rows: Iterable[Sequence[Any]]) -> None:
+        """Add rows of plain Python values, ``None`` where one is missing; see :meth:`add`."""
+        rows = iter(rows)
+        while batch := list(islice(rows, _TOGETHER)):
+            self._add([[row[i] for row in batch] for i in range(len(self._columns))])
+
+    def _add(self, columns: Sequence[NDArray[Any] | Sequence[Any]]) -> None:
+        data: dict[str, NDArray[Any]] = {}
+        for i, values in enumerate(columns):
+            if isinstance(values, np.ndarray):
+                data[f"c{i}"] = values
+            else:
+                listed = data[f"c{i}"] = np.empty(len(values), object)
                 listed[:] = values
-                values = listed
-            data[f"c{i}"] = values
         number = len(data["c0"])
         if not number:
             return
-        self._connection.register("block", data)
-        self._do("INSERT INTO output SELECT * FROM block")
-        self._connection.unregister("block")
+        with self._translated():
+            self._connection.register("block", data)
+            self._connection.execute("INSERT INTO output SELECT * FROM block")
+            self._connection.unregister("block")
         self.rows += number
 
-    def _do(self, statement: str) -> None:
+    @contextmanager
+    def _translated(self) -> Generator[None]:
         try:
-            self._connection.execute(statement)
+            yield
         except duckdb.Error as error:
-            raise ExportError(f"{self._to}: {str(error).strip()}") from error
-
-
-def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
-    """How many rows a Parquet file has, and the names of its columns, read again as a whole.
-
-    Raises
-    ------
-    ExportError
-        It cannot be read.
-    """
-    try:
-        with duckdb.connect() as connection:
-            found = Batches(connection, "FROM read_parquet(?)", [str(file)], 50_000)
-            return sum(len(batch) for batch in found), found.columns
-    except duckdb.Error as error:
-        raise ExportError(f"{file.name}: cannot be read back: {str(error).strip()}") from error
-
-
-# Rows → Parquet, by DuckDB, so that nobody needs another package for it -------------------------
-
-PARQUET_BATCH: Final = 50_000
-"""Rows that are held at a time."""
-
-_TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))
+            raise ExportError(f"{self._called}: {str(error).strip()}") from error
 
 
 def write_parquet(
@@ -650,34 +687,16 @@ def write_parquet(
         The file cannot be written, or a later row does not fit the type of its column.
     """
     rows = iter(rows)
-    batch = list(islice(rows, PARQUET_BATCH))
-    types = types or [_type_of([row[i] for row in batch]) for i in range(len(columns))]
-    named = ", ".join(f"{quoted(n)} {t}" for n, t in zip(columns, types, strict=True))
-    number = 0
-    # A file of its own, and not memory, takes what the rows add up to.
+    if types is None:
+        first = list(islice(rows, _TOGETHER))
+        types = [_type_of([row[i] for row in first]) for i in range(len(columns))]
+        rows = chain(first, rows)
     with (
         written_at(to) as place,
-        working_folder("parquet") as folder,
-        _translated(to),
-        duckdb.connect(str(folder / "rows.duckdb")) as connection,
+        ParquetTable(place, zip(columns, types, strict=True), enums=True, called=to) as table,
     ):
-        connection.execute(f"CREATE TABLE output ({named})")
-        while batch:
-            _append(connection, batch, len(columns))
-            number += len(batch)
-            batch = list(islice(rows, PARQUET_BATCH))
-        connection.execute(f"COPY output TO {literal(str(place))} (FORMAT parquet)")
-    return number
-
-
-def _append(connection: duckdb.DuckDBPyConnection, batch: list[Sequence[Any]], width: int) -> None:
-    data: dict[str, np.ndarray[Any, np.dtype[np.object_]]] = {}
-    for i in range(width):
-        data[f"c{i}"] = np.empty(len(batch), np.object_)
-        data[f"c{i}"][:] = [row[i] for row in batch]
-    connection.register("batch", data)
-    connection.execute("INSERT INTO output SELECT * FROM batch")
-    connection.unregister("batch")
+        table.add_rows(rows)
+    return table.rows
 
 
 def _type_of(values: list[Any]) -> str:
@@ -690,12 +709,20 @@ def _type_of(values: list[Any]) -> str:
     return "VARCHAR"
 
 
-@contextmanager
-def _translated(to: Path) -> Generator[None]:
+def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
+    """Count the rows of a Parquet file, and name its columns; it is read again as a whole.
+
+    Raises
+    ------
+    ExportError
+        It cannot be read.
+    """
     try:
-        yield
+        with duckdb.connect() as connection:
+            found = Batches(connection, "FROM read_parquet(?)", [str(file)])
+            return sum(len(batch) for batch in found), found.columns
     except duckdb.Error as error:
-        raise ExportError(f"{to}: {str(error).strip()}") from error
+        raise ExportError(f"{file.name}: cannot be read back: {str(error).strip()}") from error
 
 
 # Rows that a statement of ours is given: a table that lasts as long as the statement is asked ----
