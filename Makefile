@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house
+.PHONY: help demo test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -25,6 +25,7 @@ help:
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
+	@echo "make api     write docs/api.md from the docstrings again"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -117,6 +118,9 @@ duckdb-versions: $(VENV)/.dev
 
 patterns: $(VENV)/.dev
 	$(BIN)/python tests/library_page.py
+
+api: $(VENV)/.dev
+	$(BIN)/python tests/api_page.py
 
 sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py

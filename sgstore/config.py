@@ -297,7 +297,7 @@ class Signs:
     orientation: str = "asam"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Config:
     """All settings of a scene graph generator.
 
@@ -380,6 +380,17 @@ class Config:
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
         """Those of the type names that no mapping knows whose meaning the client does not tell either."""
         return {name: n for name, n in types.items() if name.lower() not in self.types}
+
+    def __repr__(self) -> str:
+        """The settings that are not as by default: ``Config(range.radius=30.0)``."""
+        told = list[str]()
+        for name, default in Config().as_dict().items():
+            value = self.as_dict()[name]
+            if not isinstance(default, dict) or not default:
+                told += [f"{name}={value!r}"] * (value != default)
+            else:
+                told += [f"{name}.{k}={value[k]!r}" for k in default if value[k] != default[k]]
+        return f"Config({', '.join(told)})"
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as they stand in TOML and JSON."""

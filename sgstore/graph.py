@@ -327,7 +327,7 @@ class EdgeColumns(Sequence["EdgeRecord"]):
         return f"<{len(self):,} edges>"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class SceneGraph:
     """The scene graph of one frame: ``(V, E, Ego, kind, rel, att)`` of the paper, as records.
 
@@ -357,6 +357,10 @@ class SceneGraph:
     nodes: dict[int, dict[str, Any]]
     edges: Sequence[tuple[int, str, int, dict[str, Any]]]
     reach: LaneDistances | None = field(default=None, compare=False, repr=False)
+
+    def __repr__(self) -> str:
+        size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"
+        return f"<SceneGraph {self.trace}#{self.seq}: {size}>"
 
     def places(self) -> dict[int, list[tuple[int, float]]]:
         """Where entities are along their own lanes: node id → pairs of a lane and the way from its start; m."""

@@ -6,9 +6,12 @@ first rows come at once and memory does not grow with their number.
 
 from __future__ import annotations
 
+import copy
+import re
+from collections import namedtuple
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -43,6 +46,7 @@ from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+    from typing import Self
 
     import networkx as nx
     import numpy as np
@@ -50,6 +54,9 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog, Compared, Gathered, SqlStatement
     from sgstore.store import StoreFile
+
+SHOWN: Final = 80
+"""Characters of a query that the repr of its matches shows."""
 
 FIRST_WINDOW: Final = 64
 """Buckets of the first window: 3,840 frames."""
@@ -99,10 +106,13 @@ class Interval:
 
 
 class Matches:
-    """What matches a query. Iterating gives rows; each way of asking searches anew.
+    """Matches of a query. Iterating gives rows; each way of asking searches anew.
 
     ``count``, ``frames`` and ``clips`` speak of the frames in which the pattern holds, whatever ``RETURN``
     says; of a query that lists a limited number of rows, of the frames of these rows.
+
+    Rows are named tuples: their fields are named as the columns, with ``_`` for what no name may have. The
+    column ``e.name`` is ``row.e_name``.
 
     Attributes
     ----------
@@ -129,9 +139,35 @@ class Matches:
         self._catalog = catalog
         self._text = text
         self._parameters = parameters
-        compiled = self._ready = compile_query(text, catalog(), parameters)
+        self._limit: int | None = None
+        compiled = self._ready = self._compile(catalog())
         self.graphs = compiled.layout is not None
         self.columns = compiled.columns
+
+    def __repr__(self) -> str:
+        text = " ".join(self._text.split())
+        shown = text if len(text) <= SHOWN else f"{text[: SHOWN - 1]}…"
+        limit = "" if self._limit is None else f", at most {self._limit} rows"
+        return f"<Matches of {shown!r}{limit}>"
+
+    def limit(self, most: int) -> Self:
+        """The same matches, but no more rows than so many, as if the query ended in ``LIMIT``.
+
+        Raises
+        ------
+        ValueError
+            The number is below zero.
+        """
+        if most < 0:
+            raise ValueError(f"limit is {most}, expected 0 or more")
+        fewer = copy.copy(self)
+        fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
+        fewer._ready = self._ready.limited(most)  # noqa: SLF001
+        return fewer
+
+    def _compile(self, catalog: Catalog) -> Compiled:
+        compiled = compile_query(self._text, catalog, self._parameters)
+        return compiled if self._limit is None else compiled.limited(self._limit)
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -152,7 +188,7 @@ class Matches:
         with self._file.snapshot():
             catalog = self._catalog()
             if self._ready.stored is not catalog:
-                self._ready = compile_query(self._text, catalog, self._parameters)
+                self._ready = self._compile(catalog)
             yield self._ready
 
     @property
@@ -165,7 +201,8 @@ class Matches:
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         with self._compiled() as compiled:
             layout, rows = compiled.layout, self._stream(Compiled.rows)
-            yield from rows if layout is None else map(layout.row, rows)
+            row = _row_type(self.columns)
+            yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[tuple[Any, ...]]:
         """All rows at once."""
@@ -389,6 +426,13 @@ class Matches:
             block = gathered.block(window)
             steps.rows = len(block[0])
             yield block
+
+
+@lru_cache(maxsize=64)
+def _row_type(columns: tuple[str, ...]) -> Any:
+    """A named tuple for rows of some columns; a column whose name no field can have is named by its number."""
+    names = [re.sub(r"\W+", "_", name).strip("_") for name in columns]
+    return namedtuple("Row", names, rename=True)  # pyright: ignore[reportUntypedNamedTuple]
 
 
 class Windows:

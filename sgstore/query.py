@@ -1,17 +1,19 @@
-"""A store as people use it: frames are found by pattern or SQL, seen as graphs, cut into clips.
+"""A store as people use it: recordings go in, frames are found, seen as graphs and pictures, cut into clips.
 
 ::
 
-    store = sgstore.open("drives.sgstore")
-    for frame_id, trace, seq, time_ns, t, e, *rest in store.find("MATCH (e:Ego)-[:near_coll]->(:Person)"):
-        ...
+    with sgstore.open("drives.sgstore", create=True) as store:
+        store.ingest("monday.mcap")
+        for row in store.find("MATCH (e:Ego)-[:near_coll]->(p:Person)"):
+            print(row.trace, row.t, row.p_name)
 """
 
 from __future__ import annotations
 
 from dataclasses import fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, overload
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, overload
 
 from sgstore.abstractions import abstractions
 from sgstore.graph import named_graph
@@ -21,30 +23,54 @@ from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
     import networkx as nx
     import numpy as np
     from numpy.typing import NDArray
+    from PIL.Image import Image
 
     from sgstore.lang import Catalog, FrameView, Pattern, WhyNot, WhyNotSteps
     from sgstore.lang.ir import FrameAttribute
     from sgstore.matches import Matches
+    from sgstore.segments import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
     from sgstore.temporal import CheckRun
 
 
+def open(
+    path: str | Path,
+    *,
+    create: bool = False,
+    memory: int = 0,
+    tables: Mapping[str, object] | None = None,
+    max_spill: int = 0,
+) -> Store:
+    """Open a store; parameters and errors are those of :class:`Store`.
+
+    ::
+
+        with sgstore.open("drives.sgstore", create=True) as store:
+            store.ingest("recordings/")
+    """
+    return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill)
+
+
 class Store:
-    """A store of traces, by its path. It is opened only while something is asked of it.
+    """A store of traces, by its path.
+
+    Its file is open only while something is asked of it, so that others can write to it: nothing has to be
+    closed, and ``with`` is a matter of style.
 
     Parameters
     ----------
     path : str or Path
+    create : bool
+        Make an empty store if nothing is there.
     memory : int
         Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is less.
     tables : mapping of str to path or data frame, optional
         Tables of one's own that are joined to the frames, in SQL and in patterns: Parquet, CSV or JSON files,
-        or data frames of pandas, polars, pyarrow; see :mod:`sgstore.store._joins`.
+        or data frames of pandas, polars, pyarrow.
     max_spill : int
         Most that a question may put on disk where memory does not suffice; bytes. 0: 10 GB.
 
@@ -62,10 +88,13 @@ class Store:
         self,
         path: str | Path,
         *,
+        create: bool = False,
         memory: int = 0,
         tables: Mapping[str, object] | UserTables | None = None,
         max_spill: int = 0,
     ) -> None:
+        if create and not Path(path).exists():
+            StoreFile.create(path)
         self.file = StoreFile(
             path,
             memory=memory,
@@ -74,8 +103,47 @@ class Store:
         )
         self._held: tuple[tuple[int, ...], Catalog] | None = None
 
+    def __repr__(self) -> str:
+        return f"Store({str(self.file.path)!r})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._held = None
+
+    def ingest(
+        self, traces: str | Path | Sequence[str | Path], /, **options: Any
+    ) -> list[TraceOutcome]:
+        """Read recordings into the store; those that are in it already are left as they are.
+
+        Parameters
+        ----------
+        traces : str, Path or sequence of these
+            Files, folders, or patterns such as ``drives/*.mcap``.
+        **options
+            ``config``, ``road_map``, ``egos``, ``jobs``, ``since``, ``until``, ``rate``, ``force``,
+            ``dry_run``, ``on_progress``: see :func:`sgstore.ingest.ingest`.
+
+        Returns
+        -------
+        list of TraceOutcome
+            One for each recording and ego: its ``status``, what was lost, and the ``error`` if it failed.
+
+        Raises
+        ------
+        StoreError
+            A folder holds no recording, nothing fits a pattern, or the store cannot be written.
+        MapError
+            The file given for the road map cannot be read.
+        """
+        from sgstore.ingest import ingest, recordings
+
+        names = [traces] if isinstance(traces, (str, Path)) else traces
+        return ingest(self.file.path, recordings(names), **options)
+
     def catalog(self) -> Catalog:
-        """What the store holds, as queries need to know it; remembered while the file stays as it is."""
+        """The catalog of the store for queries; remembered while the file stays as it is."""
         if self._held is not None and self._held[0] == _stamp(self.file.path):
             return self._held[1]  # to open the store costs more than to compile a query
         with self.file.snapshot():
@@ -83,13 +151,13 @@ class Store:
             return self._held[1]
 
     def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> Matches:
-        """What matches a pattern; nothing is searched before it is asked for.
+        """Return the matches of a pattern; nothing is searched before it is asked for.
 
         Parameters
         ----------
         query : str, Pattern or networkx graph
             ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a pattern that was built
-            step by step, or drawn as a graph: see :class:`sgstore.lang._patterns.Pattern`.
+            step by step, or drawn as a graph: see :class:`sgstore.Pattern`.
         **parameters
             Values of ``$name``: numbers, texts, truth values, or lists of these.
 
@@ -127,9 +195,9 @@ class Store:
         text : str
             ``CHECK name: FORALL (…) formula RESET WHEN …; …``, see the documentation of the language.
         sgsm_compat : bool
-            Whether a trace violates a check if any of its beginnings would, as SGSM reports.
+            Count a trace as violating a check if any of its beginnings would, as SGSM reports.
         status : bool
-            Whether the status at each frame is told, too.
+            Give the status at each frame, too.
         **parameters
             Values of ``$name``.
 
@@ -285,7 +353,9 @@ class Store:
         return pattern_of(self.file.graph(_ref(frame)), ignore)
 
     def payload(self, frame: int | str | FrameRef, channel: str) -> bytes:
-        """The data of the sensor message of a channel that belongs to a frame, read from the recording.
+        """The sensor message of a channel that belongs to a frame, as it stands in the recording.
+
+        For the picture in the message of a camera see :meth:`picture`.
 
         Raises
         ------
@@ -296,18 +366,86 @@ class Store:
         """
         return self.file.payload(_ref(frame), channel)
 
-    def info(self) -> tuple[StoredTrace, ...]:
+    def picture(self, frame: int | str | FrameRef, channel: str) -> Image:
+        """The picture that a camera took at a frame, read from the recording.
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+        channel : str
+            Topic of the camera.
+
+        Returns
+        -------
+        PIL.Image.Image
+
+        Raises
+        ------
+        StoreError
+            There is no such frame or channel, or no message of the channel belongs to the frame.
+        TraceError
+            The recording is gone, was replaced, or is damaged there.
+        ExportError
+            The message holds no picture.
+        MissingExtraError
+            Pillow is not installed.
+        """
+        from sgstore.draw import camera_image
+
+        return camera_image(self, _ref(frame), channel)
+
+    def show(
+        self,
+        frame: int | str | FrameRef,
+        query: str | Pattern | nx.Graph[Any] | None = None,
+        **look: Any,
+    ) -> Image:
+        """A frame drawn from above, beside what the camera saw.
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+        query : str, Pattern or networkx graph, optional
+            As :meth:`find` takes it; what it matches in the frame is marked.
+        **look
+            ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``: see
+            :func:`sgstore.draw.draw_stored`.
+
+        Returns
+        -------
+        PIL.Image.Image
+            Notebooks show it; ``save("frame.png")`` writes it.
+
+        Raises
+        ------
+        StoreError, QueryError, ExportError, TraceError
+            There is no such frame or channel, the query is none, or the recording is gone.
+        MissingExtraError
+            The packages for drawing are not installed.
+        """
+        from sgstore.draw import frame_image
+
+        matches = None if query is None else self.find(query)
+        return frame_image(self, _ref(frame), matches, **look)
+
+    def traces(self) -> tuple[StoredTrace, ...]:
         """The traces of the store, by name in natural order (``run2`` before ``run10``)."""
         return self.file.traces()
 
+    def info(self) -> tuple[StoredTrace, ...]:
+        """The same as :meth:`traces`, by its name before 0.2."""
+        return self.traces()
+
     def explain(self, text: str, /, **parameters: object) -> str:
-        """What becomes of a query, stage by stage: parse, bind, rewrite, emit."""
+        """Explain a query, stage by stage: parse, bind, rewrite, emit."""
         return self.find(text, **parameters).explain()
 
     def why_not(
         self, frame: int | str | FrameRef, text: str, /, **parameters: object
     ) -> WhyNot | WhyNotSteps:
-        """How far a pattern holds in a frame: the first part of it that fails, and how near it came.
+        """Explain why a pattern does not match a frame: the first part that fails, and how near it came.
 
         Parameters
         ----------
@@ -352,7 +490,7 @@ class Store:
             return why_not(compiled.bound, view, compiled.text)
 
     def _view(self, frame: FrameRef, asked: Sequence[FrameAttribute]) -> FrameView:
-        """A frame as patterns in memory see it, with what they ask that only the store can tell."""
+        """A frame as patterns in memory see it, with the attributes that only the store knows."""
         from sgstore.lang import FrameView
 
         trace = self.file.trace(frame.trace_id)
@@ -375,7 +513,7 @@ class Store:
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
-    """What changes whenever the database does: size and time of its file and of its log."""
+    """Return a stamp that changes with the database: size and time of its file and of its log."""
     files = (path, path.with_name(f"{path.name}.wal"))
     found = [file.stat() for file in files if file.exists()]
     return tuple(number for stat in found for number in (stat.st_mtime_ns, stat.st_size))

@@ -64,7 +64,7 @@ class Progress:
     files: int = 1
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, repr=False)
 class TraceOutcome:
     """What became of a recording, as one ego has it.
 
@@ -108,6 +108,12 @@ class TraceOutcome:
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
     error: SgstoreError | None = None
+
+    def __repr__(self) -> str:
+        about = (
+            str(self.error) if self.error else f"{self.frames} frames, {len(self.losses)} losses"
+        )
+        return f"<TraceOutcome {self.name or self.path.name!r}: {self.status}, {about}>"
 
     def as_dict(self) -> dict[str, Any]:
         """The outcome as plain values, from which :meth:`from_dict` makes it again."""

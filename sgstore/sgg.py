@@ -115,6 +115,10 @@ class SceneGraphGenerator:
         names = self._keeping.names(computed, with_map=road_map is not None)
         self.answers = tuple(name for name in RELATIONS if name in names)
 
+    def __repr__(self) -> str:
+        on = "no map" if self._road_map is None else f"map {self._road_map.name!r}"
+        return f"<SceneGraphGenerator on {on}, {len(self.answers)} relations>"
+
     @property
     def parked(self) -> Codes:
         """(n,) int8: of each entity whether it is parked, as all blocks so far tell: 1 or 0; -1: not known."""

@@ -4,6 +4,8 @@ from ._charts import draw_curve as draw_curve
 from ._charts import draw_growth as draw_growth
 from ._charts import draw_matrix as draw_matrix
 from ._charts import draw_rank_sizes as draw_rank_sizes
+from ._images import camera_image as camera_image
+from ._images import frame_image as frame_image
 from ._links import Relations as Relations
 from ._picture import SheetFrame as SheetFrame
 from ._picture import draw_frame as draw_frame
@@ -23,6 +25,7 @@ __all__ = [
     "NAME",
     "Relations",
     "SheetFrame",
+    "camera_image",
     "draw_clip",
     "draw_curve",
     "draw_frame",
@@ -33,6 +36,7 @@ __all__ = [
     "draw_sheet",
     "draw_stored",
     "draw_timelines",
+    "frame_image",
     "lines_of",
     "range_of",
     "timelines",

@@ -583,6 +583,16 @@ class Compiled:
             result = Result(form="clips", whole=False, before=-before_ns, after=after_ns)
         return self._rows(replace(self.query, result=result), window)
 
+    def limited(self, most: int) -> Compiled:
+        """The query with no more rows than so many, as if it ended in ``LIMIT``."""
+
+        def limit(query: Query) -> Query:
+            held = query.result.limit
+            least = most if held is None else min(held, most)
+            return replace(query, result=replace(query.result, limit=least))
+
+        return replace(self, bound=limit(self.bound), query=limit(self.query))
+
     @property
     def in_windows(self) -> bool:
         """Whether its rows can be had window by window: if none depends on those of other windows."""

@@ -179,7 +179,7 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 """Types of statements that only read: WITH, FROM, VALUES, TABLE, DESCRIBE, SHOW and SUMMARIZE are SELECT."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Rows:
     """The result of a statement.
 
@@ -199,6 +199,10 @@ class Rows:
     types: tuple[str, ...]
     values: list[tuple[Any, ...]]
     truncated: bool = False
+
+    def __repr__(self) -> str:
+        more = " and more" * self.truncated
+        return f"<{len(self):,} rows{more} of {', '.join(self.columns)}>"
 
     def __len__(self) -> int:
         return len(self.values)

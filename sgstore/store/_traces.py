@@ -99,7 +99,7 @@ def trace_id_of(digest: str, ego: str) -> int:
     return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class StoredTrace:
     """A trace in a store.
 
@@ -156,6 +156,11 @@ class StoredTrace:
     settings: dict[str, Any]
     ingested_at: datetime
     version: str
+
+    def __repr__(self) -> str:
+        seconds = (self.end_ns - self.start_ns) / 1e9
+        about = f"{self.frames} frames, {seconds:.1f} s, ego {self.ego!r}, map {self.map!r}"
+        return f"<StoredTrace {self.name!r}: {about}>"
 
     def as_dict(self) -> dict[str, Any]:
         """All that is known of it, as plain values."""

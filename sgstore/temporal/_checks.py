@@ -288,6 +288,9 @@ class CheckRun:
         with file.snapshot():
             self._checks = compile_checks(text, catalog(), parameters)
 
+    def __repr__(self) -> str:
+        return f"<CheckRun of {', '.join(self.names)}>"
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the checks, in order."""

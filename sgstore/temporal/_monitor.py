@@ -232,6 +232,10 @@ class Monitor:
         told = (follow.name for _, follow, _ in self._follows)
         self.names = (*(check.name for check in checks), *told)
 
+    def __repr__(self) -> str:
+        seen = 0 if self._last is None else self._last.seq + 1
+        return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
+
     def _of_ego(self, ego: str | None) -> tuple[int, QueryCache]:
         """The number of an ego, and what is asked of its graphs."""
         if (ego or "") not in self._egos:
