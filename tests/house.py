@@ -152,7 +152,7 @@ class Walk:
     """Functions of sgstore that run while it is open, in all threads of this process."""
 
     def __init__(self) -> None:
-        self.functions: set[tuple[str, str]] = set()
+        self.functions: dict[tuple[str, str], None] = {}  # in the order of their first calls
         self._seen: dict[CodeType, bool] = {}
 
     def _event(self, frame: FrameType, event: str, _: object) -> None:
@@ -163,7 +163,7 @@ class Walk:
         ours = code.co_filename.startswith(f"{PACKAGE}/")
         if ours and code.co_flags & OPTIMIZED and not code.co_name.startswith("<"):
             name = Path(code.co_filename).relative_to(PACKAGE).as_posix()
-            self.functions.add((name, code.co_qualname))
+            self.functions.setdefault((name, code.co_qualname))
 
     def __enter__(self) -> Walk:
         threading.setprofile(self._event)
@@ -194,7 +194,7 @@ def print_walk(verb: str, store: str, *, names: bool) -> None:
     functions = walk(verb, store).functions
     print(len(functions), len({file for file, _ in functions}))
     if names:
-        print(*(f"{file} {name}" for file, name in sorted(functions)), sep="\n")
+        print(*(f"{file} {name}" for file, name in functions), sep="\n")
 
 
 def walks(*, names: bool) -> dict[str, tuple[int, int]]:

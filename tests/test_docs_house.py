@@ -1,0 +1,78 @@
+"""What the pages say of the house is so: its walks, and where their links lead."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import house
+import pytest
+
+import sgstore
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+STEP = re.compile(r"^\| `([\w/]+\.py)` \| `([\w.]+)` \|", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("walk") / "town.sgstore"
+
+
+@pytest.mark.parametrize(("verb", "title"), [("ingest", "goes in"), ("find", "is answered")])
+def test_a_walk_through_the_house_is_the_way_that_it_takes(
+    verb: str, title: str, store: Path
+) -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    (part,) = (part for part in re.split(r"\n##+ ", page) if title in part.split("\n")[0])
+    told = [" ".join(step) for step in STEP.findall(part)]
+    command = [sys.executable, house.__file__, "--walk-of", verb, str(store), "--names"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    ran = done.stdout.splitlines()[1:]
+
+    assert len(told) > 8
+    assert [step for step in told if step not in ran] == []
+    assert told == sorted(told, key=ran.index)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    lost: list[str] = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        name, _, anchor = link.partition("#")
+        if link.startswith(("http:", "https:")):
+            continue
+        target = (page.parent / name).resolve() if name else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            lost.append(link)
+
+    assert lost == []
+
+
+def anchors(page: Path) -> set[str]:
+    titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", title.lower()) for title in titles)
+    return {title.replace(" ", "-") for title in plain}
+
+
+def test_the_abstraction_of_contributing_counts_people(town_store: Path) -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (program,) = (p for p in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "people" in p)
+    exec(compile(program, "CONTRIBUTING.md", "exec"), {})
+    store = sgstore.open(town_store)
+    told = store.classes("people")
+    counted = store.sql(
+        "SELECT frame_id, count(n.kind) FILTER (n.kind = 'person') AS people"
+        " FROM frames LEFT JOIN nodes n USING (frame_id) GROUP BY frame_id"
+    )
+    people = dict(counted.values)
+    classes = {frame: str(one) for frame, one in zip(told["frame_id"], told["class"], strict=True)}
+
+    assert len(set(people.values())) == len(set(classes.values())) > 3
+    assert len({(people[frame], one) for frame, one in classes.items()}) == len(
+        set(classes.values())
+    )
