@@ -4,10 +4,11 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api
+.PHONY: help demo check test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
+	@echo "make check   the edit loop: lint, types and tests of the rooms that differ from main"
 	@echo "make test    format, lint, types and tests"
 	@echo "make tests   the tests only"
 	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
@@ -56,6 +57,9 @@ lint: $(VENV)/.dev
 format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+check: $(VENV)/.dev
+	@$(BIN)/python tests/check.py
 
 # Types take one processor a minute or more: the tests run beside them.
 test: $(VENV)/.dev

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DemoQuestion:
-    """What a test engineer asks, as a sentence and as a pattern.
+    """A question of a test engineer, as a sentence and as a pattern.
 
     Attributes
     ----------

@@ -231,7 +231,7 @@ EXCERPT: Final = 160
 
 
 def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
-    """What a line shows around a part of it, and the carets below; what cannot be seen is a dot or a blank."""
+    """The line around a part of it, and carets below; invisible characters are dots or blanks."""
     first = max(0, min(start - EXCERPT // 2, len(line) - EXCERPT))
     shown = line[first : first + EXCERPT]
     shown = "".join(c if c.isprintable() else " " if c.isspace() else "·" for c in shown)
@@ -242,6 +242,6 @@ def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
 
 
 def _columns(text: str) -> int:
-    """How wide a text is in a terminal."""
+    """Width of a text in a terminal."""
     wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
     return len(text) + wide - sum(map(bool, map(unicodedata.combining, text)))

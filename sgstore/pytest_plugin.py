@@ -102,7 +102,7 @@ class ClipScene:
 
     @property
     def verdict(self) -> Verdict | None:
-        """What the check says of the trace; ``None``: the test is not about a check."""
+        """Verdict of the check for the trace; ``None`` if the test is not about a check."""
         return None
 
     def verify(self, *, messages: bool = False) -> None:
@@ -119,7 +119,7 @@ class ClipScene:
 
     @property
     def id(self) -> str:
-        """What its test is called by."""
+        """Id of its test."""
         return self.case.id or f"{self.trace}#{self.frames[0].seq}-{self.frames[-1].seq}"
 
     @property
@@ -129,7 +129,7 @@ class ClipScene:
 
     @property
     def time(self) -> tuple[float, float]:
-        """When it begins and ends, since its trace began; s."""
+        """Start and end since its trace began; s."""
         return self.frames[0].t, self.frames[-1].t
 
     @property
@@ -172,7 +172,7 @@ class ClipScene:
         return self.store.payload(self._frame(frame), channel)
 
     def carried(self, channel: str, frame: int | FrameRef = 0) -> Media:
-        """What such a message carries: the file of a picture, a video up to it, or the message."""
+        """Content of such a message: the file of a picture, a video up to it, or the message."""
         self.verify(messages=True)
         return self.store.file.carried(self._frame(frame).frame_id, channel)
 
@@ -239,7 +239,7 @@ class CheckedTrace(ClipScene):
 
     @property
     def verdict(self) -> Verdict:
-        """What the check says of the trace."""
+        """Verdict of the check for the trace."""
         found = self.checks.verdicts.get((self.trace, self.check))
         if found is None:  # of another ego
             from sgstore.temporal import Verdict
@@ -324,7 +324,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
 
 
 def violations_text(verdict: Verdict) -> str:
-    """Where a check is violated, and by whom, a line each."""
+    """Violations of a check with their entities, a line each."""
     lines = [f"{verdict.trace} violates {verdict.check}"]
     for one in verdict.violations:
         who = ", ".join(map(str, one.values.values()))
@@ -339,7 +339,7 @@ def violations_text(verdict: Verdict) -> str:
 
 
 _FOUND: Final = pytest.StashKey[dict[str, list[ClipScene]]]()
-"""What marks found already, so that many tests of one mark ask once."""
+"""Results of marks, so that many tests of one mark ask once."""
 
 
 @dataclass(frozen=True, slots=True)

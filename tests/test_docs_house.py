@@ -76,3 +76,26 @@ def test_the_abstraction_of_contributing_counts_people(town_store: Path) -> None
     assert len({(people[frame], one) for frame, one in classes.items()}) == len(
         set(classes.values())
     )
+
+
+def test_the_relation_of_contributing_is_computed_by_its_entry_point(tmp_path: Path) -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (program,) = (p for p in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "BESIDES" in p)
+    (tmp_path / "besides.py").write_text(program, encoding="utf-8")
+    about = tmp_path / "scratch-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scratch\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[sgstore.relations]\nbesides = besides:BESIDES\n")
+    asking = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import sgstore\n"
+        "frame = sgstore.Frame(0, ego='a')\n"
+        "for name, x, y in (('a', 0, 0), ('b', 0, 3), ('c', 9, 0)):\n"
+        "    frame.add(name, 'car', x, y, 0, heading=0, length=4, width=2, height=1.5)\n"
+        "graph = sgstore.SceneGraphGenerator(None, sgstore.Config()).step(frame)\n"
+        "print(sorted((a, b) for a, name, b, _ in graph.edges if name == 'besides'))"
+    )
+    command = [sys.executable, "-c", asking, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+
+    assert done.stdout.strip() == "[(0, 1), (1, 0)]"

@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def _wants_json(arguments: list[str]) -> bool:
-    """Whether what is printed is for machines, errors too."""
+    """Return true if output, errors included, is for machines."""
     forms = {"--format=json", "--format=ndjson"}
     named = {value for name, value in pairwise(arguments) if name == "--format"}
     return "--json" in arguments or bool(forms & set(arguments)) or bool(named & {"json", "ndjson"})

@@ -20,20 +20,16 @@ from sgstore.cli._options import (
     AsJson,
     Config,
     Expressions,
-    MaxSpill,
-    Output,
     Parameters,
     PatternNames,
     Preset,
+    QueryLimits,
     RoadMap,
-    RowFormat,
+    RowOptions,
     SgsmCompat,
     StorePath,
-    Timeout,
     all_asked_of,
     app,
-    form_of,
-    open_store,
     parameters_of,
     say_notes,
     say_unknown,
@@ -49,6 +45,8 @@ if TYPE_CHECKING:
 
     from sgstore.matches import Interval
     from sgstore.temporal import FrameTime, MonitorEvent, Verdict
+
+PANEL: Final = "Rules over time"
 
 
 _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -114,7 +112,7 @@ def _plain(text: str) -> str:
 COLUMNS = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def check(
     store: StorePath,
     files: Annotated[
@@ -137,11 +135,9 @@ def check(
             metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."
         ),
     ] = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
     """Check what must be true of every trace.
 
@@ -153,7 +149,7 @@ def check(
     given = parameters_of(parameters)
     asked, values = all_asked_of(files or (), names or (), texts or (), given)
     text = joined([*chain.from_iterable(asked.values())])
-    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store)
     run = opened.check(text, sgsm_compat=sgsm_compat, **values)
     if explain:
         typer.echo(run.explain())
@@ -169,8 +165,8 @@ def check(
             tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
             yield verdict
 
-    form = form_of(form, output, as_json=as_json)
-    _write(counted(), form, output)
+    form = out.chosen()
+    _write(counted(), form, out.output)
     if form is Format.table:
         say(", ".join(f"{count} {word}" for word, count in tally.items()))
     say_unknown((one.check, one.trace, one.reason) for one in kept)
@@ -249,7 +245,7 @@ def _span(interval: Interval) -> dict[str, Any]:
 # The verb that watches: checks and patterns over a recording as if it were live, or a running simulator ----
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def monitor(
     trace: Annotated[
         str,
@@ -314,7 +310,7 @@ def monitor(
 
 
 def _called(asked: Mapping[str, list[str]]) -> list[str]:
-    """What each pattern is called in events, in the order in which they are asked."""
+    """Names of the patterns in events, in the order in which they are asked."""
     from sgstore.lang import parse
     from sgstore.lang.syntax import MatchClause
 
@@ -381,7 +377,7 @@ def _line(text: str) -> None:
 # The verb that shows when: swim lanes of matches and violations ---------------------------------
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def timeline(
     store: StorePath,
     queries: Annotated[
@@ -402,17 +398,17 @@ def timeline(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
     ] = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    bounds: QueryLimits,
 ) -> int:
-    """Show when what matches or is violated: swim lanes, a lane for each who, over every trace.
+    """Plot matches and rule violations over time, one lane per entity, for each trace.
 
     In the terminal, or with -o as a picture.
     """
     from sgstore.draw import LETTERS, NAME, lines_of, timelines
 
     asked = _asked(queries or [], files or [], names or [], parameters_of(parameters))
-    found = timelines(open_store(store, timeout=timeout, max_spill=max_spill), asked, traces or ())
+    found = timelines(bounds.opened(store), asked, traces or ())
     for name in {*(traces or ())} - {one.trace for one in found}:
         raise typer.BadParameter(f"--trace: the store has no trace {name!r}")
     say_unknown((lane.name, one.trace, lane.reason) for one in found for lane in one.lanes)
@@ -431,7 +427,7 @@ def timeline(
 def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """What is asked, by the names of its lanes."""
+    """Texts to plot and their values, by the names of the lanes."""
     from sgstore.lang.library import pattern_named
 
     found: dict[str, tuple[str, Mapping[str, Any]]] = {}

@@ -1,37 +1,30 @@
-"""Verbs about coverage: what a data set holds, what it lacks, what one says of another."""
+"""Verbs about coverage: content and gaps of a data set, and comparison of two."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from sgstore.cli._options import (
-    AsJson,
-    MaxSpill,
-    Output,
-    RowFormat,
-    Timeout,
-    Verbs,
-    app,
-    bounded,
-    form_of,
-    say_left_out,
-)
+from sgstore.cli._options import QueryLimits, RowOptions, Verbs, app, say_left_out
 from sgstore.cli._output import Format, say, write_rows
 
 if TYPE_CHECKING:
     from sgstore.coverage import ChosenFrames, Classed, ReportTable
+
+PANEL: Final = "Coverage and test sets"
 
 
 coverage = Verbs(no_args_is_help=True)
 app.add_typer(
     coverage,
     name="coverage",
-    help="What a data set covers: classes, novelty, growth, combinations, failures.",
+    help="Measure what a data set covers: classes, novelty, growth, combinations, failures.",
+    rich_help_panel=PANEL,
 )
 
 A = Annotated[
@@ -44,13 +37,14 @@ A = Annotated[
 ]
 B = Annotated[str, typer.Argument(metavar="B", help="Frames, as A.")]
 Abstraction = Annotated[
-    str, typer.Option("--abstraction", metavar="NAME", help="Whose classes: E, EL, ER, RSV, …")
+    str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
 ]
 Window = Annotated[
-    int, typer.Option("--window", "-t", min=1, help="Frames that are seen together, as one class.")
+    int,
+    typer.Option("--window", "-t", min=1, help="Number of frames that form one class together."),
 ]
 Picture = Annotated[
-    Path | None, typer.Option("--picture", metavar="FILE", help="Draw it, too: .png or .svg.")
+    Path | None, typer.Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
 ]
 Limit = Annotated[
     int | None,
@@ -68,7 +62,7 @@ IN_TABLE = 40
 
 
 class UnitOption(StrEnum):
-    """What is counted."""
+    """Unit of counts."""
 
     frame = "frame"
     run = "run"
@@ -76,7 +70,7 @@ class UnitOption(StrEnum):
 
 
 class Incomplete(StrEnum):
-    """How windows count in which frames are missing."""
+    """Treatment of windows with missing frames."""
 
     equal = "equal"
     distinct = "distinct"
@@ -84,7 +78,7 @@ class Incomplete(StrEnum):
 
 
 class Listing(StrEnum):
-    """What is listed of novel scenes."""
+    """Form of a list of novel scenes."""
 
     classes = "classes"
     frames = "frames"
@@ -101,34 +95,44 @@ WhenIncomplete = Annotated[
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class SceneOptions:
+    """Options for the classes of frames."""
+
+    abstraction: Abstraction = "RSV"
+    window: Window = 1
+    incomplete: WhenIncomplete = Incomplete.equal
+    slots: Slots = None
+
+    def of(self, text: str, spill: int) -> Classed:
+        """Return the frames that a text means, with their classes."""
+        seen = self.abstraction, self.window, self.incomplete, self.slots
+        return _classed(text, *seen, spill=spill)
+
+
 @coverage.command("classes")
 def classes_(
     a: A,
-    abstraction: Abstraction = "RSV",
-    window: Window = 1,
-    incomplete: WhenIncomplete = Incomplete.equal,
-    slots: Slots = None,
     unit: Unit = UnitOption.frame,
     picture: Picture = None,
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    scenes: SceneOptions,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
     """List the classes of scenes, the most frequent first, and estimate what is unseen."""
     from sgstore.coverage import CountedUnit, classes, rank_sizes
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
-    frames = _classed(a, abstraction, window, incomplete, slots, spill=spill)
+    form, spill = out.chosen(), bounds.spill()
+    frames = scenes.of(a, spill)
     counted = CountedUnit(unit)
-    _write(classes(frames, counted), limit, form, output)
+    _write(classes(frames, counted), limit, form, out.output)
     if picture is not None:
         from sgstore.draw import draw_rank_sizes
 
         sizes, cumulative = rank_sizes(frames, counted)
-        title = f"Classes in {abstraction} of {_short(a)}"
+        title = f"Classes in {scenes.abstraction} of {_short(a)}"
         together = [] if counted is CountedUnit.trace else cumulative.tolist()
         draw_rank_sizes(sizes.tolist(), together, picture, unit=unit, title=title)
         say(f"drawn: {picture}")
@@ -137,112 +141,86 @@ def classes_(
 @coverage.command("of")
 def of_(
     a: A,
-    by: Annotated[str, typer.Option("--by", metavar="B", help="What covers it, as A.")],
-    abstraction: Abstraction = "RSV",
-    window: Window = 1,
-    incomplete: WhenIncomplete = Incomplete.equal,
-    slots: Slots = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    by: Annotated[str, typer.Option("--by", metavar="B", help="Frames that cover it, as A.")],
+    *,
+    scenes: SceneOptions,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
-    """Say how much of A is covered by B: of its classes, and of its frames."""
+    """Measure how much of A is covered by B, by classes and by frames."""
     from sgstore.coverage import covered
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
-    of, other = (
-        _classed(one, abstraction, window, incomplete, slots, spill=spill) for one in (a, by)
-    )
-    _write(covered(of, other), 0, form, output)
+    form, spill = out.chosen(), bounds.spill()
+    of, other = (scenes.of(one, spill) for one in (a, by))
+    _write(covered(of, other), 0, form, out.output)
 
 
 @coverage.command("novel")
 def novel_(
     a: A,
-    than: Annotated[str, typer.Option("--not-in", metavar="B", help="What is known, as A.")],
+    than: Annotated[str, typer.Option("--not-in", metavar="B", help="Known frames, as A.")],
     listing: Annotated[
         Listing, typer.Option("--list", help="Classes, frames, or clips of consecutive frames.")
     ] = Listing.classes,
-    abstraction: Abstraction = "RSV",
-    window: Window = 1,
-    incomplete: WhenIncomplete = Incomplete.equal,
-    slots: Slots = None,
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    scenes: SceneOptions,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
     """List the scenes of A that are not in B, the rarest first."""
     from sgstore.coverage import novel, novel_clips, novel_frames
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
-    of, other = (
-        _classed(one, abstraction, window, incomplete, slots, spill=spill) for one in (a, than)
-    )
+    form, spill = out.chosen(), bounds.spill()
+    of, other = (scenes.of(one, spill) for one in (a, than))
     listed = {
         Listing.classes: novel,
         Listing.frames: novel_frames,
         Listing.clips: novel_clips,
     }[listing]
-    _write(listed(of, other), limit, form, output)
+    _write(listed(of, other), limit, form, out.output)
 
 
 @coverage.command("venn")
 def venn_(
     a: A,
     b: B,
-    abstraction: Abstraction = "RSV",
-    window: Window = 1,
-    incomplete: WhenIncomplete = Incomplete.equal,
-    slots: Slots = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    scenes: SceneOptions,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
     """Count what A and B share, and what only one of them has."""
     from sgstore.coverage import venn
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
-    one, other = (
-        _classed(text, abstraction, window, incomplete, slots, spill=spill) for text in (a, b)
-    )
-    _write(venn(one, other), 0, form, output)
+    form, spill = out.chosen(), bounds.spill()
+    one, other = (scenes.of(text, spill) for text in (a, b))
+    _write(venn(one, other), 0, form, out.output)
 
 
 @coverage.command("growth")
 def growth_(
     a: A,
-    abstraction: Abstraction = "RSV",
-    window: Window = 1,
-    incomplete: WhenIncomplete = Incomplete.equal,
-    slots: Slots = None,
     unit: Unit = UnitOption.frame,
     points: Annotated[int, typer.Option("--points", min=2, help="Rows of the curve.")] = 40,
     picture: Picture = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    scenes: SceneOptions,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
-    """Say how the number of classes grew, beside frames at random; whether more of the same helps."""
+    """Show how the number of classes grows, beside a random order, to tell if more data helps."""
     from sgstore.coverage import CountedUnit, growth
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
-    frames = _classed(a, abstraction, window, incomplete, slots, spill=spill)
+    form, spill = out.chosen(), bounds.spill()
+    frames = scenes.of(a, spill)
     table = growth(frames, CountedUnit(unit), points)
-    _write(table, 0, form, output)
+    _write(table, 0, form, out.output)
     if picture is not None and table.rows:
         from sgstore.draw import draw_growth
 
         n, found, at_random = (table.column(name) for name in (f"{unit}s", "classes", "at_random"))
-        title = f"Growth of the classes in {abstraction} of {_short(a)}"
+        title = f"Growth of the classes in {scenes.abstraction} of {_short(a)}"
         draw_growth(n, found, at_random, picture, unit=unit, title=title, below=table.said[0])
         say(f"drawn: {picture}")
 
@@ -250,10 +228,12 @@ def growth_(
 @coverage.command("combos")
 def combos_(
     a: A,
-    k: Annotated[int, typer.Option("--k", min=1, help="How many come together.")] = 2,
+    k: Annotated[int, typer.Option("--k", min=1, help="Number of features in a combination.")] = 2,
     by: Annotated[
         str | None,
-        typer.Option("--by", metavar="B", help="Measured by what occurs in B; by default by all."),
+        typer.Option(
+            "--by", metavar="B", help="Reference: combinations that occur in B; by default all."
+        ),
     ] = None,
     abstraction: Abstraction = "RSV",
     of_ego: Annotated[
@@ -264,23 +244,21 @@ def combos_(
     covered: Covered = False,
     picture: Picture = None,
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
     """Count the combinations of k features, such as (car near ego), or of values of declared slots."""
     from sgstore.coverage import combos, selection_of
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
+    form, spill = out.chosen(), bounds.spill()
     if slots is not None:
         if by or picture or of_ego:
             raise typer.BadParameter(
                 "--slots declares what there is: not with --by, --ego or --picture"
             )
         _write_slots(
-            selection_of(a, max_spill=spill), slots, k, (covered, missing), limit, form, output
+            selection_of(a, max_spill=spill), slots, k, (covered, missing), limit, form, out.output
         )
         return
     reference = None if by is None else _classed(by, abstraction, spill=spill)
@@ -288,7 +266,7 @@ def combos_(
     listed = found.missing if missing else found.covered() if covered else found.shares
     for text in found.shares.said if listed is not found.shares else ():
         say(text)
-    _write(listed, limit, form, output)
+    _write(listed, limit, form, out.output)
     if picture is not None:
         from sgstore.draw import draw_matrix
 
@@ -316,16 +294,14 @@ def spec_(
     missing: Missing = False,
     covered: Covered = False,
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
-    """Say how much of a specification is covered: the cells of a query, or all declared slots together."""
+    """Measure how much of a specification is covered: the cells of a query, or declared slots."""
     from sgstore.coverage import selection_of, specification
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
+    form, spill = out.chosen(), bounds.spill()
     if (query is None) == (slots is None):
         raise typer.BadParameter("give a query, or a file with --slots FILE")
     if query is None or slots is not None:
@@ -338,14 +314,14 @@ def spec_(
             (covered, missing),
             limit,
             form,
-            output,
+            out.output,
         )
         return
     if by and cells:
         raise typer.BadParameter("give one of --by and --cells")
     reference = selection_of(by, max_spill=spill) if by else ""
     tables = specification(selection_of(a, max_spill=spill), query, cells, reference)
-    _write(tables[2 if missing else 1 if covered else 0], limit, form, output)
+    _write(tables[2 if missing else 1 if covered else 0], limit, form, out.output)
 
 
 @coverage.command("windows")
@@ -355,54 +331,50 @@ def windows_(
     incomplete: WhenIncomplete = Incomplete.equal,
     abstraction: Abstraction = "RSV",
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
     """List the classes of windows: of a frame together with those recorded before it."""
     from sgstore.coverage import classes
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
+    form, spill = out.chosen(), bounds.spill()
     table = classes(_classed(a, abstraction, window, incomplete, spill=spill))
-    _write(table, limit, form, output)
+    _write(table, limit, form, out.output)
 
 
 @coverage.command("explain")
 def explain_(
     b: B,
-    versus: Annotated[str, typer.Option("--vs", metavar="A", help="Against what, as B.")],
+    versus: Annotated[str, typer.Option("--vs", metavar="A", help="Frames to compare with, as B.")],
     abstraction: Abstraction = "RSV",
     tree: Annotated[
-        bool, typer.Option("--tree", help="A few questions that tell them apart, instead.")
+        bool, typer.Option("--tree", help="Print a decision tree of a few questions instead.")
     ] = False,
     depth: Annotated[int, typer.Option("--depth", min=1, max=10, help="Questions at most.")] = 4,
     frames: Annotated[
-        bool, typer.Option("--frames", help="A class counts as often as it has frames.")
+        bool, typer.Option("--frames", help="Weight classes by their frames.")
     ] = False,
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
-    """Say what tells the scenes of B from those of A: the features that differ most."""
+    """Explain how the scenes of B differ from those of A: the features that differ most."""
     from sgstore.coverage import explain
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
+    form, spill = out.chosen(), bounds.spill()
     ours, theirs = (_classed(one, abstraction, spill=spill) for one in (b, versus))
     tables = explain(ours, theirs, abstraction, by_frame=frames, depth=depth)
     for text in tables[0].said if tree else ():
         say(text)
-    _write(tables[1] if tree else tables[0], limit, form, output)
+    _write(tables[1] if tree else tables[0], limit, form, out.output)
 
 
 @coverage.command("failures")
 def failures_(
-    train: Annotated[str, typer.Option("--train", metavar="A", help="What was trained on.")],
-    test: Annotated[str, typer.Option("--test", metavar="B", help="What was tested with.")],
+    train: Annotated[str, typer.Option("--train", metavar="A", help="Training frames.")],
+    test: Annotated[str, typer.Option("--test", metavar="B", help="Test frames.")],
     outcomes: Annotated[
         Path,
         typer.Option(
@@ -422,16 +394,14 @@ def failures_(
     incomplete: WhenIncomplete = Incomplete.equal,
     novel: Annotated[bool, typer.Option("--novel", help="List the novel failures.")] = False,
     limit: Limit = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> None:
-    """Say which failures of a system are novel, and which coverage would have foretold (S3C)."""
+    """List failures of a system that are novel, and those that coverage would have predicted (S3C)."""
     from sgstore.coverage import S3C_THRESHOLD, Outcomes, failures
 
-    form, spill = form_of(form, output, as_json=as_json), bounded(timeout, max_spill)
+    form, spill = out.chosen(), bounds.spill()
     limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)
     told = Outcomes.read(outcomes, limits)
     one, other = (
@@ -440,7 +410,7 @@ def failures_(
     shares, listed = failures(one, other, told)
     for text in shares.said if novel else ():
         say(text)
-    _write(listed if novel else shares, limit, form, output)
+    _write(listed if novel else shares, limit, form, out.output)
 
 
 def _fraction(text: str) -> float:

@@ -1,7 +1,4 @@
-"""The verbs show and export.
-
-Verbs that write test sets.
-"""
+"""Verbs that draw and write: show, export."""
 
 from __future__ import annotations
 
@@ -14,18 +11,16 @@ import typer
 from sgstore.cli._options import (
     LOSS,
     AsJson,
-    MaxSpill,
     Parameters,
     PatternName,
     QueryFile,
+    QueryLimits,
     QueryText,
     StorePath,
-    Timeout,
     app,
     asked_of,
     form_of,
     lines_of,
-    open_store,
     parameters_of,
     say_left_out,
     seconds_of,
@@ -39,12 +34,14 @@ if TYPE_CHECKING:
     from sgstore.query import Store
     from sgstore.world import Clip
 
+PANEL: Final = "Pictures and exports"
+
 
 BEFORE_AFTER: Final = "2s"
 
 
 class Clouds(StrEnum):
-    """What clouds of points are written as."""
+    """Format of point clouds."""
 
     pcd = "pcd"
     npy = "npy"
@@ -83,18 +80,16 @@ WithGraph = Annotated[
     bool, typer.Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw.")
 ]
 Abstraction = Annotated[
-    str, typer.Option("--abstraction", help="nx, pyg, s3c: what the graphs are seen as.")
+    str, typer.Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs.")
 ]
 Channels = Annotated[
     list[str] | None,
     typer.Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
 ]
-CloudForm = Annotated[
-    Clouds, typer.Option("--clouds", help="frames: what clouds of points are written as.")
-]
+CloudForm = Annotated[Clouds, typer.Option("--clouds", help="frames: format of point clouds.")]
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def export(
     store: StorePath,
     query: QueryText = None,
@@ -113,8 +108,8 @@ def export(
     channels: Channels = None,
     clouds: CloudForm = Clouds.pcd,
     as_json: AsJson = False,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    bounds: QueryLimits,
 ) -> int:
     """Cut matches out of their recordings, as clips with the original messages.
 
@@ -126,7 +121,7 @@ def export(
 
     exporter_named(form)  # before anything is searched
     texts = parse_labels(labels or [])
-    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store)
     values = parameters_of(parameters)
     margins = seconds_of(before, "--before"), seconds_of(after, "--after")
     if sum((frames is not None, lock is not None, bool(query or file or name))) > 1:
@@ -190,7 +185,7 @@ def _clips(
 
 
 class DrawnRelations(StrEnum):
-    """Which edges a picture shows."""
+    """Edges that a picture shows."""
 
     ego = "ego"
     all = "all"
@@ -227,7 +222,7 @@ PicturesASecond = Annotated[
 ]
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def show(
     store: StorePath,
     frame: Frame,
@@ -242,13 +237,13 @@ def show(
     north_up: NorthUp = False,
     graph: Diagram = False,
     fps: PicturesASecond = 10.0,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    bounds: QueryLimits,
 ) -> int:
     """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
     from sgstore.draw import draw_clip, draw_stored, range_of
 
-    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store)
     asked = query or file or name
     text, values = asked_of(query, file, name, parameters_of(parameters)) if asked else ("", {})
     clip = range_of(frame)

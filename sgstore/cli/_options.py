@@ -1,15 +1,15 @@
-"""The application, and the arguments that verbs share.
-
-What holds for every verb: how its command line is read.
-"""
+"""The application, arguments that verbs share, and bundles of these."""
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 from collections import Counter
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -45,7 +45,7 @@ class Verb(TyperCommand):
 
 
 def _says_one_thing(parameter: Any) -> bool:
-    """Whether an option that is repeated would drop what was said before."""
+    """Return true if an option takes one value, so that a second one would replace it."""
     if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
         return False
     return not parameter.is_flag or bool(parameter.secondary_opts)  # a flag said twice is said
@@ -55,9 +55,49 @@ class Verbs(typer.Typer):
     """An application, or a part of one, whose commands are each a :class:`Verb`."""
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
-        """A decorator that registers a function as a verb; see :meth:`typer.Typer.command`."""
+        """A decorator that registers a function as a verb; see :meth:`typer.Typer.command`.
+
+        A parameter whose type is a dataclass stands for the options that are its fields.
+        """
         every: dict[str, Any] = {"cls": Verb, **options}
-        return super().command(name, **every)
+        register = super().command(name, **every)
+
+        def registered(function: Callable[..., Any]) -> Callable[..., Any]:
+            register(_unbundled(function))
+            return function
+
+        return registered
+
+
+def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function that takes the fields of dataclasses in place of these."""
+    hints = get_type_hints(function, include_extras=True)
+    parameters: list[inspect.Parameter] = []
+    homes: dict[str, str] = {}
+    for one in inspect.signature(function).parameters.values():
+        kind = hints[one.name]
+        if not is_dataclass(kind):
+            parameters.append(one.replace(annotation=kind, kind=one.KEYWORD_ONLY))
+            continue
+        own = get_type_hints(kind, include_extras=True)
+        for field in fields(kind):
+            homes[field.name] = one.name
+            default = one.empty if field.default is MISSING else field.default
+            option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=default)
+            parameters.append(option.replace(annotation=own[field.name]))
+    if not homes:
+        return function
+
+    @wraps(function)
+    def verb(**values: Any) -> Any:
+        given: dict[str, dict[str, Any]] = {bundle: {} for bundle in homes.values()}
+        for name in homes.keys() & values.keys():
+            given[homes[name]][name] = values.pop(name)
+        return function(**values, **{name: hints[name](**own) for name, own in given.items()})
+
+    verb.__annotations__ = {one.name: one.annotation for one in parameters}
+    vars(verb)["__signature__"] = inspect.Signature(parameters)
+    return verb
 
 
 # The application, the arguments that verbs share, and how their texts become values -------------
@@ -127,32 +167,76 @@ With = Annotated[
         " or t; repeatable.",
     ),
 ]
-RowFormat = Annotated[Format, typer.Option("--format", help="How rows are printed.")]
+ROWS: Final = "Rows"
+LIMITS: Final = "Limits"
+RowFormat = Annotated[
+    Format, typer.Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
+]
 SgsmCompat = Annotated[
     bool,
     typer.Option(
         "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Short for --format json.")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Short for --format json.", rich_help_panel=ROWS)
+]
 Output = Annotated[
-    Path | None, typer.Option("--output", "-o", help="Write to this file instead of stdout.")
+    Path | None,
+    typer.Option(
+        "--output", "-o", help="Write to this file instead of stdout.", rich_help_panel=ROWS
+    ),
 ]
 
 
 Timeout = Annotated[
     str | None,
-    typer.Option("--timeout", metavar="TIME", help="Stop after this time, such as 30s."),
+    typer.Option(
+        "--timeout",
+        metavar="TIME",
+        help="Stop after this time, such as 30s.",
+        rich_help_panel=LIMITS,
+    ),
 ]
 MaxSpill = Annotated[
     str | None,
     typer.Option(
         "--max-spill",
         metavar="SIZE",
-        help="Most that is put on disk where memory does not suffice: 500MB, 50GB.",
+        help="Most disk space for what does not fit into memory: 500MB, 50GB.",
         show_default="10GB",
+        rich_help_panel=LIMITS,
     ),
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class RowOptions:
+    """Options for the format of rows and their file."""
+
+    form: RowFormat = Format.table
+    as_json: AsJson = False
+    output: Output = None
+
+    def chosen(self) -> Format:
+        """Return the form that these options mean together."""
+        return form_of(self.form, self.output, as_json=self.as_json)
+
+
+@dataclass(frozen=True, slots=True)
+class QueryLimits:
+    """Most time and disk that a question may take."""
+
+    timeout: Timeout = None
+    max_spill: MaxSpill = None
+
+    def spill(self) -> int:
+        """Bound whatever is done from here on; return the bytes on disk, as :func:`bounded` does."""
+        return bounded(self.timeout, self.max_spill)
+
+    def opened(self, store: Path, tables: Mapping[str, Path] | None = None) -> Store:
+        """Open a store within these bounds; see :func:`open_store`."""
+        return open_store(store, tables, timeout=self.timeout, max_spill=self.max_spill)
 
 
 @app.callback(invoke_without_command=True)
@@ -222,7 +306,7 @@ _ENDINGS: Final = {
 
 
 def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
-    """What ``--format`` and ``--json`` mean together; without them the name of the file says it."""
+    """Return the format by ``--format`` and ``--json``, or by the name of the file."""
     if as_json and form not in {Format.table, Format.json}:
         raise typer.BadParameter(f"give one of --json and --format {form}")
     if as_json or form is not Format.table or output is None:
@@ -399,7 +483,7 @@ def say_notes(notes: Iterable[str]) -> None:
 
 
 def settings_of(config: Path | None, preset: str | None) -> Settings | None:
-    """What ``--config`` and ``--preset`` say; ``None``: neither is given."""
+    """Settings of ``--config`` or ``--preset``; ``None`` if neither is given."""
     from sgstore.config import load
     from sgstore.config import preset as preset_named
 

@@ -93,7 +93,7 @@ def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | 
 
 
 class Format(StrEnum):
-    """How rows are printed."""
+    """Format of rows."""
 
     table = "table"
     json = "json"

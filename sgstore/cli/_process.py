@@ -42,7 +42,7 @@ _WORDS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
 
 @dataclass(slots=True)
 class _RunEnd:
-    """What ends the run of this process, and what lost errors were reported to before."""
+    """State of the end of this process: its cause, and the earlier hook for lost errors."""
 
     signal: int = 0
     deadline_s: float = 0.0
@@ -121,12 +121,12 @@ def _too_late(_number: int, _frame: FrameType | None) -> None:
 
 
 def was_ended() -> bool:
-    """Whether a signal or the deadline has ended the run, even if the interruption that it raised was lost."""
+    """Return true if a signal or the deadline has ended the run, even if its interruption was lost."""
     return bool(_run.signal) or _run.late
 
 
 def is_interruption(error: BaseException | None) -> bool:
-    """Whether an error is due to the end of the run."""
+    """Return true if an error is due to the end of the run."""
     while error is not None:
         of_database = isinstance(error, RuntimeError) or "duckdb" in type(error).__module__
         if of_database and any(words in str(error) for words in _WORDS):
@@ -157,7 +157,7 @@ def exit_code() -> int:
 
 
 def word() -> str:
-    """What ended it."""
+    """Name of what ended the run."""
     return f"ended by {signal.Signals(_run.signal).name}" if _run.signal else "interrupted"
 
 

@@ -1,14 +1,11 @@
-"""The verbs find, why-not, like, translate, sql and patterns.
-
-Verbs that find: patterns and SQL.
-"""
+"""Verbs that find: find, why-not, like, translate, sql, patterns."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -16,21 +13,18 @@ from sgstore.cli._options import (
     NO_MATCH,
     AsJson,
     FrameName,
-    MaxSpill,
     Output,
     Parameters,
     PatternName,
     QueryFile,
+    QueryLimits,
     QueryText,
-    RowFormat,
+    RowOptions,
     StorePath,
-    Timeout,
     Verbs,
     With,
     app,
     asked_of,
-    form_of,
-    open_store,
     parameters_of,
     query_of,
     say_left_out,
@@ -47,40 +41,42 @@ if TYPE_CHECKING:
     from sgstore.matches import Interval, Matches
     from sgstore.sandbox import Answer, Sandbox
 
+PANEL: Final = "Questions"
+
 
 Safe = Annotated[
     bool,
     typer.Option(
-        "--safe", help="Ask in a process of its own that is bounded in time (5s), memory and rows."
+        "--safe", help="Run in a separate process with bounded time (5s), memory and rows."
     ),
 ]
-MaxRows = Annotated[int, typer.Option("--max-rows", min=0, help="With --safe: the most rows.")]
+MaxRows = Annotated[
+    int, typer.Option("--max-rows", min=0, help="With --safe: maximum number of rows.")
+]
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def find(
     store: StorePath,
     query: QueryText = None,
     file: QueryFile = None,
     name: PatternName = None,
     parameters: Parameters = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
     count: Annotated[
         bool, typer.Option("--count", help="Print the number of distinct frames and nothing else.")
     ] = False,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Print how the query is understood, and its SQL.")
+        bool, typer.Option("--explain", help="Print the stages of the query, and its SQL.")
     ] = False,
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if nothing matches.")
     ] = False,
     safe: Safe = False,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
     max_rows: MaxRows = 10_000,
     tables: With = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
     """Find frames by a pattern of their scene graphs.
 
@@ -90,16 +86,16 @@ def find(
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
-        _refuse_spill(max_spill)
-        form = form_of(form, output, as_json=as_json)
-        with _sandbox(store, timeout, max_rows, tables) as box:
+        _refuse_spill(bounds.max_spill)
+        form = out.chosen()
+        with _sandbox(store, bounds.timeout, max_rows, tables) as box:
             answer = box.find(text, **values)
         _say_all(answer)
-        number = write_rows(*_as_shown(answer, form), form, output)
+        number = write_rows(*_as_shown(answer, form), form, out.output)
         if not number and form is Format.table:
             say("nothing matches")
         return NO_MATCH if require and not number else 0
-    opened = open_store(store, tables_of(tables), timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store, tables_of(tables))
     with opened.file.snapshot():  # it is opened once
         matches = opened.find(text, **values)
         if explain:
@@ -110,9 +106,9 @@ def find(
             number = matches.count()
             typer.echo(number)
         else:
-            form = form_of(form, output, as_json=as_json)
+            form = out.chosen()
             columns, rows = _as_shown(matches, form)
-            number = write_rows(columns, rows, form, output)
+            number = write_rows(columns, rows, form, out.output)
             if not number and form is Format.table:
                 say("nothing matches")
     return NO_MATCH if require and not number else 0
@@ -144,7 +140,7 @@ def _node_link(
     )
 
 
-@app.command("why-not")
+@app.command("why-not", rich_help_panel=PANEL)
 def why_not(
     store: StorePath,
     frame: FrameName,
@@ -153,12 +149,12 @@ def why_not(
     name: PatternName = None,
     parameters: Parameters = None,
     as_json: AsJson = False,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    bounds: QueryLimits,
 ) -> int:
-    """Say how far a pattern holds in a frame: what fails first, and how near it came."""
+    """Explain why a pattern does not match a frame: the first condition that fails, and by how much."""
     text, values = asked_of(query, file, name, parameters_of(parameters))
-    answer = open_store(store, timeout=timeout, max_spill=max_spill).why_not(frame, text, **values)
+    answer = bounds.opened(store).why_not(frame, text, **values)
     if as_json:
         write_document(answer.as_dict(), Format.json)
     else:
@@ -166,39 +162,38 @@ def why_not(
     return 0
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def like(
     store: StorePath,
     frame: FrameName,
     ignore: Annotated[
         list[str] | None,
-        typer.Option(
-            "--ignore", metavar="NAME", help="A relation or a kind that does not count; repeatable."
-        ),
+        typer.Option("--ignore", metavar="NAME", help="Ignore a relation or a kind; repeatable."),
     ] = None,
     abstraction: Annotated[
-        str, typer.Option("--abstraction", metavar="NAME", help="Whose graphs are compared.")
+        str,
+        typer.Option(
+            "--abstraction", metavar="NAME", help="Abstraction whose graphs are compared."
+        ),
     ] = "RSV",
-    limit: Annotated[int, typer.Option("--limit", min=1, help="How many runs of frames.")] = 10,
+    limit: Annotated[int, typer.Option("--limit", min=1, help="Number of runs of frames.")] = 10,
     pattern: Annotated[
         bool, typer.Option("--pattern", help="Print a pattern that describes the frame instead.")
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
     """Find frames like another: of the same class, or the most like by what they have in common.
 
     One row for consecutive frames that are as like as each other: the first one, how many, how like, whether
     the graphs are the same, and what the example has that they have not, and they that it has not.
     """
-    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store)
     if pattern:
-        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", output)
+        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
         return 0
-    form = form_of(form, output, as_json=as_json)
+    form = out.chosen()
     found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
     if form is Format.table:
         columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
@@ -214,7 +209,7 @@ def like(
             )
             for one in found
         )
-        write_rows(columns, rows, form, output)
+        write_rows(columns, rows, form, out.output)
         return 0
     columns = ("frame_id", "trace", "seq", "time_ns", "t", "frames", "similarity", "same")
     columns += ("shared", "missing", "extra")
@@ -225,7 +220,7 @@ def like(
         )
         for one in found
     )
-    write_rows(columns, rows, form, output)
+    write_rows(columns, rows, form, out.output)
     return 0
 
 
@@ -240,7 +235,7 @@ class Language(StrEnum):
     sgl = "sgl"
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def translate(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What to translate; - is stdin.")],
     language: Annotated[
@@ -255,38 +250,36 @@ def translate(
     return 0
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def sql(
     store: StorePath,
     statement: Annotated[
         str | None, typer.Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
     ] = None,
     file: QueryFile = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
     safe: Safe = False,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
     max_rows: MaxRows = 10_000,
     tables: With = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
     """Ask a store in SQL, read only.
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     """
-    form = form_of(form, output, as_json=as_json)
+    form = out.chosen()
     if safe:
-        _refuse_spill(max_spill)
-        with _sandbox(store, timeout, max_rows, tables) as box:
+        _refuse_spill(bounds.max_spill)
+        with _sandbox(store, bounds.timeout, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))
         _say_all(answer)
-        write_rows(answer.columns, answer.rows, form, output)
+        write_rows(answer.columns, answer.rows, form, out.output)
         return 0
-    opened = open_store(store, tables_of(tables), timeout=timeout, max_spill=max_spill).file
+    opened = bounds.opened(store, tables_of(tables)).file
     with opened.user_batches(query_of(statement, file)) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
-        write_rows(batches.columns, rows, form, output, batches.types)
+        write_rows(batches.columns, rows, form, out.output, batches.types)
     return 0
 
 
@@ -316,7 +309,12 @@ def _say_all(answer: Answer) -> None:
 # Verbs about the library of named patterns: list, show, run -------------------------------------
 
 library = Verbs(no_args_is_help=True)
-app.add_typer(library, name="patterns", help="The library of named patterns: list, show, run them.")
+app.add_typer(
+    library,
+    name="patterns",
+    help="The library of named patterns: list, show, run them.",
+    rich_help_panel=PANEL,
+)
 
 LibraryName = Annotated[
     str, typer.Argument(metavar="NAME", help="Of a pattern, such as cut_in or ParkingExit.")
@@ -341,9 +339,8 @@ def list_patterns(
     kinds: Annotated[
         list[Kind] | None, typer.Option("--kind", help="Only of this kind; repeatable.")
     ] = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
+    *,
+    out: RowOptions,
 ) -> int:
     """Name the patterns of the library, with what they find.
 
@@ -352,7 +349,7 @@ def list_patterns(
     """
     from sgstore.lang.library import patterns
 
-    form = form_of(form, output, as_json=as_json)
+    form = out.chosen()
     found = [p for p in patterns().values() if not kinds or p.kind in kinds]
     if form is Format.table:
         columns = ("name", "kind", "from", "sentence")
@@ -360,7 +357,7 @@ def list_patterns(
     else:
         columns = ("name", "kind", "library", "sentence", "parameters", "source", "query")
         rows = [(*_told(p).values(),) for p in found]
-    write_rows(columns, rows, form, output)
+    write_rows(columns, rows, form, out.output)
     return 0
 
 
@@ -385,9 +382,6 @@ def run_pattern(
     store: StorePath,
     name: LibraryName,
     chosen: Chosen = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
     clips: Annotated[
         bool, typer.Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
     ] = False,
@@ -404,8 +398,9 @@ def run_pattern(
             help="End with exit code 4 if nothing matches, or if the property is violated.",
         ),
     ] = False,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
     """Find a pattern of the library in a store: when it holds, and who takes part.
 
@@ -420,19 +415,18 @@ def run_pattern(
     if found.is_check:
         if clips:
             raise typer.BadParameter(f"{found.name} is a property, which has verdicts and no clips")
-        bounds = {"timeout": timeout, "max_spill": max_spill}
-        shown = {"require": require, "form": form, "as_json": as_json, "output": output}
-        return _check(store, names=[found.name], parameters=chosen, **shown, **bounds)
+        asked = {"names": [found.name], "parameters": chosen, "require": require}
+        return _check(store, **asked, out=out, bounds=bounds)
     text = found.written(**parameters_of(chosen))
-    form = form_of(form, output, as_json=as_json)
-    matches = open_store(store, timeout=timeout, max_spill=max_spill).find(text)
+    form = out.chosen()
+    matches = bounds.opened(store).find(text)
     say_left_out(matches)
     if clips:
         offsets = seconds_of(before, "--before"), seconds_of(after, "--after")
         rows = ((c.trace, c.start_ns, c.end_ns) for c in matches.clips(*offsets))
-        number = write_rows(("trace", "start_ns", "end_ns"), rows, form, output)
+        number = write_rows(("trace", "start_ns", "end_ns"), rows, form, out.output)
     else:
-        number = _write_intervals(matches.intervals(), form, output)
+        number = _write_intervals(matches.intervals(), form, out.output)
     if not number and form is Format.table:
         say("nothing matches")
     return NO_MATCH if require and not number else 0

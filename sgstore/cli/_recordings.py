@@ -1,7 +1,4 @@
-"""The verbs ingest, info, doctor, import and record.
-
-Verbs about recordings: read them into a store, say what is in it, and what is wrong with them.
-"""
+"""Verbs about recordings: ingest, info, doctor, record, import."""
 
 from __future__ import annotations
 
@@ -40,6 +37,8 @@ if TYPE_CHECKING:
     from sgstore.segments import TraceOutcome
     from sgstore.store import StoreFile
 
+PANEL: Final = "Recordings"
+
 
 Traces = Annotated[
     list[str],
@@ -60,19 +59,21 @@ Jobs = Annotated[
     typer.Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."),
 ]
 Since = Annotated[
-    str | None, typer.Option("--since", help="From this time of a recording on: 10s.")
+    str | None, typer.Option("--since", help="Start at this time of a recording: 10s.")
 ]
-Until = Annotated[str | None, typer.Option("--until", help="Up to this time: 1min.")]
+Until = Annotated[str | None, typer.Option("--until", help="Stop at this time: 1min.")]
 Rate = Annotated[
-    float | None, typer.Option("--rate", min=0, help="Frames to keep of a second; 0: all.")
+    float | None, typer.Option("--rate", min=0, help="Frames per second to keep; 0: all.")
 ]
 Force = Annotated[
-    bool, typer.Option("--force", help="Read anew, and replace, what is in the store already.")
+    bool, typer.Option("--force", help="Read again and replace what is in the store already.")
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Report what would be done, and do nothing.")
+]
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def ingest(
     store: StorePath,
     traces: Traces,
@@ -89,7 +90,7 @@ def ingest(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Read recordings into a store; what is in it already is left as it is."""
+    """Read recordings into a store; those that are in it already are skipped."""
     from sgstore.cli._output import ingest_bar
     from sgstore.ingest import ingest as ingest_traces
     from sgstore.ingest import recordings
@@ -135,7 +136,7 @@ def _say_what_was_odd(outcome: TraceOutcome) -> None:
 
 
 def _no_kind(type_name: str) -> str:
-    """What is to be done about a type name that means no kind of its own."""
+    """Advice about a type name that no mapping knows."""
     name = json.dumps(type_name, ensure_ascii=False)
     return (
         "of which nothing says what kind it is; to say it, write into a file for --config:"
@@ -156,7 +157,7 @@ def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
     )
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def info(
     store: StorePath,
     traces: Annotated[
@@ -168,7 +169,7 @@ def info(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """List the traces of a store, or say all that is known of one."""
+    """List the traces of a store, or describe one in full."""
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
@@ -216,7 +217,7 @@ def _tell_all_of(file: StoreFile, names: list[str], form: Format) -> None:
         write_rows(tuple(documents[0]), [tuple(one.values()) for one in documents], form)
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def doctor(
     traces: Traces,
     road_map: RoadMap = None,
@@ -225,7 +226,7 @@ def doctor(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Say what would be read of recordings, and what is wrong with them; no store is needed."""
+    """Check recordings: report what can be read, and any damage. Needs no store."""
     from sgstore.doctor import Examination, examine
     from sgstore.ingest import recordings
 
@@ -254,16 +255,16 @@ def doctor(
 # Verbs that need a running simulator ------------------------------------------------------------
 
 PORT: Final = 2000
-"""Where a CARLA server listens by default."""
+"""Default port of a CARLA server."""
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def record(
     output: Annotated[
         Path,
         typer.Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten."),
     ],
-    host: Annotated[str, typer.Option("--host", help="Where the CARLA server runs.")] = "localhost",
+    host: Annotated[str, typer.Option("--host", help="Host of the CARLA server.")] = "localhost",
     port: Annotated[int, typer.Option("--port", help="Its port.")] = PORT,
     ego: Annotated[
         str, typer.Option("--ego", help="Id or role name of the ego; by default hero, ego_vehicle.")
@@ -283,7 +284,8 @@ def record(
         ),
     ] = None,
     scenery: Annotated[
-        bool, typer.Option("--scenery/--no-scenery", help="Buildings, poles, … of the level, too.")
+        bool,
+        typer.Option("--scenery/--no-scenery", help="Include buildings, poles, … of the level."),
     ] = True,
 ) -> int:
     """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego."""
@@ -332,7 +334,7 @@ def _counter() -> Generator[Callable[[int, float], None] | None]:
 
 
 class GraphFormat(StrEnum):
-    """What files of graphs are written in."""
+    """Format of files of graphs."""
 
     s3c = "s3c"
     nodelink = "nodelink"
@@ -351,11 +353,11 @@ WrittenIn = Annotated[
 ]
 Kinds = Annotated[
     list[str] | None,
-    typer.Option("--kind", metavar="LABEL=KIND", help="What a label means; repeatable."),
+    typer.Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
 ]
 Relations = Annotated[
     list[str] | None,
-    typer.Option("--relation", metavar="NAME=RELATION", help="What a relation means; repeatable."),
+    typer.Option("--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."),
 ]
 UnknownAs = Annotated[
     str,
@@ -370,20 +372,17 @@ Answers = Annotated[
     typer.Option(
         "--answers",
         metavar="RELATION",
-        help="The graphs can hold it, though none of them may; repeatable.",
+        help="A relation that the graphs can hold, even if none of them does; repeatable.",
     ),
 ]
 Period = Annotated[
     str,
-    typer.Option("--period", metavar="TIME", help="From frame to frame, where no time is told."),
+    typer.Option("--period", metavar="TIME", help="Time between frames, where the file has none."),
 ]
-Reimport = Annotated[
-    bool, typer.Option("--force", help="Read anew, and replace, what is in the store already.")
-]
-Rows = Annotated[Format, typer.Option("--rows", help="How rows are printed.")]
+Rows = Annotated[Format, typer.Option("--rows", help="Format of the rows.")]
 
 
-@app.command("import")
+@app.command("import", rich_help_panel=PANEL)
 def import_(
     store: StorePath,
     files: Files,
@@ -393,11 +392,11 @@ def import_(
     unknown_as: UnknownAs = "",
     answers: Answers = None,
     period: Period = "1s",
-    force: Reimport = False,
+    force: Force = False,
     form: Rows = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Bring graphs that other tools made into a store: each becomes a frame."""
+    """Import graphs of other tools into a store: each becomes a frame."""
     from sgstore.importing import Words, import_graphs
     from sgstore.vocabulary import relation_named
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -12,19 +12,17 @@ from sgstore.cli._options import (
     ERROR,
     NO_MATCH,
     AsJson,
-    MaxSpill,
     Output,
     Parameters,
+    QueryLimits,
     QueryText,
     RowFormat,
+    RowOptions,
     StorePath,
-    Timeout,
     Verbs,
     app,
     asked_of,
-    bounded,
     form_of,
-    open_store,
     parameters_of,
     say_left_out,
     seconds_of,
@@ -37,15 +35,20 @@ if TYPE_CHECKING:
     from sgstore.query import Store
     from sgstore.selection import Selection, Strategy
 
+PANEL: Final = "Coverage and test sets"
+
 
 lock = Verbs(no_args_is_help=True)
 app.add_typer(
-    lock, name="lock", help="Locks of test sets: verify, list, unite, intersect, subtract."
+    lock,
+    name="lock",
+    help="Locks of test sets: verify, list, unite, intersect, subtract.",
+    rich_help_panel=PANEL,
 )
 
 
 class ChosenUnit(StrEnum):
-    """What is chosen or not."""
+    """Unit of a choice."""
 
     frame = "frame"
     clip = "clip"
@@ -53,7 +56,7 @@ class ChosenUnit(StrEnum):
 
 
 class Least(StrEnum):
-    """What is to be as little as possible."""
+    """Quantity that a minimal choice minimizes."""
 
     units = "units"
     frames = "frames"
@@ -67,21 +70,23 @@ LockB = Annotated[Path, typer.Argument(metavar="B", help="A lock.")]
 LockOut = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The lock to write.")]
 NoPayloads = Annotated[
     bool,
-    typer.Option("--no-payloads", help="Leave the sensor messages alone; recordings are not read."),
+    typer.Option("--no-payloads", help="Skip sensor messages: recordings are not read."),
 ]
 
 
-Minimal = Annotated[bool, typer.Option("--minimal", help="As few as keep everything that occurs.")]
+Minimal = Annotated[
+    bool, typer.Option("--minimal", help="The fewest that keep everything that occurs.")
+]
 PerClass = Annotated[
     int | None,
     typer.Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times."),
 ]
-Rarest = Annotated[bool, typer.Option("--rarest", help="The rarest classes first.")]
+Rarest = Annotated[bool, typer.Option("--rarest", help="Rarest classes first.")]
 Stratify = Annotated[
-    str, typer.Option("--stratify", metavar="EXPR", help="By a value: 'ego.speed > 8'.")
+    str, typer.Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
 ]
 BudgetText = Annotated[
-    str, typer.Option("--budget", help="600s, 10min, 5GB, 1000frames or 40units at most.")
+    str, typer.Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
 ]
 UnitName = Annotated[ChosenUnit, typer.Option("--unit", help="Frames, clips, or whole traces.")]
 ClipLength = Annotated[
@@ -92,39 +97,38 @@ Stride = Annotated[
     typer.Option(
         "--stride",
         metavar="TIME",
-        help="From where a clip begins to where the next one does; below --clip, they overlap.",
+        help="Time from the start of a clip to that of the next; below --clip, they overlap.",
         show_default="--clip",
     ),
 ]
 Abstraction = Annotated[
-    str, typer.Option("--abstraction", metavar="NAME", help="Whose classes: E, EL, ER, RSV, …")
+    str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
 ]
 Combos = Annotated[
     int, typer.Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
 ]
 OfEgo = Annotated[bool, typer.Option("--ego", help="--combos: only features of the ego.")]
-LeastName = Annotated[
-    Least, typer.Option("--least", help="What --minimal makes as small as it can.")
-]
+LeastName = Annotated[Least, typer.Option("--least", help="Quantity that --minimal minimizes.")]
 Temper = Annotated[
-    float, typer.Option("--temper", help="--stratify: 1: as they are, 0: the same for all.")
+    float,
+    typer.Option("--temper", help="Weight of strata: 1: as frequent as they are, 0: all equal."),
 ]
 SplitText = Annotated[
     str, typer.Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, max=(1 << 63) - 1, help="Of what is random.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")]
 LockFile = Annotated[
     Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write a lock.")
 ]
 WithCurve = Annotated[
-    bool, typer.Option("--curve", help="Print what is kept by how many, beside random order.")
+    bool, typer.Option("--curve", help="Print how much is kept by how many, beside a random order.")
 ]
 Picture = Annotated[
     Path | None, typer.Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
 ]
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def select(
     store: StorePath,
     query: QueryText = None,
@@ -150,10 +154,10 @@ def select(
     picture: Picture = None,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    bounds: QueryLimits,
 ) -> None:
-    """Choose frames, clips or traces to test with, say how good the choice is, and lock it.
+    """Choose frames, clips or traces for tests, rate the choice, and lock it.
 
     Without --minimal, --per-class, --rarest or --stratify all are taken, or some at
     random within the --budget.
@@ -178,7 +182,7 @@ def select(
     )
     _check_output(output)
     shares = parse_split(split) if split else {}
-    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store)
     found = choose(_chosen(opened, str(store), query, parameters), wish)
     parts, table = _parts(found, shares)
     _show(found, table, picture, form_of(form, as_json=as_json), curve=curve)
@@ -188,7 +192,7 @@ def select(
 
 
 def _way(*, minimal: bool, per_class: int | None, rarest: bool, stratify: str) -> Strategy:
-    """How units are chosen, by the options that are given."""
+    """Strategy that the options name."""
     from sgstore.selection import Strategy
 
     ways = {Strategy.minimal: minimal, Strategy.rarest: rarest, Strategy.stratify: bool(stratify)}
@@ -299,27 +303,25 @@ def verify_(
     store: StorePath,
     no_payloads: NoPayloads = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Other versions of sgstore are a difference, too.")
+        bool, typer.Option("--strict", help="Count another version of sgstore as a difference.")
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
-    """Look whether a store has what a lock says: recordings, settings, graphs, sensor messages.
+    """Verify that a store holds the cases of a lock: recordings, settings, graphs, sensor messages.
 
     Exit code 1 if not. Other versions alone are told, and no difference
     without --strict.
     """
     from sgstore.locks import read_lock, verify
 
-    form = form_of(form, output, as_json=as_json)
+    form = out.chosen()
     known = read_lock(path)
-    opened = open_store(store, timeout=timeout, max_spill=max_spill)
+    opened = bounds.opened(store)
     found = list(verify(known, opened, payloads=not no_payloads))
     rows = [(one.where, one.what, one.detail) for one in found]
-    write_rows(("where", "what", "detail"), rows, form, output)
+    write_rows(("where", "what", "detail"), rows, form, out.output)
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
     if unread or no_payloads:
@@ -379,7 +381,7 @@ def _write(table: ReportTable | None, form: Format, output: Path | None = None) 
         say(text)
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def diff(
     a: Annotated[str, typer.Argument(metavar="A", help="Before: a store, STORE:QUERY, or a lock.")],
     b: Annotated[str, typer.Argument(metavar="B", help="After, as A.")],
@@ -397,17 +399,15 @@ def diff(
         bool, typer.Option("--by-frame", help="Scenes of traces of one name, frame by frame.")
     ] = False,
     abstraction: Annotated[
-        str, typer.Option("--abstraction", metavar="NAME", help="Whose classes: E, EL, ER, RSV, …")
+        str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
     ] = "RSV",
     parameters: Parameters = None,
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if anything is different.")
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-    output: Output = None,
-    timeout: Timeout = None,
-    max_spill: MaxSpill = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
 ) -> int:
     """Compare two stores or runs: which scenes, verdicts or matches appeared, vanished, changed."""
     from sgstore import diff as differences
@@ -416,8 +416,8 @@ def diff(
 
     if (name is not None) + (query is not None) + by_frame > 1:
         raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
-    form = form_of(form, output, as_json=as_json)
-    values, spill = parameters_of(parameters), bounded(timeout, max_spill)
+    form = out.chosen()
+    values, spill = parameters_of(parameters), bounds.spill()
     if name is not None or query is not None:
         text, values = asked_of(query, None, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
@@ -429,6 +429,6 @@ def diff(
             *(classed(selection_of(one, max_spill=spill), abstraction) for one in (a, b))
         )
     # People read the reasons below the table, each once.
-    _write(table.without(*differences.REASONS) if form is Format.table else table, form, output)
+    _write(table.without(*differences.REASONS) if form is Format.table else table, form, out.output)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0

@@ -1,14 +1,11 @@
-"""Verbs about stores (verify, remove, rebuild, derive, payload), maps and settings, and the demo.
-
-Verbs about a store as a whole: is it as it was published, take traces out of it, make it anew.
-"""
+"""Verbs about stores (verify, remove, rebuild, derive, payload), maps and settings, and the demo."""
 
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -22,17 +19,19 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store import StoreFile
 
+PANEL: Final = "Stores and maps"
 
-@app.command()
+
+@app.command(rich_help_panel=PANEL)
 def verify(
     store: StorePath,
     payloads: Annotated[
-        bool, typer.Option("--payloads", help="Hash the recordings again, too.")
+        bool, typer.Option("--payloads", help="Also hash the recordings again.")
     ] = False,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Look whether everything is as it was published; print what is not."""
+    """Verify that a store is as it was published; list every fault."""
     from sgstore.store import verify_file
 
     found = verify_file(store, recordings=payloads)
@@ -46,7 +45,7 @@ def verify(
     return ERROR if rows else 0
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def remove(
     store: StorePath,
     traces: Annotated[
@@ -55,14 +54,12 @@ def remove(
     ] = None,
     compact: Annotated[
         bool,
-        typer.Option(
-            "--compact", help="Write the store anew, to give the space back; also without a TRACE."
-        ),
+        typer.Option("--compact", help="Rewrite the file to free its space; also without a TRACE."),
     ] = False,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Take traces out of a store, all of them or none; the recordings stay where they are."""
+    """Remove traces from a store, all or none; the recordings are not touched."""
     from sgstore.store import StoreFile
 
     if not traces and not compact:
@@ -78,7 +75,7 @@ def remove(
     return 0
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def rebuild(
     store: StorePath,
     look_in: Annotated[
@@ -86,7 +83,7 @@ def rebuild(
         typer.Option(
             "--look-in",
             metavar="FOLDER",
-            help="Where recordings may be that are not where they were; repeatable.",
+            help="Folder to look in for recordings that were moved; repeatable.",
         ),
     ] = None,
     leave_out: Annotated[
@@ -94,7 +91,7 @@ def rebuild(
         typer.Option(
             "--leave-out",
             metavar="TRACE",
-            help="A trace that cannot be made anew: the new store does not have it; repeatable.",
+            help="Leave out a trace that cannot be rebuilt; repeatable.",
         ),
     ] = None,
     jobs: Annotated[
@@ -106,7 +103,7 @@ def rebuild(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> None:
-    """Make a store anew from its recordings, as it was; the old one stays until the new one is whole."""
+    """Rebuild a store from its recordings; the old one stays until the new one is complete."""
     from sgstore.cli._output import ingest_bar
     from sgstore.rebuild import rebuild as make_anew
 
@@ -125,7 +122,7 @@ def rebuild(
 # Verbs about graphs: other relations from the states of a store ---------------------------------
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def derive(
     store: StorePath,
     name: Annotated[
@@ -159,7 +156,7 @@ def derive(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Make another set of relations from the stored states, without the recordings; without --as: list them."""
+    """Derive another set of relations from the stored states; without --as, list the sets."""
     from sgstore.config import Config, load
     from sgstore.config import preset as preset_named
     from sgstore.derive import derive as derive_set
@@ -170,7 +167,7 @@ def derive(
         if name is not None or remove is not None or config or preset or force:
             raise typer.BadParameter("--abstraction NAME stands alone, or with --trace")
         kept = keep_abstraction(store, abstraction, trace or ())
-        return _write(kept, form_of(form, as_json=as_json))
+        return _write_derived(kept, form_of(form, as_json=as_json))
     if name is None or remove is not None:
         if name is not None or config or preset or (remove is None and (trace or force)):
             raise typer.BadParameter("give --as NAME with settings, --remove NAME, or nothing")
@@ -185,10 +182,10 @@ def derive(
         raise typer.BadParameter("give one of --config and --preset")
     settings = preset_named(preset) if preset else load(config) if config else Config()
     done = derive_set(store, settings, name, trace or (), replace_old=force)
-    return _write(done, form_of(form, as_json=as_json))
+    return _write_derived(done, form_of(form, as_json=as_json))
 
 
-def _write(done: list[Derivation], form: Format) -> int:
+def _write_derived(done: list[Derivation], form: Format) -> int:
     rows = ((one.trace, one.status, one.frames, one.edges) for one in done)
     write_rows(("trace", "status", "frames", "edges"), rows, form)
     for one in done:
@@ -200,7 +197,7 @@ def _write(done: list[Derivation], form: Format) -> int:
 # Verbs about road maps --------------------------------------------------------------------------
 
 
-@app.command(name="map")
+@app.command("map", rich_help_panel=PANEL)
 def map_(
     file: Annotated[
         Path,
@@ -215,7 +212,7 @@ def map_(
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Say what is in a road map: lanes by type, junctions, signals, what is wrong with it."""
+    """Summarize a road map: lanes by type, junctions, signals, and problems."""
     from sgstore.roads import summary
 
     road_map = _road_map(file)
@@ -263,7 +260,7 @@ def _road_map(file: Path) -> RoadMap:
 # The verb that fetches sensor messages ----------------------------------------------------------
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def payload(
     store: StorePath,
     frame: Annotated[
@@ -275,12 +272,13 @@ def payload(
     ] = None,
     output: Output = None,
     message: Annotated[
-        bool, typer.Option("--message", help="The message as it was recorded, whatever is in it.")
+        bool,
+        typer.Option("--message", help="The message as it was recorded, not the picture in it."),
     ] = False,
     form: RowFormat = Format.table,
     as_json: AsJson = False,
 ) -> int:
-    """Fetch what a sensor said at a frame: a picture, a video up to it, or the message."""
+    """Fetch the sensor data of a frame: a picture, a video up to it, or the message."""
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
@@ -298,7 +296,10 @@ def payload(
         data, what = carried.data, carried.form
         if carried.messages > 1:
             what += f", {carried.messages} messages from the key frame on"
-    _write_payload(data, output)
+    if output is None:
+        sys.stdout.buffer.write(data)
+    else:
+        write_bytes(output, data)
     say(f"{output or 'stdout'}: {len(data)} bytes ({what})")
     return 0
 
@@ -314,17 +315,10 @@ def _list_channels(file: StoreFile, frame: str, form: Format) -> None:
     write_rows(found.columns, found, form)
 
 
-def _write_payload(data: bytes, output: Path | None) -> None:
-    if output is None:
-        sys.stdout.buffer.write(data)
-    else:
-        write_bytes(output, data)
-
-
 # The verb about settings: print them, with what each means --------------------------------------
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def config(
     file: Annotated[
         Path | None,
@@ -360,17 +354,17 @@ def config(
 # The verb for newcomers -------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(rich_help_panel=PANEL)
 def demo(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Where its store, pictures and clips are put.")
+        Path, typer.Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
     ] = Path("sgstore-demo"),
     recording: Annotated[
         Path | None,
         typer.Option("--recording", help="The sample recording, where the package lacks it."),
     ] = None,
 ) -> int:
-    """Do the main job on a bundled recording: ingest, ask, look, export."""
+    """Run the main job on the bundled recording: ingest, find, show, export."""
     from sgstore.demo import RECORDING, run_demo
 
     run_demo(folder, typer.echo, recording or RECORDING)

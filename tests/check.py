@@ -1,0 +1,116 @@
+"""The edit loop: format, lint, types of the files that changed, and tests of their rooms: ``make check``.
+
+Changed is whatever differs from main, committed or not. Tests of a room are those named after it
+and those of the table below; a test file that changed is run, too. ``make test`` runs everything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+
+TESTS = {
+    "abstractions": "abstractions lane_roles",
+    "config": "config config_graphs",
+    "contrib": "lang_sgl",
+    "demo": "api",
+    "diff": "natural_order",
+    "doctor": "damaged",
+    "errors": "cli_errors",
+    "exporters": "exports export_*",
+    "files": "outputs folders",
+    "geometry": "geometry contacts",
+    "ingest": "ingest",
+    "lang": "lang_parser lang_match lang_mistakes lang_sql lang_answers lang_golden",
+    "map_files": "cli_map",
+    "matches": "query api",
+    "mcap": "mcap_file spool ahead",
+    "opendrive": "opendrive_*",
+    "plugins": "relations abstractions flavours",
+    "query": "query api",
+    "quoting": "user_tables",
+    "readers": "osi carla foxglove cdr flavours",
+    "rebuild": "rebuilding",
+    "relations": "relations relations_*",
+    "roads": "roads roads_lines roads_text",
+    "schema": "schema views views_page",
+    "segments": "ingest",
+    "segment_worker": "ingest_many",
+    "step": "online",
+    "store": "store store_*",
+    "temporal": "temporal monitor over_time",
+    "trace_parts": "ingest",
+    "vocabulary": "kinds",
+    "world": "sgg extent",
+    "__init__": "api",
+    "docs": "docs_* lang_docs",
+    "README": "docs_*",
+}
+"""Room, or folder or page beside the package → names of test files, without ``test_``."""
+
+
+def git(*arguments: str) -> list[str]:
+    done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()
+
+
+def changed(base: str) -> list[Path]:
+    """Files that differ from a branch, or are new."""
+    (fork,) = git("merge-base", base, "HEAD")
+    names = {*git("diff", "--name-only", fork), *git("ls-files", "-o", "--exclude-standard")}
+    return sorted(Path(name) for name in names if (ROOT / name).exists())
+
+
+def room_of(path: Path) -> str:
+    inside = path.parts[1:] if path.parts[0] == "sgstore" else path.parts
+    return inside[0].partition(".")[0]
+
+
+def tests_of(files: list[Path]) -> list[str]:
+    """Test files for changed files, by name; those of the architecture always."""
+    known = {path.stem.removeprefix("test_"): path for path in (ROOT / "tests").glob("test_*.py")}
+    wanted = {"architecture"}
+    for path in files:
+        if path.parts[0] == "tests":
+            wanted |= {path.stem.removeprefix("test_")} & set(known)
+        else:
+            room = room_of(path)
+            patterns = TESTS.get(room, f"{room} {room}_*").split()
+            wanted |= {name for name in known if any(fnmatch(name, one) for one in patterns)}
+    return [str(known[name].relative_to(ROOT)) for name in sorted(wanted)]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--base", default="main", help="branch to compare with (main)")
+    parser.add_argument("--list", action="store_true", help="say what would be run, and end")
+    options = parser.parse_args()
+    files = changed(options.base)
+    tests = tests_of(files)
+    sources = [str(f) for f in files if f.parts[0] == "sgstore" and f.suffix in {".py", ".pyi"}]
+    print("rooms:", *sorted({room_of(f) for f in files if f.parts[0] == "sgstore"}))
+    print("tests:", *tests, flush=True)
+    if options.list:
+        return 0
+    types = subprocess.Popen([BIN / "basedpyright", *sources], cwd=ROOT) if sources else None
+    codes = [
+        subprocess.run(command, cwd=ROOT, check=False).returncode
+        for command in (
+            [BIN / "ruff", "format", "--check", "-q", "."],
+            [BIN / "ruff", "check", "-q", "."],
+            [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", *tests],
+        )
+    ]
+    if types is not None:
+        codes.append(types.wait())
+    return int(any(codes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
