@@ -67,7 +67,7 @@ test: $(VENV)/.dev
 
 # A file of tests at a time in each process: what its tests share is made once.
 tests: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --durations 25 --durations-min 3
 
 test-wheel: $(VENV)/.dev
 	$(BIN)/python tests/packages.py wheel
