@@ -10,7 +10,8 @@
 -- A node_id names a node within its trace: 0 and above are entities of the trace, below zero parts of its map
 -- (-1 is off_road). A mask holds 60 frames of a bucket: bit i is the frame with seq % 60 = i.
 --
--- Enumerations are those of vocabulary.py, in its order (a test holds the two together).
+-- Enumerations are those of vocabulary.py, in its order (a test holds the two together). When a trace comes that can answer
+-- a relation which the type does not have, it is added behind the others, in place.
 --
 -- Changes
 --   * Version 4: the kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.

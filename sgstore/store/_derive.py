@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 import sgstore.store._packing as packing
+import sgstore.store._schema as shape
 from sgstore.errors import AbstractionError, StoreError
 from sgstore.graph import SceneGraph
 from sgstore.store._graphs import Graphs, filled
@@ -346,6 +347,7 @@ class Building:
             if there is None:
                 raise StoreError("the trace was removed from the store meanwhile")
             _delete(connection, self._name, self._trace_id)
+            shape.widen(connection, "store", answers)
             add_files(connection, self._staging, files)
             connection.execute(
                 "INSERT INTO store.derived BY NAME SELECT $name AS name, $trace AS trace_id,"

@@ -16,6 +16,7 @@ from sgstore.graph import LaneDistances, SceneGraph
 from sgstore.store._frames import SEQ_BITS, frames_of, trace_of
 from sgstore.store._packing import FRAME_BITS
 from sgstore.store._rows import arrays, run
+from sgstore.store._schema import relation_codes
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
@@ -154,6 +155,7 @@ class Graphs:
             _each_frame(connection.execute(sql, by_mask).fetchnumpy())
             for sql in (_STANDING, _EDGES)
         )
+        edges["relation"] = relation_codes(connection)[edges["relation"]]
         for of in (moving, standing, edges, own):
             of["frame"] = np.searchsorted(ids, of.pop("frame_id").astype(np.int64))
         traces = _Traces.of(connection, where)
@@ -190,7 +192,7 @@ class Graphs:
                 road=nodes["road"],
                 junction=nodes["junction"],
                 lane=nodes["lane"].astype(np.int64),
-                relation=edges["relation"].astype(np.int8),
+                relation=relation_codes(connection)[edges["relation"]],
                 src=edges["src"].astype(np.int64),
                 dst=edges["dst"].astype(np.int64),
             )
@@ -264,7 +266,7 @@ def _seen(
         frames,
         nodes,
         frame=edges["frame"].astype(np.int64),
-        relation=edges["relation"].astype(np.int8),
+        relation=edges["relation"],
         src=edges["src"].astype(np.int64),
         dst=edges["dst"].astype(np.int64),
         ego_lane=ego_lane,

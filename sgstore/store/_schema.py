@@ -19,21 +19,29 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
 import duckdb
+import numpy as np
 
 from sgstore.errors import StoreError
 from sgstore.quoting import quoted
+from sgstore.vocabulary import RELATION_CODE, RELATIONS, add_relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
 
     Tokens = tuple[str, ...]
 
 
 _VIEWS: Final = "-- The public views "
 """Where the views begin in ``schema.sql``."""
+
+_RELATION: Final = re.compile(r"CREATE TYPE relation AS ENUM \([^)]*\);")
+
+_RELATED: Final = ("edge", "map_edge", "derived_edge")
+"""Tables with a column of the type ``relation``."""
 
 _HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
 
@@ -54,8 +62,12 @@ def schema_sql() -> str:
 
 
 def tables_sql() -> str:
-    """The part of it that makes types and tables, for a segment: there a row is completed in several steps."""
-    return schema_sql().partition(_VIEWS)[0].replace(" NOT NULL", "")
+    """Return the part of it that makes types and tables, for a segment, which holds any relation known now.
+
+    A row is completed in several steps there.
+    """
+    made = schema_sql().partition(_VIEWS)[0].replace(" NOT NULL", "")
+    return _RELATION.sub(f"CREATE TYPE relation AS {_enum(RELATIONS)};", made)
 
 
 def schema_version() -> str:
@@ -91,8 +103,8 @@ class Shape:
 
 
 @cache
-def expected() -> Shape:
-    """What ``schema.sql`` makes."""
+def expected(relation: Tokens = ()) -> Shape:
+    """Return what ``schema.sql`` makes, where the type of relations has other words if they are given."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, str] = {}
@@ -103,6 +115,7 @@ def expected() -> Shape:
             tables[words[2]] = words
         elif words[:2] == ("CREATE", "VIEW"):
             views[words[2]] = " ".join(words[4:])
+    types["relation"] = relation or types["relation"]
     written = {name: tuple(_with_types(words, types)) for name, words in tables.items()}
     return Shape(written, types, views)
 
@@ -212,8 +225,14 @@ def other_version(about: dict[str, str]) -> str:
 
 
 def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
-    """What of ours in a store is not as ``schema.sql`` makes it, and what would take its place."""
-    shape = expected()
+    """What of ours in a store is not as ``schema.sql`` makes it, and what would take its place.
+
+    Relations may have come to those of ``schema.sql``; they are made known in this process.
+    """
+    labels = relation_labels(connection, database)
+    ours = expected().types["relation"]
+    wider = labels[: len(own_relations())] == own_relations()
+    shape = expected(tuple(_words(_enum(labels))) if wider else ours)
     tables, views, types = (
         _made(connection, what, database) for what in ("tables", "views", "types")
     )
@@ -222,7 +241,63 @@ def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
     found += _differing("type", shape.types, types, {})
     found += _shadowing(connection, database)
     found += _attached(connection, database, shape)
-    return found
+    return found or [*_strange(labels[len(own_relations()) :])]
+
+
+# Relations: a store made before holds a new one ---------------------------------------------------------------
+
+
+@cache
+def own_relations() -> tuple[str, ...]:
+    """Return the relations of ``schema.sql``."""
+    return tuple(_label(word) for word in expected().types["relation"] if word.startswith("'"))
+
+
+def relation_labels(connection: DuckDBPyConnection, database: str) -> tuple[str, ...]:
+    """Return the relations that a store can hold, by their codes there; none if it has no such type."""
+    rows = connection.execute(
+        "SELECT labels FROM system.main.duckdb_types() WHERE database_name = ?"
+        " AND schema_name = 'main' AND type_name = 'relation' AND internal = false",
+        [database],
+    ).fetchall()
+    return tuple(rows[0][0] or ()) if rows else ()
+
+
+def relation_codes(connection: DuckDBPyConnection) -> NDArray[np.int8]:
+    """Return the codes in this process of the relations of a store, by their codes there."""
+    ((labels,),) = connection.execute("SELECT enum_range(NULL::relation)").fetchall()
+    return np.array([RELATION_CODE[label] for label in labels], np.int8)
+
+
+def widen(connection: DuckDBPyConnection, database: str, names: Iterable[str]) -> None:
+    """Let a database that is attached hold these relations, too."""
+    labels = relation_labels(connection, database)
+    new = sorted(set(names) - {*labels})
+    if not new:
+        return
+    wider = _enum((*labels, *new))
+    main = f"{quoted(database)}.main"
+    for table in _RELATED:
+        connection.execute(f"ALTER TABLE {main}.{table} ALTER relation TYPE {wider}")
+    connection.execute(f"DROP TYPE {main}.relation")
+    connection.execute(f"CREATE TYPE {main}.relation AS {wider}")
+
+
+def code_sql(column: str, enum: str) -> str:
+    """Return SQL of a number for a value of an enumeration that is the same in every store."""
+    code, words = f"enum_code({column}::{enum})", tuple(_words(enum))
+    if words in expected().types.values():
+        return code
+    number = f"('0x' || md5({column}::VARCHAR)[:15])::BIGINT"
+    return f"CASE WHEN {code} < {len(own_relations())} THEN {code} ELSE {number} END"
+
+
+def _strange(labels: Iterable[str]) -> Iterator[str]:
+    for label in labels:
+        try:
+            add_relation(label)
+        except ValueError as error:
+            yield f"a relation: {error}"
 
 
 def others(connection: DuckDBPyConnection, database: str) -> list[str]:
@@ -316,12 +391,16 @@ def _made(connection: DuckDBPyConnection, what: str, database: str) -> dict[str,
     }
 
 
-def _enum(labels: tuple[str, ...]) -> str:
+def _enum(labels: Iterable[str]) -> str:
     return f"ENUM({', '.join(_literal(label) for label in labels)})"
 
 
 def _literal(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
+
+
+def _label(word: str) -> str:
+    return word[1:-1].replace("''", "'")
 
 
 def _differing(

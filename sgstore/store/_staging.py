@@ -22,7 +22,7 @@ from sgstore.errors import StoreError
 from sgstore.quoting import literal
 from sgstore.store._locking import Folder, memory_setting, translated
 from sgstore.store._packing import MISSING
-from sgstore.store._schema import tables_sql
+from sgstore.store._schema import code_sql, tables_sql
 from sgstore.store._traces import Identity
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -
 def _expression(name: str, kind: str) -> str:
     """A column as a number: numbers as they are, enumerations by their codes, texts by 60 bits of their MD5."""
     if kind.startswith("ENUM"):  # words in a file
-        return f'enum_code("{name}"::{kind})'
+        return code_sql(f'"{name}"', kind)
     if kind in _TEXTS:
         return f"""('0x' || md5("{name}"::VARCHAR)[:15])::BIGINT"""
     return f'"{name}"'

@@ -1,0 +1,158 @@
+"""Relations of other packages: by entry point, into stores made before, and where nobody knows them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+import numpy as np
+import pytest
+
+import sgstore.relations._registry as registry
+from sgstore import plugins, vocabulary
+from sgstore.demo import RECORDING
+from sgstore.errors import ConfigError, QueryNameError, StoreError
+from sgstore.ingest import ingest
+from sgstore.query import Store
+from sgstore.relations import BlockScene, Relation, edges_between
+from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from sgstore.graph import Edges
+
+
+def edges_of_pairs_abreast(scene: BlockScene) -> Edges:
+    pairs = scene.pairs
+    abreast = np.abs(np.abs(pairs.bearing) - np.pi / 2) < 0.5
+    rows = np.flatnonzero(abreast & (pairs.distance < 5))
+    return edges_between(scene, "besides", pairs.b[rows], pairs.a[rows])
+
+
+BESIDES = Relation(
+    name="besides", doc="b → a: b is abreast of a", edges=edges_of_pairs_abreast, of_pairs=True
+)
+ABREAST = "SELECT frame_id, src, dst FROM edges WHERE relation = 'besides' ORDER BY ALL"
+
+
+def entry(loaded: Any) -> SimpleNamespace:
+    def load() -> Any:
+        if isinstance(loaded, Exception):
+            raise loaded
+        return loaded
+
+    return SimpleNamespace(name="besides", value="package:BESIDES", load=load)
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The relations that are known, as if nothing had been added to those of this package."""
+    own = list(vocabulary.OWN_RELATIONS)
+    codes = {name: code for code, name in enumerate(own)}
+    folded = {k: v for k, v in vocabulary._RELATIONS_FOLDED.items() if v in codes}
+    kept = [
+        (held, held.copy())
+        for held in (vocabulary._relations, vocabulary._relation_code, vocabulary._RELATIONS_FOLDED)
+    ]
+
+    def put(values: list[Any]) -> None:
+        for (held, _), value in zip(kept, values, strict=True):
+            held.clear()
+            held.extend(value) if isinstance(held, list) else held.update(value)
+        registry.relations.cache_clear()
+        vocabulary._add_plugins.cache_clear()
+
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [])
+    put([own, codes, folded])
+    yield vocabulary._relations
+    put([before for _, before in kept])
+
+
+def installed(monkeypatch: pytest.MonkeyPatch, loaded: Any = BESIDES) -> None:
+    found = {plugins.RELATIONS.group: [entry(loaded)]}
+    monkeypatch.setattr(plugins, "entry_points", lambda group: found.get(group, []))
+    registry.relations.cache_clear()
+    vocabulary._add_plugins.cache_clear()
+
+
+def test_a_store_made_before_holds_a_relation_of_another_package(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "s.db"
+    StoreFile.create(path)
+    ingest(path, [RECORDING], until=4.0)
+    with pytest.raises(QueryNameError, match="unknown relation 'besides'"):
+        Store(path).find("MATCH (a)-[:besides]->(b)")
+    before = Store(path).sql("SELECT * FROM edges ORDER BY ALL").values
+
+    installed(monkeypatch)
+    asked = "MATCH (a)-[:besides]->(b) RETURN COUNT(*) AS n"
+    assert list(Store(path).find(asked)) == [(0,)]  # nothing is known of it there
+    ingest(path, [RECORDING], until=4.0, force=True)
+
+    abreast = Store(path).sql(ABREAST).values
+    assert abreast
+    assert list(Store(path).find(asked)) == [(len(abreast),)]
+    rest = "SELECT * FROM edges WHERE relation <> 'besides' ORDER BY ALL"
+    assert Store(path).sql(rest).values == before
+    assert not Store(path).file.verify().faults
+
+
+def test_a_store_answers_about_a_relation_that_nothing_here_knows(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, again = tmp_path / "s.db", tmp_path / "sorted.db"
+    installed(monkeypatch)
+    StoreFile.create(path)
+    ingest(path, [RECORDING], until=4.0)
+    abreast = Store(path).sql(ABREAST).values
+    del names[len(vocabulary.OWN_RELATIONS) :]
+    vocabulary._relation_code.pop("besides")
+    vocabulary._RELATIONS_FOLDED.pop("besides")
+    installed(monkeypatch, None)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [])
+    vocabulary.add_relation("comes_first")  # codes here are others than in the store
+    again.write_bytes(path.read_bytes())
+
+    store = Store(again)
+    found = store.find("MATCH (a)-[r:besides]->(b) RETURN COUNT(*) AS n")
+    frame = abreast[0][0]
+    edges = [(a, b) for a, b, name in store.graph(frame).edges(keys=True) if name == "besides"]
+
+    assert list(found) == [(len(abreast),)]
+    assert sorted(edges) == sorted((a, b) for f, a, b in abreast if f == frame)
+    assert not store.file.verify().faults
+    whole = store.graph(frame, abstraction="SG")
+    assert {name for *_, name in whole.edges(keys=True)} >= {"besides", "isIn"}
+    store.file.compact()
+    assert store.sql(ABREAST).values == abreast
+
+
+@pytest.mark.parametrize("label", ["Near", "vehicle", "a b", "1st", "x" * 41])
+def test_a_store_whose_relations_are_no_names_is_refused(
+    names: list[str], tmp_path: Path, label: str
+) -> None:
+    path = tmp_path / "s.db"
+    StoreFile.create(path)
+    with duckdb.connect(str(path)) as connection:
+        listed = ", ".join(f"'{name}'" for name in (*vocabulary.OWN_RELATIONS, label))
+        for table in ("edge", "map_edge", "derived_edge"):
+            connection.execute(f"ALTER TABLE {table} ALTER relation TYPE ENUM({listed})")
+        connection.execute("DROP TYPE relation")
+        connection.execute(f"CREATE TYPE relation AS ENUM({listed})")
+
+    with pytest.raises(StoreError, match="a relation: "):
+        StoreFile(path)
+
+
+@pytest.mark.parametrize("loaded", [ImportError("no such module"), 7])
+def test_a_package_whose_relation_cannot_be_loaded_is_named(
+    names: list[str], monkeypatch: pytest.MonkeyPatch, loaded: object
+) -> None:
+    installed(monkeypatch, loaded)
+
+    with pytest.raises(ConfigError, match="the relation 'besides'"):
+        registry.relations()
