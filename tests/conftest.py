@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
 
-# Who starts the tests in the background of a shell has them ignore Ctrl-C, and so would what they start.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell has what it starts in the background ignore Ctrl-C, and nohup SIGHUP: so would what the tests start.
+for number, heed in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, heed)
 
 # Tests start hundreds of processes: what these import is compiled once, not in each of them.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
