@@ -10,7 +10,7 @@ import pytest
 from graph_blocks import RandomTrace, map_stub, publish
 from recordings import drive
 
-import sgstore.store._verify as verifying
+import sgstore.store._publish as publishing
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
@@ -141,7 +141,7 @@ def test_a_fault_is_told_of_the_trace_that_has_it(store) -> None:
 
 @pytest.mark.parametrize("step", [1, 2])
 def test_it_does_not_matter_in_what_pieces_a_store_is_read(store, monkeypatch, step) -> None:
-    monkeypatch.setattr(verifying, "STEP", step)
+    monkeypatch.setattr(publishing, "STEP", step)
 
     assert faults(store) == []
 

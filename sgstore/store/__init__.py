@@ -1,13 +1,16 @@
 """The store: one DuckDB file, and the only room that knows DuckDB.
 
-``file`` is its face · ``access`` lets readers and writers share the file ·
-``shape`` looks whether it is one of ours, ``guarding`` what may be opened · ``rows`` runs statements, users'
-too · ``traces`` names traces and frames · ``scenes`` puts one graph together · ``packing`` turns the graphs
-of a block into columns and masks · ``segment`` builds a trace aside, in tables that wait in ``staging`` and a
-``folder`` beside the store; ``payloads`` joins its messages to its frames, ``sealed`` is what is ready, with
-``checksums``, and ``publishing`` brings it in · ``verifying`` looks whether all is as it was published ·
-``schema`` makes an empty store from ``schema.sql`` · ``parquet`` writes rows to a file · ``joining`` brings
-users' own tables beside the store.
+Reading: ``_file`` is the face, :class:`StoreFile`. ``_locking`` lets readers and writers share the file,
+and ``_schema`` compares it with ``schema.sql`` before anything is read. ``_rows`` runs statements, users'
+too, and writes their rows to files. ``_traces`` finds traces and frames by their names, ``_graphs`` reads
+graphs, ``_catalog`` tells the compiler of queries what there is, ``_joins`` brings users' own tables beside
+the store, and ``_contents`` makes digests of frames.
+
+Writing: ``_packing`` turns the graphs of a block into columns and masks. ``_write`` builds a trace aside,
+in tables that wait in ``_staging``, ``_payloads`` joins its messages to its frames, and ``_publish`` brings
+it into the store. ``_classes`` adds classes of frames, ``_derive`` other sets of relations; ``_similarity``
+compares frames. ``_verify`` looks whether all is as it was published, ``_rebuild`` makes stores, and makes
+them anew.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""What a store holds, as the compiler of queries wants to know it, under each abstraction that it may name.
+"""The catalog of a store, as the compiler of queries needs it, with one of each abstraction.
 
 Under an abstraction a query sees other tables under the same names: *shadows*, which stand before its
 statement.

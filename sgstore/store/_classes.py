@@ -6,6 +6,7 @@ are made at ingest are published with their trace; others wait until they are as
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,18 +17,11 @@ from sgstore.abstractions import (
     GraphColumns,
     MapColumns,
     abstraction_named,
+    found,
     lane_roles,
 )
-from sgstore.store._frames import (
-    CodedClasses,
-    Triples,
-    coded_classes,
-    imported_names,
-    times,
-    triples,
-)
 from sgstore.store._graphs import Graphs
-from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, masks_of, texts, trace_bucket
+from sgstore.store._packing import SEQ_BITS, frames_of, masks_of, texts, trace_bucket
 from sgstore.store._publish import add_files, note, writing
 from sgstore.store._staging import Staging
 from sgstore.store._traces import frame_named, trace_named
@@ -192,7 +186,7 @@ class Abstracted:
             low, high = 0, (1 << 63) - 1
             if trace is not None:
                 low, _ = trace_named(connection, str(trace))
-                low, high = (one << (BUCKET_BITS + FRAME_BITS) for one in (low, low + 1))
+                low, high = (one << SEQ_BITS for one in (low, low + 1))
                 high -= 1
             found = connection.execute(
                 "SELECT frame_id, coalesce(class, '') AS class FROM classes WHERE abstraction = ?"
@@ -211,7 +205,7 @@ class Abstracted:
         return found[0] if found else None
 
     def roles_of(self, frame_id: int) -> dict[int, str]:
-        """What lanes are to the ego of a frame, by node id: :func:`sgstore.abstractions.lane_roles`."""
+        """Roles of lanes for the ego of a frame, by node id: :func:`sgstore.abstractions.lane_roles`."""
         with self._access.reading() as connection:
             found = connection.execute(
                 "SELECT node_id, role FROM roles WHERE frame_id = ?", [frame_id]
@@ -238,12 +232,12 @@ class Abstracted:
             return times(connection)
 
     def imported_names(self) -> dict[str, int]:
-        """What imported files call their graphs, and the ids of the frames that these became."""
+        """Names of graphs in imported files, and the ids of the frames that these became."""
         with self._access.reading() as connection:
             return imported_names(connection)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """What the graphs of frames are made of in an abstraction, some frames at a time.
+        """Features of the graphs of frames in an abstraction, some frames at a time.
 
         Parameters
         ----------
@@ -295,3 +289,144 @@ def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> li
     """Traces of which the classes in an abstraction are not kept."""
     found = connection.execute(_MISSING.format(catalog), {"name": name}).fetchall()
     return [trace_id for (trace_id,) in found]
+
+
+# Classes of all frames as numbers, and the features of graphs: what coverage is made of -----------
+
+_CLASSES: Final = """
+WITH kept AS (
+  SELECT class, bucket, mask FROM frame_class WHERE abstraction = $name
+  UNION ALL SELECT class, bucket, mask FROM later_class WHERE abstraction = $name)
+"""
+_NAMES: Final = f"""{_CLASSES}
+SELECT replace(class::VARCHAR, '-', '') AS name FROM (SELECT DISTINCT class FROM kept WHERE class IS NOT NULL)
+ORDER BY class
+"""
+_MASKS: Final = f"""{_CLASSES}
+SELECT bucket, mask, CASE WHEN class IS NULL THEN -1 ELSE dense_rank() OVER (ORDER BY class NULLS LAST) - 1 END
+  AS code FROM kept
+"""
+_IMPORTED: Final = "SELECT graph, frame_id FROM imports"
+_TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
+
+
+@dataclass(frozen=True, slots=True)
+class CodedClasses:
+    """The class of each frame in an abstraction.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The classes that there are.
+    frame_id : (N,) int64
+        Ascending.
+    code : (N,) int64
+        Index into ``names``; -1: too symmetric to be told.
+    """
+
+    names: tuple[str, ...]
+    frame_id: Ints
+    code: Ints
+
+
+def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
+    """The classes in an abstraction that a store keeps.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+    name : str
+        As the store has it.
+    """
+    names = connection.execute(_NAMES, {"name": name}).fetchnumpy()["name"]
+    rows = connection.execute(_MASKS, {"name": name}).fetchnumpy()
+    frame_id, row = frames_of(rows["bucket"].astype(np.int64), rows["mask"].astype(np.int64))
+    code = rows["code"].astype(np.int64)[row]
+    order = np.argsort(frame_id, kind="stable")
+    return CodedClasses(tuple(names.tolist()), frame_id[order], code[order])
+
+
+def times(connection: DuckDBPyConnection) -> tuple[Ints, Ints]:
+    """Ids of all frames, ascending, and their simulation times; ns."""
+    rows = connection.execute(_TIMES).fetchnumpy()
+    return rows["frame_id"].astype(np.int64), rows["time_ns"].astype(np.int64)
+
+
+def imported_names(connection: DuckDBPyConnection) -> dict[str, int]:
+    """Names of graphs in imported files, and the frames that these became; of several the last one."""
+    return dict(connection.execute(_IMPORTED).fetchall())
+
+
+@dataclass(frozen=True, slots=True)
+class Triples:
+    """Features of graphs; one row for each frame and feature.
+
+    Attributes
+    ----------
+    names : list of tuple of str
+        Features: labels of an edge's source, of itself and of its destination; or of a node alone.
+    frame : (N,) int64
+        Frames, counted from 0.
+    feature : (N,) int64
+        Index into ``names``.
+    often : (N,) int64
+        How often it occurs.
+    """
+
+    names: list[tuple[str, ...]]
+    frame: Ints
+    feature: Ints
+    often: Ints
+
+
+def triples(graphs: Labelled) -> Triples:
+    """Count nodes by their labels, and edges by their own and those of both ends, frame by frame."""
+    size = len(graphs.labels)
+    of_node = graphs.node_frame.astype(np.int64), graphs.node_label.astype(np.int64)
+    ends = [
+        graphs.node_label[found(graphs.node_frame, graphs.node, graphs.frame, end)]
+        for end in (graphs.src, graphs.dst)
+    ]
+    edge, label = _single(graphs)
+    src, dst = (end.astype(np.int64)[edge] for end in ends)
+    of_edge = graphs.frame[edge].astype(np.int64), (src * size + label) * size + dst
+    frame, key, often = _counted(of_node)
+    edge_frame, edge_key, edge_often = _counted(of_edge)
+    nodes, feature = np.unique(key, return_inverse=True)
+    edges, edge_feature = np.unique(edge_key, return_inverse=True)
+    names: list[tuple[str, ...]] = [(graphs.labels[code],) for code in nodes.tolist()]
+    for code in edges.tolist():
+        rest, last = divmod(code, size)
+        names.append(tuple(graphs.labels[part] for part in (*divmod(rest, size), last)))
+    return Triples(
+        names,
+        np.concatenate([frame, edge_frame]),
+        np.concatenate([feature, len(nodes) + edge_feature]),
+        np.concatenate([often, edge_often]),
+    )
+
+
+def _single(graphs: Labelled) -> tuple[Ints, Ints]:
+    """Edges with several labels as several: the edge, and its label."""
+    bundles = [np.array(one, np.int64) for one in graphs.bundles]
+    label = graphs.label.astype(np.int64)
+    many = np.ones(len(label), np.int64)
+    several = np.flatnonzero(label < 0)
+    lengths = np.array([len(one) for one in bundles] or [0])
+    many[several] = lengths[-1 - label[several]]
+    edge = np.repeat(np.arange(len(label)), many)
+    flat = np.concatenate([*bundles, np.zeros(0, np.int64)])
+    starts = np.cumsum(lengths) - lengths
+    within = np.arange(len(edge)) - np.repeat(np.cumsum(many) - many, many)
+    given = label[edge]
+    bundled = given < 0
+    given[bundled] = flat[starts[-1 - given[bundled]] + within[bundled]]
+    return edge, given
+
+
+def _counted(of: tuple[Ints, Ints]) -> tuple[Ints, Ints, Ints]:
+    """Pairs of numbers, each once, and how often each comes."""
+    frame, key = of
+    span = int(key.max(initial=0)) + 1
+    both, often = np.unique(frame * span + key, return_counts=True)
+    return both // span, both % span, often

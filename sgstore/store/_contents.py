@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.abstractions import abstraction_named
-from sgstore.store._frames import seq_of, trace_of
 from sgstore.store._graphs import Graphs
+from sgstore.store._packing import seq_of, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -80,7 +80,7 @@ TOGETHER: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What the graphs of a trace were made with.
+    """Settings and map that the graphs of a trace were made with.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Mark:
 
 
 def marks(file: StoreFile) -> dict[int, Mark]:
-    """What the graphs of the traces of a store were made with, by the ids of the traces."""
+    """Settings and maps of the traces of a store, by the ids of the traces."""
     return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
 
 

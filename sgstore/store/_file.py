@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-import sgstore.store._create as schema
 import sgstore.store._rebuild as anew
 import sgstore.store._rows as rows
 from sgstore.errors import StoreError, TraceError
@@ -125,7 +124,7 @@ class StoreFile:
         """
         path = Path(path)
         if not path.exists():
-            schema.create(path)
+            anew.create(path)
         return cls(path, memory=memory, wait_s=wait_s)
 
     @contextmanager
@@ -223,12 +222,12 @@ class StoreFile:
             yield found
 
     def joined(self) -> dict[str, JoinedTable]:
-        """How the rows of users' own tables belong to frames, by the names of the tables."""
+        """Joins of users' own tables with frames, by the names of the tables."""
         with self._reading() as connection:
             return {} if self.tables is None else self.tables.joined(connection)
 
     def catalog(self) -> Catalog:
-        """What the store holds, as the compiler of queries wants to know it."""
+        """The catalog of the store, as the compiler of queries needs it."""
         from sgstore.store._catalog import catalog_of
 
         with self._reading() as connection:
@@ -341,7 +340,7 @@ class StoreFile:
         return read_message(path, **place)
 
     def carried(self, ref: int | str, channel: str) -> Media:
-        """What the message of a channel that belongs to a frame carries: a picture, a video, or the message.
+        """Content of the message of a channel for a frame: a picture, a video, or the message itself.
 
         Parameters
         ----------
@@ -569,7 +568,7 @@ class StoreFile:
         ask: Callable[[DuckDBPyConnection, ExitStack], T],
         given: Iterable[GivenTable] = (),
     ) -> Generator[T]:
-        """What a question finds, while the store is open.
+        """Answer of a question, while the store is open.
 
         If the database fails by a fault of its own, the question is asked again. What it enters into the stack
         is left with the store.

@@ -7,20 +7,19 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
 from sgstore.abstractions import GraphColumns, MapColumns
 from sgstore.graph import LaneDistances, SceneGraph
-from sgstore.store._frames import SEQ_BITS, frames_of, trace_of
-from sgstore.store._packing import FRAME_BITS
+from sgstore.store._packing import FRAME_BITS, SEQ_BITS, frames_of, trace_of
 from sgstore.store._rows import arrays, run
 from sgstore.store._schema import relation_codes
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
@@ -31,11 +30,13 @@ if TYPE_CHECKING:
     Numbers = NDArray[np.unsignedinteger[Any]]
 
 
+T = TypeVar("T")
+
 WINDOW: Final = 8
 """Buckets that are read at once."""
 
 _MAPS: Final = 4
-"""Maps that are remembered."""
+"""Maps that are remembered, because many frames lie on one."""
 
 _GROUNDS: Final = """
 SELECT enum_code(kind) AS kind, coalesce(name, '') AS name, coalesce(lane_type, '') AS lane_type,
@@ -80,11 +81,27 @@ FIRST: Final = 2_000
 _EDGES_TOGETHER: Final = 2_000_000
 
 
+class _RecentMaps(Generic[T]):
+    """Maps by their digests; of more than :data:`_MAPS` those that were used last."""
+
+    def __init__(self) -> None:
+        self._maps: OrderedDict[str, T] = OrderedDict()
+
+    def get(self, digest: str, read: Callable[[], T]) -> T:
+        """Return a map; it is read if it is not remembered."""
+        if digest not in self._maps:
+            self._maps[digest] = read()
+            while len(self._maps) > _MAPS:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end(digest)
+        return self._maps[digest]
+
+
 class Graphs:
     """Graphs of the traces of a store, some buckets at a time. Maps are remembered."""
 
     def __init__(self) -> None:
-        self._maps: OrderedDict[str, MapColumns] = OrderedDict()
+        self._maps = _RecentMaps[MapColumns]()
 
     def of_trace(
         self, connection: DuckDBPyConnection, trace_id: int
@@ -181,30 +198,29 @@ class Graphs:
         (digest,) = connection.execute(
             "SELECT digest FROM map WHERE map_id = ?", [map_id]
         ).fetchall()[0]
-        if digest not in self._maps:
-            where = {"map_id": map_id}
-            nodes = connection.execute(_GROUNDS, where).fetchnumpy()
-            edges = connection.execute(_GROUND_EDGES, where).fetchnumpy()
-            self._maps[digest] = MapColumns(
-                kind=nodes["kind"].astype(np.int8),
-                name=nodes["name"],
-                lane_type=nodes["lane_type"],
-                road=nodes["road"],
-                junction=nodes["junction"],
-                lane=nodes["lane"].astype(np.int64),
-                relation=relation_codes(connection)[edges["relation"]],
-                src=edges["src"].astype(np.int64),
-                dst=edges["dst"].astype(np.int64),
-            )
-            while len(self._maps) > _MAPS:
-                self._maps.popitem(last=False)
-        self._maps.move_to_end(digest)
-        return self._maps[digest]
+        return self._maps.get(digest, lambda: _map_columns(connection, map_id))
+
+
+def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
+    where = {"map_id": map_id}
+    nodes = connection.execute(_GROUNDS, where).fetchnumpy()
+    edges = connection.execute(_GROUND_EDGES, where).fetchnumpy()
+    return MapColumns(
+        kind=nodes["kind"].astype(np.int8),
+        name=nodes["name"],
+        lane_type=nodes["lane_type"],
+        road=nodes["road"],
+        junction=nodes["junction"],
+        lane=nodes["lane"].astype(np.int64),
+        relation=relation_codes(connection)[edges["relation"]],
+        src=edges["src"].astype(np.int64),
+        dst=edges["dst"].astype(np.int64),
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class _Traces:
-    """Where the traces of a store have their origin, and their maps; -1: none."""
+    """Origins and maps of the traces of a store; map -1: none."""
 
     trace_id: NDArray[np.int64]
     origin: dict[str, NDArray[np.float64]]
@@ -228,7 +244,7 @@ def _each_frame(of: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dict[str, Any]]:
-    """What belongs to the frames of each map, which are numbered anew there."""
+    """Divide rows by the maps of their frames, which are numbered anew for each map."""
     if maps == 1:
         return [of]
     frame = np.empty(len(number), np.int64)
@@ -242,7 +258,7 @@ def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dic
 
 
 def _places(number: Numbers, numbers: int) -> list[NDArray[np.int64]]:
-    """Where each of 0 … ``numbers`` - 1 stands."""
+    """Positions of each of 0 … ``numbers`` - 1."""
     order = np.argsort(number, kind="stable").astype(np.int64)
     return np.split(order, np.cumsum(np.bincount(number, minlength=numbers))[:-1])
 
@@ -281,9 +297,6 @@ def filled(values: NDArray[Any]) -> NDArray[np.float64]:
 
 # The scene graph of one frame, looked up by its bucket; the same as the views show of it --------
 
-_MAP_OF_FRAME: Final = 4
-"""Maps whose nodes and edges are remembered."""
-
 _FRAME: Final = """
 SELECT f.ego, f.map_id, m.digest
 FROM frame f LEFT JOIN map m ON m.map_id = f.map_id WHERE f.frame_id = $frame_id
@@ -319,6 +332,7 @@ _MAP_EDGES: Final = """
 SELECT src, relation::VARCHAR AS relation, dst FROM map_edge WHERE map_id = $map_id
 ORDER BY src DESC, map_edge.relation, dst DESC
 """
+_FIXED: Final = {"is_ego": False, "is_static": True}
 _MAP_REACH: Final = "SELECT src, dst, start FROM map_reach WHERE map_id = $map_id"
 
 
@@ -334,10 +348,10 @@ class _Map:
 
 
 class Scenes:
-    """Scene graphs of a store, one at a time. Maps are remembered, because many frames lie on one."""
+    """Scene graphs of a store, one at a time. Maps are remembered."""
 
     def __init__(self) -> None:
-        self._maps: OrderedDict[str, _Map] = OrderedDict()
+        self._maps = _RecentMaps[_Map]()
 
     def graph(self, connection: DuckDBPyConnection, frame: FrameRef) -> SceneGraph:
         """The scene graph of a frame."""
@@ -353,8 +367,7 @@ class Scenes:
 
         (about,) = rows(_FRAME)
         nodes = {row["node_id"]: _known(row) for row in rows(_MOVING_OF_FRAME)}
-        fixed = {"is_ego": False, "is_static": True}
-        nodes |= {row["node_id"]: _known(row | fixed) for row in rows(_STANDING_OF_FRAME)}
+        nodes |= {row["node_id"]: _known(row | _FIXED) for row in rows(_STANDING_OF_FRAME)}
         lanes = {(row.pop("src"), row.pop("dst")): _known(row) for row in rows(_LANES)}
         gaps = {(row.pop("src"), row.pop("dst")): _known(row) for row in rows(_GAPS)}
         known = {("isIn", *ends): about for ends, about in lanes.items()}
@@ -369,7 +382,8 @@ class Scenes:
         present = [row["node_id"] for row in rows(_PRESENT)]
         reach = None
         if present:
-            road_map = self._map(connection, about["map_id"], about["digest"])
+            map_id = about["map_id"]
+            road_map = self._maps.get(about["digest"], lambda: _read_map(connection, map_id))
             reach = road_map.reach
             nodes |= {node: dict(road_map.nodes[node]) for node in present}
             edges += _edges_among(road_map, present)
@@ -384,30 +398,25 @@ class Scenes:
             reach=reach,
         )
 
-    def _map(self, connection: DuckDBPyConnection, map_id: int, digest: str) -> _Map:
-        if digest not in self._maps:
-            where = {"map_id": map_id}
-            edges = arrays(connection, _MAP_EDGES, where)
-            reach = arrays(connection, _MAP_REACH, where)
-            fixed = {"is_ego": False, "is_static": True}
-            self._maps[digest] = _Map(
-                nodes={
-                    row["node_id"]: _known(row | fixed | _velocity(row))
-                    for row in run(connection, _MAP_NODES, where).dicts()
-                },
-                src=-1 - edges["src"].astype(np.int64),
-                dst=-1 - edges["dst"].astype(np.int64),
-                relation=edges["relation"].tolist(),
-                reach=LaneDistances(
-                    reach["src"].astype(np.int64),
-                    reach["dst"].astype(np.int64),
-                    reach["start"].astype(np.float64),
-                ),
-            )
-            while len(self._maps) > _MAP_OF_FRAME:
-                self._maps.popitem(last=False)
-        self._maps.move_to_end(digest)
-        return self._maps[digest]
+
+def _read_map(connection: DuckDBPyConnection, map_id: int) -> _Map:
+    where = {"map_id": map_id}
+    edges = arrays(connection, _MAP_EDGES, where)
+    reach = arrays(connection, _MAP_REACH, where)
+    return _Map(
+        nodes={
+            row["node_id"]: _known(row | _FIXED | _velocity(row))
+            for row in run(connection, _MAP_NODES, where).dicts()
+        },
+        src=-1 - edges["src"].astype(np.int64),
+        dst=-1 - edges["dst"].astype(np.int64),
+        relation=edges["relation"].tolist(),
+        reach=LaneDistances(
+            reach["src"].astype(np.int64),
+            reach["dst"].astype(np.int64),
+            reach["start"].astype(np.float64),
+        ),
+    )
 
 
 def _velocity(row: dict[str, Any]) -> dict[str, Any]:
@@ -416,7 +425,7 @@ def _velocity(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _known(row: dict[str, Any]) -> dict[str, Any]:
-    """What is known of a node or of an edge."""
+    """Attributes of a node or of an edge, without those that are NULL."""
     return {
         name: value
         for name, value in row.items()

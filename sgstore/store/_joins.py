@@ -125,7 +125,7 @@ class UserTable:
 
 @dataclass(frozen=True, slots=True)
 class JoinedTable:
-    """How the rows of a table belong to the frames of a store.
+    """Join of a table with the frames of a store.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ class UserTables:
         return frozenset(row[0] for row in connection.execute(sql).fetchall())
 
     def joined(self, connection: DuckDBPyConnection) -> dict[str, JoinedTable]:
-        """How the rows of each table that can belong to frames do so."""
+        """Joins of all tables whose rows can belong to frames."""
         found: dict[str, JoinedTable] = {}
         for table in self.tables:
             if table.key:

@@ -88,7 +88,7 @@ def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...
 
 
 def stamp_of(path: Path) -> Stamp:
-    """What changes whenever a store does: which file it is, its size and time, and those of its log."""
+    """Identity, size and time of a store's file and of its log: they change whenever the store does."""
     found: list[tuple[int, ...]] = []
     for file in (path, path.with_name(f"{path.name}.wal")):
         with suppress(OSError):
@@ -155,7 +155,7 @@ def refuse_odd_name(store: Path) -> None:
 
 
 def engine_fault(error: duckdb.Error) -> str | None:
-    """What went wrong, in a line, if an error is a fault of the database itself; else ``None``."""
+    """Return one line about an error that is a fault of the database itself; ``None`` for others."""
     if not isinstance(error, duckdb.InternalException | duckdb.FatalException):
         return None
     reason = str(error).strip().partition("\n")[0].removeprefix("INTERNAL Error: ")
@@ -163,7 +163,7 @@ def engine_fault(error: duckdb.Error) -> str | None:
 
 
 def spill_fault(message: str) -> str | None:
-    """What is said of a question that needs more memory and disk than it may take; ``None``: another error."""
+    """Return the message for a question that exceeds its memory and disk; ``None``: another error."""
     if not message.startswith("Out of Memory Error"):
         return None
     return (
@@ -285,7 +285,7 @@ class _FileLock:
 
     @property
     def mine(self) -> int:
-        """How many readings this thread has under way."""
+        """Number of readings that this thread has open."""
         return getattr(self.held, "count", 0)
 
     @mine.setter

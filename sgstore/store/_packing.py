@@ -41,6 +41,9 @@ FRAME_BITS: Final = 6
 """Bits of a frame's number in its bucket."""
 MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
 
+SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
+"""Bits of a frame's id below those of its trace."""
+
 TOLERANCE: Final = f"greatest({TOLERANCE_NS}, coalesce(period_ns, 0) // {TOLERANCE_SHARE})"
 """SQL: :func:`sgstore.world.tolerance_ns` of a trace's ``period_ns``."""
 LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
@@ -76,6 +79,36 @@ def trace_bucket(trace_id: int, seq: Ints) -> Ints:
 def frame_ids(trace_id: int, seq: Ints) -> Ints:
     """Ids of frames of a trace."""
     return (trace_bucket(trace_id, seq) << FRAME_BITS) + seq % BUCKET_FRAMES
+
+
+def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
+    """The frames of masks: their ids, and the row of each."""
+    ids: list[Ints] = []
+    rows: list[Ints] = []
+    for bit in range(BUCKET_FRAMES):
+        row = np.flatnonzero(mask >> bit & 1)
+        ids.append((bucket[row] << FRAME_BITS) + bit)
+        rows.append(row)
+    return np.concatenate(ids), np.concatenate(rows)
+
+
+def trace_of(frame_id: Ints) -> Ints:
+    """Ids of the traces of frames."""
+    return frame_id >> SEQ_BITS
+
+
+def seq_of(frame_id: Ints) -> Ints:
+    """Numbers of frames in their traces."""
+    bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
+    return bucket * BUCKET_FRAMES + frame_id % (1 << FRAME_BITS)
+
+
+def begins(frame_id: Ints) -> Bools:
+    """(N,): which frames do not come next after the one before them, in its trace."""
+    trace, seq = trace_of(frame_id), seq_of(frame_id)
+    found = np.ones(len(frame_id), np.bool_)
+    found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
+    return found
 
 
 def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]:

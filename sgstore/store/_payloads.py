@@ -68,7 +68,7 @@ JOIN (SELECT *, row_number() OVER (PARTITION BY log_time_ns ORDER BY chunk_offse
 
 @dataclass(slots=True)
 class Periods:
-    """How often the messages of channels come, told from the first ones.
+    """Periods of channels, estimated from their first messages.
 
     Attributes
     ----------

@@ -9,15 +9,17 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from glob import escape
 from importlib.metadata import version
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.store._schema as shape
 from sgstore.errors import StoreError
-from sgstore.quoting import literal
+from sgstore.quoting import literal, quoted
 from sgstore.store._locking import spill_folder
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP, plain
 from sgstore.store._staging import Checksum, Staging, expressions, scratch
 from sgstore.store._traces import already_stored, free_name, stored_name
+from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator
@@ -266,8 +268,8 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
 
 # What is added to traces that are in a store already: built aside, brought in by one transaction, noted ----
 
-_WINDOW = 1024
-"""Buckets of which a checksum is taken at once."""
+STEP: Final = 64
+"""Buckets whose rows are in memory at once: 3,840 frames."""
 
 
 @contextmanager
@@ -291,8 +293,10 @@ def add_files(
 
 def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -> None:
     """Take down what a trace has now in tables that change after it was published."""
+    sql = "SELECT frames FROM store.trace WHERE trace_id = ?"
+    frames = sum(n for (n,) in connection.execute(sql, [trace_id]).fetchall())
     for table in tables:
-        checksum = _checksum(connection, table, trace_id)
+        checksum = checksum_of(connection, "store", table, trace_id, frames)
         connection.execute(
             'DELETE FROM store.manifest WHERE trace_id = ? AND "table" = ?', [trace_id, table]
         )
@@ -303,39 +307,36 @@ def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -
             )
 
 
-def _checksum(connection: DuckDBPyConnection, table: str, trace_id: int) -> Checksum:
+def checksum_of(
+    connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
+) -> Checksum:
+    """Checksum of the rows of a trace in a table, of which few are in memory at once."""
     checksum = Checksum()
-    select = expressions(connection, table, "store")
-    for condition, values in _ranges(connection, table, trace_id):
-        rows = connection.execute(f"SELECT {select} FROM store.{table} WHERE {condition}", values)
+    select = expressions(connection, table, database)
+    for condition, values in _ranges(connection, database, table, trace_id, frames):
+        rows = connection.execute(
+            f"SELECT {select} FROM {quoted(database)}.main.{table} WHERE {condition}", values
+        )
         checksum.add(rows.fetchnumpy())
     return checksum
 
 
 def _ranges(
-    connection: DuckDBPyConnection, table: str, trace_id: int
-) -> Iterable[tuple[str, list[Any]]]:
+    connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
+) -> Iterator[tuple[str, list[int]]]:
     """Conditions on the rows of a trace, each of so many as fit into memory."""
-    columns = connection.execute(
+    sql = (
         "SELECT column_name FROM duckdb_columns()"
-        " WHERE database_name = 'store' AND schema_name = 'main' AND table_name = ?",
-        [table],
-    ).fetchall()
+        " WHERE table_name = ? AND schema_name = 'main' AND database_name = ?"
+    )
+    names = {name for (name,) in connection.execute(sql, [table, database]).fetchall()}
     bits = {"bucket": 0, "frame_id": FRAME_BITS}
-    column = next((name for name in bits if (name,) in columns), None)
+    column = next((name for name in bits if name in names), None)
     if column is None:
-        return [("trace_id = ?", [trace_id])]
-    bit = bits[column]
-    low, high = trace_id << BUCKET_BITS, (trace_id + 1) << BUCKET_BITS
-    (last,) = connection.execute(
-        f"SELECT max({column} >> {bit}) FROM store.{table} WHERE {column} >= ? AND {column} < ?",
-        [low << bit, high << bit],
-    ).fetchall()[0]
-    end = low if last is None else last + 1
-    return [
-        (
-            f"{column} >= ? AND {column} < ?",
-            [first << bit, min(first + _WINDOW, end) << bit],
-        )
-        for first in range(low, end, _WINDOW)
-    ]
+        yield "trace_id = ?", [trace_id]
+        return
+    first = trace_id << BUCKET_BITS
+    behind = first + -(-frames // BUCKET_FRAMES)
+    # In the last range, behind the last frame, there should be nothing.
+    for low, high in pairwise([*range(first, behind, STEP), behind, (trace_id + 1) << BUCKET_BITS]):
+        yield f"{column} >= ? AND {column} < ?", [low << bits[column], high << bits[column]]

@@ -13,15 +13,26 @@ import math
 import os
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import sgstore.store._create as schema
+import duckdb
+
 import sgstore.store._schema as shape
 from sgstore.errors import StoreError
-from sgstore.quoting import quoted
-from sgstore.store._locking import Access, BusyError, Folder, spill_folder
+from sgstore.quoting import literal, quoted
+from sgstore.store._locking import (
+    STORAGE_VERSION,
+    Access,
+    BusyError,
+    Folder,
+    refuse_odd_name,
+    spill_folder,
+    translated,
+)
 from sgstore.store._publish import copy_sorted
+from sgstore.store._schema import SCHEMA_VERSION, schema_digest, schema_sql
 from sgstore.store._staging import scratch
 
 if TYPE_CHECKING:
@@ -74,7 +85,7 @@ class OldSet:
 
 @dataclass(frozen=True, slots=True)
 class Remains:
-    """What is known of a store.
+    """Contents of a store that are needed to make it anew.
 
     Attributes
     ----------
@@ -97,7 +108,7 @@ class Remains:
 
 
 def remains_of(path: Path) -> Remains:
-    """What is known of a store.
+    """Contents of a store that are needed to make it anew.
 
     Raises
     ------
@@ -253,6 +264,60 @@ def _object(text: object) -> dict[str, Any]:
     return {str(key): one for key, one in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
+# An empty store -------------------------------------------------------------------------------
+
+
+def create(path: Path) -> None:
+    """Make an empty store, whole or not at all; nothing that exists is overwritten.
+
+    Raises
+    ------
+    StoreError
+        There is no such folder, or it cannot be written.
+    """
+    refuse_odd_name(path)
+    if not path.parent.is_dir():
+        raise StoreError(f"{path}: there is no folder {path.parent}")
+    with Folder(path) as beside, translated(path):
+        place = beside.path / "store"
+        with duckdb.connect(":memory:") as connection:
+            attach_empty(connection, place)
+            connection.execute("DETACH fresh")
+        _name(place, path)
+
+
+def _name(place: Path, path: Path) -> None:
+    """Give a file its name, unless that is taken: of two that make the same store the first one stays."""
+    try:
+        os.link(place, path)
+    except FileExistsError:
+        pass
+    except OSError:  # a file system that has no links
+        try:
+            if not path.exists():
+                place.rename(path)
+        except OSError as error:
+            raise StoreError(f"{path}: cannot be made: {error.strerror}") from error
+
+
+def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
+    """Make an empty store and attach it as ``fresh``."""
+    file = literal(str(place.absolute()))
+    connection.execute(f"ATTACH {file} AS fresh (STORAGE_VERSION '{STORAGE_VERSION}')")
+    connection.execute("USE fresh")
+    connection.begin()  # one transaction: of its own, each of the 130 statements would be written through
+    connection.execute(schema_sql())
+    about = {
+        "schema_version": SCHEMA_VERSION,
+        "schema_digest": schema_digest(),
+        "created_by": f"sgstore {version('sgstore')}",
+    }
+    for key, value in about.items():
+        connection.execute("INSERT INTO store_info VALUES (?, ?)", [key, value])
+    connection.commit()
+    connection.execute("USE memory")
+
+
 # A store that is written anew beside the old one, and then put in its place ---------------------
 
 
@@ -266,7 +331,7 @@ def compact(path: Path, access: Access, memory: int) -> None:
         access.attached(connection, beside.path),
     ):
         connection.execute("FORCE CHECKPOINT store")
-        schema.attach_empty(connection, beside.path / "store")
+        attach_empty(connection, beside.path / "store")
         copy_sorted(connection)
         connection.execute("DETACH fresh")
         _replace(path, beside.path / "store")

@@ -1,4 +1,4 @@
-"""Whether everything of ours in a store is as ``schema.sql`` makes it, whoever the file came from.
+"""Comparison of the tables and views of a store, from whomever, with those that ``schema.sql`` makes.
 
 A file that a stranger sends may hold a view in the place of a table, a macro that is called like a function,
 a trigger. So before anything is read of a store, its catalogue is compared with the one that ``schema.sql``
@@ -87,7 +87,7 @@ def schema_digest() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What ``schema.sql`` makes, by name.
+    """Tables, views and types of ``schema.sql``, by name.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Shape:
 
 @cache
 def expected(relation: Tokens = ()) -> Shape:
-    """Return what ``schema.sql`` makes, where the type of relations has other words if they are given."""
+    """Return the shape that ``schema.sql`` makes, with other relations if they are given."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, str] = {}
@@ -167,7 +167,7 @@ _REMEDY: Final = "'sgstore rebuild' makes it anew from its recordings"
 
 
 def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
-    """What :func:`check` would refuse, one by one; and the tables and views that are none of ours.
+    """List all that :func:`check` would refuse, and the tables and views that are none of ours.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def _about(connection: DuckDBPyConnection, database: str, path: Path) -> dict[st
 
 
 def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str] | None:
-    """What a store says of itself: version and digest of its schema; ``None`` if it is no store."""
+    """Read version and digest of a store's schema from it; ``None`` if it is no store."""
     made = _made(connection, "tables", database).get("store_info")
     if made is None:
         return None
@@ -208,7 +208,7 @@ def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str]
 
 
 def other_version(about: dict[str, str]) -> str:
-    """What is to be said of a store whose schema is not this one; empty if it is."""
+    """Return the message for a store whose schema is not this one; empty if it is."""
     held, maker = (
         about.get("schema_version", "unknown"),
         about.get("created_by", "an unknown version"),
@@ -225,7 +225,7 @@ def other_version(about: dict[str, str]) -> str:
 
 
 def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
-    """What of ours in a store is not as ``schema.sql`` makes it, and what would take its place.
+    """List our tables, views and types that differ from ``schema.sql``, and others' that shadow them.
 
     Relations may have come to those of ``schema.sql``; they are made known in this process.
     """
@@ -454,3 +454,7 @@ def _attached(connection: DuckDBPyConnection, database: str, shape: Shape) -> It
         for schema, table, name in rows:
             if schema == "main" and table.lower() in (*shape.tables, *shape.views):
                 yield f"table {table!r} has the {what} {name!r}"
+
+
+SCHEMA_VERSION: Final = schema_version()
+"""Version of ``schema.sql``. A store of another version is refused: a store is a cache of its traces."""

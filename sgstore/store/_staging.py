@@ -90,7 +90,7 @@ def _words(values: NDArray[Any]) -> Words:
 
 
 def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
-    """What to select of a table of the schema, or of a file of it, so that :meth:`Checksum.add` can take it."""
+    """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them."""
     sql = (
         "SELECT column_name, data_type FROM duckdb_columns()"
         " WHERE table_name = ? AND schema_name = 'main' AND NOT internal"
@@ -202,7 +202,7 @@ _NOT_SEALED: Final = {"bits", "store_info"}
 
 
 class Place(NamedTuple):
-    """Where tables wait.
+    """Folder in which tables wait to be published.
 
     Attributes
     ----------
@@ -406,7 +406,7 @@ class Staging:
 
 
 def _values(table: str, columns: Columns) -> str:
-    """What is selected from columns: enumerations by their codes, and NULL for what is missing."""
+    """SQL that selects columns: enumerations by their codes, and NULL for missing values."""
     enums = _ENUMS.get(table, {})
     return ", ".join(
         f'{_value(name, values, enums.get(name))} AS "{name}"' for name, values in columns.items()
@@ -487,7 +487,7 @@ class Sealed:
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """What a process of ours sealed in a folder.
+        """Read what a process of ours sealed in a folder.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What identifies a trace in a store, what a store knows of it, and how people name it and its frames."""
+"""Traces of a store: their identity, their attributes, and the names of them and of their frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TRACE_BITS: Final = 63 - BUCKET_BITS - FRAME_BITS
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What makes a trace the same trace, and its graphs the same graphs.
+    """Identity of a trace and of its graphs.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Whether a store is as it was published: rows by their checksums, masks, and what rows refer to.
+"""Verification of a store: rows against their checksums, masks, and references between rows.
 
 Reading a table also makes the database verify the checksums of its blocks.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,8 +15,8 @@ import sgstore.store._schema as shape
 from sgstore.config import from_dict
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.store._locking import Access, translated
-from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP
-from sgstore.store._publish import MAP_TABLES, owned
+from sgstore.store._packing import LONGEST_STEP
+from sgstore.store._publish import MAP_TABLES, checksum_of, owned
 from sgstore.store._staging import Checksum, expressions
 from sgstore.store._traces import stored_traces
 from sgstore.world import BUCKET_FRAMES
@@ -28,10 +27,6 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.store._traces import StoredTrace
-
-
-STEP: Final = 64
-"""Buckets whose rows are in memory at once: 3,840 frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +50,7 @@ class Fault:
 
 @dataclass(slots=True)
 class Verification:
-    """What came of looking through a store.
+    """Result of verifying a store.
 
     Attributes
     ----------
@@ -292,7 +287,7 @@ def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
 
 
 def damage(connection: DuckDBPyConnection, path: Path) -> str:
-    """What is wrong with a store, if anything is: the first fault that is found."""
+    """Return the first fault of a store; empty if there is none."""
     try:
         found = verify(connection, path)
     except SgstoreError as error:
@@ -364,9 +359,10 @@ def _rows(
     if not manifest:
         yield Fault(trace.name, "rows", "nothing is noted of what was published of it")
     tables = {table for (whose, _), of in published.items() if whose == "trace" for table in of}
-    for table, condition in list(owned(connection, _database(connection))):
+    database = _database(connection)
+    for table, _ in list(owned(connection, database)):
         if table in tables:
-            checksum = _checksum(connection, table, condition, trace)
+            checksum = checksum_of(connection, database, table, trace.trace_id, trace.frames)
             found.rows += checksum.rows
             if checksum != manifest.get(table, Checksum()):
                 yield Fault(trace.name, "rows", _difference(table, checksum, manifest.get(table)))
@@ -377,40 +373,6 @@ def _difference(table: str, now: Checksum, then: Checksum | None) -> str:
     if now.rows != rows:
         return f"table {table} has {now.rows} rows of it; {rows} were published"
     return f"table {table} holds other values than were published"
-
-
-def _checksum(
-    connection: DuckDBPyConnection, table: str, condition: str, trace: StoredTrace
-) -> Checksum:
-    checksum = Checksum()
-    select = expressions(connection, table, _database(connection))
-    for where, values in _ranges(connection, table, condition, trace):
-        rows = connection.execute(f"SELECT {select} FROM {table} WHERE {where}", values)
-        checksum.add(rows.fetchnumpy())
-    return checksum
-
-
-def _ranges(
-    connection: DuckDBPyConnection, table: str, condition: str, trace: StoredTrace
-) -> Iterator[tuple[str, dict[str, int]]]:
-    """Conditions on the rows of a trace, each of so many as fit into memory."""
-    sql = (
-        "SELECT column_name FROM duckdb_columns()"
-        " WHERE table_name = ? AND schema_name = 'main' AND database_name = ?"
-    )
-    names = {n for (n,) in connection.execute(sql, [table, _database(connection)]).fetchall()}
-    column = next((name for name in ("bucket", "frame_id") if name in names), None)
-    if column is None:
-        yield condition, {"trace_id": trace.trace_id}
-        return
-    bits = FRAME_BITS if column == "frame_id" else 0
-    first = trace.trace_id << BUCKET_BITS
-    behind = first + -(-trace.frames // BUCKET_FRAMES)
-    # In the last range, behind the last frame, there should be nothing.
-    starts = [*range(first, behind, STEP), behind, (trace.trace_id + 1) << BUCKET_BITS]
-    for low, high in pairwise(starts):
-        values = {"low": low << bits, "high": high << bits}
-        yield f"{column} >= $low AND {column} < $high", values
 
 
 def _maps(

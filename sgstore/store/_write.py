@@ -235,7 +235,7 @@ class Segment:
         }
 
     def _insert_about(self) -> None:
-        """What is known before the first frame."""
+        """Insert channels, context and map, which are known before the first frame."""
         insert = self._staging.insert
         insert("channel", self._owned(_channel_columns(self._info)))
         context = packing.message_columns(self._info.context, self._channel_ids)
