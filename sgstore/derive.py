@@ -34,7 +34,7 @@ _NOT_RELATIONS: Final = ("ego", "egos", "payloads", "mapping", "rate")
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """What became of a trace.
+    """Outcome of a trace.
 
     Attributes
     ----------
@@ -280,7 +280,7 @@ def _shown(settings: RangeSettings) -> dict[str, Any]:
 
 
 def _covers(old: RangeSettings, new: RangeSettings) -> bool:
-    """Whether what is in the new range is in the old one, for certain."""
+    """Return whether all in the new range is in the old one, for certain."""
     if _shown(old) == _shown(new):
         return True
     for name in ("by", "static_by"):

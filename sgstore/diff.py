@@ -119,7 +119,7 @@ def _tally(rows: list[tuple[Any, ...]], what: str) -> list[str]:
 
 
 def has_checks(text: str) -> bool:
-    """Whether a text is one of checks, and not a query."""
+    """Return whether a text is one of checks, and not a query."""
     return _CHECK.search(text) is not None
 
 

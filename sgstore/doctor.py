@@ -1,4 +1,4 @@
-"""What would be read of a recording, and what is wrong with it, without a store."""
+"""Check of recordings without a store: report what can be read, and any damage."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ChannelFound:
 
 @dataclass(slots=True)
 class Examination:
-    """What is in a recording, and what is wrong with it.
+    """Contents and faults of a recording.
 
     Attributes
     ----------

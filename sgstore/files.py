@@ -262,7 +262,7 @@ class Stream(io.RawIOBase):
         return True
 
     def seekable(self) -> bool:
-        """Whether it is a file that has places."""
+        """Return whether the stream has positions."""
         try:
             os.lseek(self._descriptor, 0, os.SEEK_CUR)
         except OSError:
@@ -278,7 +278,7 @@ class Stream(io.RawIOBase):
         return self._descriptor
 
     def isatty(self) -> bool:
-        """Whether it is a terminal."""
+        """Return whether the stream is a terminal."""
         return os.isatty(self._descriptor)
 
     def write(self, data: Any, /) -> int:
@@ -350,7 +350,7 @@ class OutputFile:
             return self._stack.enter_context(working_folder("output"))
 
     def path(self) -> Path:
-        """Where a file is to be made that :meth:`keep` puts in its place."""
+        """Path at which a file is made, until :meth:`keep` puts it in its place."""
         if self._path is None:
             with _told(self._to):
                 self._path = self._stack.enter_context(working_folder("output")) / "output"

@@ -94,7 +94,7 @@ def _parts(bag: Path) -> tuple[BagPart, ...]:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is named as a recording is."""
+    """Return whether the name of a file is one of a recording."""
     return path.name.lower().endswith(ENDINGS) and path.is_file()
 
 
@@ -174,7 +174,7 @@ class Workers:
             worker.end()
 
     def read(self, paths: list[Path], folder: Path) -> Iterator[list[EgoView]]:
-        """What became of each recording, in order; segments are built in folders below the one given."""
+        """Yield the outcomes of recordings, in order; segments are built in folders below the one given."""
         waiting, done, given = deque(range(len(paths))), dict[int, list[EgoView]](), 0
         while given < len(paths):
             self._hire(min(self._count, len(waiting) + len(self._workers)))
@@ -393,7 +393,7 @@ class _IngestRun:
 
 
 class _Meter:
-    """How far a run has come."""
+    """Progress of a run."""
 
     def __init__(self, paths: list[Path], on_progress: Callable[[Progress], None] | None) -> None:
         self._paths = paths

@@ -221,7 +221,7 @@ def read_lock(path: str | Path) -> Lock:
 
 
 class _WrongError(Exception):
-    """What is wrong with a lock."""
+    """Fault of a lock."""
 
 
 def _lock(values: Any) -> Lock:
@@ -519,7 +519,7 @@ def _same(trace: LockedTrace, store: Store) -> StoredTrace:
 
 
 def rows_of(case: LockedCase, trace_id: int, frame_id: Ints) -> slice:
-    """Which of the frames of a store, by ascending id, are those of a case."""
+    """Rows of the frames of a case among those of a store, which are by ascending id."""
     first, last = frame_ids(trace_id, np.array([case.first, case.last]))
     return slice(
         int(np.searchsorted(frame_id, first)), int(np.searchsorted(frame_id, last, side="right"))
@@ -643,7 +643,7 @@ def _placed(lock: Lock) -> dict[tuple[Source, int, int], LockedCase]:
 
 
 def _check(a: Lock, b: Lock) -> None:
-    """Whether what both speak of is the same."""
+    """Refuse locks that disagree about a trace or a case."""
     theirs = {(trace.recording, trace.ego): trace for trace in b.traces}
     for trace in a.traces:
         other = theirs.get((trace.recording, trace.ego))
@@ -723,12 +723,12 @@ class Difference:
 
     @property
     def matters(self) -> bool:
-        """Whether the set is another: versions alone do not make it one."""
+        """Return whether the set is another: versions alone do not make it one."""
         return self.what != "version"
 
 
 def verify(lock: Lock, store: Store, *, payloads: bool = True) -> Iterator[Difference]:
-    """What of a lock is different in a store.
+    """Compare a lock with a store.
 
     A trace is found by its recording and its ego, else by its name: so a recording that was changed and
     ingested again is looked through, and the cases that the change is in are named.
@@ -760,7 +760,7 @@ def verify(lock: Lock, store: Store, *, payloads: bool = True) -> Iterator[Diffe
 def verify_case(
     lock: Lock, case: LockedCase, store: Store, *, graphs: bool = True, payloads: bool = True
 ) -> Iterator[Difference]:
-    """What of a single case of a lock is different in a store, as :func:`verify` says it.
+    """Compare one case of a lock with a store, as :func:`verify` does.
 
     Parameters
     ----------

@@ -147,5 +147,5 @@ def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
 
 
 def _is_opendrive(text: str) -> bool:
-    """Whether a text is XML. Lanes that a recording tells otherwise are another text."""
+    """Return whether a text is XML. Lanes that a recording tells otherwise are another text."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("<")

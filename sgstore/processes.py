@@ -26,7 +26,7 @@ _START: Final = (
 
 
 def command(module: str) -> list[str]:
-    """What starts a module as a process: isolated, with the packages that this process has.
+    """Command that runs a module as a process: isolated, with the packages of this process.
 
     Parameters
     ----------

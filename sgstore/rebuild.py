@@ -147,7 +147,7 @@ def rebuild(
 
 
 def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
-    """What is known of a store, but for some traces."""
+    """Return the contents of a store without some traces."""
     names = [one.name for one in whole.traces]
     strange = [name for name in leave_out if name not in names]
     if strange:
@@ -187,7 +187,7 @@ def _alone(fresh: Path) -> Generator[None]:
 def _found(
     path: Path, traces: Sequence[OldTrace], look_in: Sequence[str | Path]
 ) -> dict[int, Path]:
-    """Where the recording of each trace is now.
+    """Find the recording of each trace.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def _found(
 
 
 def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
-    """Where a recording is, or why it cannot be used."""
+    """Return the place of a recording, or the reason why it cannot be used."""
     reason = "changed since it was ingested"
     try:
         mark = mark_of(trace.path)
@@ -280,7 +280,7 @@ def _settings(trace: OldTrace) -> Config:
 def _steps(
     traces: Sequence[OldTrace], places: dict[int, Path]
 ) -> Iterator[_ReadingStep | OldTrace]:
-    """What is to be done, in the order in which it came: read together what was read alike, or import."""
+    """Return the steps, in the order of the traces: what was read alike is read together."""
     steps: list[_ReadingStep | OldTrace] = []
     alike = groupby(traces, key=lambda t: (t.digest, t.settings, t.since, t.until, t.map_id))
     for _, views in alike:

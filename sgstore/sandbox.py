@@ -64,7 +64,7 @@ _ADDRESS_SPACE: Final = 4 << 30
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a question gives.
+    """Result of a question.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class Sandbox:
 
     @property
     def folder(self) -> Path | None:
-        """Where the process keeps the tables that it has read; ``None`` while there is no process."""
+        """Folder of the tables that the process has read; ``None`` while there is no process."""
         return self._folder
 
     def sql(self, text: str) -> Answer:
@@ -368,7 +368,7 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
 
 
 def _spilled(error: SgstoreError) -> bool:
-    """Whether the database would have gone on in temporary files: :func:`_limit` lets it write none."""
+    """Return whether an error is due to temporary files: :func:`_limit` lets the database write none."""
     text = str(error)
     return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
 
@@ -379,7 +379,7 @@ def _send(to: IO[bytes], reply: object) -> None:
 
 
 def _limit(memory: int, *, files: int) -> None:
-    """What the operating system allows this process, where it can be told; it cannot be widened again."""
+    """Limit the resources of this process, where the system can; the limits cannot be widened again."""
     try:
         import resource
     except ImportError:  # not on Windows: there the database's own limits and the deadline hold

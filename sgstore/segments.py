@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far the work on a recording has come, and all of it.
+    """Work done on a recording, and all that there is.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Progress:
 
 @dataclass(slots=True, repr=False)
 class TraceOutcome:
-    """What became of a recording, as one ego has it.
+    """Outcome of a recording for one ego.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class TraceOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What is to be done with recordings.
+    """Settings by which recordings are read.
 
     Attributes
     ----------
@@ -230,7 +230,7 @@ class TraceTally:
         return (self.times[-1] - self.times[0]) / 1e9 if self.times else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """What was counted, as plain values.
+        """Return the counts as plain values.
 
         Returns
         -------
@@ -396,7 +396,7 @@ class SegmentReader:
         return found
 
     def _is_new(self, wanted: _Wanted, road_map: RoadMap | None) -> bool:
-        """Whether the store lacks a view, or it is to be read anew."""
+        """Return whether the store lacks the trace of an ego, or it is to be read anew."""
         store, job, outcome = self._store(), self._job, wanted.view.outcome
         if store is None or job.force:
             return True

@@ -28,7 +28,7 @@ _SLACK: Final = _SLACK_NS / 1e9
 
 @dataclass(frozen=True, slots=True)
 class TracePart:
-    """Which frames of a trace are read.
+    """Part of a trace: a span of time, and a rate.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class TracePart:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is all of the trace."""
+        """Return whether it is all of the trace."""
         return self == TracePart()
 
     def blocks(self, blocks: Iterator[FrameBlock], size: int) -> Iterator[FrameBlock]:
@@ -80,7 +80,7 @@ class TracePart:
 
 
 class _Clock:
-    """Which of the frames are kept, one block after another."""
+    """Selection of frames at a lower rate, one block after another."""
 
     def __init__(self, part: TracePart) -> None:
         self._part = part
@@ -91,7 +91,7 @@ class _Clock:
         self.over = False
 
     def within(self, time_ns: int) -> bool:
-        """Whether something that happened at a time happened in the part, once frames up to it were seen."""
+        """Return whether a time is in the part, once frames up to it were seen."""
         since = (time_ns - (self._zero or 0)) / 1e9
         part = self._part
         return (
@@ -101,7 +101,7 @@ class _Clock:
         )
 
     def kept(self, time_ns: Ints) -> Bools:
-        """Whether each frame is kept."""
+        """Return for each frame whether it is kept."""
         part = self._part
         self._zero = int(time_ns[0]) if self._zero is None else self._zero
         since = (time_ns - self._zero) / 1e9

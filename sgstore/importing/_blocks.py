@@ -197,7 +197,7 @@ def _entities(first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> Enti
 
 
 def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> LaneStates:
-    """How entities lie in lanes. A lane is the primary one if the file says so, or if it is the only one."""
+    """Lanes of entities. A lane is the primary one if the file says so, or if it is the only one."""
     frame, node, lane = _whole(list(inside), 3)
     rows = list(inside.values())
     known = {

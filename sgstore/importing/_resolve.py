@@ -193,7 +193,7 @@ OTHER: Final = "other"
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
-    """What a node is.
+    """Meaning of a node's label.
 
     Attributes
     ----------
@@ -212,13 +212,13 @@ class LabelMeaning:
 
     @property
     def is_part(self) -> bool:
-        """Whether it is a part of the road, and no entity."""
+        """Return whether it is a part of the road, and no entity."""
         return self.kind in MAP_KINDS
 
 
 @dataclass(frozen=True)
 class Words:
-    """How labels and relations are understood.
+    """Mapping of labels and relations to the vocabulary.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ class Words:
         return known or ""
 
     def meaning(self, name: str, label: str) -> LabelMeaning | None:
-        """What a node of this name and label is; ``None``: nobody knows."""
+        """Return the meaning of a node of this name and label; ``None`` if it is unknown."""
         for text in dict.fromkeys((label, name) if label else (name, _plain(name))):
             found = self._meant(text)
             if found is not None:
@@ -287,7 +287,7 @@ class Words:
         return relation_named(given.get(normalize_name(name), name))
 
     def why_not_kind(self, name: str, label: str) -> str:
-        """Why a node is not understood, and what can be done."""
+        """Explain why a node is not understood, and what can be done."""
         text = label or _plain(name)
         several = kinds_labelled(text)
         known = [*labels(), *_SHORT]
@@ -301,7 +301,7 @@ class Words:
         )
 
     def why_not_relation(self, name: str) -> str:
-        """Why a relation is not understood, and what can be done."""
+        """Explain why a relation is not understood, and what can be done."""
         like = suggestion(name, RELATIONS)
         hint = f" (did you mean {like!r}?)" if like else ""
         return (
@@ -330,7 +330,7 @@ def _kind(text: str) -> str:
 
 
 def _simulators(text: str) -> LabelMeaning | None:
-    """What the type name of a simulator means: itself, or what stands before one of its dots."""
+    """Kind of a simulator's type name: of the whole, or of what stands before one of its dots."""
     meanings = type_meanings()
     name = text.lower()
     while name:
@@ -386,7 +386,7 @@ _TEXTS: Final = frozenset({"special", "subkind", "type_name", "type"})
 def state_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
 ) -> dict[str, float]:
-    """What is known of an entity in a frame: columns of :class:`sgstore.world.States`; all else is lost.
+    """State of an entity in a frame: columns of :class:`sgstore.world.States`; all else is lost.
 
     Raises
     ------
@@ -435,7 +435,7 @@ def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[st
 def part_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
 ) -> dict[str, Any]:
-    """What is known of a part of the road: columns of :class:`sgstore.roads.MapNodes`; all else is lost.
+    """Attributes of a part of the road: columns of :class:`sgstore.roads.MapNodes`; all else is lost.
 
     Raises
     ------
@@ -465,7 +465,7 @@ def part_of(
 def lane_state_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
 ) -> dict[str, float]:
-    """What is known of how an entity lies in a lane; ``primary`` is 1 or 0 where the file says it."""
+    """Position of an entity in a lane; ``primary`` is 1 or 0 where the file says it."""
     found: dict[str, float] = {}
     for name, value in attributes.items():
         if value is None:
@@ -574,7 +574,7 @@ class Understanding:
         self._relations: dict[str, str | None] = {}
 
     def of(self, graph: GivenGraph) -> Meant:
-        """What a graph means; what has no meaning is left out and counted in ``graph.lost``, or is an error.
+        """Resolve a graph; parts without a meaning are left out and counted in ``graph.lost``, or are an error.
 
         Raises
         ------
@@ -641,7 +641,7 @@ class Understanding:
 
 @dataclass(slots=True)
 class FileMeaning:
-    """What all graphs of a file have together.
+    """Meanings that all graphs of a file share.
 
     Attributes
     ----------

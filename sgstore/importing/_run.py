@@ -42,7 +42,7 @@ _BLOCK_SIZE: Final = 200_000
 
 @dataclass(slots=True)
 class Imported:
-    """What became of a file.
+    """Outcome of a file.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class _ImportRun:
             self._store.settle()
 
     def outcome(self, path: Path) -> Imported:
-        """What becomes of one file."""
+        """Import one file, and return the outcome."""
         done = Imported(path)
         try:
             self._import(path, done)
@@ -226,7 +226,7 @@ class _ImportRun:
         return graph
 
     def _variant(self, found: FileMeaning) -> str:
-        """What the parts of the road are, and how the file was understood: it identifies the map."""
+        """Identity of a map of named parts: these, and the mapping by which the file was understood."""
         about = {
             "of": self._form,
             "words": self._words.as_dict(),
