@@ -46,6 +46,7 @@ OWNERS = {
     "networkx": {"graph", "exporters"},
     "shapely": {"geometry", "roads", "opendrive"},
     "lark": {"lang"},
+    "highspy": {"selection"},
     "matplotlib": {"draw"},
     "PIL": {"draw", "exporters"},
     "pytest": {"pytest_plugin"},

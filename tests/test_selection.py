@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ from sgstore.store import seq_of, trace_of
 
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 SEEDS = range(36)
+SOLVER = find_spec("highspy") is not None
+needs_solver = pytest.mark.skipif(not SOLVER, reason="needs the extra [solver]")
 
 
 def family(seed: int) -> tuple[SetFamily, np.ndarray]:
@@ -68,14 +71,14 @@ def test_a_small_cover_is_the_cheapest_of_all_and_greedy_is_within_its_factor(se
     best = min(float(of.cost[some].sum()) for some in full)
 
     found = minimal(of)
-    bare = minimal(of, steps=0)
+    bare = minimal(of, nodes=0)
     factor = sum(1 / i for i in range(1, int(holds.sum(axis=1).max(initial=1)) + 1))
 
     assert (of.covered(found.chosen) >= of.need).all()
     assert found.bound <= best + 1e-6
     assert bare.bound <= best + 1e-6 <= bare.cost + 2e-6
     assert of.cost[greedy(of)].sum() <= factor * best + 1e-6
-    if of.need.max(initial=0) <= 1:
+    if SOLVER:
         assert found.cost == pytest.approx(best)
         assert found.exact
 
@@ -101,15 +104,16 @@ def test_the_bound_is_that_of_the_linear_programme_where_that_is_known() -> None
     low, *_ = bounded(triangle, np.array([0, 1, 2]))
 
     assert low == pytest.approx(1.5, abs=0.01)
-    assert minimal(triangle).cost == minimal(triangle).bound == 2
+    assert minimal(triangle).cost == minimal(triangle).bound == 2  # whole sets, so 1.5 is 2
 
 
+@needs_solver
 def test_a_search_that_may_not_end_still_gives_a_cover_and_a_bound_below_it() -> None:
     rng = np.random.default_rng(5)
     holds = rng.random((60, 120)) < 0.06
     of = SetFamily.of(np.array(np.nonzero(holds)), 60, 120)
 
-    short, long = minimal(of, steps=40), minimal(of)
+    short, long = minimal(of, nodes=0), minimal(of)
 
     assert (of.covered(short.chosen) >= of.need).all()
     assert short.bound <= long.bound <= long.cost <= short.cost
@@ -156,7 +160,7 @@ def whole(store: Store) -> ChosenFrames:
 
 def classes_in(found: Selection) -> set[int]:
     """Classes in the frames of what was selected, counted frame by frame."""
-    of = classed(found.units.chosen, found.wish.abstraction)
+    of = classed(found.units.chosen, found.spec.abstraction)
     units = found.units
     frames = {
         frame
@@ -188,7 +192,7 @@ def test_features_of_frames_on_several_maps_are_those_of_each_frame_alone(store:
 def test_the_minimal_set_keeps_every_class(
     store: Store, piece: SelectionUnit, least: Measure
 ) -> None:
-    wish = SelectionSpec(Strategy.minimal, piece, abstraction="EL", least=least)
+    wish = SelectionSpec(Strategy.minimal, piece, abstraction="EL", objective=least)
 
     found = select(whole(store), wish)
     everything = set(classed(whole(store), "EL").code.tolist())
@@ -294,7 +298,7 @@ def test_strata_share_a_budget_as_they_are_or_evenly(store: Store) -> None:
     def strata(temper: float) -> dict[str, tuple[int, int]]:
         budget = Budget.parse("40frames")
         wish = SelectionSpec(
-            Strategy.stratify, each=0, by="trace.name", temper=temper, budget=budget
+            Strategy.stratify, each=0, by="trace.name", alpha=temper, budget=budget
         )
         return select(whole(store), wish).strata
 

@@ -58,6 +58,23 @@ def test_the_program_of_the_page_prints_a_bound_below_its_cost(
     assert bound <= cost <= at_random
 
 
+def test_the_old_names_of_options_are_understood(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[str] = []
+    by_value = ("--stratify", "ego.speed > 8", "--per-class", "3")
+    for options in (
+        ("--minimal", "--objective", "seconds"),
+        ("--minimal", "--least", "seconds"),
+        (*by_value, "--alpha", "0.5"),
+        (*by_value, "--temper", "0.5"),
+    ):
+        assert run(["select", str(folder / "drives.sgstore"), "--json", *options]) == 0
+        told.append(capsys.readouterr().out)
+
+    assert told[0] == told[1] != told[2] == told[3]
+
+
 def test_every_verb_of_locks_is_on_the_page() -> None:
     from sgstore.cli._selection import lock
 

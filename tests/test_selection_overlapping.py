@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from importlib.util import find_spec
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -162,7 +163,7 @@ def test_what_is_superfluous_changes_no_optimum_whatever_sets_cost(seed: int) ->
     left = sum(minimal(part).cost for part, _ in parts)
 
     assert cost[forced].sum() + left >= best - 1e-9
-    if seed % 2 == 0:
+    if find_spec("highspy"):  # the extra [solver], which finds the optimum of what is left
         assert cost[forced].sum() + left == pytest.approx(best)
 
 
@@ -213,7 +214,7 @@ def test_the_cheapest_union_lies_between_bound_and_cost(
 ) -> None:
     chosen = some(store, (low, low + (13 if stride < 0.2 else 23)))
     wish = SelectionSpec(
-        Strategy.minimal, SelectionUnit.clip, 0.4, "RSV", least=Measure.frames, stride_s=stride
+        Strategy.minimal, SelectionUnit.clip, 0.4, "RSV", objective=Measure.frames, stride_s=stride
     )
     found = select(chosen, wish)
     assert found.holdings is not None

@@ -108,11 +108,15 @@ Combos = Annotated[
     int, typer.Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
 ]
 OfEgo = Annotated[bool, typer.Option("--ego", help="--combos: only features of the ego.")]
-LeastName = Annotated[Least, typer.Option("--least", help="Quantity that --minimal minimizes.")]
-Temper = Annotated[
-    float,
-    typer.Option("--temper", help="Weight of strata: 1: as frequent as they are, 0: all equal."),
+ObjectiveName = Annotated[
+    Least, typer.Option("--objective", help="Quantity that --minimal minimizes.")
 ]
+Alpha = Annotated[
+    float,
+    typer.Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal."),
+]
+OldLeast = Annotated[Least | None, typer.Option("--least", hidden=True)]  # until 0.3
+OldTemper = Annotated[float | None, typer.Option("--temper", hidden=True)]  # until 0.3
 SplitText = Annotated[
     str, typer.Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
 ]
@@ -143,8 +147,10 @@ def select(
     abstraction: Abstraction = "RSV",
     combos: Combos = 0,
     ego: OfEgo = False,
-    least: LeastName = Least.units,
-    temper: Temper = 1.0,
+    objective: ObjectiveName = Least.units,
+    alpha: Alpha = 1.0,
+    least: OldLeast = None,
+    temper: OldTemper = None,
     split: SplitText = "",
     seed: Seed = 0,
     parameters: Parameters = None,
@@ -165,8 +171,8 @@ def select(
     from sgstore.selection import Budget, Measure, SelectionSpec, SelectionUnit, parse_split
     from sgstore.selection import select as choose
 
-    wish = SelectionSpec(
-        _way(minimal=minimal, per_class=per_class, rarest=rarest, stratify=stratify),
+    spec = SelectionSpec(
+        _strategy(minimal=minimal, per_class=per_class, rarest=rarest, stratify=stratify),
         SelectionUnit(unit.value),
         seconds_of(clip, "--clip"),
         abstraction,
@@ -174,16 +180,16 @@ def select(
         of_ego=ego,
         each=per_class or (0 if stratify else 1),
         by=stratify,
-        temper=temper,
+        alpha=alpha if temper is None else temper,
         budget=Budget.parse(budget) if budget else None,
-        least=Measure(least.value),
+        objective=Measure((least or objective).value),
         seed=seed,
         stride_s=seconds_of(stride, "--stride") if stride else None,
     )
     _check_output(output)
     shares = parse_split(split) if split else {}
     opened = bounds.opened(store)
-    found = choose(_chosen(opened, str(store), query, parameters), wish)
+    found = choose(_chosen(opened, str(store), query, parameters), spec)
     parts, table = _parts(found, shares)
     _show(found, table, picture, form_of(form, as_json=as_json), curve=curve)
     if output is not None:
@@ -191,7 +197,7 @@ def select(
         _lock(found, asked, parts, output, payloads=not no_payloads)
 
 
-def _way(*, minimal: bool, per_class: int | None, rarest: bool, stratify: str) -> Strategy:
+def _strategy(*, minimal: bool, per_class: int | None, rarest: bool, stratify: str) -> Strategy:
     """Strategy that the options name."""
     from sgstore.selection import Strategy
 
@@ -272,7 +278,7 @@ def _curve(found: Selection, picture: Path | None, form: Format, *, printed: boo
             drawn.table.rows,
             found.holdings.total,
             picture,
-            unit=found.units.piece,
+            unit=found.units.unit,
             title=f"What a selection keeps: {found.holdings.kind}",
             below=drawn.table.said[0],
         )

@@ -57,7 +57,7 @@ class BudgetTracker:
 
     @classmethod
     def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
-        """A full purse."""
+        """A full tracker."""
         shared = units.overlap and measure is not Measure.units
         weights = units.weights(measure) if shared else None
         nothing = np.zeros(len(units.frame_id), np.bool_)
@@ -116,8 +116,8 @@ class SelectionSpec:
 
     Attributes
     ----------
-    way : Strategy
-    piece : SelectionUnit
+    strategy : Strategy
+    unit : SelectionUnit
     clip_s : float
         Length of clips; s.
     abstraction : str
@@ -129,10 +129,10 @@ class SelectionSpec:
         In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
     by : str
         Expression whose value is the stratum of a frame.
-    temper : float
+    alpha : float
         A stratum gets a share of the budget as the power of its size: 1 as it is, 0 the same for all.
     budget : Budget or None
-    least : Measure
+    objective : Measure
         What is to be as little as possible.
     seed : int
     stride_s : float or None
@@ -140,17 +140,17 @@ class SelectionSpec:
         ``None``: the length.
     """
 
-    way: Strategy = Strategy.every
-    piece: SelectionUnit = SelectionUnit.frame
+    strategy: Strategy = Strategy.every
+    unit: SelectionUnit = SelectionUnit.frame
     clip_s: float = 2.0
     abstraction: str = "RSV"
     combos: int = 0
     of_ego: bool = False
     each: int = 1
     by: str = ""
-    temper: float = 1.0
+    alpha: float = 1.0
     budget: Budget | None = None
-    least: Measure = Measure.units
+    objective: Measure = Measure.units
     seed: int = 0
     stride_s: float | None = None
 
@@ -161,10 +161,10 @@ class SelectionSpec:
         ------
         ConfigError
         """
-        if self.way is Strategy.stratify and not (self.budget or self.each):
+        if self.strategy is Strategy.stratify and not (self.budget or self.each):
             raise ConfigError("strata need a budget (--budget 600s), or a number (--per-class 10)")
         if (
-            self.way is Strategy.per_class
+            self.strategy is Strategy.per_class
             and self.each > 1
             and (self.stride_s or math.inf) < self.clip_s
         ):
@@ -172,28 +172,28 @@ class SelectionSpec:
                 "clips that overlap share frames, so a class that is in two of them may have come once:"
                 " to have each class several times, leave out --stride"
             )
-        if not 0 <= self.temper <= 10:
+        if not 0 <= self.alpha <= 10:
             raise ConfigError(
-                f"--temper {self.temper:g}; expected 0 (the same for all) to 1 (as they are)"
+                f"--alpha {self.alpha:g}; expected 0 (the same for all) to 1 (as they are)"
             )
 
     def as_dict(self, query: str) -> dict[str, Any]:
         """All of it as plain values, as a lock says it."""
-        cover = self.way in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
+        cover = self.strategy in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
         return {
             "query": query or None,
-            "way": self.way.value,
-            "unit": self.piece.value,
-            "clip_s": self.clip_s if self.piece is SelectionUnit.clip else None,
-            "stride_s": self.stride_s if self.piece is SelectionUnit.clip else None,
+            "way": self.strategy.value,
+            "unit": self.unit.value,
+            "clip_s": self.clip_s if self.unit is SelectionUnit.clip else None,
+            "stride_s": self.stride_s if self.unit is SelectionUnit.clip else None,
             "abstraction": self.abstraction if cover else None,
             "combos": self.combos if cover else None,
             "of_ego": self.of_ego if cover and self.combos else None,
-            "each": self.each if self.way in {Strategy.per_class, Strategy.stratify} else None,
+            "each": self.each if self.strategy in {Strategy.per_class, Strategy.stratify} else None,
             "by": self.by or None,
-            "temper": self.temper if self.way is Strategy.stratify else None,
+            "temper": self.alpha if self.strategy is Strategy.stratify else None,
             "budget": None if self.budget is None else str(self.budget),
-            "least": self.least.value if cover else None,
+            "least": self.objective.value if cover else None,
             "seed": self.seed,
         }
 
@@ -204,7 +204,7 @@ class Selection:
 
     Attributes
     ----------
-    wish : SelectionSpec
+    spec : SelectionSpec
     units : Units
     picked : int64
         Numbers of units, in the order in which they were chosen.
@@ -218,7 +218,7 @@ class Selection:
         Of each stratum, by its value: units, and units that were chosen.
     """
 
-    wish: SelectionSpec
+    spec: SelectionSpec
     units: Units
     picked: Ints
     holdings: Holdings | None = None
@@ -227,7 +227,7 @@ class Selection:
     strata: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
 
 
-def select(chosen: ChosenFrames, wish: SelectionSpec) -> Selection:
+def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     """Select units of some frames.
 
     Raises
@@ -239,13 +239,13 @@ def select(chosen: ChosenFrames, wish: SelectionSpec) -> Selection:
     QueryError, ExportError
         The expression of the strata is none.
     """
-    units = units_of(chosen, wish.piece, wish.clip_s, wish.stride_s)
+    units = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
     if not len(units):
         said = [f"{chosen.text}: no frame to select from"]
         return Selection(
-            wish, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
+            spec, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
         )
-    found = _selected(wish, units, units.ranks(wish.seed))
+    found = _selected(spec, units, units.ranks(spec.seed))
     if not units.overlap:
         return found
     frames, seconds = (units.together(found.picked, m) for m in (Measure.frames, Measure.seconds))
@@ -257,45 +257,45 @@ def select(chosen: ChosenFrames, wish: SelectionSpec) -> Selection:
     return replace(found, result=result, said=[*found.said, said])
 
 
-def _selected(wish: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    match wish.way:
+def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
+    match spec.strategy:
         case Strategy.every:
-            return _every(wish, units, rank)
+            return _every(spec, units, rank)
         case Strategy.stratify:
-            return _stratified(wish, units, rank)
+            return _stratified(spec, units, rank)
         case _:
-            held = holdings(units, wish.abstraction, wish.combos, of_ego=wish.of_ego)
-            if wish.way is Strategy.rarest:
-                return _rarest(wish, units, rank, held)
-            return _covering(wish, units, rank, held)
+            held = holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
+            if spec.strategy is Strategy.rarest:
+                return _rarest(spec, units, rank, held)
+            return _covering(spec, units, rank, held)
 
 
-def _every(wish: SelectionSpec, units: Units, rank: Ints) -> Selection:
+def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
     """All units, or units at random until the budget is used up."""
     picked = np.arange(len(units))
-    if wish.budget is not None:
-        purse = BudgetTracker.of(units, wish.budget.measure, wish.budget.most)
-        picked = purse.fitting(np.argsort(rank))
+    if spec.budget is not None:
+        tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
+        picked = tracker.fitting(np.argsort(rank))
         picked = picked if picked.size < len(units) else np.arange(len(units))
-    return Selection(wish, units, picked, result={"units": len(picked), "of": len(units)})
+    return Selection(spec, units, picked, result={"units": len(picked), "of": len(units)})
 
 
-def _covering(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
-    each = wish.each if wish.way is Strategy.per_class else 1
+def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
+    each = spec.each if spec.strategy is Strategy.per_class else 1
     shared = units.overlap
-    if shared and wish.least is not Measure.units:
-        cover = cheapest(units, held, wish.least, rank)
+    if shared and spec.objective is not Measure.units:
+        cover = cheapest(units, held, spec.objective, rank)
     else:
-        cover = minimal(held.family(units, units.costs(wish.least), each, rank))
-    result = _said_of(held, units, wish)
+        cover = minimal(held.family(units, units.costs(spec.objective), each, rank))
+    result = _said_of(held, units, spec)
     met = _met(held, units, cover.chosen)
-    bound = cover.bound if wish.least is not Measure.units else round(cover.bound)
+    bound = cover.bound if spec.objective is not Measure.units else round(cover.bound)
     result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound, "exact": cover.exact}
     result["greedy"] = cover.greedy
     said = [
-        f"{len(cover.chosen)} of {len(units)} {units.piece}s keep all {held.total} {held.kind}"
-        + (f", each in {each} {units.piece}s or in all that have it" if each > 1 else ""),
-        f"{wish.least}: {_number(cover.cost)}; lower bound {_number(bound)}, so "
+        f"{len(cover.chosen)} of {len(units)} {units.unit}s keep all {held.total} {held.kind}"
+        + (f", each in {each} {units.unit}s or in all that have it" if each > 1 else ""),
+        f"{spec.objective}: {_number(cover.cost)}; lower bound {_number(bound)}, so "
         + (
             "there is none smaller"
             if cover.exact
@@ -303,20 +303,20 @@ def _covering(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         )
         + f" (greedy choice alone: {_number(cover.greedy)})",
     ]
-    budget = wish.budget
+    budget = spec.budget
     if budget is None:
-        return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
+        return Selection(spec, units, cover.chosen, held, result | {"kept": met}, said)
     whole = units.together(cover.chosen, budget.measure)
     if whole <= budget.most * ROUNDING:
         said.append(f"that is {_number(whole)} {budget.measure}, within {budget}")
-        return Selection(wish, units, cover.chosen, held, result | {"kept": met}, said)
+        return Selection(spec, units, cover.chosen, held, result | {"kept": met}, said)
     if shared and budget.measure is not Measure.units:
         fitted = affordable(units, held, budget.measure, rank, budget.most * ROUNDING)
     else:
         family = held.family(units, units.costs(budget.measure), each, rank)
         fitted = within(family, budget.most * ROUNDING)
     reached = _met(held, units, fitted.chosen)
-    result = _said_of(held, units, wish) | {
+    result = _said_of(held, units, spec) | {
         "units": len(fitted.chosen),
         "cost": fitted.cost,
         "kept": reached,
@@ -324,18 +324,23 @@ def _covering(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         "at_most": int(fitted.most + 1e-6),
     }
     said = [
-        f"within {budget}: {len(fitted.chosen)} of {len(units)} {units.piece}s keep {reached} of"
+        f"within {budget}: {len(fitted.chosen)} of {len(units)} {units.unit}s keep {reached} of"
         f" {held.total} {held.kind}"
         + (f" ({fitted.met} of each up to {each} times)" if each > 1 else ""),
         f"upper bound: no choice within the budget meets more than {int(fitted.most + 1e-6)}"
         f" (this one: {fitted.met}); all would take {_number(whole)} {budget.measure}"
         " with the smallest set that is known",
     ]
-    return Selection(wish, units, fitted.chosen, held, result, said)
+    return Selection(spec, units, fitted.chosen, held, result, said)
 
 
-def _said_of(held: Holdings, units: Units, wish: SelectionSpec) -> dict[str, Any]:
-    return {"of": len(units), "elements": held.total, "kind": held.kind, "least": wish.least.value}
+def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any]:
+    return {
+        "of": len(units),
+        "elements": held.total,
+        "kind": held.kind,
+        "least": spec.objective.value,
+    }
 
 
 def _met(held: Holdings, units: Units, picked: Ints) -> int:
@@ -353,11 +358,11 @@ def _above(cost: float, bound: float) -> str:
     return f"{_number(cost - bound)} ({(cost - bound) / bound:.1%})" if bound else _number(cost)
 
 
-def _rarest(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
+def _rarest(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
     """For each class that no unit has yet, the rarest first, the unit that brings most besides."""
-    measure = wish.budget.measure if wish.budget else wish.least
-    purse = BudgetTracker.of(units, measure, wish.budget.most if wish.budget else np.inf)
-    family = held.family(units, purse.cost, 1, rank)
+    measure = spec.budget.measure if spec.budget else spec.objective
+    tracker = BudgetTracker.of(units, measure, spec.budget.most if spec.budget else np.inf)
+    family = held.family(units, tracker.cost, 1, rank)
     starts, sets = family.by_element()
     there = np.zeros(len(held.frames), np.bool_)
     picked: list[int] = []
@@ -365,74 +370,76 @@ def _rarest(wish: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Se
         if there[element]:
             continue
         options = sets[starts[element] : starts[element + 1]]
-        price = purse.prices(options)
-        options, price = options[price <= purse.left], price[price <= purse.left]
+        price = tracker.prices(options)
+        options, price = options[price <= tracker.left], price[price <= tracker.left]
         if not len(options):
             continue
         gain = np.array([(~there[family.elements(one)]).sum() for one in options.tolist()])
         best = int(np.lexsort((rank[options], -gain / price))[0])
         picked.append(int(options[best]))
-        purse.buy(picked[-1], float(price[best]))
+        tracker.buy(picked[-1], float(price[best]))
         there[family.elements(picked[-1])] = True
     reached = int(held.weight[there].sum())
-    used = purse.spent
+    used = tracker.spent
     said = [
-        f"the rarest first: {len(picked)} of {len(units)} {units.piece}s"
+        f"the rarest first: {len(picked)} of {len(units)} {units.unit}s"
         f" ({_number(used)} {measure}) keep {reached} of {held.total} {held.kind}"
     ]
-    result = _said_of(held, units, wish) | {"units": len(picked), "cost": used, "kept": reached}
-    return Selection(wish, units, np.array(picked, np.int64), held, result, said)
+    result = _said_of(held, units, spec) | {"units": len(picked), "cost": used, "kept": reached}
+    return Selection(spec, units, np.array(picked, np.int64), held, result, said)
 
 
-def _stratified(wish: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    stratum, names = _strata(wish, units)
+def _stratified(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
+    stratum, names = _strata(spec, units)
     order = np.lexsort((rank, stratum))
     size = np.bincount(stratum, minlength=len(names))
-    if wish.budget is None:
+    if spec.budget is None:
         within_own = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
-        picked = order[within_own < wish.each]
+        picked = order[within_own < spec.each]
     else:
-        purse = BudgetTracker.of(units, wish.budget.measure, wish.budget.most)
-        share = size.astype(np.float64) ** wish.temper
+        tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
+        share = size.astype(np.float64) ** spec.alpha
         share = share / max(share.sum(), 1e-12)
-        picked = _allotted(order, stratum, purse, share * wish.budget.most, rank)
+        picked = _allotted(order, stratum, tracker, share * spec.budget.most, rank)
     taken = np.bincount(stratum[picked], minlength=len(names))
     strata = {
         name: (int(all_), int(some))
         for name, all_, some in zip(names, size.tolist(), taken.tolist(), strict=True)
     }
-    said = [f"{len(picked)} of {len(units)} {units.piece}s, of {len(names)} strata by {wish.by}"]
+    said = [f"{len(picked)} of {len(units)} {units.unit}s, of {len(names)} strata by {spec.by}"]
     result = {
         "units": len(picked),
         "of": len(units),
         "strata": {n: list(v) for n, v in strata.items()},
     }
-    return Selection(wish, units, picked, None, result, said, strata)
+    return Selection(spec, units, picked, None, result, said, strata)
 
 
-def _allotted(order: Ints, stratum: Ints, purse: BudgetTracker, shares: Floats, rank: Ints) -> Ints:
+def _allotted(
+    order: Ints, stratum: Ints, tracker: BudgetTracker, shares: Floats, rank: Ints
+) -> Ints:
     """Each stratum up to its share; then, of what is left of the budget, units at random."""
     within_share: list[Ints] = []
     used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
-        before = purse.spent
-        within_share.append(purse.fitting(order[stratum[order] == number], share))
-        used[number] = purse.spent - before
+        before = tracker.spent
+        within_share.append(tracker.fitting(order[stratum[order] == number], share))
+        used[number] = tracker.spent - before
     picked = np.concatenate([np.zeros(0, np.int64), *within_share])
     # Shares are rarely a whole number of units: the rest goes to those strata that are furthest below theirs.
     others = np.setdiff1d(order, picked)
-    lack = (shares - used)[stratum[others]] / purse.cost[others]
+    lack = (shares - used)[stratum[others]] / tracker.cost[others]
     others = others[np.lexsort((rank[others], -lack))]
     first = np.unique(stratum[others], return_index=True)[1]
-    return np.concatenate([picked, purse.fitting(others[np.sort(first)])])
+    return np.concatenate([picked, tracker.fitting(others[np.sort(first)])])
 
 
-def _strata(wish: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
+def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
     """The stratum of each unit, the value that most of its frames have; and all values."""
     from sgstore.exporters import Labels
 
     asked = np.flatnonzero(units.asked)
-    labels = Labels.asked(units.chosen.store, {"stratum": wish.by}, units.frame_id[asked])
+    labels = Labels.asked(units.chosen.store, {"stratum": spec.by}, units.frame_id[asked])
     values = labels.of(units.frame_id[asked])["stratum"]
     names = sorted({_value(value) for value in values})
     number = {name: i for i, name in enumerate(names)}
@@ -527,6 +534,6 @@ def locked_selection(
         )
         for unit in sorted(selection.picked.tolist())
     ]
-    how = selection.wish.as_dict(query)
+    how = selection.spec.as_dict(query)
     how |= {"parameters": dict(parameters or {}), "result": dict(selection.result)}
     return lock_of(units.chosen.store, wanted, how, payloads=payloads, progress=progress)

@@ -1,6 +1,7 @@
-"""Set cover: reduction, bounds, search, and overlapping units.
+"""Set cover: reduction, greedy choice, bounds, and overlapping units.
 
-What a set cover need not decide: sets that must be taken, elements and sets that are superfluous; and parts.
+Reduction leaves out what need not be decided: sets that must be taken, elements and sets that are superfluous;
+and it finds parts that have nothing to do with one another.
 
 An element is superfluous if another one is in no other sets than it is: whoever holds that one holds it, too. A
 set is superfluous if another one holds all that it holds and costs no more. Each such step may make room for
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.selection._sets import SetFamily, greedy, met, or_alone, ordered, spread, thinned
+from sgstore.selection._solver import NODES, ROUNDING, Solver
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats, Ints
 
 
-_REDUCE_WORK: Final = 100_000_000
+_COMPARISONS: Final = 100_000_000
 """Steps of comparing, all together: what is found superfluous by then is dropped, the rest stays."""
 
 _BATCH: Final = 2_000_000
@@ -43,7 +45,7 @@ def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
     need, alive = family.need.copy(), np.ones(len(family), np.bool_)
     forced = np.zeros(len(family), np.bool_)
     wanted = need > 0
-    work, size = _REDUCE_WORK, -1
+    work, size = _COMPARISONS, -1
     while size != (size := int(alive.sum()) + int(wanted.sum())):
         _force(family, need, alive, forced)
         wanted &= need > 0
@@ -280,11 +282,11 @@ def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
         first = found
 
 
-# Bounds of set covers from below, and the search for the cheapest -------------------------------
+# Bounds of set covers from below ----------------------------------------------------------------
 # A price for each element: if no set costs less than the prices of its elements, no cover costs less than all
 # prices together (the dual of the linear programme). Any prices at all give a bound too, if what sets cost less
 # than their elements is taken off (Lagrange). Prices are found by steps along subgradients; they also suggest
-# covers. The search branches over the sets that hold the element which is in the fewest.
+# covers.
 #
 # Sources. Held, Wolfe, Crowder, "Validation of subgradient optimization", Mathematical Programming 6 (1974);
 # Beasley, "A Lagrangian heuristic for set-covering problems", Naval Research Logistics 37 (1990); Caprara,
@@ -299,11 +301,8 @@ PATIENCE: Final = 20
 TRIES: Final = 10
 """Every so many steps the prices suggest a cover."""
 
-_WORK: Final = 200_000_000
+_MEMBERSHIPS: Final = 200_000_000
 """Memberships that all steps may look at together: fewer steps where there are very many."""
-
-ROUNDING: Final = 1e-7
-"""How much of a cost is due to rounding."""
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
@@ -330,7 +329,7 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
     upper = float(cost[cover].sum())
     best, kept, low = cover, prices, -math.inf
     scale, idle = 2.0, 0
-    rounds = int(np.clip(_WORK // max(len(set_of), 1), TRIES, ROUNDS))
+    rounds = int(np.clip(_MEMBERSHIPS // max(len(set_of), 1), TRIES, ROUNDS))
     for step in range(rounds):
         left = cost - np.bincount(set_of, prices[family.members], len(cost))
         taken = left < 0
@@ -369,149 +368,14 @@ def _suggested(family: SetFamily, left: Floats) -> Ints:
     return thinned(family, chosen[np.argsort(place[chosen])])
 
 
-def feasible(family: SetFamily, prices: Floats) -> Floats:
-    """Prices made so low that no set costs less than its elements, then as high as that allows, one by one."""
-    set_of = family.set_of
-    asked = np.bincount(set_of, prices[family.members], len(family))
-    over = np.maximum(asked / family.cost, 1.0)
-    factor = np.ones(len(prices))
-    np.maximum.at(factor, family.members, over[set_of])
-    prices = prices / factor
-    left = family.cost - np.bincount(set_of, prices[family.members], len(family))
-    starts, sets = family.by_element()
-    order = np.argsort(np.diff(starts), kind="stable")
-    for element in order.tolist():
-        own = sets[starts[element] : starts[element + 1]]
-        room = max(float(left[own].min()), 0.0)
-        prices[element] += room
-        left[own] -= room
-    return prices
-
-
-def searched(
-    family: SetFamily, cover: Ints, prices: Floats, steps: int, *, whole: bool
-) -> tuple[Ints, float, int]:
-    """The cheapest cover by branch and bound, or the best one after so many steps.
-
-    Parameters
-    ----------
-    family : SetFamily
-        Each element needs one set.
-    cover : int64
-        One that is known.
-    prices : (E,) float64
-        Of the elements: :func:`bounded`.
-    steps : int
-    whole : bool
-        Whether all costs are whole numbers.
-
-    Returns
-    -------
-    cover : int64
-    bound : float
-        Its cost, if the search came to its end; else 0.
-    used : int
-        Steps that it took.
-    """
-    search = _CoverSearch(family, cover, feasible(family, prices), steps, whole=whole)
-    ended = search.run()
-    return search.best, (search.upper if ended else 0.0), search.used
-
-
-class _CoverSearch:
-    """Depth first, without recursion: sets of elements and of sets are the bits of whole numbers."""
-
-    def __init__(
-        self, family: SetFamily, cover: Ints, prices: Floats, steps: int, *, whole: bool
-    ) -> None:
-        self._cost = family.cost.tolist()
-        self._prices = prices.tolist()
-        self._members = [_bits(family.elements(i)) for i in range(len(family))]
-        starts, sets = family.by_element()
-        self._sets = [_bits(sets[starts[e] : starts[e + 1]]) for e in range(len(starts) - 1)]
-        self._step = 1.0 if whole else 0.0
-        self._steps = steps
-        self._weight = 1 + len(self._sets) // 100
-        self.used = 0
-        self.best, self.upper = cover, float(family.cost[cover].sum())
-
-    def run(self) -> bool:
-        """Search; whether all was searched."""
-        every = (1 << len(self._sets)) - 1
-        stack: list[tuple[int, int, float, tuple[int, ...]]] = [
-            (every, (1 << len(self._members)) - 1, 0.0, ())
-        ]
-        while stack:
-            if self.used >= self._steps:
-                return False
-            self.used += self._weight
-            open_, allowed, cost, chosen = stack.pop()
-            if not open_:
-                if cost < self.upper - ROUNDING:
-                    self.upper, self.best = cost, np.array(sorted(chosen), np.int64)
-                continue
-            # Of whole costs only what is cheaper by one is of interest.
-            least = cost + self._least(open_)
-            if least > self.upper - max(self._step, ROUNDING) + ROUNDING:
-                continue
-            stack += self._branches(open_, allowed, cost, chosen)
-        return True
-
-    def _least(self, open_: int) -> float:
-        """What covering elements costs at least."""
-        prices = self._prices
-        return sum(prices[i] for i in _places(open_))
-
-    def _branches(
-        self, open_: int, allowed: int, cost: float, chosen: tuple[int, ...]
-    ) -> list[tuple[int, int, float, tuple[int, ...]]]:
-        """One for each set that holds the element which is in the fewest; the most promising last."""
-        fewest = min(
-            (self._sets[i] & allowed for i in _places(open_)), key=lambda sets: sets.bit_count()
-        )
-        found: list[tuple[int, int, float, tuple[int, ...]]] = []
-        options = sorted(
-            _places(fewest),
-            key=lambda i: self._cost[i] / max((self._members[i] & open_).bit_count(), 1),
-        )
-        for one in options:
-            allowed &= ~(1 << one)  # the branches that follow are those without it
-            rest = open_ & ~self._members[one]
-            found.append((rest, allowed, cost + self._cost[one], (*chosen, one)))
-        return found[::-1]
-
-
-def _bits(numbers: Ints) -> int:
-    found = 0
-    for number in numbers.tolist():
-        found |= 1 << number
-    return found
-
-
-def _places(bits: int) -> list[int]:
-    found: list[int] = []
-    while bits:
-        low = bits & -bits
-        found.append(low.bit_length() - 1)
-        bits ^= low
-    return found
-
-
 # Set cover: few sets, or cheap ones, that together hold every element as often as is asked ------
-# What must be taken is taken, what is superfluous is dropped (:mod:`sgstore.selection._cover`), what is left
-# falls into parts that have nothing to do with one another. Each part is covered greedily and bounded from
-# below (:mod:`sgstore.selection._cover`); a part whose bound is not met is searched, up to a number of steps.
-# So the answer is exact where that is cheap, and beside it stands how far from the best it can be at most.
+# What must be taken is taken, what is superfluous is dropped, what is left falls into parts that have nothing
+# to do with one another. Each part is covered greedily and bounded from below; a part whose bound is not met is
+# given to HiGHS, if that is installed (:mod:`sgstore.selection._solver`). So the answer is exact where that is
+# cheap, and beside it stands how far from the best it can be at most.
 #
 # Source. Under a budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem", Information Processing
 # Letters 70 (1999).
-
-STEPS: Final = 60_000
-"""Steps of searching, in all parts together; one with many elements counts as several. They are counted, not
-timed, so that the answer is the same everywhere."""
-
-SEARCHED: Final = 1_000_000
-"""Memberships of a part that is searched at most: in larger ones so few steps find nothing."""
 
 
 @dataclass(frozen=True)
@@ -541,32 +405,27 @@ class Cover:
         return self.cost <= self.bound + ROUNDING * max(self.cost, 1)
 
 
-def minimal(family: SetFamily, steps: int = STEPS) -> Cover:
-    """The cheapest sets that hold each element as often as it needs; or cheap ones, and a bound.
+def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
+    """Return the cheapest sets that hold each element as often as it needs; or cheap ones, and a bound.
 
     Parameters
     ----------
     family : SetFamily
-    steps : int
-        Of searching at most; 0: greedy choice and bound alone.
+    nodes : int
+        Nodes that the solver may look at, in all parts together; 0: greedy choice and bound alone.
     """
     forced, rest = reduced(family)
     chosen, bound = [forced], float(family.cost[forced].sum())
     plain = bound
-    whole = bool((family.cost == np.round(family.cost)).all())
+    solver = Solver(nodes)
     for part, sets in rest:
         own = greedy(part)
         plain += float(part.cost[own].sum())
-        own = thinned(part, own)
-        low, better, prices = bounded(part, own)
-        if part.cost[better].sum() < part.cost[own].sum():
-            own = better
-        low = math.ceil(low - ROUNDING) if whole else low
-        small = len(part.members) <= SEARCHED and part.need.max() == 1
-        if steps and small and part.cost[own].sum() > low + ROUNDING:
-            own, found, used = searched(part, own, prices, steps, whole=whole)
-            steps -= used
-            low = max(low, found)
+        low, own, _ = bounded(part, thinned(part, own))
+        low = math.ceil(low - ROUNDING) if part.whole else low
+        if part.cost[own].sum() > low + ROUNDING:
+            own, proven = solver.improved(part, own)
+            low = max(low, proven)
         chosen.append(sets[own])
         bound += min(low, float(part.cost[own].sum()))
     all_chosen = np.concatenate(chosen)

@@ -93,10 +93,10 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
     ]
     reached = int(so_far[-1]) if len(so_far) else 0
     needed = int(np.searchsorted(so_far, reached)) + 1 if len(so_far) else 0
-    need, seconds = random_need(units, held, reached, selection.wish.seed)
+    need, seconds = random_need(units, held, reached, selection.spec.seed)
     own = selection.result.get("seconds", 0.0)
     said = [
-        f"{needed} {units.piece}s{f' ({own:.1f} s)' if own else ''} keep {reached} of {elements} {held.kind};"
+        f"{needed} {units.unit}s{f' ({own:.1f} s)' if own else ''} keep {reached} of {elements} {held.kind};"
         f" in random order that takes {need.mean():.1f} ± {need.std():.1f} of {total}"
         f"{f' ({seconds:.1f} s)' if seconds else ''} (mean and standard deviation of {len(need)} orders)"
     ]

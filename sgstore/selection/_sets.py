@@ -88,6 +88,11 @@ class SetFamily:
         return len(self.cost)
 
     @property
+    def whole(self) -> bool:
+        """True if all costs are whole numbers."""
+        return bool((self.cost == np.round(self.cost)).all())
+
+    @property
     def set_of(self) -> Ints:
         """(M,): the set of each of ``members``."""
         return np.repeat(np.arange(len(self)), np.diff(self.starts))

@@ -61,7 +61,7 @@ def split(selection: Selection, shares: dict[str, float]) -> dict[int, str]:
     total: dict[str, int] = {}
     for trace, many in zip(traces.tolist(), often.tolist(), strict=True):
         total[recording[trace]] = total.get(recording[trace], 0) + many
-    order = sorted(total, key=lambda d: (-total[d], _drawn(d, selection.wish.seed)))
+    order = sorted(total, key=lambda d: (-total[d], _drawn(d, selection.spec.seed)))
     lack = {name: share * len(rows) for name, share in shares.items()}
     part: dict[str, str] = {}
     for digest in order:
@@ -87,7 +87,7 @@ def split_table(
         frames, whose class occurs there, too. ``None``: of nothing.
     """
     units = selection.units
-    of = classed(units.chosen, selection.wish.abstraction)
+    of = classed(units.chosen, selection.spec.abstraction)
     code = np.full(len(units.frame_id), UNKNOWN)
     code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
     mine = {

@@ -107,7 +107,7 @@ class Units:
     ----------
     chosen : ChosenFrames
         The frames that were asked for.
-    piece : SelectionUnit
+    unit : SelectionUnit
     frame_id : (N,) int64
         The frames of all units, ascending.
     asked : (N,) bool
@@ -118,7 +118,7 @@ class Units:
     """
 
     chosen: ChosenFrames
-    piece: SelectionUnit
+    unit: SelectionUnit
     frame_id: Ints
     asked: Bools
     log_time_ns: Ints
@@ -225,7 +225,7 @@ def _mixed(
 
 
 def units_of(
-    chosen: ChosenFrames, piece: SelectionUnit, clip_s: float = 2.0, stride_s: float | None = None
+    chosen: ChosenFrames, unit: SelectionUnit, clip_s: float = 2.0, stride_s: float | None = None
 ) -> Units:
     """The units of some frames.
 
@@ -237,7 +237,7 @@ def units_of(
     Parameters
     ----------
     chosen : ChosenFrames
-    piece : SelectionUnit
+    unit : SelectionUnit
     clip_s : float
         Length of clips; s.
     stride_s : float, optional
@@ -264,13 +264,13 @@ def units_of(
     rows = chosen.rows_of(frame_id)
     asked = np.zeros(len(frame_id), np.bool_)
     asked[rows] = True
-    if piece is SelectionUnit.trace:
+    if unit is SelectionUnit.trace:
         rows = np.flatnonzero(np.isin(trace_of(frame_id), trace_of(frame_id[rows])))
     each = np.arange(len(rows))
-    own = Units(chosen, piece, frame_id[rows], asked[rows], log_time_ns[rows], each, each + 1)
-    if piece is SelectionUnit.frame or not len(rows):
+    own = Units(chosen, unit, frame_id[rows], asked[rows], log_time_ns[rows], each, each + 1)
+    if unit is SelectionUnit.frame or not len(rows):
         return own
-    if piece is SelectionUnit.clip:
+    if unit is SelectionUnit.clip:
         begin, end = _clips(own, time_ns[rows], clip_s, stride_s)
     else:
         begin, end = _ranges(np.append(True, np.diff(trace_of(own.frame_id)) != 0))
