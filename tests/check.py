@@ -32,6 +32,7 @@ TESTS = {
     "matches": "query api",
     "mcap": "mcap_file spool ahead",
     "opendrive": "opendrive_*",
+    "processes": "ingest_many sandbox",
     "plugins": "relations abstractions flavours",
     "query": "query api",
     "quoting": "user_tables",

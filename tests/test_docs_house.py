@@ -7,14 +7,29 @@ import subprocess
 import sys
 from pathlib import Path
 
+import check
 import house
 import pytest
 
 import sgstore
+from sgstore.demo import RECORDING
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 STEP = re.compile(r"^\| `([\w/]+\.py)` \| `([\w.]+)` \|", re.MULTILINE)
+BESIDES = """
+import sys; sys.path.insert(0, sys.argv[1])
+import sgstore
+frame = sgstore.Frame(0, ego="a")
+for name, x, y in (("a", 0, 0), ("b", 0, 3), ("c", 9, 0)):
+    frame.add(name, "car", x, y, 0, heading=0, length=4, width=2, height=1.5)
+graph = sgstore.SceneGraphGenerator(None, sgstore.Config()).step(frame)
+print(sorted((a, b) for a, name, b, _ in graph.edges if name == "besides"))
+store = sgstore.open(f"{sys.argv[1]}/town.sgstore", create=True)
+store.ingest(sys.argv[2], until=2)
+((edges,),) = store.sql("SELECT count(*) FROM edges WHERE relation = 'besides'")
+print(0 < store.find("MATCH (e:Ego)-[:besides]-(v:Vehicle)").count() < edges)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -86,16 +101,14 @@ def test_the_relation_of_contributing_is_computed_by_its_entry_point(tmp_path: P
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scratch\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[sgstore.relations]\nbesides = besides:BESIDES\n")
-    asking = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "import sgstore\n"
-        "frame = sgstore.Frame(0, ego='a')\n"
-        "for name, x, y in (('a', 0, 0), ('b', 0, 3), ('c', 9, 0)):\n"
-        "    frame.add(name, 'car', x, y, 0, heading=0, length=4, width=2, height=1.5)\n"
-        "graph = sgstore.SceneGraphGenerator(None, sgstore.Config()).step(frame)\n"
-        "print(sorted((a, b) for a, name, b, _ in graph.edges if name == 'besides'))"
-    )
-    command = [sys.executable, "-c", asking, str(tmp_path)]
+    command = [sys.executable, "-c", BESIDES, str(tmp_path), str(RECORDING)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
 
-    assert done.stdout.strip() == "[(0, 1), (1, 0)]"
+    assert done.stdout.splitlines() == ["[(0, 1), (1, 0)]", "True"]
+
+
+def test_a_change_in_any_room_asks_tests_of_that_room() -> None:
+    rooms = {path.name.partition(".")[0] for path in house.PACKAGE.iterdir()}
+    rooms -= {"__main__", "__pycache__", "py", "sample"}
+
+    assert [r for r in sorted(rooms) if len(check.tests_of([Path("sgstore", f"{r}.py")])) < 2] == []
