@@ -21,10 +21,10 @@ from sgstore.lang._catalog import (
     class_attribute,
 )
 from sgstore.lang._hints import TOLD, comparison_hint, hint_at
+from sgstore.lang._operators import TEXT_TESTS
 from sgstore.lang._symbols import (
     CLASSES,
     RESERVED,
-    TEXT_TESTS,
     Binders,
     SymbolTable,
     abstraction_named,

@@ -18,6 +18,7 @@ from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_expressions import parameter
 from sgstore.lang._catalog import Type
+from sgstore.lang._operators import COMPARISONS
 from sgstore.lang._parse import parse
 from sgstore.lang._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
 from sgstore.lang.library import patterns
@@ -34,7 +35,6 @@ MAX_NS: Final = 10**18
 
 _UNBOUNDED: Final = frozenset({"NEXT", "WEAKNEXT", "PREVIOUS"})
 _LENGTH: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min|frames)", re.IGNORECASE)
-_COMPARISONS: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
 
 
 def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
@@ -237,7 +237,7 @@ def _settled(expression: b.Bound) -> b.Bound:
     match expression:
         case b.Operation(word, operands, kind):
             parts = tuple(_settled(operand) for operand in operands)
-            if word in _COMPARISONS:
+            if word in COMPARISONS:
                 parts = _compared(parts)
             return b.Operation(word, parts, kind)
         case b.Tense(operands=operands):

@@ -26,6 +26,7 @@ from sgstore.lang._catalog import (
     Type,
 )
 from sgstore.lang._external import SPAN, ExternalMatches, nothing, with_places
+from sgstore.lang._operators import INFIX
 from sgstore.lang._parse import parse
 from sgstore.lang._rewrite import rewritten, unfold_paths
 from sgstore.lang._symbols import traces_in
@@ -273,10 +274,6 @@ def shown(
 # The stages of the compiler as text, for ``--explain`` ------------------------------------------
 
 _PLACES: Final = frozenset({"span", "name_span"})
-_INFIX: Final = frozenset(
-    {"AND", "OR", "XOR", "IMPLIES", "=", "<>", "<", "<=", ">", ">=", "IN"}
-    | {"+", "-", "*", "/", "%", "STARTS WITH", "ENDS WITH", "CONTAINS", "=~"}
-)
 
 
 def tree_text(part: Any) -> str:
@@ -439,7 +436,7 @@ def _leaf(value: Bound) -> str:
 def _operation(operation: Operation, indent: str) -> str:
     parts = [value_text(operand, indent) for operand in operation.operands]
     word = operation.word
-    if word in _INFIX:
+    if word in INFIX:
         return "(" + f" {word} ".join(parts) + ")"
     if word.startswith("IS "):
         return f"({parts[0]} {word})"

@@ -9,8 +9,6 @@ three values.
 from __future__ import annotations
 
 import math
-import operator
-import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,11 +21,13 @@ from sgstore.geometry import pair_numbers
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._formulas import WAY
+from sgstore.lang._operators import OPERATORS, Column
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from sgstore.geometry import PairNumbers
     from sgstore.graph import SceneGraph
+    from sgstore.lang._catalog import Attribute
     from sgstore.world import Bools, Floats
 
 
@@ -270,9 +270,12 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.view.pair(function, at.nodes[one], at.nodes[other])
         case b.BlockValue():
             return blocks(expression)
-        case b.Operation():
-            return _operation(expression, blocks)
-        case b.Choices() | b.Aggregate() | b.Tense() | b.SignalCall() | b.StepTime():
+        case b.Choices(items=items):
+            chosen = frozenset(item.value for item in items)
+            return lambda _: chosen
+        case b.Operation(word=word, operands=operands):
+            return OPERATORS[word].one([evaluator(operand, blocks) for operand in operands])
+        case b.Aggregate() | b.Tense() | b.SignalCall() | b.StepTime():
             raise TypeError(f"{expression} has no value of its own")
 
 
@@ -283,162 +286,6 @@ def _in_junction(at: Binding, node: int) -> bool | None:
 
 def _type_of(attributes: Attributes) -> Any:
     return attributes.get("lane_type" if attributes["kind"] == "lane" else "type_name")
-
-
-def _operation(operation: b.Operation, blocks: Blocks) -> Evaluate:
-    word = operation.word
-    if word == "IN":
-        return _membership(operation, blocks)
-    parts = [evaluator(operand, blocks) for operand in operation.operands]
-    if word in _LOGIC:
-        combine = _LOGIC[word]
-        return lambda at: combine(part(at) for part in parts)
-    if word == "coalesce":
-        return lambda at: next((v for v in (part(at) for part in parts) if v is not None), None)
-    if word in {"IS NULL", "IS NOT NULL"}:
-        wanted, part = word == "IS NULL", parts[0]
-        return lambda at: (part(at) is None) == wanted
-    if word == "=~":
-        return _regex(operation, parts[0])
-    return _strict(_FUNCTIONS[word], parts)
-
-
-def _strict(function: Callable[..., Any], parts: list[Evaluate]) -> Evaluate:
-    """A function that is unknown where one of its arguments is."""
-    if len(parts) == 2:
-        left, right = parts
-
-        def of_two(at: Binding) -> Any:
-            one = left(at)
-            if one is None:
-                return None
-            other = right(at)
-            return None if other is None else function(one, other)
-
-        return of_two
-
-    def of_many(at: Binding) -> Any:
-        values = [part(at) for part in parts]
-        return None if None in values else function(*values)
-
-    return of_many
-
-
-def _membership(operation: b.Operation, blocks: Blocks) -> Evaluate:
-    operand, choices = operation.operands
-    if not isinstance(choices, b.Choices):
-        raise TypeError(f"{choices} is no list")
-    items = frozenset(item.value for item in choices.items)
-    value = evaluator(operand, blocks)
-
-    def member(at: Binding) -> bool | None:
-        if not items:
-            return False
-        found = value(at)
-        return None if found is None else found in items
-
-    return member
-
-
-def _regex(operation: b.Operation, text: Evaluate) -> Evaluate:
-    pattern = operation.operands[1]
-    if not isinstance(pattern, b.Value):
-        raise TypeError(f"{pattern} is no constant")
-    wanted = re.compile(str(pattern.value))
-
-    def whole(value: str) -> bool:
-        return wanted.fullmatch(value) is not None
-
-    return _strict(whole, [text])
-
-
-def _and(values: Any) -> bool | None:
-    result: bool | None = True
-    for value in values:
-        if value is False:
-            return False
-        if value is None:
-            result = None
-    return result
-
-
-def _or(values: Any) -> bool | None:
-    result: bool | None = False
-    for value in values:
-        if value is True:
-            return True
-        if value is None:
-            result = None
-    return result
-
-
-def _not(values: Any) -> bool | None:
-    (value,) = values
-    return None if value is None else not value
-
-
-def _xor(values: Any) -> bool | None:
-    known = list(values)
-    return None if None in known else sum(known) % 2 == 1
-
-
-def _implies(values: Any) -> bool | None:
-    condition, consequence = values
-    return _or((_not((condition,)), consequence))
-
-
-_LOGIC: Final[dict[str, Callable[[Any], bool | None]]] = {
-    "AND": _and,
-    "OR": _or,
-    "NOT": _not,
-    "XOR": _xor,
-    "IMPLIES": _implies,
-}
-
-
-def _divided(a: float, by: float) -> float | None:
-    return a / by if by else None
-
-
-def _remainder(a: float, by: float) -> float | None:
-    return math.fmod(a, by) if by else None
-
-
-def _root(a: float) -> float | None:
-    return math.sqrt(a) if a >= 0 else None
-
-
-def _rounded(a: float) -> float:
-    """Halves go away from zero, as in SQL."""
-    return math.copysign(math.floor(abs(a) + 0.5), a)
-
-
-_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
-    "=": operator.eq,
-    "<>": operator.ne,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": _divided,
-    "%": _remainder,
-    "negative": operator.neg,
-    "abs": abs,
-    "sqrt": _root,
-    "floor": math.floor,
-    "ceil": math.ceil,
-    "round": _rounded,
-    "min": min,
-    "max": max,
-    "lower": str.lower,
-    "upper": str.upper,
-    "STARTS WITH": str.startswith,
-    "ENDS WITH": str.endswith,
-    "CONTAINS": operator.contains,
-}
 
 
 # Conditions asked of many nodes at once: what :mod:`sgstore.lang._evaluate` asks of one after the other ----
@@ -467,28 +314,35 @@ class NodeColumns:
         known = (node for kind in kinds.every for node in view.by_kind.get(kind, ()))
         self.nodes = [node for node in known if view.is_one(node, kinds)]
         self._rows = [view.rows.get(node, -1) for node in self.nodes]
-        self._columns: dict[object, Floats] = {}
+        self._columns: dict[object, Column] = {}
 
     # The view is not kept, for it keeps the crowd: what refers to one another is freed late.
 
-    def attribute(self, view: FrameView, name: str) -> Floats:
-        """(N,) an attribute that is a number, or true or false; NaN where it is not known."""
+    def attribute(self, view: FrameView, name: str, *, truth: bool) -> Column:
+        """(N,) an attribute that is a number, or true or false (``truth``)."""
         column = self._columns.get(name)
         if column is None:
             nodes = view.nodes
             told = [nodes[node].get(name, math.nan) for node in self.nodes]
-            column = np.array([math.nan if v is None else v for v in told], np.float64)
+            column = _known(np.array([math.nan if v is None else v for v in told], np.float64))
+            if truth:
+                column = Column(column.values == 1, column.known)
             self._columns[name] = column
         return column
 
-    def pair(self, view: FrameView, name: str, one: int, *, ahead: bool) -> Floats:
+    def pair(self, view: FrameView, name: str, one: int, *, ahead: bool) -> Column:
         """(N,) a number of a node and each of these, or, unless ``ahead``, of each of these and the node."""
         key = name, one, ahead
         column = self._columns.get(key)
         if column is None:
             values = view.pairs(name, one, ahead=ahead)
-            column = self._columns[key] = np.append(values, math.nan)[self._rows]
+            column = self._columns[key] = _known(np.append(values, math.nan)[self._rows])
         return column
+
+
+def _known(values: Floats) -> Column:
+    unknown = np.isnan(values)
+    return Column(values, ~unknown if unknown.any() else True)
 
 
 def crowd(view: FrameView, kinds: b.Kinds) -> NodeColumns:
@@ -499,20 +353,49 @@ def crowd(view: FrameView, kinds: b.Kinds) -> NodeColumns:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class KnownTruth:
-    """Where a condition is true and where it is false, (N,) or of all the same; it is unknown elsewhere."""
-
-    true: Any
-    false: Any
-
-
 T = TypeVar("T")
 
-Numbers = Callable[[Binding, NodeColumns], Any]
-"""(N,) numbers, or one that is the same for all; NaN where they are not known."""
+Columns = Callable[[T], Column]
+"""The values of an expression, given what it is asked of."""
 
-Condition = Callable[[Binding, NodeColumns], KnownTruth]
+
+def column_evaluator(
+    expression: b.Bound, leaf: Callable[[b.Bound], Columns[T] | None]
+) -> Columns[T]:
+    """Return the function of the values of an expression for many bindings or frames at once.
+
+    Parameters
+    ----------
+    expression : Bound
+    leaf : function
+        Gives that of a part which is no constant and no operation, or which is something else here; ``None``:
+        it is what it is anywhere.
+    """
+    found = leaf(expression)
+    if found is not None:
+        return found
+    match expression:
+        case b.Value(value=None):
+            return _always(Column(0, known=False))
+        case b.Value(value=value):
+            return _always(Column(np.asarray(value)))
+        case b.Choices(items=items):
+            return _always(Column(tuple(item.value for item in items)))
+        case b.Operation(word=word, operands=operands):
+            combine = OPERATORS[word].columns
+            parts = [column_evaluator(operand, leaf) for operand in operands]
+            return lambda asked: combine([part(asked) for part in parts])
+        case _:
+            raise TypeError(f"{expression} has no columns")
+
+
+def _always(column: Column) -> Columns[Any]:
+    return lambda _: column
+
+
+# What is asked of the nodes of a graph ------------------------------------------------------------------------
+
+Asked = tuple[Binding, NodeColumns]
 Test = Callable[[Binding, NodeColumns], "Bools"]
 
 
@@ -521,13 +404,13 @@ class _Alone(Exception):  # noqa: N818 - no error: this is asked of one node aft
 
 
 def crowd_test(condition: b.Bound, key: str) -> Test | None:
-    """Where a condition is true, for all that one variable may be, the others being bound.
+    """Return the function that tells where a condition is true, for all that one variable may be.
 
     Parameters
     ----------
     condition : Bound
     key : str
-        The variable.
+        The variable; the others are bound.
 
     Returns
     -------
@@ -535,220 +418,65 @@ def crowd_test(condition: b.Bound, key: str) -> Test | None:
         (N,) bool of a binding and a crowd; ``None``: it is to be asked of one node after the other.
     """
     try:
-        asked = _condition(condition, key)
+        asked = column_evaluator(condition, lambda part: _of_crowd(part, key))
     except _Alone:
         return None
 
     def test(at: Binding, among: NodeColumns) -> Bools:
         with np.errstate(all="ignore"):
-            return np.broadcast_to(asked(at, among).true, len(among.nodes))
+            return np.broadcast_to(asked((at, among)).true, len(among.nodes))
 
     return test
 
 
-def _always(value: T) -> Callable[[Binding, NodeColumns], T]:
-    def same(_at: Binding, _among: NodeColumns) -> T:
-        return value
-
-    return same
-
-
-# Conditions --------------------------------------------------------------------------------------------------
-
-
-def _condition(condition: b.Bound, key: str) -> Condition:
-    match condition:
-        case b.Value(value=value) if value is None or isinstance(value, bool):
-            return _always(KnownTruth(value is True, value is False))
-        case b.Operation(word=word, operands=operands) if word in _COLUMN_LOGIC:
-            parts, combine = [_condition(part, key) for part in operands], _COLUMN_LOGIC[word]
-            return lambda at, among: combine([part(at, among) for part in parts])
-        case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
-            one, other, compare = _numbers(left, key), _numbers(right, key), _COMPARED[word]
-            return lambda at, among: compare(one(at, among), other(at, among))
-        case b.Operation(word="IS NULL" | "IS NOT NULL" as word, operands=(operand,)):
-            return _null_test(_numbers(operand, key), null=word == "IS NULL")
-        case b.NodeAttribute(node=node) if node == key and condition.type == Type.boolean:
-            name = _plain(condition)
-            return lambda at, among: _SAME(among.attribute(at.view, name), 1.0)
-        case _:
+def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
+    match part:
+        case b.Value(value=str()) | b.Choices():
             raise _Alone
-
-
-def _null_test(numbers: Numbers, *, null: bool) -> Condition:
-    def of_null(at: Binding, among: NodeColumns) -> KnownTruth:
-        unknown = np.isnan(numbers(at, among))
-        return KnownTruth(unknown, ~unknown) if null else KnownTruth(~unknown, unknown)
-
-    return of_null
-
-
-def _plain(attribute: b.NodeAttribute) -> str:
-    """The name of an attribute that is told with the node."""
-    about = attribute.attribute
-    if (
-        about.unit in {DisplayUnit.binding, DisplayUnit.role}
-        or about is NODE_ATTRIBUTES["injunction"]
-    ):
-        raise _Alone
-    return about.name
-
-
-def _and_columns(parts: list[KnownTruth]) -> KnownTruth:
-    true, false = parts[0].true, parts[0].false
-    for part in parts[1:]:
-        true, false = true & part.true, false | part.false
-    return KnownTruth(true, false)
-
-
-def _not_columns(parts: list[KnownTruth]) -> KnownTruth:
-    return KnownTruth(parts[0].false, parts[0].true)
-
-
-def _or_columns(parts: list[KnownTruth]) -> KnownTruth:
-    return _not_columns([_and_columns([_not_columns([part]) for part in parts])])
-
-
-def _implies_columns(parts: list[KnownTruth]) -> KnownTruth:
-    return _or_columns([_not_columns(parts[:1]), parts[1]])
-
-
-def _xor_columns(parts: list[KnownTruth]) -> KnownTruth:
-    odd, known = parts[0].true, parts[0].true | parts[0].false
-    for part in parts[1:]:
-        odd, known = odd ^ part.true, known & (part.true | part.false)
-    return KnownTruth(known & odd, known & (odd ^ True))
-
-
-def _coalesce(parts: list[KnownTruth]) -> KnownTruth:
-    found = parts[-1]
-    for part in reversed(parts[:-1]):
-        known = part.true | part.false
-        found = KnownTruth(
-            part.true | ((known ^ True) & found.true), part.false | ((known ^ True) & found.false)
-        )
-    return found
-
-
-_COLUMN_LOGIC: Final[Mapping[str, Callable[[list[KnownTruth]], KnownTruth]]] = {
-    "AND": _and_columns,
-    "OR": _or_columns,
-    "NOT": _not_columns,
-    "XOR": _xor_columns,
-    "IMPLIES": _implies_columns,
-    "coalesce": _coalesce,
-}
-
-
-def _compared(
-    true: Callable[..., Any], false: Callable[..., Any]
-) -> Callable[[Any, Any], KnownTruth]:
-    """A comparison and its contrary; neither is true where something is not known."""
-
-    def compare(one: Any, other: Any) -> KnownTruth:
-        known = ~(np.isnan(one) | np.isnan(other))
-        return KnownTruth(true(one, other) & known, false(one, other) & known)
-
-    return compare
-
-
-_SAME: Final = _compared(np.equal, np.not_equal)
-_COMPARED: Final[Mapping[str, Callable[[Any, Any], KnownTruth]]] = {
-    "=": _SAME,
-    "<>": _compared(np.not_equal, np.equal),
-    "<": _compared(np.less, np.greater_equal),
-    "<=": _compared(np.less_equal, np.greater),
-    ">": _compared(np.greater, np.less_equal),
-    ">=": _compared(np.greater_equal, np.less),
-}
-
-
-# Numbers -----------------------------------------------------------------------------------------------------
-
-
-def _numbers(value: b.Bound, key: str) -> Numbers:
-    match value:
-        case b.Value(value=bool() | str()):
+        case b.Value(value=int() | float() as number) if abs(number) > MOST:
             raise _Alone
-        case b.Value(value=number):
-            known = math.nan if number is None else float(number)
-            if abs(known) > MOST:
-                raise _Alone
-            return _always(known)
-        case b.NodeAttribute(node=node, attribute=attribute) if attribute.type == Type.number:
-            name = _plain(value)
-            if node == key:
-                return lambda at, among: among.attribute(at.view, name)
-            return _of_others(value)
+        case b.Value() | b.Operation():
+            return None
+        case b.NodeAttribute(node=node, attribute=attribute) if attribute.type in {
+            Type.number,
+            Type.boolean,
+        } and not _is_derived(attribute):
+            if node != key:
+                return _of_others(part)
+            name, truth = attribute.name, attribute.type is Type.boolean
+            return lambda asked: asked[1].attribute(asked[0].view, name, truth=truth)
         case b.PairNumber(function=function, a=one, b=other) if function in PAIR_NUMBERS:
             if key not in {one, other}:
-                return _of_others(value)
+                return _of_others(part)
             if one == other:
                 raise _Alone
             ahead = other == key
             bound = one if ahead else other
-            return lambda at, among: among.pair(at.view, function, at.nodes[bound], ahead=ahead)
-        case b.Operation(word=word, operands=operands) if word in _COLUMN_FUNCTIONS:
-            parts, function = [_numbers(part, key) for part in operands], _COLUMN_FUNCTIONS[word]
-            return lambda at, among: function(*(part(at, among) for part in parts))
+            return lambda asked: asked[1].pair(
+                asked[0].view, function, asked[0].nodes[bound], ahead=ahead
+            )
         case _:
             raise _Alone
 
 
-def _of_others(value: b.NodeAttribute | b.PairNumber) -> Numbers:
-    """A number of nodes that are bound: the same for all that are not."""
-    asked = evaluator(value, _no_blocks)
+def _is_derived(attribute: Attribute) -> bool:
+    """Tell whether an attribute is not told with the node."""
+    return (
+        attribute.unit in {DisplayUnit.binding, DisplayUnit.role}
+        or attribute is NODE_ATTRIBUTES["injunction"]
+    )
 
-    def same(at: Binding, _: NodeColumns) -> float:
-        found = asked(at)
-        return math.nan if found is None else float(found)
+
+def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
+    """The value of nodes that are bound: the same for all that are not."""
+    told = evaluator(value, _no_blocks)
+
+    def same(asked: Asked) -> Column:
+        found = told(asked[0])
+        return Column(0, known=False) if found is None else Column(found)
 
     return same
 
 
 def _no_blocks(block: b.BlockValue) -> Any:
     raise TypeError(f"{block} is no number of a node")
-
-
-def _divided_columns(a: Any, by: Any) -> Any:
-    return np.where(np.equal(by, 0), math.nan, np.divide(a, np.where(np.equal(by, 0), 1, by)))
-
-
-def _remainder_columns(a: Any, by: Any) -> Any:
-    return np.where(np.equal(by, 0), math.nan, np.fmod(a, np.where(np.equal(by, 0), 1, by)))
-
-
-def _rounded_columns(a: Any) -> Any:
-    """Halves go away from zero, as in SQL."""
-    return np.copysign(np.floor(np.abs(a) + 0.5), a)
-
-
-def _least(*values: Any) -> Any:
-    found = values[0]
-    for value in values[1:]:
-        found = np.minimum(found, value)
-    return found
-
-
-def _greatest(*values: Any) -> Any:
-    found = values[0]
-    for value in values[1:]:
-        found = np.maximum(found, value)
-    return found
-
-
-_COLUMN_FUNCTIONS: Final[Mapping[str, Callable[..., Any]]] = {
-    "+": np.add,
-    "-": np.subtract,
-    "*": np.multiply,
-    "/": _divided_columns,
-    "%": _remainder_columns,
-    "negative": np.negative,
-    "abs": np.abs,
-    "sqrt": np.sqrt,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "round": _rounded_columns,
-    "min": _least,
-    "max": _greatest,
-}

@@ -9,13 +9,13 @@ named columns and not repeated expressions.
 
 from __future__ import annotations
 
-import re
 import string
 from dataclasses import dataclass, field
-from functools import cache, reduce
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import DERIVED, Attribute, DisplayUnit, Home, Type
+from sgstore.lang._operators import COMPARISONS, COMPILER_SQL, OPERATORS
 from sgstore.lang.ir import (
     Aggregate,
     BlockValue,
@@ -483,15 +483,6 @@ Leaf = (
 )
 """What an expression is made of, as far as a statement must bring it as a column."""
 
-_INFIX: Final = frozenset({"AND", "OR"})
-_TESTS: Final = {
-    "STARTS WITH": "starts_with",
-    "ENDS WITH": "ends_with",
-    "CONTAINS": "contains",
-    "=~": "regexp_full_match",
-}
-_COMPARISONS: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
-
 
 def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
     """An expression; ``leaf`` gives the text of the columns in it."""
@@ -523,73 +514,16 @@ def _value(value: Value, values: BoundValues) -> str:
     return values.add(value.value)
 
 
-_WHOLE: Final = re.compile(r"""\$\d+|\w+|"[^"]*"(\."[^"]*")*|'[^']*'""")
-"""A placeholder, a word or a number, a column, a text: what needs no brackets."""
-
-_BRACKETS: Final = re.compile(r"""(?:"[^"]*"|'[^']*'|[^"'()])*([()])""")
-
-
-def operand_text(text: str) -> str:
-    """A text that can stand beside any operator: in brackets, unless it is one word or one call."""
-    return text if _WHOLE.fullmatch(text) or _is_call(text) else f"({text})"
-
-
-def _is_call(text: str) -> bool:
-    """Whether a text is in brackets already, perhaps with the name of a function before them."""
-    if not re.match(r"\w*\(", text):
-        return False
-    depth = 0
-    for bracket in _BRACKETS.finditer(text):
-        depth += 1 if bracket[1] == "(" else -1
-        if depth == 0:
-            return bracket.end() == len(text)
-    return False
-
-
 def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
     name = operation.word
-    if name in _COMPARISONS:
-        left, right = (_compared(o, operation, leaf, values) for o in operation.operands)
-        return f"{operand_text(left)} {name} {operand_text(right)}"
     if name == "IN":
-        return _membership(operation, leaf, values)
-    parts = [expression_text(operand, leaf, values) for operand in operation.operands]
-    if name in _TESTS:
-        return f"{_TESTS[name]}({parts[0]}, {parts[1]})"
-    return _function(name, parts)
-
-
-_TEMPLATES: Final = {
-    "NOT": "NOT {0}",
-    "IMPLIES": "(NOT {0} OR {1})",
-    "IS NULL": "{0} IS NULL",
-    "IS NOT NULL": "{0} IS NOT NULL",
-    "negative": "(- {0})",
-    "/": "({0} / nullif({1}, 0))",
-    "%": "({0} % nullif({1}, 0))",
-    "+": "({0} + {1})",
-    "-": "({0} - {1})",
-    "*": "({0} * {1})",
-    "sqrt": "CASE WHEN {0} >= 0 THEN sqrt({0}) END",
-    "name": "{0} || ' ' || CAST({1} AS VARCHAR)",
-    "whose": "CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END",
-}
-
-
-def _function(name: str, parts: list[str]) -> str:
-    """What stands between, before or around its operands."""
-    operands = [operand_text(part) for part in parts]
-    if name in _INFIX:
-        return "(" + f" {name} ".join(operands) + ")"
-    if name == "XOR":  # unknown if one part is, as <> is
-        return reduce(lambda left, right: f"({left} <> {right})", operands)
-    if name in _TEMPLATES:
-        return _TEMPLATES[name].format(*operands)
-    if name in {"min", "max"}:
-        known = " AND ".join(f"{operand} IS NOT NULL" for operand in operands)
-        extreme = {"min": "least", "max": "greatest"}[name]
-        return f"CASE WHEN {known} THEN {extreme}({', '.join(parts)}) END"
-    return f"{name}({', '.join(parts)})"
+        parts = _membership(operation, leaf, values)
+    elif name in COMPARISONS:
+        parts = [_compared(operand, operation, leaf, values) for operand in operation.operands]
+    else:
+        parts = [expression_text(operand, leaf, values) for operand in operation.operands]
+    sql = COMPILER_SQL.get(name) or OPERATORS[name].sql
+    return sql(parts)
 
 
 def _compared(
@@ -606,16 +540,18 @@ def _compared(
     return expression_text(operand, leaf, values)
 
 
-def _membership(operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
+def _membership(
+    operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues
+) -> list[str]:
     operand, choices = operation.operands
     assert isinstance(choices, Choices)  # noqa: S101 - the binder built it so
     if not choices.items:
-        return "FALSE"
+        return [""]
     if isinstance(operand, NodeAttribute) and all(item.closed for item in choices.items):
         text = leaf(operand)
     else:
         text = expression_text(operand, leaf, values)
-    return f"{operand_text(text)} IN ({', '.join(_value(item, values) for item in choices.items)})"
+    return [text, *(_value(item, values) for item in choices.items)]
 
 
 def leaves(expression: Bound) -> Iterable[Leaf]:

@@ -11,6 +11,7 @@ from sgstore.lang._bind_temporal import course
 from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_FUNCTIONS, PAIR_NAMES, Type
 from sgstore.lang._hints import FUNCTIONS_TOLD
 from sgstore.lang._needs import in_range
+from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
 from sgstore.vocabulary import ENTITY_KINDS, normalize_name, relation_named
@@ -19,16 +20,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-_NUMERIC: Final = frozenset({"abs", "sqrt", "floor", "ceil", "round"})
-_EXTREME: Final = frozenset({"min", "max"})
 _AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
 _OTHERS: Final = frozenset(
-    {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", "lower", "upper"}
+    {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", *OF_TEXT}
 )
 _COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
-    {*PAIR_FUNCTIONS, *_NUMERIC, *_EXTREME, *_OTHERS, *_AGGREGATES, *_COURSES}
+    {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *_OTHERS, *_AGGREGATES, *_COURSES}
 )
 
 MAX_CALLS: Final = 30
@@ -252,14 +251,13 @@ def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:
 
 _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     **dict.fromkeys(PAIR_NAMES, _pair),
-    **dict.fromkeys(_NUMERIC, _numeric),
-    **dict.fromkeys(_EXTREME, _extreme),
+    **dict.fromkeys(NUMERIC, _numeric),
+    **dict.fromkeys(EXTREMES, _extreme),
+    **dict.fromkeys(OF_TEXT, _text_function),
     "classcount": _class_count,
     "coalesce": _coalesce,
     "inrange": _in_range,
     CLASSES: _after_in,
     "known": _known,
     "type": _type,
-    "lower": _text_function,
-    "upper": _text_function,
 }

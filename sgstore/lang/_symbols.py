@@ -448,7 +448,6 @@ def _known(
 
 # Tests of texts: ``CONTAINS`` and the like, and regular expressions -----------------------------
 
-TEXT_TESTS: Final = frozenset({"STARTS WITH", "ENDS WITH", "CONTAINS", "=~"})
 _NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+")
 
 

@@ -17,6 +17,7 @@ from sgstore.lang import ir as b
 from sgstore.lang._catalog import FRAME_ATTRIBUTES, DisplayUnit
 from sgstore.lang._evaluate import Binding, FrameView
 from sgstore.lang._formulas import leaves
+from sgstore.lang._operators import INFIX
 from sgstore.lang._search import ScopeSearch, expression
 from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS, SUPER_KINDS
 
@@ -25,10 +26,6 @@ if TYPE_CHECKING:
 
 
 _ENTITIES: Final = frozenset(ENTITY_KINDS)
-_INFIX: Final = frozenset(
-    {"AND", "OR", "XOR", "IMPLIES", "=", "<>", "<", "<=", ">", ">=", "IN"}
-    | {"+", "-", "*", "/", "%", "STARTS WITH", "ENDS WITH", "CONTAINS", "=~"}
-)
 _ESCAPES: Final = {"\\": "\\\\", "'": "\\'", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
@@ -195,10 +192,10 @@ class Writer:
         word, operands = operation.word, operation.operands
         if word == "IS NOT NULL" and isinstance(operands[0], b.NodeValue):
             return f"known({self.expression(operands[0])})"
-        if word not in _INFIX and word not in {"IS NULL", "IS NOT NULL", "NOT", "negative"}:
+        if word not in INFIX and word not in {"IS NULL", "IS NOT NULL", "NOT", "negative"}:
             return f"{word}({', '.join(self.expression(operand) for operand in operands)})"
         parts = [self.expression(operand, inner=True) for operand in operands]
-        if word in _INFIX:
+        if word in INFIX:
             text = f" {word} ".join(parts)
         elif word in {"NOT", "negative"}:
             text = f"{'NOT ' if word == 'NOT' else '-'}{parts[0]}"

@@ -1,0 +1,473 @@
+"""Operators and functions of values: each declared once, for SQL, for one binding and for columns.
+
+An operand may be unknown. Most operators are *strict*: their value is unknown where one of their operands is,
+so they are written for known values only. Logic, tests of ``NULL``, ``coalesce`` and ``IN`` have rules of their
+own.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.world import Bools
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Values of many bindings or frames at once, and where they are known.
+
+    Attributes
+    ----------
+    values : array or scalar
+        (N,) or (B, F); of length 1 in an axis, or a scalar, for what is the same everywhere. Meaningless where
+        it is not known.
+    known : bool or array of bool
+        ``True`` where nothing is unknown.
+    """
+
+    values: Any
+    known: Any = True
+
+    @property
+    def flags(self) -> Bools:
+        """The values as truths."""
+        return np.asarray(self.values, np.bool_)
+
+    @property
+    def true(self) -> Any:
+        """Where it is true; unknown is not."""
+        return self.flags if self.known is True else self.known & self.flags
+
+    @property
+    def false(self) -> Any:
+        """Where it is false; unknown is not."""
+        flags = np.logical_not(self.flags)
+        return flags if self.known is True else self.known & flags
+
+
+def all_known(columns: Iterable[Column]) -> Any:
+    """Where all of some columns are known; ``True``: everywhere."""
+    found: Any = True
+    for column in columns:
+        if column.known is not True:
+            found = column.known if found is True else found & column.known
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """An operator in each engine.
+
+    Attributes
+    ----------
+    sql : function
+        Its SQL, given that of its operands.
+    one : function
+        The function of its value for one binding, given those of its operands.
+    columns : function
+        Its values, given those of its operands.
+    infix : bool
+        Whether it is written between its operands.
+    """
+
+    sql: Callable[[Sequence[str]], str]
+    one: Callable[[Sequence[Callable[[Any], Any]]], Callable[[Any], Any]]
+    columns: Callable[[Sequence[Column]], Column]
+    infix: bool = False
+
+
+# SQL: a call takes its operands as they are, all else takes them in brackets where they need them ----
+
+_WHOLE: Final = re.compile(r"""\$\d+|\w+|"[^"]*"(\."[^"]*")*|'[^']*'""")
+"""A placeholder, a word or a number, a column, a text: what needs no brackets."""
+
+_BRACKETS: Final = re.compile(r"""(?:"[^"]*"|'[^']*'|[^"'()])*([()])""")
+
+
+def operand_text(text: str) -> str:
+    """Return a text that can stand beside any operator: in brackets, unless it is one word or one call."""
+    return text if _WHOLE.fullmatch(text) or _is_call(text) else f"({text})"
+
+
+def _is_call(text: str) -> bool:
+    """Tell whether a text is in brackets already, perhaps with the name of a function before them."""
+    if not re.match(r"\w*\(", text):
+        return False
+    depth = 0
+    for bracket in _BRACKETS.finditer(text):
+        depth += 1 if bracket[1] == "(" else -1
+        if depth == 0:
+            return bracket.end() == len(text)
+    return False
+
+
+def _template(template: str) -> Callable[[Sequence[str]], str]:
+    return lambda parts: template.format(*map(operand_text, parts))
+
+
+def _call(name: str) -> Callable[[Sequence[str]], str]:
+    return lambda parts: f"{name}({', '.join(parts)})"
+
+
+def _between(word: str) -> Callable[[Sequence[str]], str]:
+    return lambda parts: "(" + f" {word} ".join(map(operand_text, parts)) + ")"
+
+
+def _odd(parts: Sequence[str]) -> str:
+    """Unknown if one part is, as <> is."""
+    return reduce(lambda left, right: f"({left} <> {right})", map(operand_text, parts))
+
+
+def _if_all_known(name: str) -> Callable[[Sequence[str]], str]:
+    def text(parts: Sequence[str]) -> str:
+        known = " AND ".join(f"{operand_text(part)} IS NOT NULL" for part in parts)
+        return f"CASE WHEN {known} THEN {name}({', '.join(parts)}) END"
+
+    return text
+
+
+def _member(parts: Sequence[str]) -> str:
+    value, *items = parts
+    return f"{operand_text(value)} IN ({', '.join(items)})" if items else "FALSE"
+
+
+# Strict operators -------------------------------------------------------------------------------
+
+
+def _strict(
+    sql: Callable[[Sequence[str]], str],
+    one: Callable[..., Any],
+    columns: Callable[..., Any],
+    *,
+    infix: bool = False,
+    partial: bool = False,
+) -> Operator:
+    """An operator that is unknown where one of its operands is.
+
+    Unless it is ``partial``, it has a value wherever they are known. If it is, ``one`` gives ``None`` where it
+    has none, and ``columns`` gives values and where it has them.
+    """
+
+    def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+        if len(parts) == 2:
+            left, right = parts
+
+            def of_two(at: Any) -> Any:
+                a = left(at)
+                if a is None:
+                    return None
+                b = right(at)
+                return None if b is None else one(a, b)
+
+            return of_two
+
+        def of_many(at: Any) -> Any:
+            values = [part(at) for part in parts]
+            return None if None in values else one(*values)
+
+        return of_many
+
+    def of_columns(parts: Sequence[Column]) -> Column:
+        return Column(columns(*(part.values for part in parts)), all_known(parts))
+
+    def of_some(parts: Sequence[Column]) -> Column:
+        values, fits = columns(*(part.values for part in parts))
+        known = all_known(parts)
+        return Column(values, fits if known is True else known & fits)
+
+    return Operator(sql, of_one, of_some if partial else of_columns, infix)
+
+
+def _divided(a: float, by: float) -> float | None:
+    return a / by if by else None
+
+
+def _divided_columns(a: Any, by: Any) -> tuple[Any, Any]:
+    fits = np.not_equal(by, 0)
+    return np.divide(a, np.where(fits, by, 1)), fits
+
+
+def _remainder(a: float, by: float) -> float | None:
+    return math.fmod(a, by) if by else None
+
+
+def _remainder_columns(a: Any, by: Any) -> tuple[Any, Any]:
+    fits = np.not_equal(by, 0)
+    return np.fmod(a, np.where(fits, by, 1)), fits
+
+
+def _root(a: float) -> float | None:
+    return math.sqrt(a) if a >= 0 else None
+
+
+def _root_columns(a: Any) -> tuple[Any, Any]:
+    fits = np.greater_equal(a, 0)
+    return np.sqrt(np.where(fits, a, 0)), fits
+
+
+def _rounded(a: float) -> float:
+    """Halves go away from zero, as in SQL."""
+    return math.copysign(math.floor(abs(a) + 0.5), a)
+
+
+def _rounded_columns(a: Any) -> Any:
+    return np.copysign(np.floor(np.abs(a) + 0.5), a)
+
+
+def _least(*values: Any) -> Any:
+    return reduce(np.minimum, values)
+
+
+def _greatest(*values: Any) -> Any:
+    return reduce(np.maximum, values)
+
+
+def _of_texts(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *values: function(*(np.asarray(value).astype(str) for value in values))
+
+
+def _contains(text: Any, part: Any) -> Any:
+    return np.char.find(text, part) >= 0
+
+
+def _matches(text: str, pattern: str) -> bool:
+    return re.fullmatch(pattern, text) is not None
+
+
+def _matches_columns(texts: Any, pattern: Any) -> Any:
+    wanted, texts = re.compile(str(pattern)), np.asarray(texts).astype(str)
+    words, places = np.unique(texts, return_inverse=True)
+    flags = np.array([wanted.fullmatch(word) is not None for word in words], np.bool_)
+    return flags[places].reshape(texts.shape)
+
+
+# Operators with a rule of their own -------------------------------------------------------------
+
+
+def _ruled(
+    sql: Callable[[Sequence[str]], str],
+    one: Callable[[Iterable[Any]], Any],
+    columns: Callable[[Sequence[Column]], Column],
+    *,
+    infix: bool = False,
+) -> Operator:
+    """An operator that is given unknown operands too; ``one`` asks for them one after the other."""
+
+    def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+        return lambda at: one(part(at) for part in parts)
+
+    return Operator(sql, of_one, columns, infix)
+
+
+def _and(values: Iterable[Any]) -> bool | None:
+    result: bool | None = True
+    for value in values:
+        if value is False:
+            return False
+        if value is None:
+            result = None
+    return result
+
+
+def _or(values: Iterable[Any]) -> bool | None:
+    result: bool | None = False
+    for value in values:
+        if value is True:
+            return True
+        if value is None:
+            result = None
+    return result
+
+
+def _not(values: Iterable[Any]) -> bool | None:
+    (value,) = values
+    return None if value is None else not value
+
+
+def _xor(values: Iterable[Any]) -> bool | None:
+    known = list(values)
+    return None if None in known else sum(known) % 2 == 1
+
+
+def _implies(values: Iterable[Any]) -> bool | None:
+    condition, consequence = values
+    return _or((_not((condition,)), consequence))
+
+
+def _and_columns(parts: Sequence[Column]) -> Column:
+    true = reduce(operator.and_, (part.true for part in parts))
+    if all(part.known is True for part in parts):
+        return Column(true)
+    return Column(true, true | reduce(operator.or_, (part.false for part in parts)))
+
+
+def _or_columns(parts: Sequence[Column]) -> Column:
+    true = reduce(operator.or_, (part.true for part in parts))
+    if all(part.known is True for part in parts):
+        return Column(true)
+    return Column(true, true | reduce(operator.and_, (part.false for part in parts)))
+
+
+def _not_columns(parts: Sequence[Column]) -> Column:
+    return Column(np.logical_not(parts[0].flags), parts[0].known)
+
+
+def _xor_columns(parts: Sequence[Column]) -> Column:
+    return Column(reduce(operator.xor, (part.flags for part in parts)), all_known(parts))
+
+
+def _implies_columns(parts: Sequence[Column]) -> Column:
+    return _or_columns([_not_columns(parts[:1]), parts[1]])
+
+
+def _first_known(values: Iterable[Any]) -> Any:
+    return next((value for value in values if value is not None), None)
+
+
+def _first_known_columns(parts: Sequence[Column]) -> Column:
+    found = parts[-1]
+    for part in reversed(parts[:-1]):
+        if part.known is True:
+            found = part
+        else:
+            known = True if found.known is True else part.known | found.known
+            found = Column(np.where(part.known, part.values, found.values), known)
+    return found
+
+
+def _is_member(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+    value, choices = parts
+
+    def member(at: Any) -> bool | None:
+        items = choices(at)
+        if not items:
+            return False
+        found = value(at)
+        return None if found is None else found in items
+
+    return member
+
+
+def _is_member_columns(parts: Sequence[Column]) -> Column:
+    value, items = parts
+    if not items.values:
+        return Column(np.False_)
+    return Column(
+        reduce(operator.or_, (value.values == item for item in items.values)), value.known
+    )
+
+
+def _null_test(word: str, *, null: bool) -> Operator:
+    def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+        (part,) = parts
+        return lambda at: (part(at) is None) == null
+
+    def of_columns(parts: Sequence[Column]) -> Column:
+        known = parts[0].known
+        return Column(np.logical_not(known) if null else np.asarray(known))
+
+    return Operator(_template(f"{{0}} {word}"), of_one, of_columns)
+
+
+def _comparison(word: str, one: Callable[..., Any], columns: Callable[..., Any]) -> Operator:
+    return _strict(_template(f"{{0}} {word} {{1}}"), one, columns, infix=True)
+
+
+def _arithmetic(word: str, one: Callable[..., Any], columns: Callable[..., Any]) -> Operator:
+    return _strict(_between(word), one, columns, infix=True)
+
+
+def _text_test(word: str, one: Callable[..., Any], columns: Callable[..., Any]) -> Operator:
+    return _strict(_call(word), one, _of_texts(columns), infix=True)
+
+
+COMPARISONS: Final[Mapping[str, Operator]] = {
+    "=": _comparison("=", operator.eq, np.equal),
+    "<>": _comparison("<>", operator.ne, np.not_equal),
+    "<": _comparison("<", operator.lt, np.less),
+    "<=": _comparison("<=", operator.le, np.less_equal),
+    ">": _comparison(">", operator.gt, np.greater),
+    ">=": _comparison(">=", operator.ge, np.greater_equal),
+}
+TEXT_TESTS: Final[Mapping[str, Operator]] = {
+    "STARTS WITH": _text_test("starts_with", str.startswith, np.char.startswith),
+    "ENDS WITH": _text_test("ends_with", str.endswith, np.char.endswith),
+    "CONTAINS": _text_test("contains", operator.contains, _contains),
+    "=~": _strict(_call("regexp_full_match"), _matches, _matches_columns, infix=True),
+}
+CONNECTIVES: Final[Mapping[str, Operator]] = {
+    "AND": _ruled(_between("AND"), _and, _and_columns, infix=True),
+    "OR": _ruled(_between("OR"), _or, _or_columns, infix=True),
+    "NOT": _ruled(_template("NOT {0}"), _not, _not_columns),
+    "XOR": _ruled(_odd, _xor, _xor_columns, infix=True),
+    "IMPLIES": _ruled(_template("(NOT {0} OR {1})"), _implies, _implies_columns, infix=True),
+}
+NUMERIC: Final[Mapping[str, Operator]] = {
+    "abs": _strict(_call("abs"), abs, np.abs),
+    "sqrt": _strict(
+        _template("CASE WHEN {0} >= 0 THEN sqrt({0}) END"), _root, _root_columns, partial=True
+    ),
+    "floor": _strict(_call("floor"), math.floor, np.floor),
+    "ceil": _strict(_call("ceil"), math.ceil, np.ceil),
+    "round": _strict(_call("round"), _rounded, _rounded_columns),
+}
+"""Functions of one number."""
+
+EXTREMES: Final[Mapping[str, Operator]] = {
+    "min": _strict(_if_all_known("least"), min, _least),
+    "max": _strict(_if_all_known("greatest"), max, _greatest),
+}
+"""Functions of two numbers or more."""
+
+OF_TEXT: Final[Mapping[str, Operator]] = {
+    "lower": _strict(_call("lower"), str.lower, _of_texts(np.char.lower)),
+    "upper": _strict(_call("upper"), str.upper, _of_texts(np.char.upper)),
+}
+"""Functions of one text."""
+
+OPERATORS: Final[Mapping[str, Operator]] = {
+    **COMPARISONS,
+    **TEXT_TESTS,
+    **CONNECTIVES,
+    **NUMERIC,
+    **EXTREMES,
+    **OF_TEXT,
+    "+": _arithmetic("+", operator.add, np.add),
+    "-": _arithmetic("-", operator.sub, np.subtract),
+    "*": _arithmetic("*", operator.mul, np.multiply),
+    "/": _strict(
+        _template("({0} / nullif({1}, 0))"), _divided, _divided_columns, infix=True, partial=True
+    ),
+    "%": _strict(
+        _template("({0} % nullif({1}, 0))"),
+        _remainder,
+        _remainder_columns,
+        infix=True,
+        partial=True,
+    ),
+    "negative": _strict(_template("(- {0})"), operator.neg, np.negative),
+    "coalesce": _ruled(_call("coalesce"), _first_known, _first_known_columns),
+    "IS NULL": _null_test("IS NULL", null=True),
+    "IS NOT NULL": _null_test("IS NOT NULL", null=False),
+    "IN": Operator(_member, _is_member, _is_member_columns, infix=True),
+}
+"""All operators by the word that an :class:`~sgstore.lang.ir.Operation` has. The operands of ``IN`` are a value
+and, in memory, its choices as one."""
+
+INFIX: Final = frozenset(word for word, one in OPERATORS.items() if one.infix)
+
+COMPILER_SQL: Final = {
+    "name": _template("{0} || ' ' || CAST({1} AS VARCHAR)"),
+    "whose": _template("CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END"),
+}
+"""SQL of operations that the compiler makes, and no query can say."""
