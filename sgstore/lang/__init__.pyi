@@ -24,8 +24,10 @@ from ._compile import compile_query as compile_query
 from ._compile import unnumbered_text as unnumbered_text
 from ._compile import value_text as value_text
 from ._evaluate import Binding as Binding
+from ._evaluate import Columns as Columns
 from ._evaluate import Evaluate as Evaluate
 from ._evaluate import FrameView as FrameView
+from ._evaluate import column_evaluator as column_evaluator
 from ._external import CLOCK as CLOCK
 from ._external import CLOCK_OF_TRACES as CLOCK_OF_TRACES
 from ._external import TOLD_WEATHER as TOLD_WEATHER
@@ -40,6 +42,8 @@ from ._needs import MOTION as MOTION
 from ._needs import Need as Need
 from ._needs import of_check as of_check
 from ._needs import of_query as of_query
+from ._operators import Column as Column
+from ._operators import all_known as all_known
 from ._parse import joined as joined
 from ._parse import parse as parse
 from ._patterns import Pattern as Pattern
@@ -66,6 +70,10 @@ from .library import pattern_named as pattern_named
 from .library import patterns as patterns
 
 __all__ = [
+    "Column",
+    "Columns",
+    "all_known",
+    "column_evaluator",
     "Attribute",
     "Binding",
     "CheckInCatalog",

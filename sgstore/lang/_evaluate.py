@@ -1,9 +1,7 @@
 """Evaluation in memory: one binding at a time, or columns of nodes.
 
-Bound expressions as Python functions: the value of an expression for one binding of one graph in memory.
-
-The same meaning as :mod:`sgstore.lang._sql_masks` gives them in a store: ``None`` is NULL, and logic has
-three values.
+Expressions have the meaning that :mod:`sgstore.lang._sql_masks` gives them in a store: ``None`` is NULL, and
+logic has three values.
 """
 
 from __future__ import annotations
@@ -79,12 +77,12 @@ class FrameView:
 
     @cached_property
     def ahead(self) -> Mapping[tuple[str, int], list[int]]:
-        """Where the edges of a relation lead from a node."""
+        """Nodes to which the edges of a relation lead from a node."""
         return self._neighbours(0, 2)
 
     @cached_property
     def back(self) -> Mapping[tuple[str, int], list[int]]:
-        """Where the edges of a relation that end in a node come from."""
+        """Nodes from which the edges of a relation lead to a node."""
         return self._neighbours(2, 0)
 
     def _neighbours(self, at: int, other: int) -> Mapping[tuple[str, int], list[int]]:
@@ -109,7 +107,7 @@ class FrameView:
         return {}
 
     def role_of(self, node: int) -> str | None:
-        """What a lane is to the ego; ``None`` where it is not known."""
+        """Return the role of a lane to the ego; ``None`` where it is not known."""
         return self._roles.get(node)
 
     @cached_property
@@ -117,7 +115,7 @@ class FrameView:
         return self.roles() if self.roles else {}
 
     def is_one(self, node: int, kinds: b.Kinds) -> bool:
-        """Whether a node is of these kinds."""
+        """Tell whether a node is of these kinds."""
         kind = self.nodes[node]["kind"]
         return kind in (kinds.ego if node == self.graph.ego else kinds.other)
 
@@ -204,7 +202,7 @@ PAIR_NUMBERS: Final = {
 
 @dataclass(slots=True)
 class Binding:
-    """What the variables are bound to while a graph is searched.
+    """Nodes and edges that the variables are bound to while a graph is searched.
 
     Attributes
     ----------
@@ -280,7 +278,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:
-    """Whether a part of the map, whose id is below zero, belongs to a junction."""
+    """Tell whether a part of the map, whose id is below zero, belongs to a junction."""
     return "junction" in at.view.nodes[node] if node < 0 else None
 
 
@@ -435,6 +433,8 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
             raise _Alone
         case b.Value(value=int() | float() as number) if abs(number) > MOST:
             raise _Alone
+        case b.Operation(word="coalesce", type=Type.number):
+            raise _Alone  # of what others have left over: numbers of pairs are dear
         case b.Value() | b.Operation():
             return None
         case b.NodeAttribute(node=node, attribute=attribute) if attribute.type in {

@@ -1,7 +1,4 @@
-"""Temporal queries over a store, and their matches.
-
-Patterns that look at several frames, over a store: found in columns.
-"""
+"""Temporal queries over a store, and their matches."""
 
 from __future__ import annotations
 
@@ -33,11 +30,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Compiled, SqlStatement
+    from sgstore.lang import Catalog, Column, Compiled, SqlStatement
     from sgstore.lang.ir import BoundStep, StepLink
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
-    from sgstore.temporal._signals import SignalColumn
     from sgstore.world import Ints
 
     Keys = NDArray[np.int64]
@@ -54,7 +50,7 @@ class _MatchCollector:
 
 
 class Finder:
-    """What finds the matches of a query over several frames in a store.
+    """Finder of the matches of a query over several frames in a store.
 
     Parameters
     ----------
@@ -116,7 +112,7 @@ class Finder:
         return self._collected(found)
 
     def text(self, places: tuple[Bound, ...]) -> str:
-        """What is asked of single frames, and what is made of it."""
+        """The questions about single frames, and the formulas over their answers."""
         lines: list[str] = []
         for number, (step, ask) in enumerate(zip(self._query.steps, self._steps, strict=True)):
             if number:
@@ -162,12 +158,12 @@ class Finder:
         return self._kept if self._query.injective else ()
 
     def _named(self, number: int) -> tuple[str, ...]:
-        """What a step shares with others, or tells: columns of its relation once it is held."""
+        """Return the columns of a step's relation that other steps or results use."""
         ask = self._steps[number]
         return (*(n for n in ask.variables if n in self._kept), *ask.edges)
 
     def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
-        """Where a step holds: its pattern, its other conditions, and for as long as is asked."""
+        """Return the frames in which a step holds: its pattern, its other conditions, and its duration."""
         step, ask = self._query.steps[number], self._steps[number]
         relation = trace.relations[f"step {number}"]
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
@@ -187,7 +183,7 @@ class Finder:
     def _true(
         self, trace: TraceReader, relation: TimedRelation, ask: Ask, formula: Formula, owners: Ints
     ) -> Any:
-        """Whether a formula is true in each row of a relation."""
+        """Tell whether a formula is true in each row of a relation."""
         true = np.zeros(len(owners), np.bool_)
         for low, high, rows in _chunks(relation.starts, trace.together):
             bindings = relation.keys[low:high, : len(ask.variables)]
@@ -332,7 +328,7 @@ class Finder:
         places: tuple[Bound, ...],
         formulas: dict[Bound, Formula],
     ) -> list[Any]:
-        """What is worked out of some bindings: (B, F) flags, or columns."""
+        """Return values over time of some bindings: (B, F) flags, or columns."""
         values = PlanValues(self._plan, trace, names, bindings)
         return [
             values.formula(formulas[place])
@@ -378,13 +374,13 @@ def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
         yield low, high, slice(int(starts[low]), int(starts[high]))
 
 
-def _picked(column: SignalColumn | Any, at: tuple[Any, Any]) -> Any:
+def _picked(column: Column | Any, at: tuple[Any, Any]) -> Any:
     """The values at some places as Python has them; ``None`` where they are unknown."""
     if isinstance(column, np.ndarray):
         return np.broadcast_to(column, (len(column), column.shape[1]))[_row(column, at)].astype(
             object
         )
-    shape = np.broadcast_shapes(column.values.shape, column.known.shape)
+    shape = np.broadcast_shapes(column.values.shape, np.shape(column.known))
     values, known = np.broadcast_to(column.values, shape), np.broadcast_to(column.known, shape)
     place = _row(values, at)
     told = values[place].astype(object)
@@ -402,7 +398,7 @@ def _row(values: Any, at: tuple[Any, Any]) -> tuple[Any, Any]:
 
 
 class TemporalMatches(Matches):
-    """What matches a query, of single frames or of several; see :class:`sgstore.matches.Matches`.
+    """Matches of a query over single frames or several; see :class:`sgstore.matches.Matches`.
 
     A match of a sequence is told once: its frame is that in which its last step is found, its interval goes
     from the frame of its first step to that one (to the end of its run, if the last step has a duration).
@@ -422,7 +418,7 @@ class TemporalMatches(Matches):
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why each of the traces in :attr:`left_out` cannot answer, by name."""
+        """The reason for each of the traces in :attr:`left_out`, by name."""
         found = super().reasons
         with super()._compiled() as compiled:
             lacks = self._lacking(compiled)
@@ -448,7 +444,7 @@ class TemporalMatches(Matches):
         yield from super()._windows(statement, at_once=at_once, whole_traces=whole)
 
     def explain(self) -> str:
-        """What became of the query, stage by stage; of one over several frames also what is asked of each."""
+        """Explain the query stage by stage; of one over several frames also the questions about each frame."""
         with self._compiled() as compiled:
             text = compiled.stages()
             if not compiled.query.steps:

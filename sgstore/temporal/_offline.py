@@ -1,6 +1,7 @@
 """Relations and signals of whole traces, read from the store.
 
-Where something holds in one trace: bindings, and for each the frames; looked up many at a time.
+A relation has, for each binding, the frames of one trace in which something holds; many bindings are looked up
+at a time.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from sgstore.lang import (
     EXTENTS,
     TRACE_OF_BUCKET,
     TRACES,
+    Column,
     in_order,
     relation,
     traces_of,
@@ -23,7 +25,7 @@ from sgstore.lang import (
 from sgstore.matches import Windows
 from sgstore.store import trace_of
 from sgstore.temporal._formula import Formula, propositions, tolerant
-from sgstore.temporal._signals import Clock, SignalColumn, SignalValues, evaluate_rows
+from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows, evaluator_over_time
 from sgstore.vocabulary import RELATIONS
 from sgstore.world import longest_step_ns, tolerance_ns
 
@@ -113,7 +115,7 @@ class TimedRelation:
         found[owner, self.frames[rows]] = True
         return found
 
-    def column(self, places: Ints, length: int, number: int = 0) -> SignalColumn:
+    def column(self, places: Ints, length: int, number: int = 0) -> Column:
         """A value in each frame for some keys."""
         told = self.values[number]
         plain = np.ma.getdata(told)
@@ -128,7 +130,7 @@ class TimedRelation:
         known[at] = ~np.ma.getmaskarray(told)[rows]
         if kind is np.float64:
             known &= ~np.isnan(values)
-        return SignalColumn(values, known)
+        return Column(values, known)
 
 
 # Traces as a plan needs them: the clock, and the relations of atoms and signals, several traces a question
@@ -171,7 +173,7 @@ class Ask:
 
     @property
     def everywhere(self) -> bool:
-        """Whether it asks nothing, and so holds in every frame."""
+        """Tell whether it asks nothing, and so holds in every frame."""
         scope = self.query.scope
         return not (scope.nodes or scope.edges or scope.where)
 
@@ -207,7 +209,7 @@ class TraceReader:
 
     @property
     def together(self) -> int:
-        """How many bindings are worked on at once, in all frames."""
+        """The number of bindings that are worked on at once, in all frames."""
         return max(CELLS // max(len(self), 1), 1)
 
     def seconds(self, frame: int) -> float:
@@ -255,16 +257,17 @@ class PlanValues:
             self._atoms[name] = found.flags(places, len(self._trace))
         return self._atoms[name]
 
-    def test(self, test: Test) -> SignalColumn:
+    def test(self, test: Test) -> Column:
         """The value of a test."""
 
         def condition(expression: Bound) -> Bools:
             return self.formula(test.formulas[expression])
 
         clock = self._trace.clock
-        return SignalValues(test, clock, self._signal, condition, self._proposition).column()
+        values = SignalValues(test, clock, self._signal, condition, self._proposition)
+        return values.column(evaluator_over_time(test))
 
-    def _signal(self, signal: Signal) -> SignalColumn:
+    def _signal(self, signal: Signal) -> Column:
         found = self._trace.relations[signal.name]
         places = found.find(self._projected(signal.variables))
         return found.column(places, len(self._trace))
@@ -276,7 +279,7 @@ class PlanValues:
 
 
 def asks_of(plan: Plan) -> dict[str, Ask]:
-    """What a plan needs of a store, by the names of its atoms and signals."""
+    """Return the questions of a plan to a store, by the names of its atoms and signals."""
     atoms = {name: Ask(atom.query, atom.variables) for name, atom in plan.atoms.items()}
     signals = {
         name: Ask(signal.query, signal.variables, (signal.value,), signal.edges, first=True)

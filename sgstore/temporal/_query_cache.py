@@ -1,7 +1,5 @@
 """The monitor's queries on one frame, each asked once, and the truth of bindings.
 
-Bindings of which something is known, and all the others.
-
 A binding says of each variable which node it is, or ``None``: any node of which nothing is known. What is known
 of a binding that is not held is what is known of the one held that says most of what it says; so a check over a
 hundred vehicles of which five come near costs what five cost.
@@ -25,11 +23,10 @@ from sgstore.vocabulary import RELATIONS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from sgstore.lang import Evaluate, FrameView, Need
+    from sgstore.lang import Column, Evaluate, FrameView, Need
     from sgstore.lang import ir as b
     from sgstore.temporal._plan import Plan, Signal
     from sgstore.temporal._signal_state import StreamClock
-    from sgstore.temporal._signals import SignalColumn
     from sgstore.world import Bools
 
 
@@ -38,7 +35,7 @@ T = TypeVar("T")
 
 
 class Lattice:
-    """How bindings of some variables lie to one another.
+    """Order of partial bindings of some variables, from none bound to all.
 
     Parameters
     ----------
@@ -53,7 +50,7 @@ class Lattice:
         self._patterns = [frozenset(pattern) for pattern in patterns]
 
     def placed(self, key: Key, places: tuple[int, ...]) -> Partial:
-        """What some variables are bound to, as a binding."""
+        """Return the binding in which some variables have these values."""
         if self.size == 1:
             return key or self.stranger
         told: list[int | None] = [None] * self.size
@@ -94,7 +91,7 @@ class Lattice:
 
 
 def _both(one: Partial, other: Partial) -> Partial | None:
-    """What two bindings say together; ``None`` if they contradict one another."""
+    """Return the union of two bindings; ``None`` if they contradict one another."""
     told: list[int | None] = []
     for a, b in zip(one, other, strict=True):
         if a is not None and b is not None and a != b:
@@ -104,7 +101,7 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """What is known of bindings.
+    """Values by binding; a binding without an entry has that of a wider one.
 
     Parameters
     ----------
@@ -118,7 +115,7 @@ class BindingTable(Generic[T]):
         self.held: dict[Partial, T] = {lattice.stranger: strangers}
 
     def of(self, binding: Partial) -> T:
-        """What is known of a binding."""
+        """Return the value of a binding."""
         held = self.held
         found = held.get(binding)
         if found is not None:
@@ -184,7 +181,7 @@ class FrameQuery:
             self._kinds = next(iter(scope.nodes.values())).kinds
 
     def answers(self, view: FrameView, people: NodeNames) -> Mapping[Key, Any]:
-        """What the variables are bound to in a graph, each with its value (``None`` where it is unknown)."""
+        """Return the bindings of the variables in a graph, each with its value (``None``: unknown)."""
         if self._kinds is not None:
             present = people.of(self._kinds)
             if self._variables:
@@ -239,12 +236,12 @@ class NodeNames:
         return self._view.nodes[node].get(attribute)
 
     def name(self, node: int) -> str:
-        """What a node is called."""
+        """Return the name of a node."""
         return str(self._view.nodes[node].get("name", node))
 
 
 class Wanted:
-    """What a trace must have shown before it can be told what it answers.
+    """Needs that a trace has not met yet, frame by frame.
 
     Parameters
     ----------
@@ -257,7 +254,7 @@ class Wanted:
 
     @property
     def open(self) -> bool:
-        """Whether something is not known yet."""
+        """Tell whether something is not known yet."""
         return bool(self._open)
 
     def look(self, people: NodeNames) -> None:
@@ -280,7 +277,7 @@ class Wanted:
 
     @property
     def reason(self) -> str:
-        """What the trace has not shown; empty: nothing. Of what was never there nothing is unknown."""
+        """The needs that the trace has not met, as text. Nothing is needed of what was never there."""
         left = (n for n in self._open if n.attribute is None or n.kinds is None or n in self._met)
         return "; ".join(dict.fromkeys(need.reason for need in left))
 
@@ -304,7 +301,7 @@ class QueryCache:
     fresh: set[b.Kinds] = field(default_factory=set["b.Kinds"])
 
     def met(self, kinds: b.Kinds) -> Mapping[int, str]:
-        """Who of some kinds was in a frame so far: node → name; it grows with each frame."""
+        """Return the nodes of some kinds seen so far: node → name; it grows with each frame."""
         return self._met.setdefault(kinds, {})
 
     def add(
@@ -469,7 +466,7 @@ class Valuation:
                 columns[name] = np.array([bool(letters[row] & bit) for row in rows], np.bool_)
             return columns[name]
 
-        def signal(one: Signal) -> SignalColumn:
+        def signal(one: Signal) -> Column:
             number, places = self._signals[one.name]
             answers: Mapping[Partial, object] = self._questions.answers[number]  # type: ignore[assignment]
             return column_of([answers.get(tuple(row[p] for p in places)) for row in rows])

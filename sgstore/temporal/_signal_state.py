@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import QueryError
-from sgstore.lang import FUTURE
+from sgstore.lang import FUTURE, Column
 from sgstore.lang import ir as b
 from sgstore.temporal._progression import Progression, ProgressionFrame, Tick
-from sgstore.temporal._signals import NS, Clock, SignalColumn, SignalValues, is_angle
+from sgstore.temporal._signals import NS, Clock, SignalValues, evaluator_over_time, is_angle
 from sgstore.world import longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
@@ -108,6 +108,7 @@ class SignalState:
         self.plan, self.pulse, self._bridge = plan, pulse, bridge
         self.places: dict[b.Bound, int] = {}
         self.conditions: dict[b.Bound, Progression] = {}
+        self.evaluators = {name: evaluator_over_time(test) for name, test in plan.tests.items()}
         for test in plan.tests.values():
             for part in b.walk(test.expression):
                 if isinstance(part, b.Tense) and part.word in FUTURE:
@@ -126,7 +127,7 @@ class SignalState:
 
     @property
     def begun(self) -> Memory:
-        """What is remembered before the first frame."""
+        """The memory before the first frame."""
         pasts = (progression.begun for progression in self.conditions.values())
         return (*(None for _ in self.places), *pasts)
 
@@ -141,7 +142,7 @@ class SignalState:
 
     @property
     def gap(self) -> bool:
-        """Whether a gap lies before this frame."""
+        """Tell whether a gap lies before this frame."""
         return self.pulse.gap and not self._bridge
 
     @property
@@ -166,8 +167,8 @@ class SignalState:
         self,
         memories: Sequence[Memory],
         atom: Callable[[str], Bools],
-        signal: Callable[[Signal], SignalColumn],
-    ) -> tuple[dict[str, SignalColumn], list[Memory]]:
+        signal: Callable[[Signal], Column],
+    ) -> tuple[dict[str, Column], list[Memory]]:
         """The values of all tests in this frame for some bindings, and what these remember from now on.
 
         Parameters
@@ -180,7 +181,7 @@ class SignalState:
 
         Returns
         -------
-        tests : dict of str to SignalColumn
+        tests : dict of str to Column
             (B, 1), or (1, 1), by name.
         memories : list of B
         """
@@ -197,7 +198,7 @@ class _Now:
         courses: SignalState,
         memories: Sequence[Memory],
         atom: Callable[[str], Bools],
-        signal: Callable[[Signal], SignalColumn],
+        signal: Callable[[Signal], Column],
     ) -> None:
         self._all, self._atom, self.signal = courses, atom, signal
         self._tick = courses.pulse.tick
@@ -208,21 +209,22 @@ class _Now:
         self._pasts = dict(zip(courses.conditions, columns[places:], strict=True))
         self._new: dict[b.Bound, list[Any]] = {}
         self._kept: dict[b.Bound, list[Any]] = {}
-        self._tests: dict[str, SignalColumn] = {}
-        self._courses: dict[b.Bound, SignalColumn] = {}
+        self._tests: dict[str, Column] = {}
+        self._courses: dict[b.Bound, Column] = {}
         self._flags: dict[b.Bound, Bools] = {}
         self._rows = len(memories)
 
     def memories(self) -> list[Memory]:
-        """What the bindings remember from now on."""
+        """Return the memory of each binding from now on."""
         columns = [self._new[course] for course in self._all.places]
         columns += [self._kept[condition] for condition in self._all.conditions]
         return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
 
-    def test(self, test: Test) -> SignalColumn:
+    def test(self, test: Test) -> Column:
         """The value of a test."""
         if test.name not in self._tests:
-            self._tests[test.name] = _Momentary(test, self).column()
+            evaluate = self._all.evaluators[test.name]
+            self._tests[test.name] = _Momentary(test, self).column(evaluate)
         return self._tests[test.name]
 
     def proposition(self, name: str) -> Bools:
@@ -251,13 +253,13 @@ class _Now:
         self._flags[condition] = np.array([value for value, _ in found], np.bool_)
         return self._flags[condition]
 
-    def course(self, course: b.SignalCall, test: Test) -> SignalColumn:
+    def course(self, course: b.SignalCall, test: Test) -> Column:
         """The value of a course."""
         if course not in self._courses:
             self._courses[course] = self._course(course, test)
         return self._courses[course]
 
-    def _course(self, course: b.SignalCall, test: Test) -> SignalColumn:
+    def _course(self, course: b.SignalCall, test: Test) -> Column:
         match course.word:
             case "prev" | "delta":
                 column = self.signal(test.signals[course.operand])
@@ -288,13 +290,13 @@ class _Now:
                     [(now - f) / NS if flag and f is not None else None for f, flag in ages]
                 )
 
-    def _prev(self, course: b.SignalCall, now: list[Any]) -> SignalColumn:
+    def _prev(self, course: b.SignalCall, now: list[Any]) -> Column:
         here, gap = self._tick.number, self._all.gap
         self._new[course] = [None if value is None else (here, value) for value in now]
         known = (None if gap or o is None or o[0] != here - 1 else o[1] for o in self._old[course])
         return column_of(list(known))
 
-    def _delta(self, course: b.SignalCall, now: list[Any]) -> SignalColumn:
+    def _delta(self, course: b.SignalCall, now: list[Any]) -> Column:
         there, turns = self._all.there(course), is_angle(course.operand)
         told: list[float | None] = []
         kept: list[_Trail | None] = []
@@ -315,7 +317,7 @@ class _Now:
         self._new[course] = kept
         return column_of(told)
 
-    def _run_length(self, course: b.SignalCall, flags: list[bool]) -> SignalColumn:
+    def _run_length(self, course: b.SignalCall, flags: list[bool]) -> Column:
         tick, gap = self._tick, self._all.gap
         self._new[course] = [
             (old if old is not None and not gap else tick) if flag else None
@@ -323,7 +325,7 @@ class _Now:
         ]
         return column_of([self._length(course, start, 1) for start in self._new[course]])
 
-    def _since_true(self, course: b.SignalCall, flags: list[bool]) -> SignalColumn:
+    def _since_true(self, course: b.SignalCall, flags: list[bool]) -> Column:
         self._new[course] = [
             self._tick if flag else old for old, flag in zip(self._old[course], flags, strict=True)
         ]
@@ -353,8 +355,8 @@ class _Momentary(SignalValues):
         super().__init__(test, clock, now.signal, condition, present)
         self._now = now
 
-    def _course(self, course: b.SignalCall) -> SignalColumn:
-        return self._now.course(course, self._test)
+    def course(self, course: b.SignalCall) -> Column:
+        return self._now.course(course, self.test)
 
 
 _Point = tuple[int, float, float, int]
@@ -384,10 +386,10 @@ def _wrapped(degrees: float) -> float:
     return (degrees + 180.0) % 360.0 - 180.0
 
 
-def column_of(values: list[Any]) -> SignalColumn:
+def column_of(values: list[Any]) -> Column:
     """A value of each binding in one frame: (B, 1); ``None`` is not known."""
     known = [value is not None for value in values]
     like = next((value for value in values if value is not None), 0.0)
     empty = "" if isinstance(like, str) else type(like)()
     told = np.array([empty if value is None else value for value in values])
-    return SignalColumn(told[:, None], np.array(known, np.bool_)[:, None])
+    return Column(told[:, None], np.array(known, np.bool_)[:, None])

@@ -1,7 +1,5 @@
 """Signals and formulas over whole traces, as columns.
 
-Formulas over whole traces: every operator at all frames at once, in linear time.
-
 A column is true or false at each frame; operators make columns of columns. An *until* looks for the next frame
 at which its right side holds, from where its bound begins, and compares it with the next one at which its left
 side fails.
@@ -9,12 +7,13 @@ side fails.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.lang import Column, all_known, column_evaluator
 from sgstore.lang import ir as b
 from sgstore.temporal._formula import (
     TRUE,
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sgstore.lang import Columns
     from sgstore.temporal._plan import Signal, Test
     from sgstore.world import Bools, Ints
 
@@ -49,7 +49,7 @@ CELLS: Final = 4_000_000
 
 
 def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
-    """Where a formula is true in a trace.
+    """Evaluate a formula at each frame of a trace.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
 
 
 def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
-    """Where a formula is true for each of several bindings in one trace.
+    """Evaluate a formula at each frame of a trace for several bindings.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ def _at(places: Places, frame: Places) -> Places:
 
 # Values over time as columns: ``prev``, ``delta``, ``run_length``, ``since_true``, ``age``, and terms of them
 # ------------------------------------------------------------------------------------------------
-# A :class:`SignalColumn` has a row for each binding and a column for each frame, and says where it is known.
+# A column of values, :class:`sgstore.lang.Column`, has a row for each binding and a column for each frame.
 # Gaps in a recording are not bridged: behind one, ``prev`` and ``delta`` are unknown and runs begin anew.
 
 ANGLES: Final = frozenset(
@@ -283,19 +283,6 @@ ANGLES: Final = frozenset(
 """Values that come round after 360 degrees."""
 
 NS: Final = 1e9
-
-
-@dataclass(frozen=True, slots=True)
-class SignalColumn:
-    """Values: (B, F), or (1, F) and (1, 1) for what is the same for all; and where they are known."""
-
-    values: Array
-    known: Bools
-
-    @property
-    def true(self) -> Bools:
-        """Where it is true; unknown is not."""
-        return self.known & self.values.astype(np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,7 +329,7 @@ class SignalValues:
     test : Test
     clock : Clock
     signal : function
-        Gives the values of a signal.
+        Gives the values of a signal: (B, F).
     condition : function
         Gives the value of a condition within the test: (B, F) bool.
     present : function
@@ -353,79 +340,71 @@ class SignalValues:
         self,
         test: Test,
         clock: Clock,
-        signal: Callable[[Signal], SignalColumn],
+        signal: Callable[[Signal], Column],
         condition: Callable[[b.Bound], Bools],
         present: Callable[[str], Bools],
     ) -> None:
-        self._test, self._clock = test, clock
-        self._signal, self._condition, self._present = signal, condition, present
+        self.test, self.clock = test, clock
+        self.signal, self.condition, self._present = signal, condition, present
 
-    def column(self, expression: b.Bound | None = None) -> SignalColumn:
-        """The value of an expression of the test, the whole one by default."""
-        if expression is None:
-            expression = self._test.expression
-        if expression in self._test.signals:
-            return self._signal(self._test.signals[expression])
-        match expression:
-            case b.Value(value=value):
-                known = np.full((1, 1), value is not None)
-                return SignalColumn(np.full((1, 1), 0 if value is None else value), known)
-            case b.SignalCall():
-                return self._course(expression)
-            case b.Tense():
-                return _certain(self._condition(expression))
-            case b.Operation():
-                return self._operation(expression)
-            case _:
-                raise TypeError(f"{expression} has no value over time")
+    def column(self, evaluate: Columns[SignalValues]) -> Column:
+        """Return the value of the test: (B, F), or of length 1 in an axis in which it is the same everywhere.
 
-    def _course(self, course: b.SignalCall) -> SignalColumn:
+        ``evaluate`` is the evaluator of the test (:func:`evaluator_over_time`).
+        """
+        with np.errstate(all="ignore"):
+            found = evaluate(self)
+        return Column(np.atleast_2d(found.values), found.known)
+
+    def course(self, course: b.SignalCall) -> Column:
+        """The value of ``prev``, ``delta``, ``run_length``, ``since_true``, ``age`` or ``exists_now``."""
         match course.word:
             case "prev":
-                return self._back(self.column(course.operand), 1)
+                return self._back(self.signal(self.test.signals[course.operand]), 1)
             case "delta":
                 return self._delta(course)
             case "run_length":
-                return self._run_length(self._condition(course.operand), frames=course.frames)
+                return self._run_length(self.condition(course.operand), frames=course.frames)
             case "since_true":
-                return self._since(self._condition(course.operand), frames=course.frames)
+                return self._since(self.condition(course.operand), frames=course.frames)
             case "age":
                 return self._age(self._seen(course))
             case _:
-                return _certain(self._seen(course))
+                return Column(self._seen(course))
 
     def _seen(self, course: b.SignalCall) -> Bools:
         (node,) = b.nodes_of(course.operand)
-        return self._present(self._test.presence[node])
+        return self._present(self.test.presence[node])
 
-    def _back(self, column: SignalColumn, by: int | Ints) -> SignalColumn:
+    def _back(self, column: Column, by: int | Ints) -> Column:
         """The values some frames before, unknown where there are none or a gap lies between."""
-        frames = len(self._clock.times)
+        frames = len(self.clock.times)
         here = np.arange(frames)
         there = here - by if isinstance(by, int) else by
         inside = np.clip(there, 0, None)
-        runs = self._clock.runs
+        runs = self.clock.runs
         told = (there >= 0) & (runs[inside] == runs)
         values = np.broadcast_to(column.values, (len(column.values), frames))
         known = np.broadcast_to(column.known, (len(column.known), frames))
-        return SignalColumn(values[:, inside], known[:, inside] & told)
+        return Column(values[:, inside], known[:, inside] & told)
 
-    def _delta(self, course: b.SignalCall) -> SignalColumn:
-        now, times = self.column(course.operand), self._clock.times
+    def _delta(self, course: b.SignalCall) -> Column:
+        now = self.signal(self.test.signals[course.operand])
+        times = self.clock.times
         by: int | Ints = course.by
         if not course.frames:
-            then = times - course.by + self._clock.tolerance
+            then = times - course.by + self.clock.tolerance
             by = np.minimum(np.searchsorted(times, then, "right") - 1, np.arange(len(times)))
         before = self._back(now, by)
         known = now.known & before.known
         change = np.where(known, now.values, 0.0) - np.where(known, before.values, 0.0)
         if not is_angle(course.operand):
-            return SignalColumn(change, known)
-        return SignalColumn(self._turned(now, by, change), known)
+            return Column(change, known)
+        return Column(self._turned(now, by, change), known)
 
-    def _turned(self, now: SignalColumn, by: int | Ints, change: Array) -> Array:
-        """How far something turned, all the way round if it did; the short way where it was not seen."""
-        frames = len(self._clock.times)
+    def _turned(self, now: Column, by: int | Ints, change: Array) -> Array:
+        """Return the change of an angle, full turns included; the short way where it was not seen."""
+        frames = len(self.clock.times)
         there = np.arange(frames) - by if isinstance(by, int) else by
         there = np.clip(there, 0, None)
         both = now.known[:, 1:] & now.known[:, :-1]
@@ -434,70 +413,53 @@ class SignalValues:
         whole = unseen == unseen[:, there]
         return np.where(whole, sums - sums[:, there], _wrapped(change))
 
-    def _run_length(self, flags: Bools, *, frames: bool) -> SignalColumn:
-        """How long a condition has held up to each frame: number of frames, or s from the first of them."""
+    def _run_length(self, flags: Bools, *, frames: bool) -> Column:
+        """Return the length of the run of a condition up to each frame: frames, or s from its first one."""
         here = np.arange(flags.shape[1])
         first = flags.copy()
-        first[:, 1:] = flags[:, 1:] & (~flags[:, :-1] | self._clock.gap_before[1:])
+        first[:, 1:] = flags[:, 1:] & (~flags[:, :-1] | self.clock.gap_before[1:])
         start = np.maximum.accumulate(np.where(first, here, 0), axis=1)
-        times = self._clock.times
+        times = self.clock.times
         length = here - start + 1 if frames else (times - times[start]) / NS
-        return _certain(np.where(flags, length, 0))
+        return Column(np.where(flags, length, 0))
 
-    def _since(self, flags: Bools, *, frames: bool) -> SignalColumn:
+    def _since(self, flags: Bools, *, frames: bool) -> Column:
         here = np.arange(flags.shape[1])
         last = np.maximum.accumulate(np.where(flags, here, -1), axis=1)
-        times = self._clock.times
+        times = self.clock.times
         ago = here - last if frames else (times - times[np.clip(last, 0, None)]) / NS
-        return SignalColumn(ago, last >= 0)
+        return Column(ago, last >= 0)
 
-    def _age(self, seen: Bools) -> SignalColumn:
+    def _age(self, seen: Bools) -> Column:
         first = np.argmax(seen, axis=1)
-        times = self._clock.times
-        return SignalColumn((times - times[first][:, None]) / NS, seen)
+        times = self.clock.times
+        return Column((times - times[first][:, None]) / NS, seen)
 
-    def _operation(self, operation: b.Operation) -> SignalColumn:
-        if operation.word == "IN":
-            return self._membership(operation)
-        if operation.word == "=~":
-            return self._regex(operation)
-        parts = [self.column(operand) for operand in operation.operands]
-        if operation.word in _LOGIC:
-            return _LOGIC[operation.word](parts)
-        tolerant = operation.word in _TOLERANT and _of_time(operation)
-        with np.errstate(all="ignore"):
-            if tolerant:
-                by = self._clock.tolerance / NS
-                one, other = (part.values for part in parts)
-                values = _TOLERANT[operation.word](one, other, by)
-                return SignalColumn(values, _everywhere([part.known for part in parts]))
-            values, defined = _FUNCTIONS[operation.word](*(part.values for part in parts))
-        known = _everywhere([part.known for part in parts])
-        return SignalColumn(values, known & defined)
 
-    def _membership(self, operation: b.Operation) -> SignalColumn:
-        operand, choices = operation.operands
-        assert isinstance(choices, b.Choices)  # noqa: S101 - the binder built it so
-        found = self.column(operand)
-        items = [item.value for item in choices.items]
-        same = [found.values == item for item in items]
-        if not same:
-            return _certain(np.zeros(found.values.shape, np.bool_))
-        return SignalColumn(np.logical_or.reduce(same), found.known)
+def evaluator_over_time(test: Test) -> Columns[SignalValues]:
+    """Return the evaluator of the expression of a test."""
+    return column_evaluator(test.expression, partial(_over_time, test=test))
 
-    def _regex(self, operation: b.Operation) -> SignalColumn:
-        text, pattern = operation.operands
-        assert isinstance(pattern, b.Value)  # noqa: S101 - the binder built it so
-        found, wanted = self.column(text), re.compile(str(pattern.value))
-        words, places = np.unique(
-            np.where(found.known, found.values, "").astype(str), return_inverse=True
-        )
-        flags = np.array([wanted.fullmatch(word) is not None for word in words], np.bool_)
-        return SignalColumn(flags[places].reshape(found.values.shape), found.known)
+
+def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
+    if part in test.signals:
+        signal = test.signals[part]
+        return lambda at: at.signal(signal)
+    match part:
+        case b.SignalCall():
+            return lambda at: at.course(part)
+        case b.Tense():
+            return lambda at: Column(at.condition(part))
+        case b.Operation(word=word, operands=operands) if word in _TOLERANT and _of_time(part):
+            compare = _TOLERANT[word]
+            left, right = (column_evaluator(o, partial(_over_time, test=test)) for o in operands)
+            return lambda at: compare(left(at), right(at), at.clock.tolerance / NS)
+        case _:
+            return None
 
 
 def is_angle(value: b.Bound) -> bool:
-    """Whether a value comes round after 360 degrees."""
+    """Tell whether a value comes round after 360 degrees."""
     match value:
         case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
             return attribute.name in ANGLES
@@ -508,21 +470,12 @@ def is_angle(value: b.Bound) -> bool:
 
 
 def _of_time(operation: b.Operation) -> bool:
-    """Whether a comparison is of how long something lasts, or is ago, in seconds."""
+    """Tell whether a comparison is of how long something lasts, or is ago, in seconds."""
     parts = (part for operand in operation.operands for part in b.walk(operand))
     return any(isinstance(p, b.SignalCall) and p.word in _TIMES and not p.frames for p in parts)
 
 
 _TIMES: Final = frozenset({"run_length", "since_true", "age"})
-
-
-def _certain(values: Array) -> SignalColumn:
-    return SignalColumn(values, np.ones((1, 1), np.bool_))
-
-
-def _everywhere(flags: list[Bools]) -> Bools:
-    """Where all are true."""
-    return np.asarray(np.logical_and.reduce(np.broadcast_arrays(*flags)), np.bool_)
 
 
 def _wrapped(degrees: Array) -> Array:
@@ -533,141 +486,20 @@ def _summed(steps: Array) -> Array:
     return np.concatenate((np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)), axis=1)
 
 
-# Operations -------------------------------------------------------------------------------------------------
+def _tolerant(function: Callable[[Array, Array, float], Array]) -> Any:
+    """A comparison of times, those that differ by no more than a tolerance being the same."""
+
+    def compare(one: Column, other: Column, by: float) -> Column:
+        return Column(function(one.values, other.values, by), all_known((one, other)))
+
+    return compare
 
 
-def _null_test(parts: list[SignalColumn]) -> SignalColumn:
-    return _certain(~parts[0].known)
-
-
-def _known_test(parts: list[SignalColumn]) -> SignalColumn:
-    return _certain(parts[0].known)
-
-
-def _coalesce(parts: list[SignalColumn]) -> SignalColumn:
-    found = parts[-1]
-    for part in reversed(parts[:-1]):
-        found = SignalColumn(
-            np.where(part.known, part.values, found.values), part.known | found.known
-        )
-    return found
-
-
-def _and(parts: list[SignalColumn]) -> SignalColumn:
-    true = _everywhere([part.true for part in parts])
-    false = ~_everywhere([~(part.known & ~part.true) for part in parts])
-    return SignalColumn(true, true | false)
-
-
-def _not(parts: list[SignalColumn]) -> SignalColumn:
-    return SignalColumn(~parts[0].true, parts[0].known)
-
-
-def _or(parts: list[SignalColumn]) -> SignalColumn:
-    return _not([_and([_not([part]) for part in parts])])
-
-
-def _xor(parts: list[SignalColumn]) -> SignalColumn:
-    odd = np.logical_xor.reduce(np.broadcast_arrays(*(part.true for part in parts)))
-    return SignalColumn(odd, _everywhere([part.known for part in parts]))
-
-
-def _implies(parts: list[SignalColumn]) -> SignalColumn:
-    return _or([_not(parts[:1]), parts[1]])
-
-
-_LOGIC: Final[Mapping[str, Callable[[list[SignalColumn]], SignalColumn]]] = {
-    "AND": _and,
-    "OR": _or,
-    "NOT": _not,
-    "XOR": _xor,
-    "IMPLIES": _implies,
-    "IS NULL": _null_test,
-    "IS NOT NULL": _known_test,
-    "coalesce": _coalesce,
-}
-
-
-def _total(function: Callable[..., Any]) -> Callable[..., tuple[Array, Any]]:
-    """A function that is defined everywhere."""
-
-    def defined(*values: Array) -> tuple[Array, Any]:
-        return function(*values), True
-
-    return defined
-
-
-def _divided(a: Array, by: Array) -> tuple[Array, Array]:
-    fits = np.asarray(by) != 0
-    return np.divide(a, np.where(fits, by, 1)), fits
-
-
-def _remainder(a: Array, by: Array) -> tuple[Array, Array]:
-    fits = np.asarray(by) != 0
-    return np.fmod(a, np.where(fits, by, 1)), fits
-
-
-def _root(a: Array) -> tuple[Array, Array]:
-    fits = np.asarray(a) >= 0
-    return np.sqrt(np.where(fits, a, 0)), fits
-
-
-def _rounded(a: Array) -> Array:
-    return np.copysign(np.floor(np.abs(a) + 0.5), a)
-
-
-def _least(*values: Array) -> Array:
-    return np.minimum.reduce(np.broadcast_arrays(*values))
-
-
-def _greatest(*values: Array) -> Array:
-    return np.maximum.reduce(np.broadcast_arrays(*values))
-
-
-def _of_texts(function: Callable[..., Any]) -> Callable[..., tuple[Array, Any]]:
-    def defined(*values: Array) -> tuple[Array, Any]:
-        return function(*(np.asarray(value).astype(str) for value in values)), True
-
-    return defined
-
-
-def _contains(text: Array, part: Array) -> Array:
-    return np.char.find(text, part) >= 0
-
-
-_TOLERANT: Final[Mapping[str, Callable[[Array, Array, float], Array]]] = {
-    "=": lambda one, other, by: np.abs(one - other) <= by,
-    "<>": lambda one, other, by: np.abs(one - other) > by,
-    "<": lambda one, other, by: one < other - by,
-    "<=": lambda one, other, by: one <= other + by,
-    ">": lambda one, other, by: one > other + by,
-    ">=": lambda one, other, by: one >= other - by,
-}
-"""Comparisons of times, those that differ by no more than a tolerance being the same."""
-
-_FUNCTIONS: Final[Mapping[str, Callable[..., tuple[Array, Any]]]] = {
-    "=": _total(np.equal),
-    "<>": _total(np.not_equal),
-    "<": _total(np.less),
-    "<=": _total(np.less_equal),
-    ">": _total(np.greater),
-    ">=": _total(np.greater_equal),
-    "+": _total(np.add),
-    "-": _total(np.subtract),
-    "*": _total(np.multiply),
-    "/": _divided,
-    "%": _remainder,
-    "negative": _total(np.negative),
-    "abs": _total(np.abs),
-    "sqrt": _root,
-    "floor": _total(np.floor),
-    "ceil": _total(np.ceil),
-    "round": _total(_rounded),
-    "min": _total(_least),
-    "max": _total(_greatest),
-    "lower": _of_texts(np.char.lower),
-    "upper": _of_texts(np.char.upper),
-    "STARTS WITH": _of_texts(np.char.startswith),
-    "ENDS WITH": _of_texts(np.char.endswith),
-    "CONTAINS": _of_texts(_contains),
+_TOLERANT: Final[Mapping[str, Callable[[Column, Column, float], Column]]] = {
+    "=": _tolerant(lambda one, other, by: np.abs(one - other) <= by),
+    "<>": _tolerant(lambda one, other, by: np.abs(one - other) > by),
+    "<": _tolerant(lambda one, other, by: one < other - by),
+    "<=": _tolerant(lambda one, other, by: one <= other + by),
+    ">": _tolerant(lambda one, other, by: one > other + by),
+    ">=": _tolerant(lambda one, other, by: one >= other - by),
 }
