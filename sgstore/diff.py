@@ -10,6 +10,7 @@ import numpy as np
 
 from sgstore.coverage import UNKNOWN, ReportTable, names_of, of_unknown, shared
 from sgstore.store import seq_of, trace_of
+from sgstore.temporal import unknown_notes
 from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def verdicts(a: Store, b: Store, text: str, values: Mapping[str, Any]) -> Report
     """
     found = [{(v.check, v.trace): v for v in store.check(text, **values)} for store in (a, b)]
     rows: list[tuple[Any, ...]] = []
-    unknown: dict[tuple[str, str, str], list[str]] = {}
+    unknown: list[tuple[str, str, str]] = []
     checks = list(dict.fromkeys(check for of in found for check, _ in of))
     keys = found[0].keys() | found[1].keys()
     for key in sorted(keys, key=lambda one: (checks.index(one[0]), natural(one[1]))):
@@ -151,15 +152,12 @@ def verdicts(a: Store, b: Store, text: str, values: Mapping[str, Any]) -> Report
         many = [len(one.violations) if one else None for one in (was, now)]
         why = [(one.reason if one else "") or None for one in (was, now)]
         rows.append((change, *key, *said, *many, *why))
-        for side, reason in zip("AB", why, strict=True):
-            if reason:
-                unknown.setdefault((key[0], side, reason), []).append(key[1])
+        unknown += [
+            (f"{key[0]} is unknown in {side}", key[1], reason or "")
+            for side, reason in zip("AB", why, strict=True)
+        ]
     columns = ("change", "check", "trace", "a", "b", "violations_a", "violations_b", *REASONS)
-    told = [
-        f"{check} is unknown in {side} of {', '.join(names)}: {reason}"
-        for (check, side, reason), names in unknown.items()
-    ]
-    return ReportTable(columns, rows, [*_tally(rows, "verdicts"), *told])
+    return ReportTable(columns, rows, [*_tally(rows, "verdicts"), *unknown_notes(unknown)])
 
 
 def _spans(verdict: Verdict | None) -> Any:

@@ -468,12 +468,10 @@ def say_left_out(matches: Matches | Answer | ChosenFrames) -> None:
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
     """Say what is unknown of which traces, and why: of names, traces and reasons; no reason, nothing to say."""
-    said: dict[tuple[str, str], list[str]] = {}
-    for name, trace, reason in told:
-        if reason:
-            said.setdefault((name, reason), []).append(trace)
-    for (name, reason), traces in said.items():
-        say(f"{name} is unknown of {', '.join(traces)}: {reason}")
+    from sgstore.temporal import unknown_notes
+
+    for note in unknown_notes((f"{name} is unknown", trace, why) for name, trace, why in told):
+        say(note)
 
 
 def say_notes(notes: Iterable[str]) -> None:

@@ -2,6 +2,7 @@
 
 from ._checks import CheckRun as CheckRun
 from ._checks import Verdict as Verdict
+from ._checks import unknown_notes as unknown_notes
 from ._formula import Formula as Formula
 from ._formula import formula_of as formula_of
 from ._matches import TemporalMatches as TemporalMatches
@@ -26,4 +27,5 @@ __all__ = [
     "formula_of",
     "opened",
     "prefix_verdicts",
+    "unknown_notes",
 ]

@@ -1,6 +1,6 @@
 """``CHECK`` over a store: verdicts, violations and quantifiers.
 
-Which traces of a store do not know what a question needs, and why.
+A trace that lacks what a check needs has the verdict ``unknown``, with the reason.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def levels_of(
 
 
 def folded_values(levels: Sequence[Level], values: Bools) -> list[Bools]:
-    """What is true of the bindings of each level, the outermost first, before them all the one of none.
+    """Return the truth of the bindings of each level, outermost first; the empty binding comes before.
 
     Parameters
     ----------
@@ -202,9 +202,27 @@ class Witness:
     violations: tuple[Interval, ...]
 
 
+def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Return what to say of traces that cannot answer, those with the same reason in one line.
+
+    Parameters
+    ----------
+    told : iterable of (subject, trace, reason)
+        Such as ``near is unknown``, ``cut_in_1``, ``it has no ego``; without a reason there is nothing to say.
+    """
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for subject, trace, reason in told:
+        if reason:
+            grouped.setdefault((subject, reason), []).append(trace)
+    return [
+        f"{subject} of {', '.join(traces)}: {reason}"
+        for (subject, reason), traces in grouped.items()
+    ]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """What a check says of a trace.
+    """Verdict of a check on a trace.
 
     Attributes
     ----------
@@ -235,12 +253,12 @@ class Verdict:
 
     @property
     def first_violation(self) -> Interval | None:
-        """Where the check is violated first; ``None``: nowhere."""
+        """The first violation; ``None``: there is none."""
         return self.violations[0] if self.violations else None
 
     @property
     def violated(self) -> bool:
-        """Whether the trace is known to violate the check."""
+        """Tell whether the trace is known to violate the check."""
         return self.verdict == "false"
 
     @property
@@ -298,7 +316,7 @@ class CheckRun:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What may be a mistake: texts that are compared with names, say, of which the store has none."""
+        """Notes on likely mistakes, such as texts that are compared with names and that no name is equal to."""
         with self._file.snapshot():
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
             found = dict.fromkeys(compared)
@@ -311,14 +329,14 @@ class CheckRun:
                 yield from check.verdicts()
 
     def explain(self) -> str:
-        """What becomes of the checks: formulas over atoms, and what each atom is."""
+        """Explain the checks: formulas over atoms, and each atom."""
         parts = [_Check(self._file, one, compat=False, status=False).text() for one in self._checks]
         return "\n\n".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
 class _BindingVerdict:
-    """What is known of one binding, or of a check without quantifiers."""
+    """Verdict of one binding, or of a check without quantifiers."""
 
     violations: tuple[Violation, ...] = ()
     status: Statuses | None = None
