@@ -576,6 +576,10 @@ def test_cells_of_a_query_are_counted_against_what_was_said(worlds) -> None:
     assert by_product[0].rows[0][2] == len({k for k, _ in cells}) * len({r for _, r in cells})
     assert len(by_product[2].rows) == by_product[0].rows[0][2] - len(cells)
     assert observed[0].rows[0][1:3] == (len(theirs & cells.keys()), len(theirs))
+    ordered = specification(selection_of(a), f"{query} ORDER BY kind DESC;", 20)
+    assert [sorted(part.rows) for part in ordered] == [sorted(part.rows) for part in declared]
+    with pytest.raises(QueryError, match="no LIMIT"):
+        specification(selection_of(a), f"{query} LIMIT 3")
     with pytest.raises(QueryError, match="returns values"):
         specification(selection_of(a), "MATCH (v:Car)")
 

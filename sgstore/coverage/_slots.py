@@ -42,6 +42,7 @@ from sgstore.coverage._frames import (
     share,
 )
 from sgstore.errors import ConfigError, QueryError
+from sgstore.lang import parse, syntax
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -65,7 +66,7 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
     store = chosen.store
     matches = store.find(query)
     if matches.columns[: len(_FRAME)] != _FRAME:
-        matches = store.find(f"{query.rstrip().rstrip(';')}, FRAMES")
+        matches = store.find(_with_frames(query))
     columns = matches.columns[len(_FRAME) :]
     if not columns or not _RETURN.search(query):
         raise QueryError(
@@ -79,6 +80,22 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
         if wanted is None or row[0] in wanted:
             frames.setdefault(row[len(_FRAME) :], set()).add(row[0])
     return columns, {cell: len(of) for cell, of in sorted(frames.items(), key=lambda i: repr(i[0]))}
+
+
+def _with_frames(query: str) -> str:
+    """Return a query that can be asked, with the frame of each match among what it returns."""
+    found = next((one for one in parse(query) if isinstance(one, syntax.MatchClause)), None)
+    if found is None or found.returns is None:
+        return query
+    returns = found.returns
+    if returns.limit is not None or returns.sample is not None:
+        raise QueryError(
+            "a specification counts all matches, and has no LIMIT and no SAMPLE",
+            text=query,
+            span=returns.span,
+        )
+    end = returns.items[-1].span.end
+    return f"{query[:end]}, FRAMES{query[end:]}"
 
 
 def specification(
