@@ -1,4 +1,4 @@
-"""What matches a query: rows, frames, intervals, clips.
+"""Matches of a query: rows, frames, intervals, clips.
 
 Results are streams: they come window by window over the buckets of the store, in windows that grow, so that the
 first rows come at once and memory does not grow with their number.
@@ -176,7 +176,7 @@ class Matches:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why each of the traces in :attr:`left_out` cannot, by name."""
+        """The reason for each of the traces in :attr:`left_out`, by name."""
         return self._ready.reasons
 
     @contextmanager
@@ -193,7 +193,7 @@ class Matches:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What may be a mistake, such as a text that is compared with names and is none of the store's."""
+        """Notes on likely mistakes, such as a text that is compared with names and is none of the store's."""
         with self._compiled() as compiled:
             compared = compared_in_query(compiled.bound)
             return notes_in(self._file, compared, self._text, self._parameters)
@@ -233,7 +233,7 @@ class Matches:
             yield from dict.fromkeys(found)
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """What the variables of nodes are bound to in one frame, whatever ``RETURN`` says: node ids by name."""
+        """Return the node ids of the variables in one frame by name, whatever ``RETURN`` says."""
         bucket = frame.frame_id >> BUCKET_SHIFT
         with self._compiled() as compiled:
             statement = compiled.bindings(Window(bucket, bucket + 1))
@@ -364,7 +364,7 @@ class Matches:
         return write_csv(self.columns, self, Path(path))
 
     def explain(self) -> str:
-        """What became of the query, stage by stage: parse, bind, rewrite, emit."""
+        """Explain the query, stage by stage: parse, bind, rewrite, emit."""
         with self._compiled() as compiled:
             return compiled.stages()
 
@@ -414,7 +414,7 @@ class Matches:
         return in_order(self._file.rows(EXTENTS).values, self._ready.catalog)
 
     def _given(self, statement: SqlStatement) -> list[GivenTable]:
-        """What a statement is given of what was found otherwise."""
+        """Return the table that a statement is given of external matches."""
         return [
             GivenTable(one.name, one.types, partial(self._blocks, one))
             for one in statement.gathered
@@ -501,7 +501,7 @@ def notes_in(
     query: str,
     parameters: Mapping[str, object],
 ) -> tuple[str, ...]:
-    """What is to be said of the texts of a query that a store has not; see :func:`notes_on`."""
+    """Return notes about the texts of a query that a store has not; see :func:`notes_on`."""
     return notes_on(compared, query, parameters, lambda sql, values: file.rows(sql, values).values)
 
 

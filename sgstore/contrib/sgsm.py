@@ -131,7 +131,7 @@ def _check(found: str) -> None:
 
 
 def _place(text: str, error: SyntaxError) -> TextSpan:
-    """Where Python finds a mistake."""
+    """Return the place where Python finds a mistake."""
     before = text.split("\n")[: (error.lineno or 1) - 1]
     start = sum(len(line) + 1 for line in before) + max((error.offset or 1) - 1, 0)
     return TextSpan(min(start, len(text)), min(start, len(text)) + 1)
@@ -147,7 +147,7 @@ class _Found:
     where: list[str] = field(default_factory=list[str])
 
     def text(self) -> str:
-        """What stands in the braces of a block."""
+        """Return the text in the braces of a block."""
         paths = self.paths or [f"({self.node}{self.label})"]
         return ", ".join(paths) + (f" WHERE {' AND '.join(self.where)}" if self.where else "")
 
@@ -328,7 +328,7 @@ class _Translation:
         return f"{_ATTRIBUTES[name].format(node)} {sign} {self._number(compared.comparators[0])}"
 
     def _resembling(self, node: str, name: str, test: ast.Constant) -> str:
-        """What SGL finds by searching a text for a regular expression."""
+        """Return the values that SGL finds by searching a text for a regular expression."""
         try:
             wanted = re.compile(str(test.value))
         except re.error as error:
@@ -391,7 +391,7 @@ class _Translation:
         return f"n{self._numbers}"
 
     def _resolved(self, value: ast.expr) -> ast.expr:
-        """What a name stands for."""
+        """Return the expression that a name stands for."""
         for _ in range(MAX_NAMES):
             if not isinstance(value, ast.Name) or value.id not in self._names:
                 return value
@@ -430,7 +430,7 @@ class _Translation:
         return QueryError(reason, text=self._text, span=TextSpan(start, max(end, start + 1)))
 
     def _offset(self, line: int, column: int) -> int:
-        """Where a place of Python's, a line and a byte in it, lies in the text."""
+        """Return the offset in the text of a place of Python's: a line and a byte in it."""
         lines = _LINE.findall(self._text)  # by Python's ends of lines alone
         text = lines[line - 1] if line <= len(lines) else ""
         inside = text.encode(errors="replace")[:column].decode(errors="replace")
@@ -445,7 +445,7 @@ _LINE: Final = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
 
 
 def _function(value: ast.expr) -> str:
-    """What a call calls, without its module; empty if it is no call."""
+    """Return the name of the called function, without its module; empty if it is no call."""
     return _last_name(value.func) if isinstance(value, ast.Call) else ""
 
 

@@ -1,8 +1,7 @@
 """The query language: text and a catalog in, SQL out; no database inside.
 
-The stages are parse (:mod:`~sgstore.lang.parser`), bind (:mod:`~sgstore.lang.binder`), rewrite
-(:mod:`~sgstore.lang.rewrite`) and emit (:mod:`~sgstore.lang.results`), each a pure function whose result can be
-printed.
+The stages are parse (``_parse``), bind (``_bind``), rewrite (``_rewrite``) and emit (``_results``), each a pure
+function whose result can be printed.
 """
 
 import lazy_loader

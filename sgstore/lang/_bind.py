@@ -1,7 +1,5 @@
 """The binder: syntax trees of queries and checks become IR.
 
-Syntax tree → bound query: labels, relations, attributes, variables and functions are known from here on.
-
 Everything that can be the user's fault is found here or in the parser, before any SQL exists.
 """
 
@@ -96,7 +94,7 @@ def bind_query(
 
 
 def _is_plain(match: s.MatchClause) -> bool:
-    """Whether it is one pattern, without a duration or a name."""
+    """Tell whether it is one pattern, without a duration or a name."""
     first = match.sequence.steps[0]
     if len(match.sequence.steps) > 1 or not isinstance(first, s.StepClause):
         return False
@@ -129,7 +127,7 @@ def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _told(scope: b.Scope) -> b.Scope:
-    """What is known of a match once it is found: nodes and edges that have names, ends of these, the ego."""
+    """Return the scope of a found match: nodes and edges that have names, ends of these, and the ego."""
     edges = tuple(edge for edge in scope.edges if edge.named)
     ends = {end for edge in edges for end in (edge.src, edge.dst)}
     told = {
@@ -190,7 +188,7 @@ def define(statement: s.Define, session: Session) -> None:
 
 @dataclass(slots=True)
 class UsingChoice:
-    """What ``USING`` chooses; ``None``: nothing."""
+    """Choices that ``USING`` makes; ``None``: no choice."""
 
     ego: str | None = None
     unknown_is_false: bool = False
@@ -200,7 +198,7 @@ class UsingChoice:
 
 
 def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> UsingChoice:
-    """What a statement chooses by ``USING``.
+    """Return the choices that a statement makes by ``USING``.
 
     Raises
     ------
@@ -449,7 +447,7 @@ def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bou
 
 
 def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
-    """What a node with a label may be.
+    """Return the kinds that a label allows.
 
     Raises
     ------
@@ -573,14 +571,14 @@ def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
 
 
 def _of_each(value: b.Bound) -> bool:
-    """Whether a value speaks of single matches, but for what is counted of all."""
+    """Tell whether a value speaks of single matches, but for what is counted of all."""
     if isinstance(value, b.Operation):
         return any(_of_each(operand) for operand in value.operands)
     return not isinstance(value, b.Aggregate | b.Value | b.Choices)
 
 
 def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
-    """What to order or to sample by: the name of a result, or a value of each match."""
+    """Return a key to order or to sample by: the name of a result, or a value of each match."""
     own = {column.name: column.value for column in result.columns}
     known = (*result.names, *own)
     taken = isinstance(value, s.Variable) and names.meaning(value.name) is not None

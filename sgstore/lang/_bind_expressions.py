@@ -219,7 +219,7 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
 
 
 def _no_attribute(name: str) -> str | None:
-    """What a name is that is no attribute: a relation, a predicate; ``None``: no idea."""
+    """Return a hint for a name that is no attribute but a relation or a predicate; ``None``: no idea."""
     if relation_named(name):
         return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
     return call_hint(name)
@@ -290,7 +290,7 @@ def _logic(e: s.Logic, names: SymbolTable) -> b.Operation:
 
 
 def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
-    """What is written between the first operand and the second."""
+    """Return the text between the first operand and the second."""
     return names.session.text[operands[0].span.end : operands[1].span.start]
 
 

@@ -1,9 +1,7 @@
 """The binder of temporal operators and sequences.
 
-What looks at other frames than one: operators of time, functions of how something went, lengths of time.
-
-They stand in conditions of a ``MATCH``, in what it returns, and in a ``CHECK``; inside braces only one frame is
-looked at.
+Operators of time, functions over signals and lengths of time stand in conditions of a ``MATCH``, in what it
+returns, and in a ``CHECK``; inside braces only one frame is looked at.
 """
 
 from __future__ import annotations
@@ -317,7 +315,7 @@ class StepScope(ScopeBuilder):
             self.nodes[key] = self.known[key]
 
     def kinds(self, key: str) -> b.Kinds:
-        """What a node may be here."""
+        """Return the kinds that a node may have here."""
         return self.nodes[key].kinds if key in self.nodes else self.known[key].kinds
 
     def the_ego(self, span: TextSpan) -> str:
@@ -356,7 +354,7 @@ class BoundSequence:
     links: list[o.StepLink] = field(default_factory=list[o.StepLink])
 
     def scope(self) -> ScopeBuilder:
-        """What values of a match speak of: nodes and edges that have names, and the ego."""
+        """Scope of the values of a match: nodes and edges that have names, and the ego."""
         return ScopeBuilder(self.session, nodes=self.ends | self.known, edges=list(self.edges))
 
     def take_in_ego(self, told: ScopeBuilder) -> None:

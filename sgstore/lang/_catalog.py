@@ -1,4 +1,4 @@
-"""What the compiler knows of a store: its vocabulary of attributes, and what it holds.
+"""Catalog of a store for the compiler: its attributes and its contents.
 
 The attributes are fixed by the schema and are the same for every store. A :class:`Catalog` says what one
 store holds: which kinds of nodes live where, which triples (relation, kind, kind) occur and how often, and
@@ -37,7 +37,7 @@ Triple = tuple[str, str, str]
 
 
 class Home(StrEnum):
-    """Where the values of an attribute live."""
+    """Table that holds the values of an attribute."""
 
     state = "state"
     """Of entities that move or change, frame by frame: table ``state``."""
@@ -50,7 +50,7 @@ class Home(StrEnum):
 
 
 class DisplayUnit(StrEnum):
-    """How the value in the database becomes the value that people see."""
+    """Conversion of a value in the database to the value that people see."""
 
     plain = "plain"
     degrees = "degrees"
@@ -154,7 +154,7 @@ class Attribute:
 
     @property
     def of_store(self) -> bool:
-        """Whether it is told by what the store holds beside the graph of the frame."""
+        """Tell whether it is told by what the store holds beside the graph of the frame."""
         other = {DisplayUnit.seen, DisplayUnit.counted, DisplayUnit.weather, DisplayUnit.clock}
         return bool(self.table) or self.unit in other
 
@@ -538,7 +538,7 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class RelationScope:
-    """Which pairs of entities are related, as :class:`sgstore.config.Pairs` says it.
+    """Pairs of entities for which relations are computed, as in :class:`sgstore.config.Pairs`.
 
     Attributes
     ----------
@@ -570,7 +570,7 @@ class RelationScope:
 
 @dataclass(frozen=True, slots=True)
 class TraceFacts:
-    """What the compiler knows of a trace.
+    """Facts about a trace that the compiler needs.
 
     Attributes
     ----------
@@ -596,7 +596,7 @@ class TraceFacts:
 
 @dataclass(frozen=True, slots=True)
 class TableFacts:
-    """What the compiler knows of a table of a user's own.
+    """Facts about a user's own table that the compiler needs.
 
     Attributes
     ----------
@@ -627,7 +627,7 @@ class TableFacts:
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """What a store holds, as far as the compiler cares.
+    """Contents of a store, as far as the compiler needs them.
 
     Attributes
     ----------

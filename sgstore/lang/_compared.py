@@ -44,7 +44,7 @@ Compared = tuple[str, str]
 
 
 def compared_in_query(query: b.Query) -> list[Compared]:
-    """What a bound query compares with texts, each once."""
+    """Return the comparisons with texts in a bound query, each once."""
     returned = [column.value for column in query.result.columns]
     found = list(_compared([*query.scope.where, *returned], query.scope))
     for step in query.steps:
@@ -53,7 +53,7 @@ def compared_in_query(query: b.Query) -> list[Compared]:
 
 
 def compared_in_check(check: BoundCheck) -> list[Compared]:
-    """What a bound check compares with texts, each once."""
+    """Return the comparisons with texts in a bound check, each once."""
     values = [check.formula, *(one.where for one in check.quantifiers if one.where is not None)]
     values += [check.reset] if check.reset is not None else []
     return list(dict.fromkeys(_compared([*values, *check.scope.where], check.scope)))
@@ -93,7 +93,7 @@ def _texts(attribute: b.Bound, values: Iterable[b.Bound], scope: b.Scope) -> Ite
 
 
 def _type_of(kinds: b.Kinds) -> str:
-    """What ``type`` is of nodes of some kinds."""
+    """Return the attribute that ``type`` means for nodes of some kinds."""
     if "lane" not in kinds.every:
         return "type_name"
     return "type" if kinds.every & frozenset(ENTITY_KINDS) else "lane_type"
@@ -102,7 +102,7 @@ def _type_of(kinds: b.Kinds) -> str:
 def notes_on(
     compared: Iterable[Compared], query: str, parameters: Mapping[str, object], ask: Ask
 ) -> tuple[str, ...]:
-    """What is to be said of texts that are no value that a store has.
+    """Return notes about texts that no value of a store is equal to.
 
     Parameters
     ----------

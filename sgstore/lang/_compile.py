@@ -1,6 +1,6 @@
 """The compiler: text to SQL statements, with subgraphs and ``--explain``.
 
-``RETURN SUBGRAPHS``: each match as a small graph, from the columns of one statement.
+With ``RETURN SUBGRAPHS`` each match is a small graph, made from the columns of one statement.
 
 The graph of a match has the nodes that the pattern binds, those without a name too, with all that is known of
 them, and the edges that it asks for. A path of exactly n edges is there edge by edge; one of m to n edges is
@@ -92,7 +92,7 @@ class _ValuePlace:
     names: tuple[str, ...]
 
     def known(self, row: Sequence[Any]) -> Record:
-        """What is known of it: the values that are not missing."""
+        """The values that are not missing."""
         values = zip(self.names, row[self.first :], strict=False)
         return {name: value for name, value in values if value is not None}
 
@@ -116,7 +116,7 @@ class Layout:
 
     @classmethod
     def of(cls, query: Query) -> Layout:
-        """How the graphs of the matches of a query are had; what it returns beside them is kept."""
+        """Return the layout of the graphs of a query's matches; other results are kept."""
         scope = _bound_variables(query)
         result = query.result
         kept = result.form == "subgraphs" or result.whole
@@ -222,7 +222,7 @@ def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record],
 
 
 def path_text(edge: Edge) -> str:
-    """What a path of edges is called: ``isIn*1..3``, ``*2..4``."""
+    """Return a path of edges as text: ``isIn*1..3``, ``*2..4``."""
     relations = "|".join(sorted(edge.relations)) if edge.relations != any_relation() else ""
     return f"{relations}*{edge.low}..{edge.high}"
 
@@ -337,7 +337,7 @@ def edge_text(edge: Edge) -> str:
 
 
 def kinds_text(kinds: Kinds) -> str:
-    """What a node may be."""
+    """Return the kinds of a node as text."""
     if kinds == ANY:
         return "anything"
     entities = frozenset(ENTITY_KINDS)
@@ -517,7 +517,7 @@ class Compiled:
         return tuple(self.reasons)
 
     def rows(self, window: Window | None = None) -> SqlStatement:
-        """What it returns."""
+        """The statement for its rows."""
         return self._rows(self.query, window)
 
     def _rows(self, query: Query, window: Window | None) -> SqlStatement:
@@ -527,7 +527,7 @@ class Compiled:
     def _told(
         self, query: Query, window: Window | None
     ) -> tuple[Query, ExternalMatches | None, results.Span | None]:
-        """What says the matches of a query that looks at several frames; of any other nothing does."""
+        """Return the finder of a query over several frames; ``None`` for any other query."""
         if not query.steps:
             return query, None, None
         query, places = with_places(query)
@@ -592,7 +592,7 @@ class Compiled:
 
     @property
     def in_windows(self) -> bool:
-        """Whether its rows can be had window by window: if none depends on those of other windows."""
+        """Tell whether its rows can be had window by window: if none depends on those of other windows."""
         result = self.query.result
         framed = result.whole or result.framed or result.form != "rows"
         across = result.distinct and not framed
@@ -610,7 +610,7 @@ class Compiled:
         return replace(self, query=replace(self.query, result=result))
 
     def stages(self) -> str:
-        """What became of the text, stage by stage."""
+        """The text after each stage of the compiler."""
         statements = parse(self.text)
         statement = self.rows()
         values = "".join(f"\n${i} = {v!r}" for i, v in enumerate(statement.values, start=1))
@@ -623,7 +623,7 @@ class Compiled:
         return "\n\n".join(f"---- {name}\n{text}" for name, text in parts)
 
     def count(self, window: Window | None = None) -> SqlStatement:
-        """How many frames match."""
+        """Return the statement for the number of frames that match."""
         query, writer, _ = self._told(replace(self.query, result=Result()), window)
         return results.count(query, self.catalog, window, writer)
 

@@ -338,7 +338,7 @@ class ExternalMatches(Frames):
             super()._say(join, scope, given, leaf)
 
     def _told_rows(self) -> str:
-        """What is found, one row a frame."""
+        """Return what was found, one row for each frame."""
         columns = {"first": "BIGINT", "last": "BIGINT"}
         columns |= {f"{key}.id": "BIGINT" for key in self._found.nodes}
         columns |= {f"{key}.type": "VARCHAR" for key in self._found.edges}

@@ -142,7 +142,7 @@ WAY: Final = "lane_dist"
 
 
 def way_text(frame: str, a: str, b: str, conditions: Iterable[str]) -> str:
-    """How far it is along the lanes from a to b.
+    """Return the SQL of the distance along the lanes from a to b.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def parts_of(name: str) -> tuple[str, ...]:
 
 @cache
 def stage_of(name: str) -> int:
-    """How many layers of a statement come before a number of a pair; 0 for a raw column."""
+    """Return the number of layers before a number of a pair; 0 for a raw column."""
     return 1 + max(stage_of(part) for part in parts_of(name)) if name in _PAIR else 0
 
 
@@ -318,7 +318,7 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
 
 
 def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
-    """Whose number a node id is: an entity's the trace's, and, below 0, a part of the map's the map's."""
+    """Return the SQL of the owner of a node id: the trace of an entity, or, below 0, the map."""
     if not profile.mapped:
         return trace
     of_map = f"coalesce({road_map}, -1 - ({trace}))"
@@ -328,7 +328,7 @@ def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
 
 
 def role_text(frame: str, node: str) -> str:
-    """What a lane is to the ego in a frame."""
+    """Return the SQL of the role of a lane to the ego in a frame."""
     on = [f'"r"."frame_id" = {frame}', f'"r"."node_id" = {node}']
     role = Select(['any_value("r"."role")'], ['"roles" AS "r"'], on)
     return f"({role.text()})"
@@ -425,7 +425,7 @@ def _class_text(abstraction: str, frame: str) -> str:
 
 
 def _looked_up(attribute: Attribute, frame: str) -> str:
-    """What other frames, or events, say of a frame."""
+    """Return the SQL of a value of a frame that other frames or events tell."""
     column = next(iter(attribute.columns.values()))
     if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
         return _weather_text(column, frame)
@@ -596,7 +596,7 @@ def lane_text(leaf: Leaf, alias: str) -> str:
 
 
 def is_position(leaf: Leaf) -> bool:
-    """Whether a value is stored about the trace's origin."""
+    """Tell whether a value is stored about the trace's origin."""
     return isinstance(leaf, NodeAttribute) and leaf.attribute.unit in {
         DisplayUnit.east,
         DisplayUnit.north,
@@ -605,14 +605,14 @@ def is_position(leaf: Leaf) -> bool:
 
 
 def is_constant(leaf: Leaf) -> bool:
-    """Whether a value of an entity never changes."""
+    """Tell whether a value of an entity never changes."""
     if not isinstance(leaf, NodeAttribute):
         return False
     return Home.entity in leaf.attribute.columns or leaf.attribute.unit is DisplayUnit.label
 
 
 def among(column: str, numbers: list[int]) -> str:
-    """Whether a column is one of some numbers of ours."""
+    """Tell whether a column is one of some numbers of ours."""
     return f"({column}) IN ({', '.join(map(str, numbers))})" if numbers else "FALSE"
 
 

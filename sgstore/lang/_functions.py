@@ -79,7 +79,7 @@ def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _no_function(name: str) -> str | None:
-    """What a name is that is no function: an attribute, a relation, a sequence; ``None``: no idea."""
+    """Return a hint for a name that is an attribute, a relation or a sequence; ``None``: no idea."""
     word = normalize_name(name)
     if word in FUNCTIONS_TOLD:
         return FUNCTIONS_TOLD[word]
@@ -103,7 +103,7 @@ def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
 
 
 def _signature(name: str) -> str | None:
-    """How a function of two entities, or a predicate of the library, is called, and what it is."""
+    """Return the signature and the meaning of a function of two entities or of a library predicate."""
     if name in PAIR_NAMES:
         return f"{PAIR_NAMES[name]}(a, b): {PAIR_FUNCTIONS[PAIR_NAMES[name]]}"
     found = predicates().get(name)

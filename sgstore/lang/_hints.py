@@ -1,7 +1,4 @@
-"""Hints for mistakes: syntax of other languages, and unknown names.
-
-What people write who know another language, or are in a hurry, and what would be right: hints for syntax.
-"""
+"""Hints for mistakes: syntax of other languages, and unknown names."""
 
 from __future__ import annotations
 
@@ -61,7 +58,7 @@ def _slip(looks: str, hint: str, at: str = "", then: str = "") -> SyntaxHint:
 
 
 def places(names: Container[str]) -> frozenset[str]:
-    """What kind of place it is, by the terminals that may stand there.
+    """Return the kinds of a place in a text, by the terminals that may stand there.
 
     ``edge`` (or the end of a pattern), ``value`` (or a condition), ``operator`` (behind a value), ``time``
     (a length of it), ``number``, ``label``, ``name``, ``within`` an edge, ``start`` (of a statement), ``comma``
@@ -387,7 +384,7 @@ _ODD: Final = {
 def slip_hint(
     text: str, start: int, end: int, at: frozenset[str], words: Iterable[str]
 ) -> str | None:
-    """What would be right where a part of a text was not expected; ``None``: no idea.
+    """Return a hint for an unexpected part of a text; ``None``: no idea.
 
     Parameters
     ----------
@@ -657,7 +654,7 @@ _OTHERS: Final = tuple(
 
 
 def hint_at(name: str, known: Iterable[str]) -> str | None:
-    """What a name may have meant: that which is most like it or short for it, or else all that is known.
+    """Return a hint for an unknown name: the most similar one, or else all that are known.
 
     Names in an order keep it, so that what is common stands first; a set is sorted.
     """
@@ -682,7 +679,7 @@ def _short_for(name: str, names: list[str]) -> str | None:
 
 
 def bracket_hint(text: str, position: int, found: str) -> str | None:
-    """Where a bracket that is not closed was opened, if the text ends too soon; or that there is none to close.
+    """Return a hint for an unmatched bracket: where it was opened, or that there is none to close.
 
     Parameters
     ----------
@@ -734,7 +731,7 @@ _SAID_OTHERWISE: Final = {
 
 
 def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | None:  # noqa: FBT001
-    """What a variable that is not known may have meant: an attribute, a text, the time; ``None``: no idea.
+    """Return a hint for an unknown variable: an attribute, a text, the time; ``None``: no idea.
 
     Parameters
     ----------
@@ -762,7 +759,7 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
 
 
 def condition_hint(found: Type, written: str) -> str | None:
-    """What would be right where a value stands for a condition.
+    """Return a hint for a value that stands in place of a condition.
 
     Parameters
     ----------
@@ -783,7 +780,7 @@ def condition_hint(found: Type, written: str) -> str | None:
 
 
 def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | None:
-    """What would be right where values of two types are compared.
+    """Return a hint for a comparison of values of two types.
 
     Parameters
     ----------
@@ -804,7 +801,7 @@ def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | N
 
 
 def _number_hint(value: object) -> str | None:
-    """What a text that stands for a number should be, or a number that stands for a text."""
+    """Return a hint for a text in place of a number, or a number in place of a text."""
     if isinstance(value, int | float):
         return f"a text stands in quotes: '{value}'"
     found = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*([a-z°/²%]*)\s*", str(value), re.IGNORECASE)

@@ -40,7 +40,7 @@ _MAP: Final = '":map"'
 
 
 def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
-    """Whether a value is the same in all frames of a bucket in which its binding holds."""
+    """Tell whether a value is the same in all frames of a bucket in which its binding holds."""
     match leaf:
         case NodeValue() | EdgeRelation() | TraceAttribute():
             return True

@@ -1,7 +1,4 @@
-"""Node kinds in tables, and kinds that conditions imply.
-
-Where nodes live in the tables, and which rows are of which kinds.
-"""
+"""Node kinds in tables, and kinds that conditions imply."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Where the nodes that a variable may be bound to live: their kinds in each place."""
+    """Kinds of the nodes that a variable may be bound to, by the place that holds them."""
 
     moving: frozenset[str]
     fixed: frozenset[str]
@@ -49,7 +46,7 @@ class Profile:
         return sum(map(bool, (self.moving, self.fixed, self.mapped)))
 
     def has(self, home: Home) -> bool:
-        """Whether values that live in a home may be theirs."""
+        """Tell whether values that live in a home may be theirs."""
         kinds = {
             Home.state: self.moving,
             Home.entity: self.moving | self.fixed,
@@ -126,7 +123,7 @@ def edge_conditions(
 
 
 def alias_of(edge: Edge) -> str:
-    """What an edge is called in a statement: its key, and its relation if it is one."""
+    """Return the alias of an edge in a statement: its key, and its relation if it has only one."""
     return (
         f"{edge.key}:{next(iter(edge.relations))}" if len(edge.relations) == 1 else f"{edge.key}:"
     )

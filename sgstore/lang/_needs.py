@@ -1,6 +1,6 @@
-"""What a trace must know to answer a question.
+"""Needs: values that a trace must know to answer a question.
 
-Whether the relations of a pair of entities were computed at all: what a missing edge says.
+``in_range(a, b)`` asks whether the relations of a pair were computed at all.
 
 A scene graph relates the pairs that the settings of its trace name: the ego with what is in range, what moves
 with what is near. Of such a pair a missing edge says that the relation does not hold; of any other it says
@@ -56,7 +56,7 @@ _VEHICLE: Final = ANY.only(frozenset(VEHICLES))
 
 
 def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
-    """Whether the relations of two nodes were computed.
+    """Return the condition that the relations of two nodes were computed.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
     if len(of) < 2:
         return _related(a, b, next(iter(of), RelationScope()))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
-    return _any(
-        _all_in_scope(
+    return _or(
+        _and(
             Operation(
                 "IN", (number, Choices(tuple(Value(i, Type.number) for i in ids))), Type.boolean
             ),
@@ -90,25 +90,25 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
 def _related(a: str, b: str, reach: RelationScope | None) -> Bound:
     if reach is None:
         return Value(None, Type.boolean)
-    ego = _any(LabelTest(node, EGO) for node in (a, b))
+    ego = _or(LabelTest(node, EGO) for node in (a, b))
     ways: list[Bound] = []
     if reach.ego:
         close = [_up_to(a, b, reach.ego_within, reach)] if reach.ego_within > 0 else []
-        ways.append(_all_in_scope(ego, *close))
+        ways.append(_and(ego, *close))
     if reach.within > 0:
         near = _up_to(a, b, reach.within, reach)
         move = [_not(test) for node in (a, b) for test in (_still(node), LabelTest(node, _SIGNAL))]
         further = [_not(ego)] if reach.ego else []
-        ways.append(_all_in_scope(*further, *move, near))
+        ways.append(_and(*further, *move, near))
         if reach.static:
-            ways.append(_all_in_scope(*further, _still(a), _still(b), near))
+            ways.append(_and(*further, _still(a), _still(b), near))
     listed = [
-        _all_in_scope(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
+        _and(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
         for pair in reach.kinds
         for one, other in (pair, pair[::-1])
     ]
     entities = [LabelTest(node, _ENTITY) for node in (a, b)]
-    return _all_in_scope(*entities, *([_any(listed)] if listed else []), _any(ways))
+    return _and(*entities, *([_or(listed)] if listed else []), _or(ways))
 
 
 def _labelled(label: str) -> Kinds:
@@ -118,12 +118,11 @@ def _labelled(label: str) -> Kinds:
 
 
 def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
-    """Whether two nodes are no further apart; what has no place is near nothing."""
+    """Return the condition that two nodes are no further apart; a node without a place is near nothing."""
     limit = Value(bound, Type.number)
     if reach.between == "origins":
-        return _any(
-            _all_in_scope(*tests, _no_more(distance, limit))
-            for tests, distance in _between_origins(a, b)
+        return _or(
+            _and(*tests, _no_more(distance, limit)) for tests, distance in _between_origins(a, b)
         )
     distance = _pair("dist", a, b)
     if reach.between == "footprints":  # one without extent is a point
@@ -147,7 +146,7 @@ def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
 
 
 def _lies_low(node: str, *, yes: bool) -> Bound:
-    low = _all_in_scope(LabelTest(node, _VEHICLE), _not(_still(node)))
+    low = _and(LabelTest(node, _VEHICLE), _not(_still(node)))
     return low if yes else _not(low)
 
 
@@ -185,11 +184,11 @@ def _not(condition: Bound) -> Bound:
     return Operation("NOT", (condition,), Type.boolean)
 
 
-def _all_in_scope(*conditions: Bound) -> Bound:
+def _and(*conditions: Bound) -> Bound:
     return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
 
 
-def _any(conditions: Iterable[Bound]) -> Bound:
+def _or(conditions: Iterable[Bound]) -> Bound:
     found = tuple(conditions)
     if len(found) < 2:
         return found[0] if found else Value(value=False, type=Type.boolean)
@@ -249,7 +248,7 @@ class Need:
 
     @property
     def reason(self) -> str:
-        """What is told of a trace that does not."""
+        """Message about a trace that does not meet it."""
         if self.attribute is None:
             return "it has no ego"
         of = "" if self.kinds is None else f" of {self.node}"
@@ -257,7 +256,7 @@ class Need:
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
-    """What a trace must know to answer a check; nothing where ``USING UNKNOWN false`` says so."""
+    """Return the needs of a check; none with ``USING UNKNOWN false``."""
     if check.unknown_is_false:
         return ()
     nodes = check.scope.nodes
@@ -265,11 +264,11 @@ def of_check(check: BoundCheck) -> tuple[Need, ...]:
     spoken = [check.formula, *(q.where for q in check.quantifiers if q.where is not None)]
     spoken += [check.reset] if check.reset is not None else []
     egos = {Need(key, node.kinds, None) for key, node in nodes.items() if key not in bound}
-    return _ordered(egos | _all(spoken, nodes, strict=True))
+    return _ordered(egos | _of_each(spoken, nodes, strict=True))
 
 
 def of_query(query: b.Query) -> tuple[Need, ...]:
-    """What a trace must know so that a query can find something in it.
+    """Return the needs of a query: what a trace must know so that something can be found in it.
 
     Where one of several conditions is enough (``OR``), and no time is looked at, what all of them need counts.
     """
@@ -279,7 +278,7 @@ def of_query(query: b.Query) -> tuple[Need, ...]:
     steps = [(step.scope, step.when) for step in query.steps] or [(query.scope, ())]
     for scope, when in steps:
         found |= {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
-        found |= _all([*scope.where, *when], scope.nodes, strict=False)
+        found |= _of_each([*scope.where, *when], scope.nodes, strict=False)
     # One ego is as good as another.
     egos = {need.kinds: need for need in found if need.attribute is None}
     return _ordered({need for need in found if need.attribute is not None} | {*egos.values()})
@@ -292,14 +291,16 @@ def _ordered(needs: set[Need]) -> tuple[Need, ...]:
     return tuple(sorted(needs, key=rank))
 
 
-def _all(expressions: Iterable[b.Bound], nodes: Mapping[str, b.Node], *, strict: bool) -> set[Need]:
+def _of_each(
+    expressions: Iterable[b.Bound], nodes: Mapping[str, b.Node], *, strict: bool
+) -> set[Need]:
     return {need for e in expressions for need in _needed(e, nodes, strict=strict)}
 
 
 def _needed(  # noqa: C901, PLR0911 - a case each
     expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
 ) -> set[Need]:
-    """What an expression needs; ``strict``: all that it speaks of, even if less were enough."""
+    """Return the needs of an expression; ``strict``: of all its parts, even if fewer were enough."""
 
     def of_node(key: str, name: str) -> set[Need]:
         attribute = NODE_ATTRIBUTES[normalize_name(name)]
@@ -312,9 +313,9 @@ def _needed(  # noqa: C901, PLR0911 - a case each
         case b.Operation("OR" | "IMPLIES", operands) if not strict:
             return set.intersection(*(_needed(one, nodes, strict=False) for one in operands))
         case b.Operation(operands=operands):
-            return _all(operands, nodes, strict=strict)
+            return _of_each(operands, nodes, strict=strict)
         case b.Tense(operands=operands):
-            return _all(operands, nodes, strict=True)
+            return _of_each(operands, nodes, strict=True)
         case b.SignalCall(word="age" | "exists_now"):
             return set()
         case b.SignalCall(operand=operand):
@@ -331,6 +332,8 @@ def _needed(  # noqa: C901, PLR0911 - a case each
             return {Need("", None, attribute)}
         case b.BlockValue(scope=scope, value=value):
             inner = [*scope.where, *([value] if value is not None else [])]
-            return _all(inner, {k: n for k, n in nodes.items() if k in scope.outer}, strict=True)
+            return _of_each(
+                inner, {k: n for k, n in nodes.items() if k in scope.outer}, strict=True
+            )
         case _:
             return set()

@@ -45,18 +45,18 @@ class Column:
 
     @property
     def true(self) -> Any:
-        """Where it is true; unknown is not."""
+        """Mask where it is true; unknown is not."""
         return self.flags if self.known is True else self.known & self.flags
 
     @property
     def false(self) -> Any:
-        """Where it is false; unknown is not."""
+        """Mask where it is false; unknown is not."""
         flags = np.logical_not(self.flags)
         return flags if self.known is True else self.known & flags
 
 
 def all_known(columns: Iterable[Column]) -> Any:
-    """Where all of some columns are known; ``True``: everywhere."""
+    """Return the mask where all of some columns are known; ``True``: everywhere."""
     found: Any = True
     for column in columns:
         if column.known is not True:

@@ -55,7 +55,7 @@ class Terminal:
     priority: int
 
     def length_at(self, text: str, start: int) -> int:
-        """How many characters of the text from ``start`` it matches; 0: none. Words match as a whole."""
+        """Return the length of the match at ``start``; 0: none. Words match as a whole."""
         if self.pattern is None:
             end = start + len(self.literal)
             length = len(self.literal) if text[start:end].upper() == self.literal else 0
@@ -270,7 +270,7 @@ class Token:
 
 @dataclass(slots=True)
 class _StackEntry:
-    """What lies on the parser's stack: the state after a symbol, what was built of it, where it stands."""
+    """Entry of the parser's stack: the state after a symbol, its result, and its place in the text."""
 
     state: int
     value: Any
@@ -337,7 +337,7 @@ def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -
 
 
 def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
-    """Whether two dashes are meant as an edge, so that what follows is not taken for a comment and dropped."""
+    """Tell whether two dashes are meant as an edge, so that the rest is not taken for a comment."""
     if text.startswith("-->", position):
         return True
     behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
@@ -377,7 +377,7 @@ def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) ->
 
 
 def _children(rule: Rule, parts: list[_StackEntry]) -> list[Any]:
-    """What a rule is built of: without mere signs, with repetitions spread out, absent parts as ``None``."""
+    """Return the parts of a rule: without mere signs, repetitions spread out, absent parts as ``None``."""
     children: list[Any] = []
     for index, part in enumerate(parts):
         if rule.absent:
@@ -470,7 +470,7 @@ def _unexpected(
 
 
 def _shown(found: str) -> str:
-    """What was found, for a message: short, and so that it can be seen."""
+    """Return a part of the text for a message, short and with all characters visible."""
     if not found.isprintable():
         return " ".join(f"U+{ord(character):04X}" for character in found[:8])
     short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
@@ -478,7 +478,7 @@ def _shown(found: str) -> str:
 
 
 def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
-    """Whether the parser would accept the terminal after all reductions that it brings about."""
+    """Tell whether the parser would accept the terminal after all reductions that it brings about."""
     states = [entry.state for entry in stack]
     while (action := machine.states[states[-1]].get(name)) is not None:
         if action >= 0:
@@ -492,7 +492,7 @@ def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
 
 
 def _listed(machine: Tables, names: list[str]) -> str:
-    """What was expected, in words; operators and beginnings of values are each one thing."""
+    """Return the expected terminals in words; operators, and beginnings of values, count as one."""
     left = set(names) - _LATER
     said: list[str] = []
     if left >= _EDGES:

@@ -1,8 +1,6 @@
 """Patterns from Python: built step by step, from networkx, or from an example frame.
 
-Patterns given otherwise than as text: built step by step, or drawn as a networkx graph.
-
-Both become a text of the language and the values of its parameters, so that they mean what the text means.
+All become a text of the language and the values of its parameters, so that they mean what the text means.
 """
 
 from __future__ import annotations
@@ -284,7 +282,7 @@ def _left(ignored: Sequence[str]) -> tuple[frozenset[str], frozenset[str]]:
 
 
 class _Around:
-    """What there is around the ego of a graph."""
+    """Neighbourhood of the ego of a graph."""
 
     def __init__(
         self, graph: SceneGraph, ego: int, relations: frozenset[str], kinds: frozenset[str]
@@ -305,7 +303,7 @@ class _Around:
                 self._in.setdefault(src, set()).add(dst)
 
     def of_ego(self) -> Iterator[str]:
-        """Where the ego is."""
+        """Place of the ego."""
         yield from self._places("ego", self._ego)
 
     def others(self) -> list[int]:

@@ -1,6 +1,7 @@
 """The query plan: which condition is answered in which phase, and the order of rows.
 
-Which condition of a scope is answered in which phase, and which nodes wait for the second one.
+The first phase works on bit masks, the second on single frames. A node that only the second one needs waits
+for it.
 """
 
 from __future__ import annotations
@@ -146,7 +147,7 @@ def _file(condition: Bound, parts: Phases) -> None:
 
 
 def is_masked(condition: Bound) -> bool:
-    """Whether a condition is a block, or the negation of one, or compares a count with a number."""
+    """Tell whether a condition is a block, or the negation of one, or compares a count with a number."""
     match condition:
         case BlockValue(word="EXISTS") | Operation("NOT", (BlockValue(word="EXISTS"),)):
             return True
@@ -170,7 +171,7 @@ def _edge_alone(found: set[Leaf]) -> str | None:
 
 
 def _of_null(condition: Bound) -> bool:
-    """Whether a condition may be true of what has no row: of an edge without attributes."""
+    """Tell whether a condition may be true of what has no row: of an edge without attributes."""
     return any(
         isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce"}
         for part in walk(condition)
@@ -259,7 +260,7 @@ def in_order(extents: Iterable[Sequence[int]], catalog: Catalog) -> list[tuple[i
 def frame_key(
     select: Select, frame: str, catalog: Catalog, window: Window | None, values: BoundValues
 ) -> str:
-    """What rows are ordered by so that traces come in order, and the frames of each in theirs.
+    """Return the sort key that puts traces in order, and the frames of each in theirs.
 
     It is one number, for that is sorted fastest: the id of the frame, with the place of the trace instead of
     its id. Where ids are in order already, it is the id.
@@ -291,7 +292,7 @@ def frame_key(
 def name_key(
     select: Select, number: int, column: str, catalog: Catalog, values: BoundValues
 ) -> str:
-    """What rows are ordered by instead of a column with names of traces.
+    """Return the sort key that replaces a column with names of traces.
 
     Parameters
     ----------

@@ -1,7 +1,5 @@
 """SQL of results: rows, frames, intervals, clips and counts.
 
-Which nodes of several frames are the same: what groups and counts of matches go by.
-
 A node id is a number within a trace, or, below 0, within a map. So an entity is a trace and a number, a part
 of a map is a map and a number, and traces may share that map.
 """
@@ -31,7 +29,7 @@ from sgstore.lang._formulas import (
     owner_text,
 )
 from sgstore.lang._kinds import Profile
-from sgstore.lang._plan import frame_key, name_key, traces_of
+from sgstore.lang._plan import TRACE_OF_BUCKET, frame_key, name_key, traces_of
 from sgstore.lang._sql_frames import Frames, column_of
 from sgstore.lang.ir import (
     CLIP_COLUMNS,
@@ -59,7 +57,7 @@ if TYPE_CHECKING:
     from sgstore.lang._plan import Gathered, Window
 
 
-_TRACE_OF_NODE: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
+_TRACE_KEYS: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
 """What tells the trace, and so whose numbers ids are."""
 
 
@@ -69,12 +67,12 @@ the map, which traces may share. No query can name it."""
 
 
 def owner_of(node: str) -> NodeAttribute:
-    """Whose number the id of a node is."""
+    """Return the owner of a node id: a trace or a map."""
     return NodeAttribute(node, OWNER, Type.number)
 
 
 def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
-    """What tells the nodes among some values apart, beside these values.
+    """Return the owners that tell the nodes among some values apart, beside these values.
 
     Nothing where only one trace is asked, or one of the values says which trace it is.
     """
@@ -105,8 +103,7 @@ def _apart(value: Bound) -> Bound:
 
 def _tells_trace(keys: Iterable[Bound]) -> bool:
     return any(
-        isinstance(k, FrameAttribute | TraceAttribute) and k.attribute in _TRACE_OF_NODE
-        for k in keys
+        isinstance(k, FrameAttribute | TraceAttribute) and k.attribute in _TRACE_KEYS for k in keys
     )
 
 
@@ -122,8 +119,6 @@ def _several(query: Query, catalog: Catalog) -> bool:
 
 _LAST: Final = 59
 """The bit of the last frame of a bucket."""
-
-_TRACE_OF_RUN: Final = '"bucket" >> 18'
 
 
 def runs(masks: str, keys: list[str], apart: list[str]) -> str:
@@ -144,7 +139,8 @@ def runs(masks: str, keys: list[str], apart: list[str]) -> str:
     str
         A relation with the columns of the keys, ``":from"`` and ``":to"``: ids of the first and the last frame.
     """
-    same = f'PARTITION BY {", ".join([_TRACE_OF_RUN, *apart])} ORDER BY "bucket"'
+    trace = f'"bucket" >> {TRACE_OF_BUCKET}'
+    same = f'PARTITION BY {", ".join([trace, *apart])} ORDER BY "bucket"'
     joined = Select(['":masks".*', '":bucket"."joined"'])
     joined.join(nested(masks, ":masks"), [])
     joined.join('"bucket" AS ":bucket"', ['":bucket"."bucket" = ":masks"."bucket"'])
@@ -269,7 +265,7 @@ def frames(
 def count(
     query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
 ) -> SqlStatement:
-    """How many frames match."""
+    """Return the statement for the number of frames that match."""
     told, writer = writer is not None, writer or Frames(query, catalog, window)
     parts = writer.phases(query.scope)
     if parts.rest or parts.late or told:
@@ -423,12 +419,12 @@ class _RowStatement:
 
     @property
     def _grouped(self) -> bool:
-        """Whether a row tells of several frames."""
+        """Tell whether a row tells of several frames."""
         result = self.result
         return (result.distinct or result.aggregated) and not result.framed
 
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
-        """Which keys, behind the query's own, are names of traces whose characters give another order."""
+        """Return the sort keys that are names of traces whose characters give another order."""
         known = [trace.name for trace in self.writer.catalog.traces]
         if known == sorted(known):
             return []
@@ -436,7 +432,7 @@ class _RowStatement:
         return [place for place in range(own, len(keys)) if keys[place] in told]
 
     def _per_values(self) -> list[Bound]:
-        """What is asked of each match to take samples of each value of it."""
+        """Return the value of each match that samples are taken of."""
         per = self.result.sample and self.result.sample.per
         own = [] if per is None or isinstance(per, str) else [per]
         return [*own, *self._per_owners()]
@@ -529,7 +525,7 @@ class _IntervalStatement:
         return runs(self.writer.in_masks(scope, wanted, self._keys()), keys, self.apart)
 
     def _between(self, spans: str) -> str:
-        """What is told of the frames at both ends."""
+        """Return the columns about the frames at both ends."""
         select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
         select.columns += ['":from"."frame_id" AS "first"']
         select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
@@ -553,12 +549,12 @@ class _IntervalStatement:
 
 
 def _column(leaf: Leaf) -> str:
-    """Where a value stands in what matches."""
+    """Return the column of a value in the matches."""
     return f"{_ROWS}.{quoted(column_of(leaf))}"
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """What must stay the same for a value to do so."""
+    """Return the columns that must stay the same for a value to do so."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )

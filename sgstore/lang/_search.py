@@ -87,7 +87,7 @@ class Matcher:
                 yield layout.graph(at.nodes, at.edges, view.nodes)
 
     def holds(self, view: FrameView) -> bool:
-        """Whether there is a match in a graph."""
+        """Tell whether there is a match in a graph."""
         return any(True for _ in self._search.run(Binding(view)))
 
 
@@ -109,7 +109,7 @@ class _SearchStep:
 
     @property
     def among(self) -> bool:
-        """Whether all nodes of its kinds are looked at, not only neighbours or the ego."""
+        """Tell whether all nodes of its kinds are looked at, not only neighbours or the ego."""
         return bool(self.key) and self.via is None and bool(self.kinds.other)
 
 
@@ -237,7 +237,7 @@ class ScopeSearch:
     def _walks(
         self, view: FrameView, edge: Edge, here: int, dst: int, length: int, seen: tuple[int, ...]
     ) -> bool:
-        """Whether so many edges lead from one node to another; nodes on the way differ, if nodes do."""
+        """Tell whether so many edges lead from one node to another; nodes on the way differ, if nodes do."""
         if length == 0:
             return here == dst
         for step in _steps(view, edge.relations, here, both=edge.both):
@@ -329,7 +329,7 @@ def _fitting(at: Binding, step: _SearchStep) -> list[int]:
 def _steps(
     view: FrameView, relations: frozenset[str], here: int, *, both: bool, forward: bool = True
 ) -> Iterator[int]:
-    """Where edges lead from a node, each once."""
+    """Nodes to which edges lead from a node, each once."""
     sides = (view.ahead, view.back) if both else (view.ahead,) if forward else (view.back,)
     found: dict[int, None] = {}
     for side in sides:

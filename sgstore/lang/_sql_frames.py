@@ -380,7 +380,7 @@ class Frames(Masks):
         edges: frozenset[str],
         wanted: Iterable[Leaf],
     ) -> tuple[Select, dict[Leaf, str]]:
-        """What the first phase leaves, joined with what lasting values come from; how each is computed."""
+        """Return the result of the first phase, joined with the tables of lasting values, and their SQL."""
         select = Select()
         select.join(nested(self.masks(scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
         bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
@@ -437,7 +437,7 @@ class Frames(Masks):
         ties: frozenset[str],
         needed: list[Leaf],
     ) -> SharedRelation | None:
-        """What the first phase leaves, and its frames; what it gives to the blocks of the second."""
+        """Return the result of the first phase and its frames, and what the blocks of the second phase need."""
         if parts.empty:
             return None
         nodes = bound - parts.late
@@ -499,7 +499,7 @@ class Frames(Masks):
     def _homes(
         self, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
     ) -> set[Home]:
-        """Where the values of a node that are needed live; ``stated``: its state is joined anyway."""
+        """Return the tables of the needed values of a node; ``stated``: its state is joined anyway."""
         profile = Profile.of(scope.kinds(key), self.catalog)
         of_it = [leaf for leaf in needed if key in _valued(leaf)]
         homes = _homes(of_it, profile)
@@ -595,7 +595,7 @@ class Frames(Masks):
         join.at[key] = Aliases(state, entity, part, TRACE)
 
     def _say(self, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf) -> None:
-        """How a value is computed; a block or the attributes of an edge are joined for it."""
+        """Return the SQL of a value; a block or the attributes of an edge are joined for it."""
         match leaf:
             case NodeValue(node=node):
                 join.texts[leaf] = join.nodes[node]
@@ -710,7 +710,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
 
 
 def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
-    """Where values of a node live, of the places where the node may live."""
+    """Return the tables with values of a node, of those where the node may be."""
     homes: set[Home] = set()
     for leaf in needed:
         if isinstance(leaf, PairNumber):
@@ -721,7 +721,7 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
 
 
 def _of_kind(leaf: Leaf) -> bool:
-    """Whether a value is made of the kind, and the id, of a node."""
+    """Tell whether a value is made of the kind, and the id, of a node."""
     attribute = leaf.attribute if isinstance(leaf, NodeAttribute) else None
     return attribute is not None and (
         attribute.unit is DisplayUnit.label or attribute.name == "kind"

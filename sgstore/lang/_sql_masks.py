@@ -1,6 +1,6 @@
 """SQL of the first phase: presence and relations as bit masks.
 
-Where nodes are present and what is asked of them alone: as masks, a relation for each place they live in.
+Presence of nodes and conditions on one node alone: as masks, a relation for each table that holds such nodes.
 """
 
 from __future__ import annotations
@@ -233,11 +233,11 @@ class CountRange:
 
     @property
     def empty(self) -> bool:
-        """Whether no count is wanted."""
+        """Tell whether no count is wanted."""
         return self.end is not None and self.least >= self.end
 
     def condition(self, count: str) -> str:
-        """Whether a count is wanted."""
+        """Tell whether a count is wanted."""
         least = f"{count} >= {self.least}"
         return least if self.end is None else f"{least} AND {count} < {self.end}"
 
@@ -484,11 +484,11 @@ class Masks(PresenceSql, ABC):
         return select.text()
 
     def in_mask(self, alias: str, frame: str) -> str:
-        """Whether a frame of the same bucket is one of those in which a row of the first phase holds."""
+        """Tell whether a frame of the same bucket is one of those in which a row of the first phase holds."""
         return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
 
     def number_of_frames(self, text: str) -> str:
-        """How many frames a relation of the first phase that binds nothing speaks of, as ``frames``."""
+        """Return the number of frames of a first-phase relation that binds nothing, as ``frames``."""
         total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
         return Select([total], [nested(text, ":pattern")]).text()
 
@@ -513,7 +513,7 @@ class Masks(PresenceSql, ABC):
 
     @property
     def chooses_traces(self) -> bool:
-        """Whether the query chooses some of the traces, by their ego or by a dataset."""
+        """Tell whether the query chooses some of the traces, by their ego or by a dataset."""
         return self.query.ego is not None or self.catalog.only is not None
 
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
@@ -774,7 +774,7 @@ class Masks(PresenceSql, ABC):
         return select.text()
 
     def _block(self, condition: Bound, given: SharedRelation) -> tuple[str, frozenset[str], bool]:
-        """Where a block is true (or, if the last is false, where it is not), and the nodes it speaks of."""
+        """Return where a block is true (or, if the last is false, where it is not), and its outer nodes."""
         match condition:
             case BlockValue(scope=scope):
                 return self.existence(scope, given), frozenset(scope.outer), True

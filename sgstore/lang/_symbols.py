@@ -1,7 +1,5 @@
 """The symbol table, data sets and tests of texts.
 
-Names while a query is bound: which are visible, what they mean, which nodes a scope speaks of.
-
 Two chains run from the inside out. *Names* are what a text may say: those of a block see those around it,
 those of a predicate's body see its parameters only. *Scopes* are where nodes live; a node that is spoken of
 in a scope further in becomes an outer node of every scope between.
@@ -42,7 +40,7 @@ RESERVED: Final = frozenset({"env", "frame", "trace"})
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """What a name means: a node, an edge, or (for the parameter of a predicate) a value."""
+    """Meaning of a name: a node, an edge, or (for the parameter of a predicate) a value."""
 
     node: str | None = None
     edge: str | None = None
@@ -57,7 +55,7 @@ Binders = Mapping[type, Binder]
 
 @dataclass(slots=True)
 class Session:
-    """What is common to the whole of a query while it is bound.
+    """State that the whole of a query shares while it is bound.
 
     Attributes
     ----------
@@ -150,7 +148,7 @@ class ScopeBuilder:
         return self.parent.top if self.parent else self
 
     def kinds(self, key: str) -> Kinds:
-        """What a node may be here."""
+        """Return the kinds that a node may have here."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
     def mention(self, key: str) -> None:
@@ -187,7 +185,7 @@ class ScopeBuilder:
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
     def distinct(self) -> frozenset[tuple[str, str]]:
-        """What must differ, of what was spoken of so far: own nodes from each other and from outer ones."""
+        """Return the pairs of nodes that must differ: own nodes from each other and from outer ones."""
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
@@ -240,7 +238,7 @@ class SymbolTable:
         return SymbolTable(self.session, self.scope, meanings)
 
     def meaning(self, name: str) -> Symbol | None:
-        """What a name means here; ``None`` if it is not known. ``ego`` is not looked up here."""
+        """Return the meaning of a name here; ``None`` if it is not known. ``ego`` is not looked up."""
         names: SymbolTable | None = self
         while names is not None:
             if name in names.meanings:
@@ -273,7 +271,7 @@ class SymbolTable:
         return key
 
     def _hint(self, name: str) -> str | None:
-        """What a name that means nothing here may have meant."""
+        """Return a hint for a name that has no meaning here."""
         if self.session.calls:
             return f"{self.session.calls[-1]}() knows its parameters and ego only"
         elsewhere = name.lower() in self.session.keys
@@ -387,7 +385,7 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
 def seen_in(
     classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
 ) -> b.FrameAttribute:
-    """Whether the class of a frame is that of a frame of a dataset: traces, or a table with frames.
+    """Return the condition that the class of a frame occurs in a dataset: traces, or a table with frames.
 
     Raises
     ------
@@ -414,7 +412,7 @@ def seen_in(
 
 
 def class_count(abstraction: str) -> b.FrameAttribute:
-    """How many frames of the store are of the class of the frame."""
+    """Return the number of frames in the store that are of the class of the frame."""
     home = {Home.state: abstraction}
     name = f"class_count({abstraction})"
     attribute = Attribute(name, Type.number, home, "frames of its class", DisplayUnit.counted)

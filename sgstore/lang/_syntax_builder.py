@@ -1,4 +1,4 @@
-"""What the parser builds of each rule of the grammar.
+"""Syntax trees: the function that builds each rule of the grammar.
 
 A builder is named for its rule (or for the alias of its alternative), takes the span and the children, and
 returns a part of the syntax tree. Signs and keywords are no children; an absent optional part is ``None``.
@@ -61,7 +61,7 @@ def _string(span: TextSpan, children: Children) -> s.Constant:
 
 
 def _unquoted(text: str) -> str:
-    r"""What stands between the quotes; a backslash that escapes nothing stays, as ``\d`` needs."""
+    r"""Return the text between the quotes; a backslash that escapes nothing stays, as ``\d`` needs."""
     return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
 
 

@@ -1,4 +1,4 @@
-"""Why a graph does not match a pattern.
+"""Explanation of a failed match: the first part of a pattern that a graph does not have.
 
 Bound patterns as text of the language, part by part: what is printed of them can be pasted and asked again.
 
@@ -106,7 +106,7 @@ class Writer:
         return name
 
     def name(self, key: str, kinds: b.Kinds | None = None) -> str:
-        """What a node or an edge is called."""
+        """Return the name of a node or an edge."""
         if key not in self._names:
             every = kinds.every if kinds else frozenset[str]()
             self._names[key] = self._free(next(iter(every)) if len(every) == 1 else "any")
@@ -132,13 +132,13 @@ class Writer:
         return f"-[{name}{label or (':%' if times else '')}{times}]{'-' if edge.both else '->'}"
 
     def edge_name(self, key: str) -> str:
-        """What an edge is called."""
+        """Return the name of an edge."""
         if key not in self._names:
             self._names[key] = self._free("edge")
         return self._names[key]
 
     def block(self, scope: b.Scope) -> str:
-        """What stands in the braces of a block."""
+        """Return the text in the braces of a block."""
         tests = [one for one in scope.where if isinstance(one, b.LabelTest)]
         paths = [self.node(test.node, test.kinds) for test in tests]
         said = {test.node for test in tests}.union(*((e.src, e.dst) for e in scope.edges))
@@ -263,7 +263,7 @@ MOST_LOOKED_AT: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class WhyNot:
-    """How far a pattern holds in a graph.
+    """Longest part of a pattern that holds in a graph.
 
     Attributes
     ----------
@@ -311,7 +311,7 @@ class WhyNot:
 
 @dataclass(frozen=True, slots=True)
 class WhyNotSteps:
-    """How far each step of a sequence holds in one graph; how long it does, and what comes when, is left aside.
+    """Longest part of each step of a sequence that holds in one graph; durations and order are left aside.
 
     Attributes
     ----------
@@ -340,7 +340,7 @@ class WhyNotSteps:
 
 
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
-    """How far a bound pattern, written as ``text``, holds in a graph; of a sequence, each of its steps."""
+    """Explain how far a bound pattern, written as ``text``, holds in a graph; of a sequence, each step."""
     if not query.steps:
         return _in_frame(query.scope, query, view)
     texts = (" ".join(text[step.span.start : step.span.end].split()) for step in query.steps)
@@ -361,7 +361,7 @@ def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
 
 
 def looked_up(query: b.Query) -> list[b.FrameAttribute]:
-    """What a pattern asks of a frame that only the store can tell: its weather, tables of users' own."""
+    """Return the values of a frame that only the store can tell: its weather, users' own tables."""
     found: dict[str, b.FrameAttribute] = {}
 
     def look(scope: b.Scope) -> None:
@@ -448,7 +448,7 @@ def _failure(part: _Part, scope: b.Scope, asked: _AskedPart, held: tuple[str, ..
 
 
 def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:
-    """How far a condition is from being true: 0 if it is, else by how much its numbers miss; inf if unknown."""
+    """Return the distance of a condition from being true: 0 if it is true, inf if it is unknown."""
     if _value(condition, at, query) is True:
         return 0.0
     match condition:
@@ -472,7 +472,7 @@ def _value(of: b.Bound, at: Binding, query: b.Query) -> Any:
 
 
 def _apart(edge: b.Edge, at: Binding) -> float:
-    """How near the ends of an edge are to one another: their distance, or inf where they have none."""
+    """Return the distance between the ends of an edge; inf where they have none."""
     distance = at.view.pair("dist", at.nodes[edge.src], at.nodes[edge.dst])
     return math.inf if distance is None else distance
 
@@ -501,7 +501,7 @@ def _name(view: FrameView, node: int) -> str:
 
 
 def _population(view: FrameView) -> str:
-    """How many nodes there are of each kind."""
+    """Return the number of nodes of each kind."""
     counts = Counter(attributes["kind"] for attributes in view.nodes.values())
     found = [(kind_label(kind), counts[kind]) for kind in KINDS if counts[kind]]
     return " AND ".join(f"COUNT {{(:{label})}} = {many}" for label, many in found)
@@ -529,7 +529,7 @@ def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
 
 
 def _values(condition: b.Bound, at: Binding, asked: _AskedPart) -> str:
-    """What the values in a condition are."""
+    """Return the values in a condition."""
     texts: dict[str, str] = {}
     for leaf in leaves(condition):
         name = asked.writer.expression(leaf)

@@ -1,6 +1,6 @@
 """The IR: bound patterns, sequences and checks.
 
-Bound patterns: every name resolved, every value typed; what the stages after the binder share.
+Every name is resolved and every value typed. The stages after the binder share these classes.
 
 A *scope* is what stands in one ``MATCH`` or one pair of braces: nodes, edges, conditions that all must be true,
 and which nodes must differ. Nodes have keys that are unique in the query whatever the case of letters; those of
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """What a node may be: its kinds if it is the ego, and its kinds if it is not."""
+    """Kinds that a node may have: if it is the ego, and if it is not."""
 
     ego: frozenset[str]
     other: frozenset[str]
@@ -51,7 +51,7 @@ class Kinds:
 
     @property
     def one_a_frame(self) -> bool:
-        """Whether there is no more than one such node in a frame, for it must be the ego."""
+        """Tell whether there is no more than one such node in a frame, for it must be the ego."""
         return not self.other
 
 
@@ -166,7 +166,7 @@ class NodeAttribute:
 
 @dataclass(frozen=True, slots=True)
 class LabelTest:
-    """Whether a node, bound outside, has a label."""
+    """Test that a node, bound outside, has a label."""
 
     node: str
     kinds: Kinds
@@ -325,7 +325,7 @@ Bound = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scope:
-    """What one ``MATCH`` or one block asks for. Two scopes are equal only if they are the same.
+    """Pattern of one ``MATCH`` or one block. Two scopes are equal only if they are the same object.
 
     Attributes
     ----------
@@ -347,7 +347,7 @@ class Scope:
     distinct: frozenset[tuple[str, str]]
 
     def kinds(self, key: str) -> Kinds:
-        """What a node of this scope, or one that it speaks of, may be."""
+        """Return the kinds of a node of this scope, or of one that it speaks of."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
 
@@ -384,7 +384,7 @@ class ReturnColumn:
 
 @dataclass(frozen=True, slots=True)
 class SortKey:
-    """What to order by: a value, or the name of a result."""
+    """Key to order by: a value, or the name of a result."""
 
     value: Bound | str
     descending: bool
@@ -400,7 +400,7 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What to return of the matches.
+    """Values and form in which matches are returned.
 
     Attributes
     ----------
@@ -442,7 +442,7 @@ class Result:
 
     @property
     def aggregated(self) -> bool:
-        """Whether it counts or sums over matches, rather than listing them."""
+        """Tell whether it counts or sums over matches, rather than listing them."""
         return any(isinstance(e, Aggregate) for c in self.columns for e in walk(c.value))
 
     def changed(self, change: Callable[[Bound], Bound]) -> Result:
@@ -519,7 +519,7 @@ def walk(expression: Bound) -> Iterator[Bound]:
 
 
 def is_temporal(expression: Bound) -> bool:
-    """Whether an expression looks at more than one frame."""
+    """Tell whether an expression looks at more than one frame."""
     return any(isinstance(part, Tense | SignalCall | StepTime) for part in walk(expression))
 
 
@@ -573,7 +573,7 @@ _COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class BoundHold:
-    """How long a step must last: the first and the last frame of the run are so far apart.
+    """Duration that a step must have: from the first to the last frame of its run.
 
     Attributes
     ----------
@@ -589,7 +589,7 @@ class BoundHold:
     inclusive: bool
 
     def fits(self, length: Any, tolerance: int) -> Any:
-        """Whether a run that is so long lasts as it must.
+        """Tell whether a run that is so long lasts as it must.
 
         Parameters
         ----------
@@ -631,7 +631,7 @@ class BoundStep:
 
 @dataclass(frozen=True, slots=True)
 class StepLink:
-    """When a step comes after the one before.
+    """Relation in time between a step and the one before it.
 
     Attributes
     ----------

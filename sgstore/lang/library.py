@@ -127,7 +127,7 @@ class NamedPattern:
 
     @property
     def is_check(self) -> bool:
-        """Whether it is a ``CHECK``, which has a verdict, and not a ``MATCH``, which has matches."""
+        """Tell whether it is a ``CHECK``, which has a verdict, and not a ``MATCH``, which has matches."""
         return self.kind == "property"
 
     def written(self, **values: object) -> str:

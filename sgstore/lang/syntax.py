@@ -372,7 +372,7 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class LinkClause:
-    """What stands between two steps: when the second one comes after the first.
+    """Link between two steps: when the second one comes after the first.
 
     Attributes
     ----------

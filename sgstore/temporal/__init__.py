@@ -1,7 +1,7 @@
 """Temporal formulas (LTLf with past and bounds): over whole traces as columns, and frame by frame.
 
-Both engines give the same answers: :func:`evaluate` at all frames of a trace at once, :class:`Online` as the
-frames come, each as soon as it is known.
+Both engines give the same answers: :func:`evaluate` at all frames of a trace at once,
+:class:`OnlineFormula` as the frames come, each as soon as it is known.
 """
 
 import lazy_loader

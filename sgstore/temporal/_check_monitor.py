@@ -1,9 +1,8 @@
 """The monitor of one ``CHECK``, frame by frame.
 
-What a check still asks of one binding: states that are shared by all bindings that are in the same.
-
-A state is made once and compared by identity. What follows a state and a letter is remembered, where time does
-not matter in it, so most bindings of most checks take one look into a table a frame.
+A check has a state for each binding, shared by all bindings in the same state. A state is made once and is
+compared by identity. What follows a state and a letter is remembered, where time does not matter in it, so most
+bindings of most checks take one look into a table a frame.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ Duties = tuple["frozenset[Term] | Term | None", ...]
 
 
 class ObligationState:
-    """What is still to be shown, and what operators of the past keep.
+    """State of a formula: its open obligations, and the memory of operators of the past.
 
     Attributes
     ----------
@@ -96,7 +95,7 @@ class ObligationState:
 
     @property
     def ended(self) -> bool:
-        """Whether the formula is true if no frame follows."""
+        """Tell whether the formula is true if no frame follows."""
         if self.word in {"broken", "begins"}:
             return self.word == "begins"
         open_terms = [d for duty in self.duties if duty for d in _open(duty)]
@@ -105,7 +104,7 @@ class ObligationState:
 
 @dataclass(frozen=True, slots=True)
 class ObligationStep:
-    """What a frame makes of a state.
+    """Transition of a state by one frame.
 
     Attributes
     ----------
@@ -173,7 +172,7 @@ class Automaton:
         tick: Tick,
         seen: dict[tuple[ObligationState, int], ObligationStep],
     ) -> ObligationStep:
-        """What a frame makes of a state.
+        """Return the transition of a state by one frame.
 
         Parameters
         ----------
@@ -256,7 +255,7 @@ class Automaton:
         return word == "kept" or (word == "broken" and self._reset is None)
 
     def final(self, state: ObligationState, counted: int) -> bool:
-        """Whether no frame changes a state any more, if so many guards were true in some frame."""
+        """Tell whether no frame changes a state any more, if so many guards were true in some frame."""
         return self._lasts(state.word) and counted == (1 << len(self._guards)) - 1
 
     def _moved(self, state: ObligationState, frame: ProgressionFrame) -> tuple[str, Duties]:
@@ -306,7 +305,7 @@ def _part(formula: Formula) -> tuple[bool, Formula]:
 
 @dataclass(frozen=True, slots=True)
 class _CheckEntry:
-    """What is known of a binding.
+    """Knowledge about one binding.
 
     Attributes
     ----------
@@ -439,7 +438,7 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """What is known of a binding that is violated as long as the trace may not end."""
+        """Return the entry of a binding that is violated as long as the trace may not end."""
         since, over = entry.since, entry.over
         if not step.state.ended:
             since = since or here
@@ -456,7 +455,7 @@ class CheckMonitor:
     # What is known
 
     def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
-        """What is told of bindings of which something else is known than before; of all, if somebody is new."""
+        """Return the events of bindings whose status has changed; of all bindings, if an entity is new."""
         rows = list(self._known.held) if self._kinds & self._questions.fresh else changed
         for row in rows:
             entry = self._known.of(row)
@@ -489,7 +488,7 @@ class CheckMonitor:
                 yield key  # type: ignore[misc]
 
     def _counts(self, key: Key, entry: _CheckEntry) -> bool:
-        """Whether a binding is one that the check is about."""
+        """Tell whether a binding is one that the check is about."""
         if entry.counted != (1 << len(self._guards)) - 1:
             return False
         if any(n not in self._domains[v] for n, v in zip(key, self._variables, strict=True)):
@@ -500,7 +499,7 @@ class CheckMonitor:
 
     @property
     def _others(self) -> set[int]:
-        """What the nodes that no quantifier binds were: the egos."""
+        """Return the nodes that no quantifier binds: the egos."""
         rest = [n for n in self._domains if n not in self._variables]
         return {node for name in rest for node in self._domains[name]}
 
@@ -521,7 +520,7 @@ class CheckMonitor:
     # The end
 
     def status(self) -> str:
-        """What is known of the check, for the entities that were met: one of ``STATUS``."""
+        """The status of the check for the entities seen so far: one of ``STATUS``."""
         levels = self._levels()
         bindings = innermost(levels)
         return STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]

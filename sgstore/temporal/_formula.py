@@ -54,7 +54,7 @@ class TruthConstant:
 
 @dataclass(frozen=True, slots=True)
 class Proposition:
-    """What is true or false at a frame by itself."""
+    """Proposition: true or false at each frame by itself."""
 
     name: str
 
@@ -188,7 +188,7 @@ def operands_of(formula: Formula) -> tuple[Formula, ...]:
 
 
 def looks_ahead(formula: Formula) -> bool:
-    """Whether a formula depends on later frames."""
+    """Tell whether a formula depends on later frames."""
     return any(isinstance(part, Next | Until) for part in walk(formula))
 
 

@@ -1,6 +1,6 @@
 """The online monitor, and its sources of frames.
 
-Where the frames of a monitor come from: a recording as if it were live, or a running CARLA.
+Frames come from a recording, as if it were live, or from a running CARLA.
 """
 
 from __future__ import annotations
@@ -318,7 +318,7 @@ class Monitor:
 
     @property
     def status(self) -> dict[str, str]:
-        """What is known of each check so far: ``true``, ``false``, ``presumably_true``, ``presumably_false``.
+        """The status of each check so far: ``true``, ``false``, ``presumably_true``, ``presumably_false``.
 
         The latter are what the verdict would be if the trace ended now. ``unknown``: it cannot be told.
         """
@@ -381,7 +381,7 @@ class _PendingEvents:
     def passed(
         self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
     ) -> list[MonitorEvent]:
-        """What is told in a frame, of what was found up to it."""
+        """Return the events of a frame, of what was found up to it."""
         if not self.wanted.open:
             return found
         self.wanted.look(people)
@@ -394,7 +394,7 @@ class _PendingEvents:
 
 
 def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
-    """What so many patterns are called."""
+    """Return names for so many patterns."""
     if isinstance(called, str):
         return [called] if count == 1 else [f"{called} {i + 1}" for i in range(count)]
     if len(called) != count:

@@ -1,7 +1,5 @@
 """Evaluation plans: temporal expressions as formulas over atoms, and their text.
 
-From bound expressions that look at several frames to formulas over atoms: the one form that is evaluated.
-
 A :class:`Plan` has all that an expression, or several of one statement, need of single frames, once each:
 
 * an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a query of its own:
@@ -129,7 +127,7 @@ class Test:
 
 @dataclass(slots=True)
 class Plan:
-    """What some expressions need of single frames.
+    """Atoms, signals and tests of single frames that some expressions are made of.
 
     Parameters
     ----------
@@ -179,7 +177,7 @@ class Plan:
         return b.nodes_of(expression) | edges | frozenset(ends)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """What must be there, or a condition on one frame is false, its smallest ones being false then."""
+        """Return the nodes and edges without which a condition on one frame is false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -365,7 +363,7 @@ def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # n
 
 
 def _never_unknown(expression: b.Bound) -> bool:
-    """Whether it compares a number of matches with a constant, which is known always."""
+    """Tell whether it compares a number of matches with a constant, which is known always."""
     match expression:
         case b.Operation(operands=(b.BlockValue(word="COUNT"), b.Value(value=value))):
             return value is not None
@@ -471,7 +469,7 @@ def plan_text(
 
 
 def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
-    """What a plan needs of single frames, a line each; with a catalog, also the SQL."""
+    """Return the needs of a plan as text, a line each; with a catalog, also the SQL."""
     lines: list[str] = []
     for atom in plan.atoms.values():
         where = " AND ".join(value_text(part) for part in atom.query.scope.where) or "TRUE"
@@ -496,13 +494,13 @@ def sql_text(statement: SqlStatement) -> list[str]:
 
 
 def hold_text(hold: BoundHold) -> str:
-    """How long a step must last."""
+    """Return the duration of a step as text."""
     inclusive = " INCLUSIVE" if hold.inclusive else ""
     return f"for {hold.comparison} {length_text(hold.length)}{inclusive}"
 
 
 def link_text(link: StepLink) -> str:
-    """When a step comes after the one before."""
+    """Return a link between steps as text."""
     after = f" after {length_text(link.after)}" if link.after else ""
     within = f" within {length_text(link.within)}" if link.within else ""
     return f"{link.kind}{after}{within}"

@@ -1,7 +1,5 @@
 """Formula progression: obligations after each frame, in bounded memory.
 
-Progression: what of a formula is still to be shown after each frame, as combinations told by identity.
-
 At each frame a formula becomes a combination by *and*, *or* and *not* of **duties**: formulas that the next
 frame must show (or need not, where there is none). What is already known vanishes in it. Equal combinations
 are one object, so duties that come back are recognised, and a formula without bounds meets few of them:
@@ -95,7 +93,7 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """Whether it makes another one of its shape true; both of sense 1, or -1."""
+        """Tell whether it makes another one of its shape true; both of sense 1, or -1."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
@@ -134,18 +132,18 @@ class Terms:
         return term
 
     def constant(self, value: bool) -> Term:  # noqa: FBT001 - it is the value
-        """What is known."""
+        """Return the term of a known value."""
         return self.true if value else self.false
 
     def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
-        """What the next frame must show; ``since``: from where its bound counts, if that has begun already.
+        """Return the obligation on the next frame; ``since``: the start of its bound, if that has begun.
 
         The formula is told by identity: equal parts of a formula are to be one object.
         """
         return self._made("duty", (formula, since, weak), (id(formula), since, weak))
 
     def negated(self, term: Term) -> Term:
-        """What is not."""
+        """Return the negation of a term."""
         if term is self.true or term is self.false:
             return self.constant(term is self.false)
         if term.word == "not":
@@ -235,7 +233,7 @@ class Progression:
 
     @property
     def untimed(self) -> bool:
-        """Whether time stamps do not matter."""
+        """Tell whether time stamps do not matter."""
         return not any(
             isinstance(p, Until | Since) and (p.bound.low or p.bound.high is not None)
             for p in walk(self.formula)
@@ -277,11 +275,11 @@ class Tick:
     tolerance: int = 0
 
     def begun(self, bound: Bound, age: int) -> bool:
-        """Whether what is so old (ns, or frames) lies behind the lower end of a bound."""
+        """Tell whether what is so old (ns, or frames) lies behind the lower end of a bound."""
         return age >= bound.low - (0 if bound.frames else self.tolerance)
 
     def over(self, bound: Bound, age: int) -> bool:
-        """Whether it lies behind the upper end, too."""
+        """Tell whether it lies behind the upper end, too."""
         if bound.high is None:
             return False
         return age > bound.high + (0 if bound.frames else self.tolerance)
@@ -379,7 +377,7 @@ class ProgressionFrame:
     def _of_past(
         self, part: Formula, before: Term, entries: tuple[Entry, ...]
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """What an operator of the past is at this frame, and the entries that it keeps."""
+        """Return the value of an operator of the past at this frame, and the entries that it keeps."""
         terms, before = self._terms, self.resolved(before)
         if isinstance(part, Previous):
             return before, ()
@@ -438,7 +436,7 @@ class ProgressionFrame:
         return self._tick.time - entry[0]
 
     def past(self) -> Past:
-        """What operators of the past leave to the next frame."""
+        """Return the memory of operators of the past for the next frame."""
         return tuple(
             (self.now(p.operand) if isinstance(p, Previous) else self._present[id(p)], entries)
             for p, entries in zip(self._parts, self._entries, strict=True)
@@ -489,7 +487,7 @@ class OnlineFormula:
 
     @property
     def certain(self) -> bool:
-        """Whether no further frame can change the verdict, as far as logic without search can tell."""
+        """Tell whether no further frame can change the verdict, as far as logic without search can tell."""
         return self._first is self.terms.true or self._first is self.terms.false
 
     def step(self, letter: Mapping[str, bool], time_ns: int) -> list[tuple[int, bool]]:
@@ -544,7 +542,7 @@ class OnlineFormula:
 
     @property
     def state(self) -> object:
-        """What the verdict still depends on.
+        """The state on which the verdict still depends.
 
         If a step of a formula that is :attr:`plain` leaves it the same, it stays so while the propositions do.
         """
@@ -552,7 +550,7 @@ class OnlineFormula:
 
     @property
     def plain(self) -> bool:
-        """Whether a step depends on the propositions alone: no bounds, and nothing of the past."""
+        """Tell whether a step depends on the propositions alone: no bounds, and nothing of the past."""
         return self._plain
 
     def finish(self) -> list[tuple[int, bool]]:

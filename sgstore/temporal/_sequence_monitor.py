@@ -1,7 +1,4 @@
-"""The monitor of one ``MATCH`` or sequence, frame by frame, and its events.
-
-What a monitor tells.
-"""
+"""The monitor of one ``MATCH`` or sequence, frame by frame, and its events."""
 
 from __future__ import annotations
 
@@ -156,7 +153,7 @@ class StepState:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is remembered."""
+        """Tell whether nothing is remembered."""
         return not (self.places or self._queue or self._run)
 
     @property
@@ -179,13 +176,13 @@ class StepState:
 
     @property
     def open(self) -> list[Needs]:
-        """What frames still need, the earliest first."""
+        """Needs of frames that are still open, the earliest first."""
         return [asked.holds for asked in self._queue]
 
     def decide(
         self, needs: list[Needs], hold: BoundHold | None, period: int, tolerance: int
     ) -> None:
-        """What those frames need now: who needs nothing any more is a place, or is none."""
+        """Decide open frames: one that needs nothing any more is a place, or is none."""
         for asked, need in zip(self._queue, needs, strict=True):
             asked.holds = need
         while self._queue and isinstance(self._queue[0].holds, bool):
@@ -221,7 +218,7 @@ class StepState:
         self._waiting = []
 
     def _long(self, hold: BoundHold, period: int, tolerance: int) -> bool:
-        """Whether the run is as long as is asked."""
+        """Tell whether the run is as long as is asked."""
         assert self._run is not None  # noqa: S101 - there is one
         last = self._waiting[-1]
         length = last.time - self._start[1] + (period if hold.inclusive else 0)
@@ -472,7 +469,7 @@ class SequenceMonitor:
     def _closed(  # noqa: PLR0911 - a case each
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
     ) -> bool:
-        """Whether no further place of the next step can come that a link allows."""
+        """Tell whether no further place of the next step can come that a link allows."""
         if self._ended:
             return True
         tick = self._pulse.tick
@@ -554,7 +551,7 @@ class SequenceMonitor:
     def _alive(  # noqa: PLR0911 - a case each
         self, at: int, binding: Binding, place: StepFrame
     ) -> bool:
-        """Whether it is still open what follows a place."""
+        """Tell whether it is still open what follows a place."""
         following = at + 1
         if following == len(self._steps):
             return False
@@ -598,7 +595,7 @@ def _named(query: Query) -> tuple[str, ...]:
 
 
 def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) -> bool:
-    """Whether another place is as much later as a link asks; times have a tolerance, in ns."""
+    """Tell whether another place is as much later as a link asks; times have a tolerance, in ns."""
     later = {True: other.number - place.number, False: other.time - place.time}
     slack = {True: 0, False: tolerance}
     after, within = link.after, link.within
@@ -655,15 +652,15 @@ class _Conditions:
         known.keep(entries, lambda one, other: one == other)
 
     def row(self, nodes: Binding) -> Partial:
-        """What the conditions are told of a binding."""
+        """Return the row of a binding that the conditions are given."""
         return tuple(nodes.get(name) for name in self._variables)
 
     def now(self, number: int, row: Partial) -> Term:
-        """What the conditions of a step need, of a binding in this frame."""
+        """Return the needs of a step's conditions for a binding in this frame."""
         return self._frame(row).now(self._when[number])
 
     def resolved(self, needs: Needs) -> Needs:
-        """What conditions of a former frame need, with what this one shows."""
+        """Return the needs of a former frame, with what this one shows."""
         if isinstance(needs, bool):
             return needs
         return settled([(row, self._frame(row).resolved(term)) for row, term in needs])
@@ -674,7 +671,7 @@ class _Conditions:
 
 
 def settled(needs: list[tuple[Partial, Term]]) -> Needs:
-    """Whether one of some conditions holds, or which of them may."""
+    """Tell whether one of some conditions holds, or which of them may."""
     if any(term.word == "true" for _, term in needs):
         return True
     left = tuple((row, term) for row, term in needs if term.word != "false")

@@ -1,7 +1,5 @@
 """Sequences over columns, and joins of their bindings.
 
-Sequences over columns: steps that follow one another, for many bindings at once.
-
 A match is a frame for each step, each frame within the bounds that the link before it sets. There is one match
 for each binding and maximal run of frames of the first step: of all that begin in the run, the one whose frames
 are the earliest, compared from the first step on.
@@ -87,7 +85,7 @@ class BindingLine:
         return np.cumsum(self._starts(places)) - 1
 
     def _starts(self, places: Ints) -> Bools:
-        """Where runs begin: after a frame that is missing, a gap, or another binding's last frame."""
+        """Return where runs begin: after a missing frame, a gap, or another binding's last frame."""
         starts = np.ones(len(places), np.bool_)
         follows = np.diff(places) == 1
         starts[1:] = ~follows | self._breaks[self.frame(places[1:])]

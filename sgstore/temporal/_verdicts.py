@@ -1,7 +1,5 @@
 """Verdicts: values of formulas, when they are decided, and at every prefix.
 
-What a formula would be if the trace ended at each of its frames, for all of them at once.
-
 At a frame, a formula that looks ahead has a *course*: what it is if the trace ends there, and at which later
 ends it becomes something else. Logic joins courses; an *until* whose sides can only become true is true from
 one end on. At the frame that is asked for, the last *until* may have any course on its right, for only one
@@ -53,7 +51,7 @@ class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
 
 @dataclass(frozen=True, slots=True)
 class PrefixVerdicts:
-    """What a formula is at each frame for each end of the trace.
+    """Values of a formula at each frame for each end of the trace.
 
     Attributes
     ----------
@@ -154,7 +152,7 @@ class _Endings:
         return np.cumsum(change[:-1]) > 0
 
     def course(self, formula: Formula) -> PrefixVerdicts:
-        """What a formula is at all frames for all ends.
+        """Return the values of a formula at all frames for all ends.
 
         Raises
         ------
@@ -233,7 +231,7 @@ class DecidedFrom:
 
 
 def known(formula: Formula, table: PropositionTable) -> DecidedFrom:
-    """When it is certain what a formula is at each frame.
+    """Return the frame at which the value of a formula at each frame is certain.
 
     Parameters
     ----------
@@ -290,7 +288,7 @@ class _Knowing:
                 return self._since(formula)
 
     def _now(self, flags: Bools) -> DecidedFrom:
-        """What is known at the frame itself."""
+        """Return the values that are decided at the frame itself."""
         never = self._here.dtype.type(self._frames)
         return DecidedFrom(np.where(flags, self._here, never), np.where(flags, never, self._here))
 
@@ -513,7 +511,7 @@ class Settled:
         return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:
-        """Where the formula is violated, asked from the first frame on.
+        """Return the violations of the formula, asked from the first frame on.
 
         Parameters
         ----------
@@ -601,7 +599,7 @@ def _taken(formula: Formula, *, upper: bool) -> Formula:  # noqa: PLR0911 - a ca
 
 
 def always_true(formula: Formula) -> Formula | None:
-    """What a formula says to be true from here to the end of the trace; ``None`` if it is not of that form."""
+    """Return the operand of an ``ALWAYS`` to the end of the trace; ``None`` if a formula has another form."""
     match formula:
         case Not(operand=Until(left=left, right=right, bound=bound)) if (
             left == TRUE and bound == WHOLE
@@ -612,5 +610,5 @@ def always_true(formula: Formula) -> Formula | None:
 
 
 def bounded(formula: Formula) -> bool:
-    """Whether a formula depends on later frames only up to some time."""
+    """Tell whether a formula depends on later frames only up to some time."""
     return all(part.bound.high is not None for part in walk(formula) if isinstance(part, Until))
