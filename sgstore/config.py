@@ -1,7 +1,5 @@
 """Settings of the scene graph generator: defaults, presets, validation, and TOML input and output.
 
-The settings of a scene graph generator, table by table; what each means is said where it stands.
-
 Every setting carries its comment, which is what ``sgstore config`` and ``docs/parameters.md`` print.
 """
 
@@ -23,10 +21,12 @@ from sgstore.vocabulary import (
     ENTITY_KINDS,
     LANE_TYPES,
     MAP_ONLY,
+    OWN_RELATIONS,
     PROXIMITY,
     RELATIONS,
     SIGNALS,
     TypeMeaning,
+    add_relation,
     kinds_labelled,
     labels,
     normalize_name,
@@ -190,7 +190,8 @@ class Proximity:
     """Distance relations: the first whose upper bound is not exceeded holds, so exactly one or none."""
 
     names: tuple[str, ...] = setting(
-        PROXIMITY, "relations from the nearest to the farthest; empty: none"
+        PROXIMITY,
+        "relations from the nearest to the farthest, by these names or others; empty: none",
     )
     upper: tuple[float, ...] = setting(
         (2.0, 4.0, 7.0, 10.0, 16.0, 25.0),
@@ -212,7 +213,9 @@ class Proximity:
 class Direction:
     """Angular relations: the first whose upper bound the absolute bearing does not exceed; else the last."""
 
-    names: tuple[str, ...] = setting(DIRECTIONS, "relations from ahead to behind; empty: none")
+    names: tuple[str, ...] = setting(
+        DIRECTIONS, "relations from ahead to behind, by these names or others; empty: none"
+    )
     upper: tuple[float, ...] = setting(
         (45.0, 90.0, 135.0), "upper bounds of all but the last, included; degrees"
     )
@@ -361,7 +364,10 @@ class Config:
         check(alone, "egos", self.egos, f"'{ALL_EGOS}' alone, or a list of egos")
         check(0 <= self.rate <= 1e6, "rate", self.rate, "0 or more frames per second")
         check_labels("kinds", self.kinds, ego=False)
+        both = set(self.proximity.names) & set(self.direction.names)
+        check(not both, "direction.names", self.direction.names, "other names than proximity.names")
         for name in self.without:
+            relation_named(name)  # those of other packages are looked for
             known = [r for r in RELATIONS if r not in MAP_ONLY]
             check(name in known, "without", name, _expected(name, known))
         right = self.orientation in ORIENTATIONS
@@ -425,9 +431,17 @@ def one_of(words: Iterable[str]) -> str:
 def check_steps(
     name: str, names: tuple[str, ...], upper: tuple[float, ...], known: tuple[str, ...], bounds: int
 ) -> None:
-    """Refuse a ladder of relations whose names are unknown or doubled, or whose bounds do not rise."""
+    """Refuse a ladder of relations whose names are taken or doubled, or whose bounds do not rise.
+
+    Names that are new become known in this process.
+    """
     for relation in names:
-        check(relation in known, f"{name}.names", relation, f"one of {', '.join(known)}")
+        free = relation in known or relation not in OWN_RELATIONS
+        check(free, f"{name}.names", relation, f"one of {', '.join(known)}, or a new name")
+        try:
+            add_relation(relation)
+        except ValueError as error:
+            raise ConfigError(f"setting '{name}.names': {error}") from None
     check(len(set(names)) == len(names), f"{name}.names", names, "each name once")
     check(len(upper) == bounds, f"{name}.upper", upper, f"{bounds} bounds for {len(names)} names")
     rising = all(a < b < math.inf for a, b in zip((0.0, *upper), upper, strict=False))

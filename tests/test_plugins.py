@@ -11,6 +11,7 @@ import pytest
 
 import sgstore.relations._registry as registry
 from sgstore import plugins, vocabulary
+from sgstore.config import Config, Direction, Proximity
 from sgstore.demo import RECORDING
 from sgstore.errors import ConfigError, QueryNameError, StoreError
 from sgstore.ingest import ingest
@@ -146,6 +147,31 @@ def test_a_store_whose_relations_are_no_names_is_refused(
 
     with pytest.raises(StoreError, match="a relation: "):
         StoreFile(path)
+
+
+def test_rungs_and_sectors_have_the_names_that_a_client_gives(
+    names: list[str], tmp_path: Path
+) -> None:
+    own, usual = tmp_path / "own.db", tmp_path / "usual.db"
+    config = Config(
+        proximity=Proximity(("danger", "ok"), (4.0, 25.0)),
+        direction=Direction(("fore", "aft"), (90.0,)),
+    )
+    for path, settings in ((own, config), (usual, Config())):
+        StoreFile.create(path)
+        ingest(path, [RECORDING], until=4.0, config=settings)
+    counted = "SELECT count(*) FROM edges WHERE relation IN ({})"
+
+    for new, old in (
+        ("'danger'", "'safety_hazard', 'near_coll'"),
+        ("'ok'", "'super_near', 'very_near', 'near', 'visible'"),
+        ("'fore'", "'inDFrontOf', 'inSFrontOf'"),
+        ("'aft'", "'atSRearOf', 'atDRearOf'"),
+    ):
+        wanted = Store(usual).sql(counted.format(old)).values
+        assert Store(own).sql(counted.format(new)).values == wanted
+    ((many,),) = Store(own).sql(counted.format("'danger'")).values
+    assert list(Store(own).find("MATCH (a)-[:danger]->(b) RETURN COUNT(*) AS n")) == [(many,)]
 
 
 @pytest.mark.parametrize("loaded", [ImportError("no such module"), 7])
