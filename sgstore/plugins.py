@@ -148,3 +148,6 @@ ABSTRACTIONS: Final = Registry(
     "abstraction",
 )
 """Abstractions: functions from columns of graphs to labelled graphs."""
+
+EXPORTERS: Final = Registry("sgstore.exporters", {}, "format")
+"""Formats of other packages; those of this one are listed in :data:`sgstore.exporters.EXPORTERS`."""

@@ -289,13 +289,13 @@ def test_a_format_of_another_package_is_found(
         def load(self) -> Exporter:
             raise ImportError("no module named elsewhere")
 
-    monkeypatch.setattr("sgstore.exporters._registry.entry_points", lambda group: [Point()])
+    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
     (file,) = write_export(export, tmp_path / "out", "lines")
     assert isinstance(file, WrittenFile)
     assert file.file.read_text().split() == [str(i) for _, i in frames_in(export)]
     assert list(exporters()) == [*(one.name for one in EXPORTERS), "lines"]
 
-    monkeypatch.setattr("sgstore.exporters._registry.entry_points", lambda group: [Broken()])
+    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Broken()])
     with pytest.raises(ExportError, match=r"'broken' .* cannot be loaded: ImportError"):
         exporter_named("nothing")
 

@@ -116,7 +116,7 @@ def test_the_format_of_the_page_can_be_exported(
         def load(self) -> Any:
             return own
 
-    monkeypatch.setattr("sgstore.exporters._registry.entry_points", lambda group: [Point()])
+    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
     store = sgstore.open(folder / "drives.sgstore")
 
     (written,) = write_export(

@@ -8,21 +8,12 @@ entry point of the group ``sgstore.abstractions``. ``classes`` says what a class
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Final
 
+from sgstore import plugins
 from sgstore.abstractions._classes import Classes, classes_of
 from sgstore.abstractions._columns import GraphColumns, Labelled, MapColumns
 from sgstore.abstractions._lanes import lane_roles
-from sgstore.abstractions._literature import (
-    entities,
-    in_lanes,
-    junction,
-    related,
-    road_scene,
-    roadscene2vec,
-    whole,
-)
 from sgstore.errors import AbstractionError
 from sgstore.vocabulary import normalize_name, suggestion
 
@@ -45,9 +36,6 @@ __all__ = [
     "register",
 ]
 
-GROUP: Final = "sgstore.abstractions"
-"""Entry points of other packages: the name of an abstraction, and its function."""
-
 
 @dataclass(frozen=True, slots=True)
 class Abstraction:
@@ -65,14 +53,8 @@ class Abstraction:
     function: Callable[[GraphColumns], Labelled]
 
 
-ABSTRACTIONS: Final = (
-    Abstraction("E", entities),
-    Abstraction("EL", in_lanes),
-    Abstraction("ER", related),
-    Abstraction("RSV", road_scene),
-    Abstraction("junction", junction),
-    Abstraction("SG", whole),
-    Abstraction("roadscene2vec", roadscene2vec),
+ABSTRACTIONS: Final = tuple(
+    Abstraction(name, plugins.ABSTRACTIONS.load(name)) for name in plugins.ABSTRACTIONS.own
 )
 """Those that are shipped."""
 
@@ -125,9 +107,10 @@ _LONGEST: Final = 64
 def abstractions() -> dict[str, Abstraction]:
     """All that are known, by folded name: shipped, registered, and entry points of other packages."""
     known = _OWN | _REGISTERED
-    for point in entry_points(group=GROUP):
-        if normalize_name(point.name) not in known:
-            known[normalize_name(point.name)] = Abstraction(point.name, point.load())
+    for name, entry in plugins.ABSTRACTIONS.others().items():
+        if normalize_name(name) not in known:
+            function = plugins.ABSTRACTIONS.load_other(entry, AbstractionError)
+            known[normalize_name(name)] = Abstraction(name, function)
     return known
 
 

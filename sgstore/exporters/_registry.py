@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
+from sgstore import plugins
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import (
     ClipSource,
@@ -51,7 +51,7 @@ __all__ = [
     "exporters",
 ]
 
-GROUP: Final = "sgstore.exporters"
+GROUP: Final = plugins.EXPORTERS.group
 """Group of entry points by which an installed package adds formats."""
 
 
@@ -116,15 +116,9 @@ def exporters() -> dict[str, Exporter]:
         A package names a format that cannot be loaded.
     """
     known = {exporter.name: exporter for exporter in EXPORTERS}
-    for entry in entry_points(group=GROUP):
-        if entry.name in known:
-            continue
-        try:
-            known[entry.name] = entry.load()
-        except Exception as error:  # whatever its import does
-            raise ExportError(
-                f"the format {entry.name!r} ({entry.value}) cannot be loaded: {error!r}"
-            ) from error
+    for name, entry in plugins.EXPORTERS.others().items():
+        if name not in known:
+            known[name] = plugins.EXPORTERS.load_other(entry, ExportError)
     return known
 
 

@@ -8,19 +8,16 @@ by the schemas of its channels, and reads it. ``docs/flavours.md`` says how to a
 from __future__ import annotations
 
 import inspect
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
 
+from sgstore import plugins
 from sgstore.errors import TraceError
 from sgstore.mcap import MAGIC, McapFile, check_name, digest_of, mark_of
 from sgstore.mcap import message_at as _read_message
-from sgstore.readers.carla._trace import CarlaTrace
-from sgstore.readers.foxglove._trace import FoxgloveTrace
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_message as _read_osi_message
-from sgstore.readers.osi._trace import OsiTrace
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
@@ -91,12 +88,10 @@ class RecordingReader(Protocol):
         ...
 
 
-READERS: Final[tuple[RecordingReader, ...]] = (OsiTrace, CarlaTrace, FoxgloveTrace)
+READERS: Final[tuple[RecordingReader, ...]] = tuple(
+    plugins.READERS.load(name) for name in plugins.READERS.own
+)
 """The flavours of recordings, in the order in which they are asked."""
-
-
-GROUP: Final = "sgstore.readers"
-"""Group of entry points by which an installed package adds flavours."""
 
 
 def readers() -> Iterator[RecordingReader]:
@@ -107,13 +102,7 @@ def readers() -> Iterator[RecordingReader]:
     TraceError
         A package names a flavour that cannot be loaded.
     """
-    yield from READERS
-    for entry in entry_points(group=GROUP):
-        try:
-            reader: RecordingReader = entry.load()
-        except Exception as error:  # whatever its import does
-            reason = f"the flavour {entry.name!r} ({entry.value}) cannot be loaded: {error!r}"
-            raise TraceError(reason) from error
+    for _, reader in plugins.READERS.every(TraceError):
         yield reader
 
 
