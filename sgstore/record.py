@@ -30,7 +30,7 @@ LAST_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What became of a run.
+    """Result of a recorded run.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
 
 
 class _FrameWriter:
-    """What happens with each frame."""
+    """Steps that are taken for each frame."""
 
     def __init__(
         self, live: LiveWorld, recorder: Recorder, on_frame: Callable[[int, float], None] | None

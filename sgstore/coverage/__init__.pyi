@@ -26,7 +26,6 @@ from ._features import features as features
 from ._frames import ChosenFrames as ChosenFrames
 from ._frames import ReportTable as ReportTable
 from ._frames import frames_of as frames_of
-from ._frames import is_of_ego as is_of_ego
 from ._frames import names_of as names_of
 from ._frames import of_unknown as of_unknown
 from ._frames import periods_of as periods_of
@@ -57,7 +56,6 @@ __all__ = [
     "features",
     "frames_of",
     "growth",
-    "is_of_ego",
     "names_of",
     "novel",
     "novel_clips",

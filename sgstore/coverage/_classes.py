@@ -28,7 +28,7 @@ UNKNOWN: Final = -1
 
 
 class Missing(StrEnum):
-    """How a window counts in which frames are missing: before a trace, at a gap, or without a class.
+    """Treatment of windows in which frames are missing: before a trace, at a gap, or without a class.
 
     ``equal``: what is missing is a class of its own, the same wherever it is missing (S3C); ``distinct``: it is
     equal to nothing, so every such window is a class of its own; ``drop``: such windows do not count.
@@ -40,7 +40,7 @@ class Missing(StrEnum):
 
 
 class CountedUnit(StrEnum):
-    """What is counted: frames, runs of consecutive frames of one class, or traces that have the class."""
+    """Unit that is counted: frames, runs of consecutive frames of one class, or traces that have the class."""
 
     frame = "frame"
     run = "run"
@@ -74,7 +74,7 @@ class Classed:
 
     @property
     def unknown(self) -> int:
-        """How many frames have no class that is known."""
+        """Number of frames whose class is not known."""
         return int((self.code == UNKNOWN).sum())
 
     def sizes(self, unit: CountedUnit = CountedUnit.frame) -> Ints:
@@ -83,7 +83,7 @@ class Classed:
         return np.bincount(code, minlength=len(self.names)).astype(np.int64)
 
     def samples(self, unit: CountedUnit) -> int:
-        """How many traces there are, if these are counted; else 0: each unit is a sample of its own."""
+        """Number of traces, if these are counted; else 0: each unit is a sample of its own."""
         return len(np.unique(trace_of(self.frame_id))) if unit is CountedUnit.trace else 0
 
     def _units(self, unit: CountedUnit) -> Ints:

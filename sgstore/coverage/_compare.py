@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What can be said of classes that were not seen.
+    """Estimate of the classes that were not seen.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Estimate:
 
 
 def estimate(sizes: Ints, samples: int = 0) -> Estimate:
-    """What can be said of what was not seen.
+    """Estimate the classes that were not seen.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
 
 
 def expected_classes(sizes: Ints, drawn: Ints) -> Floats:
-    """How many classes a random part has in the mean: rarefaction, exact.
+    """Mean number of classes in a random part: rarefaction, exact.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def _said(a: Classed, unit: CountedUnit) -> list[str]:
 
 
 def unseen(found: Estimate, unit: CountedUnit) -> str:
-    """What can be said of what was not seen, as a sentence."""
+    """Estimate of the classes that were not seen, as a sentence."""
     return (
         f"unseen: {found.unseen_mass:.2%} of further {unit}s would be of a new class (Good-Turing);"
         f" at least {found.chao1:.0f} classes in all (Chao1, 95 %: {found.low:.0f} to {found.high:.0f}),"
@@ -192,7 +192,7 @@ def unseen(found: Estimate, unit: CountedUnit) -> str:
 
 
 def covered(of: Classed, by: Classed) -> ReportTable:
-    """How much of the classes of one selection occur in another: by class and by frame.
+    """Share of the classes of one selection that occur in another: by class and by frame.
 
     Returns
     -------
@@ -298,7 +298,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
 
 
 def venn(a: Classed, b: Classed) -> ReportTable:
-    """What two selections share, by class and by frame.
+    """Common part of two selections, by class and by frame.
 
     Returns
     -------
@@ -322,7 +322,7 @@ def venn(a: Classed, b: Classed) -> ReportTable:
 
 
 def growth(a: Classed, unit: CountedUnit = CountedUnit.frame, points: int = POINTS) -> ReportTable:
-    """How many classes the first n units have, in the order in which traces came into the store.
+    """Number of classes in the first n units, in the order in which traces came into the store.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What tells frames of one selection from those of another: features that differ, and a tree of questions.
+"""Differences between two selections of frames: features, and a decision tree.
 
 S3C asked so what failing test inputs have that training inputs have not. (Woodlief et al., ICSE 2024, RQ2.)
 """
@@ -49,7 +49,7 @@ class TreeQuestion:
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """Where questions lead: how much of both selections comes here."""
+    """Leaf of a decision tree: the weight of both selections in it."""
 
     questions: tuple[TreeQuestion, ...]
     ours: float
@@ -155,7 +155,7 @@ def explain(
     by_frame: bool = False,
     depth: int = DEPTH,
 ) -> tuple[ReportTable, ReportTable]:
-    """What tells ``b`` from ``a``: classes count once each, or as often as they have frames.
+    """Explain how ``b`` differs from ``a``: classes count once each, or as often as they have frames.
 
     Parameters
     ----------

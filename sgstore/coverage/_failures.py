@@ -36,7 +36,7 @@ _ID: Final = re.compile(r"[0-9]{1,18}")
 
 
 class Outcomes:
-    """Which inputs of a system failed, by the names of frames.
+    """Inputs of a system that failed, by the names of frames.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ def _failed(where: str, columns: list[str], told: list[str], threshold: float) -
 
 
 def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[ReportTable, ReportTable]:
-    """What the classes of training inputs say of the failures of test inputs.
+    """Compare the failures of test inputs with the classes of training inputs.
 
     Returns
     -------
@@ -206,7 +206,7 @@ def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[ReportT
 
 
 def _foretold(test: Classed, novel: Bools, inputs: Ints, theirs: str) -> list[Row]:
-    """How many novel failures are of classes that training lacks, or has once."""
+    """Number of novel failures in classes that training lacks, or has once."""
     classes, first = np.unique(test.code[novel], return_index=True)
     lacking = inputs[novel][first] == 0
     return [

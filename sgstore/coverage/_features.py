@@ -1,4 +1,4 @@
-"""What frames are made of in an abstraction: features, such as (car, near, ego), and k of them together.
+"""Features of frames in an abstraction, such as (car, near, ego), and combinations of k of them.
 
 Equal classes have equal features, so one frame of each class is looked at, however many there are.
 """
@@ -71,8 +71,16 @@ class ClassFeatures:
         return self.counts > 0
 
 
-def features(a: Classed, abstraction: str) -> ClassFeatures:
-    """The features of the classes of a selection; ``a`` has classes of this very abstraction.
+def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeatures:
+    """Features of the classes of a selection.
+
+    Parameters
+    ----------
+    a : Classed
+        Its classes are those of this very abstraction.
+    abstraction : str
+    of_ego : bool
+        True: only features of the ego, and of lanes by their role for it.
 
     Raises
     ------
@@ -90,7 +98,7 @@ def features(a: Classed, abstraction: str) -> ClassFeatures:
         parts.append((rows, columns, some.often.astype(np.int32)))
     edges = any(len(name) == 3 for name in number)
     known = {name for name in number if len(name) == 3 or not edges}
-    names = tuple(sorted(known))
+    names = tuple(sorted(name for name in known if not of_ego or is_of_ego(name)))
     place = {name: i for i, name in enumerate(names)}
     at = np.array([place.get(name, -1) for name in number] or [-1])
     most = max((int(often.max(initial=0)) for *_, often in parts), default=0)
@@ -132,7 +140,7 @@ def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int =
 
 @dataclass(frozen=True)
 class Combinations:
-    """Which combinations of k features occur.
+    """Combinations of k features that occur.
 
     Attributes
     ----------
@@ -189,7 +197,7 @@ def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Combos:
-    """How many combinations a selection has, and which ones it lacks.
+    """Combinations that a selection has, and those that it lacks.
 
     Attributes
     ----------
@@ -245,7 +253,7 @@ def combos(
     *,
     of_ego: bool = False,
 ) -> Combos:
-    """How many combinations of k features a selection has, and which ones it lacks.
+    """Count the combinations of k features that a selection has, and list those that it lacks.
 
     Parameters
     ----------
@@ -255,18 +263,16 @@ def combos(
     reference : Classed, optional
         What it is measured by: combinations that occur there. By default all combinations of features of ``a``.
     of_ego : bool
-        Whether only features count that speak of the ego, or of a lane by how it lies to the ego.
+        As in :func:`features`.
 
     Raises
     ------
     ConfigError
         There are more combinations than can be gone through.
     """
-    own = features(a, abstraction)
-    other = None if reference is None else features(reference, abstraction)
+    own = features(a, abstraction, of_ego=of_ego)
+    other = None if reference is None else features(reference, abstraction, of_ego=of_ego)
     names = tuple(sorted({*own.names, *(other.names if other else ())}))
-    if of_ego:
-        names = tuple(name for name in names if is_of_ego(name))
     other = None if other is None else over(other, names)
     found = combined(over(own, names), k)
     name, kinds = (

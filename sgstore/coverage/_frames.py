@@ -55,7 +55,7 @@ def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
 
 
 def is_of_ego(feature: Sequence[str]) -> bool:
-    """Whether a feature speaks of the ego, or of a lane by how it lies to the ego."""
+    """Return True for a feature of the ego, or of a lane by its role for the ego."""
     return any(label in _EGOS or _ROLE.fullmatch(label) for label in feature[::2])
 
 
@@ -187,7 +187,7 @@ class ChosenFrames:
         return tuple(self.reasons)
 
     def rows_of(self, frame_id: Ints) -> Ints:
-        """Which of frames, by ascending id, are chosen: their rows."""
+        """Rows of the chosen ones among frames with ascending ids."""
         if self.frame_id is None:
             return np.arange(len(frame_id))
         at = np.searchsorted(frame_id, self.frame_id)

@@ -56,7 +56,7 @@ _RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
 
 
 def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
-    """What a query returns, each combination once: its columns, and in how many frames each is.
+    """Combinations of values that a query returns: its columns, and the number of frames of each.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def _with_frames(query: str) -> str:
 def specification(
     chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """How many of the cells of a specification occur, which ones do, and which ones are missing.
+    """Cells of a specification that occur, and those that are missing.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ class Slot:
         return (NONE, *self.values)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """What must be found, and what must not, where it has a value."""
+        """Patterns that must be found, and that must not, where the slot has a value."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
@@ -358,7 +358,7 @@ class _Held:
 
 
 def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
-    """What each frame has of declared slots, as a class of its own.
+    """Class of each frame by the values of declared slots.
 
     Returns
     -------
@@ -441,7 +441,7 @@ def _counted(
 def slot_coverage(
     chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """How many combinations of the values of slots occur, which ones do, and which ones are missing.
+    """Combinations of the values of slots that occur, and those that are missing.
 
     Parameters
     ----------

@@ -100,7 +100,7 @@ def paint_picture(panel: Panel, picture: bytes) -> None:
 
 
 def paint_matches(panel: Panel, scene: DrawnFrame) -> None:
-    """What each variable is bound to, and how the matched nodes stand to one another."""
+    """Write the bindings of variables, and the relations among matched nodes."""
     panel.head("Matched" if any(scene.matched.values()) else "Highlighted")
     for node in list(scene.matched)[:8]:
         known = node in scene.graph.nodes
@@ -156,7 +156,7 @@ def legend_height(entries: Sequence[Entry]) -> float:
 
 
 def paint_legend(panel: Panel, entries: Sequence[Entry]) -> None:
-    """What the signs in the picture mean: short entries in two columns, long ones below."""
+    """Draw the legend: short entries in two columns, long ones below."""
     panel.head("What is what")
     top, half = panel.y, (panel.right - panel.left) / 2
     short = [e for e in entries if not e.is_long]
@@ -320,7 +320,7 @@ def _middles(ground: GroundView, rows: list[int], names: tuple[str, ...]) -> dic
 
 
 def _paint_figures(panel: Panel, ground: GroundView) -> None:
-    """How much of each lane type there is."""
+    """Write the length of each lane type."""
     nodes = ground.nodes
     lanes = [row for row in ground.rows if KINDS[nodes.kind[row]] == "lane"]
     panel.head("Lanes by type")

@@ -73,7 +73,7 @@ class DiagramLine:
 
     @property
     def text(self) -> str:
-        """What is written on it; nothing where the look of the line says it."""
+        """Text on the line; empty where its look says it."""
         if self.family in {"isIn", "part", "light"}:
             return ""
         there, back = (", ".join(words[:MOST_WORDS]) for words in (self.relations, self.back))
@@ -82,7 +82,7 @@ class DiagramLine:
 
 @dataclass(frozen=True, slots=True)
 class Excerpt:
-    """What of a graph is shown.
+    """Part of a graph that is shown.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Excerpt:
     lines: list[DiagramLine]
 
     def edges(self) -> int:
-        """How many edges are shown."""
+        """Number of edges that are shown."""
         return sum(len(line.relations) + len(line.back) for line in self.lines)
 
 
@@ -122,7 +122,7 @@ def excerpt_of(graph: SceneGraph, matched: frozenset[int], relations: Relations)
 
 
 def tier_of(graph: SceneGraph, node: int) -> Tier:
-    """Where in a diagram a node belongs."""
+    """Tier of a diagram that a node belongs to."""
     kind = str(graph.nodes[node].get("kind"))
     return "entity" if kind in ENTITY_KINDS else _TIERS.get(kind, "lane")
 
@@ -508,7 +508,7 @@ class _Diagram:
         return spots | {n: (x, y) for n, (x, y) in zip(nodes, found.tolist(), strict=True)}
 
     def _aside(self, node: int) -> float:
-        """How far to the right a part of the map lies: where it is nearest to the ego."""
+        """Position to the right of a part of the map, at its point nearest to the ego."""
         ground = self._scene.ground
         if ground is not None:
             near = ground.nearest(node, (0.0, 4.0))
@@ -522,7 +522,7 @@ class _Diagram:
         return (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
 
     def _border(self, node: int, towards: Point) -> Point:
-        """Where the line from a node's middle to a point leaves the node."""
+        """Point at which the line from a node's middle to another point leaves the node."""
         (x, y), half = self._spots[node], self._sizes[node] / 2
         dx, dy = towards[0] - x, towards[1] - y
         steps = [h / abs(d) for h, d in zip(half.tolist(), (dx, dy), strict=True) if abs(d) > 1e-9]

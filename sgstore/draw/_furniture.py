@@ -1,4 +1,4 @@
-"""What helps to read a picture of the ground: rings about the ego, a scale, a compass."""
+"""Aids to read a picture of the ground: rings about the ego, a scale, a compass."""
 
 from __future__ import annotations
 

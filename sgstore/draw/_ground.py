@@ -33,7 +33,7 @@ MOST_STOREYS: Final = 12
 
 @dataclass(frozen=True, slots=True)
 class GroundView:
-    """What of a map lies in a view.
+    """Part of a map that lies in a view.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class GroundView:
         return dict(zip(rows, levels.tolist(), strict=True))
 
     def cover(self, places: Floats, z: Floats) -> Floats:
-        """How far above (N, 2) places of the map, at heights z, the highest lane is; m. -inf: there is none.
+        """Height of the highest lane above (N, 2) places of the map at heights z; m. -inf: there is none.
 
         The height of a lane is that of its cross section that is nearest.
         """

@@ -1,4 +1,4 @@
-"""Where texts go: beside what they name, on top of nothing that matters.
+"""Placement of texts: beside what they name, on top of nothing that matters.
 
 Greedy: texts come in the order of their weight, each takes the first free place around its anchor,
 and one that finds none is left out. All measures are points of the page.

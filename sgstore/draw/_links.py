@@ -1,4 +1,4 @@
-"""Which relations of a graph are drawn, and how they read.
+"""Relations that are drawn of a graph, and their texts.
 
 A frame of forty entities has thousands of edges. Drawn is what a person asks first: what is close to
 the ego, and how the matched nodes stand to one another. Everything else on demand.

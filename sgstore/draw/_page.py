@@ -284,7 +284,7 @@ class Stage:
         )
 
     def shows(self, x: float, y: float) -> bool:
-        """Whether a point lies in the window."""
+        """Return True for a point in the window."""
         return abs(x) <= self.half[0] and abs(y) <= self.half[1]
 
     def fill(

@@ -237,7 +237,7 @@ class DrawnFrame:
         return cls(graph, matched, view, {b.node: b for b in bodies}, lost, links, ground)
 
     def place(self, node: int) -> Point | None:
-        """Where a node is in the picture, or ``None`` where the graph has no place for it."""
+        """Place of a node in the picture, or ``None`` where the graph has no place for it."""
         if node in self.bodies:
             return self.bodies[node].x, self.bodies[node].y
         place = place_of(self.graph.nodes.get(node, {}))
@@ -247,12 +247,12 @@ class DrawnFrame:
         return x, y
 
     def anchor(self, node: int) -> Point:
-        """Where a node's name belongs. A lane's: what of it is in sight and near."""
+        """Point that a node's name belongs to. A lane's: the part of it that is in sight and near."""
         spot = self.ground.spot(node) if self.ground is not None and node < 0 else None
         return spot or self.place(node) or (0.0, 0.0)
 
     def ends(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Where a link begins and ends, or ``None`` where one of its nodes has no place.
+        """Ends of a link, or ``None`` where one of its nodes has no place.
 
         Between an entity and a lane it is the shortest way.
         """
@@ -264,7 +264,7 @@ class DrawnFrame:
         return None if a is None or b is None else (a, b)
 
     def name(self, node: int) -> str:
-        """What a node is called, with its variable where it was matched: ``p = person 12``."""
+        """Name of a node, with its variable where it was matched: ``p = person 12``."""
         text = caption(node, self.graph.nodes.get(node, {}))
         if node in self.bodies and self.bodies[node].below:
             text += f", {self.bodies[node].below:.0f} m below"
@@ -276,20 +276,20 @@ class DrawnFrame:
         return sorted(self.bodies.values(), key=lambda b: (math.hypot(b.x, b.y), b.node))
 
     def named_first(self) -> list[int]:
-        """What is named whatever else is: the matched nodes, and the ego."""
+        """Nodes that are always named: the matched ones, and the ego."""
         ego = self.graph.ego
         also = [ego] if ego in self.bodies and ego not in self.matched else []
         return [node for node in self.matched if self.is_shown(node)] + also
 
     def is_shown(self, node: int) -> bool:
-        """Whether a node can be pointed at in the picture."""
+        """Return True for a node that has a place in the picture."""
         place = (
             self.ground.spot(node) if self.has_outline(node) and self.ground else self.place(node)
         )
         return place is not None and max(map(abs, place)) <= self.view.radius
 
     def has_outline(self, node: int) -> bool:
-        """Whether a node is a part of the map that has an outline in view."""
+        """Return True for a part of the map that has an outline in view."""
         return node < 0 and self.ground is not None and bool(self.ground.parts(node))
 
 

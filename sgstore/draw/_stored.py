@@ -331,7 +331,7 @@ def map_of(store: Store, trace: str) -> RoadMap | None:
 
 
 def _picture(store: Store, frame: FrameRef, camera: str | None) -> bytes | None:
-    """What the camera saw nearest to the frame, as JPEG or PNG; ``None`` if it saw nothing then."""
+    """Picture of the camera nearest to the frame, as JPEG or PNG; ``None`` if there is none."""
     if camera == NO_CAMERA:
         return None
     try:

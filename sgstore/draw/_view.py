@@ -1,4 +1,4 @@
-"""What a frame looks like from above, before anything is drawn: places, boxes and links in picture axes.
+"""A frame seen from above, before anything is drawn: places, boxes and links in picture axes.
 
 Picture axes are metres from the middle of the picture, x to the right and y up. The ego stands in the
 middle and heads upwards, unless north is wanted up. Pure functions; no drawing package is met here.
@@ -126,7 +126,7 @@ def counted(number: int, thing: str) -> str:
 
 
 def caption(node: int, attributes: Mapping[str, Any]) -> str:
-    """What a node is called in a picture: ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
+    """Name of a node in a picture: ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
     kind = clean(attributes.get("kind", "node"), 16)
     name = clean(attributes.get("name", ""), 24)
     if node < 0 and name == kind:

@@ -1,4 +1,4 @@
-"""What every exporter of clips needs: where they come from, what they are called, how they reach their folder.
+"""Shared parts of the exporters: sources and names of clips, and folders that appear complete or not at all.
 
 An export is whole or it is not there: its files are written into a folder of their own beside their
 place, and moved there, one after another, when all of them are finished, the manifest last: where there is
@@ -113,7 +113,7 @@ class WrittenClip:
         return values
 
     def as_row(self) -> dict[str, Any]:
-        """What a person wants to know of it."""
+        """Row of a table for people."""
         return {
             "clip": str(self.file),
             "trace": self.trace,
@@ -158,12 +158,12 @@ class WrittenFile:
         return asdict(self) | {"file": self.file.name}
 
     def as_row(self) -> dict[str, Any]:
-        """What a person wants to know of it."""
+        """Row of a table for people."""
         return {"file": str(self.file), "holds": self.holds, "count": self.count}
 
 
 def provenance_of(told: dict[str, str]) -> dict[str, str]:
-    """What the caller tells of an export, with the hash of its query and the version of the tool."""
+    """Provenance of an export: the caller's values, the hash of its query, and the version of the tool."""
     query = told.get("query", "")
     digest = {"query_sha256": hashlib.sha256(query.encode()).hexdigest()} if query else {}
     return {**told, **digest, "tool": tool()}
@@ -235,7 +235,7 @@ def export_folder(to: Path, names: Sequence[str] = ()) -> Generator[Path]:
 
 
 def _mark(thing: Path) -> list[int]:
-    """What tells a file or a folder from all others, wherever it is moved to."""
+    """Identity of a file or a folder, which stays when it is moved."""
     about = thing.lstat()
     return [about.st_dev, about.st_ino]
 
@@ -263,7 +263,7 @@ def _is_the(thing: Path, mark: list[int]) -> bool:
 
 
 def _is_kept_free(target: Path, thing: Path) -> bool:
-    """Whether something is there only so that nothing else comes there, and what it is for has not come."""
+    """Return True for a placeholder whose file has not come yet."""
     if target.is_symlink() or not (target.exists() and thing.exists()):
         return False
     return not any(target.iterdir()) if target.is_dir() else not target.stat().st_size

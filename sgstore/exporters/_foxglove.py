@@ -189,18 +189,18 @@ def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
 def values(told: dict[str, Any], time_ns: int) -> bytes:
     """Values by name, as JSON with their time."""
     about = {"timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}} | told
-    return json.dumps(_plain(about), allow_nan=False).encode()
+    return json.dumps(finite(about), allow_nan=False).encode()
 
 
-def _plain(value: Any) -> Any:
-    """A value as JSON knows it: what is no number is null."""
+def finite(value: Any) -> Any:
+    """Return a value for JSON, with null for numbers that are not finite."""
     match value:
         case float() if not math.isfinite(value):
             return None
         case dict():
-            return {key: _plain(item) for key, item in value.items()}
+            return {key: finite(item) for key, item in value.items()}
         case list():
-            return [_plain(item) for item in value]
+            return [finite(item) for item in value]
         case _:
             return value
 

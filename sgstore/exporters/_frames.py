@@ -1,4 +1,4 @@
-"""What the sensors said at the frames of the clips, as files: pictures, clouds of points, videos.
+"""Export of sensor messages as files: pictures, clouds of points, videos.
 
 For each clip there is a folder with one of each sensor: ``CLIP/SENSOR/000123.jpg`` is the message that belongs
 to frame 123 (the first frame that it belongs to: several frames may share one). Files of pictures are copied
@@ -96,7 +96,7 @@ class _Film:
 
 @dataclass(slots=True)
 class _Count:
-    """What came of a channel."""
+    """Counts of the messages of a channel."""
 
     schema: str
     holds: str = ""
@@ -119,7 +119,7 @@ class _Tables:
     frame_rows: int = 0
 
     def losses(self) -> list[Loss]:
-        """What was lost of each channel: the first reason, and how often it was."""
+        """Losses of each channel: the first reason, and their number."""
         return [
             Loss(
                 f"{trace}, {topic!r}: {count} messages are not there; the first: {reason}", count, 0

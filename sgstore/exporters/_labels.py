@@ -1,4 +1,4 @@
-"""What is exported: clips of a store, and labels of frames by queries.
+"""Clips of a store to be exported, and labels of their frames by queries.
 
 Labels from queries: a value for each frame, by name.
 
@@ -164,7 +164,7 @@ _OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
-    """What is wrong with an expression, shown in what was written and not in the query that it became."""
+    """Error of an expression, shown in the text of the user and not in the query made of it."""
     if error.span is None:
         return QueryError(error.reason, text=text, hint=error.hint)
     before, end = len(_OF_EGO), len(text)
@@ -183,7 +183,7 @@ def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.d
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Which of some frames are wanted, and their rows in what is."""
+    """Rows of the wanted frames, and their rows among all."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]
@@ -300,7 +300,7 @@ class Export:
         return {} if self.labels is None else self.labels.of(frame_id)
 
     def about(self) -> dict[str, Any]:
-        """What a manifest tells of it: clips, labels, and where all comes from."""
+        """Values of the manifest: clips, labels, and their sources."""
         traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
         return {
             "clips": [

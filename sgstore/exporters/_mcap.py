@@ -154,7 +154,7 @@ class _Surveyed:
     end_ns: int = 0
 
     def losses_within(self, clip: Clip) -> list[Loss]:
-        """What could not be read of an interval, or may be of it."""
+        """Losses that lie in an interval, or may lie in it."""
         return [
             loss
             for loss in self.losses
@@ -181,7 +181,7 @@ def _survey(recording: McapFile | OsiFile, source: ClipSource) -> _Surveyed:
 
 @dataclass(slots=True)
 class _Cut:
-    """Which messages of a recording belong to a clip.
+    """Messages of a recording that belong to a clip.
 
     ``context``: chunk → offsets of the messages in it that are carried in from outside the interval;
     ``late``: those of them that come behind it, and are needed only if nothing else of their channel is

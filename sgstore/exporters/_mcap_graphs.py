@@ -1,4 +1,4 @@
-"""What clips of recordings bring with them besides their messages: scene graphs, and labels of frames.
+"""Channels that an export adds to clips: scene graphs, and labels of frames.
 
 Channels, each with one message a frame, at the frame's log time:
 
@@ -12,7 +12,6 @@ The metadata of these channels says ``sgstore: derived``: they are made of the r
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -117,7 +116,7 @@ class _Kind:
 
 
 def is_added(channel: Channel) -> bool:
-    """Whether a channel was made by an export, and is no part of the recording."""
+    """Return True for a channel that an export made, and that is no part of the recording."""
     return all(channel.metadata.get(key) == value for key, value in DERIVED.items())
 
 
@@ -244,17 +243,5 @@ def _as_json(value: Any) -> bytes:
     try:
         text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     except ValueError:
-        text = json.dumps(_finite(value), ensure_ascii=False, separators=(",", ":"))
+        text = json.dumps(foxglove_scene.finite(value), ensure_ascii=False, separators=(",", ":"))
     return text.encode("utf-8", "backslashreplace")
-
-
-def _finite(value: Any) -> Any:
-    match value:
-        case float() if not math.isfinite(value):
-            return None
-        case dict():
-            return {key: _finite(item) for key, item in value.items()}
-        case list():
-            return [_finite(item) for item in value]
-        case _:
-            return value

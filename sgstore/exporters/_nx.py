@@ -101,7 +101,7 @@ def graphs_of(export: Export, frames: ClipFrames) -> Iterator[SceneGraph]:
 def _attributes(
     lanes: Rows, gaps: list[tuple[Any, ...]]
 ) -> dict[tuple[int, str, int, int], dict[str, Any]]:
-    """What is known of edges: how an entity lies in a lane, how far it is to the one ahead."""
+    """Attributes of edges: the position of an entity in its lane, the gap to the one ahead."""
     names = lanes.columns[3:]
     known = {
         (frame_id, "isIn", src, dst): {
@@ -139,7 +139,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _is_derived(export: Export) -> bool:
-    """Whether the abstraction is a set of relations that was derived, and none of that name hides it."""
+    """Return True if the abstraction is a derived set of relations that no abstraction hides by its name."""
     derived = {normalize_name(one.name) for one in export.store.file.deriving.sets()}
     name = normalize_name(export.abstraction)
     return name in derived and name not in abstractions()

@@ -298,7 +298,7 @@ def _write_lamps(out: Any, mask: int) -> None:
 
 
 def _mode(state: str, bulb: str) -> str:
-    """What a bulb does when its light shows a state."""
+    """Mode of a bulb when its light shows a state."""
     if state == "flashing":
         return "MODE_FLASHING" if bulb == "yellow" else "MODE_OFF"
     if state == "unknown":

@@ -152,7 +152,7 @@ class _TensorColumns:
 
 @dataclass(frozen=True, slots=True)
 class _LabelKind:
-    """What the numbers of a label mean. ``kind``: ``bool``, ``number`` or ``text``; of texts, all ``words``."""
+    """Meaning of a label's numbers. ``kind``: ``bool``, ``number`` or ``text``; of texts, all ``words``."""
 
     kind: str
     words: tuple[str, ...] = ()

@@ -34,7 +34,7 @@ _JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What a recording holds.
+    """Content of a recording that was written.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ ROUNDING = 1 + 1e-12
 
 @dataclass
 class BudgetTracker:
-    """What is left of a budget, and what was bought.
+    """Remainder of a budget, and the frames that were bought.
 
     Attributes
     ----------
@@ -57,14 +57,14 @@ class BudgetTracker:
 
     @classmethod
     def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
-        """A full tracker."""
+        """Make a tracker of a budget of which nothing is spent."""
         shared = units.overlap and measure is not Measure.units
         weights = units.weights(measure) if shared else None
         nothing = np.zeros(len(units.frame_id), np.bool_)
         return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
 
     def prices(self, some: Ints) -> Floats:
-        """What each of some units would cost now; 0: all of it was bought with others."""
+        """Present price of each of some units; 0: all of it was bought with others."""
         if self.weights is None:
             return self.cost[some]
         begin, end = self.units.begin[some].tolist(), self.units.end[some].tolist()
@@ -101,7 +101,7 @@ class BudgetTracker:
 
 
 class Strategy(StrEnum):
-    """How units are chosen."""
+    """Strategy by which units are chosen."""
 
     every = "every"
     minimal = "minimal"
@@ -112,7 +112,7 @@ class Strategy(StrEnum):
 
 @dataclass(frozen=True)
 class SelectionSpec:
-    """What is to be selected.
+    """Specification of a selection.
 
     Attributes
     ----------
@@ -344,7 +344,7 @@ def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any
 
 
 def _met(held: Holdings, units: Units, picked: Ints) -> int:
-    """How many elements some units hold."""
+    """Number of elements that some units hold."""
     taken = np.zeros(len(units), np.bool_)
     taken[picked] = True
     return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())

@@ -147,7 +147,7 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Which things are superfluous by what is contained in what.
+    """Find things that are superfluous because others contain them, or they contain others.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def _holding(
 def _parts(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools
 ) -> list[tuple[SetFamily, Ints]]:
-    """What is left, as families that share no element, the one with the first set first."""
+    """Remaining sets, as families that share no element, the one with the first set first."""
     rows = alive[family.set_of] & wanted[family.members]
     sets, members = family.set_of[rows], family.members[rows]
     group = _joined(sets, members, len(family), len(need))[sets]
@@ -401,7 +401,7 @@ class Cover:
 
     @property
     def exact(self) -> bool:
-        """Whether there is nothing cheaper."""
+        """True if there is nothing cheaper."""
         return self.cost <= self.bound + ROUNDING * max(self.cost, 1)
 
 
@@ -507,7 +507,7 @@ class UnitPieces:
     cost: Floats
 
     def left(self, one: int, taken: Bools) -> float:
-        """What a unit costs beyond the pieces that are taken."""
+        """Cost of a unit beyond the pieces that are taken."""
         own = slice(int(self.begin[one]), int(self.end[one]))
         return float(self.cost[own][~taken[own]].sum())
 
@@ -517,7 +517,7 @@ class UnitPieces:
         return range(low, int(np.searchsorted(self.begin, self.end[one])))
 
     def together(self, picked: Ints) -> float:
-        """What units cost together."""
+        """Cost of units together."""
         taken = np.zeros(len(self.cost), np.bool_)
         for one in picked.tolist():
             taken[self.begin[one] : self.end[one]] = True
@@ -568,7 +568,7 @@ def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> I
     taken = np.zeros(len(spans.cost), np.bool_)
 
     def cheapened(one: int) -> Iterator[tuple[int, float]]:
-        """What others share with this one is paid."""
+        """Prices of units that share pieces with one that is taken."""
         taken[spans.begin[one] : spans.end[one]] = True
         for other in spans.beside(one):
             yield other, max(spans.left(other, taken), 1e-9)

@@ -1,4 +1,4 @@
-"""How much a selection keeps after each of its units, beside units in random order."""
+"""Curve of a selection: elements kept after each of its units, beside units in random order."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _WORK: Final = 30_000_000
 
 @dataclass(frozen=True)
 class Curve:
-    """What is kept by so many units.
+    """Elements that so many units keep.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def _points(most: int, points: int) -> Ints:
 
 
 def expected(often: Ints, units: int, drawn: Ints, weight: Ints | None = None) -> Floats:
-    """How many elements so many units hold in the mean, drawn without putting them back.
+    """Mean number of elements that so many units hold, drawn without putting them back.
 
     An element that m of N units hold is missed by n of them in C(N - m, n) of C(N, n) cases (hypergeometric).
 
@@ -137,7 +137,7 @@ def expected(often: Ints, units: int, drawn: Ints, weight: Ints | None = None) -
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
-    """How many units in random order it takes to hold so many elements.
+    """Number of units in random order that it takes to hold so many elements.
 
     Returns
     -------

@@ -102,7 +102,7 @@ class SetFamily:
         return self.members[self.starts[one] : self.starts[one + 1]]
 
     def by_element(self) -> tuple[Ints, Ints]:
-        """Where the sets of each element begin, and these sets."""
+        """Sets of each element, one after another, and the place at which those of each begin."""
         order = np.argsort(self.members, kind="stable")
         starts = np.searchsorted(self.members[order], np.arange(len(self.need) + 1))
         return starts, self.set_of[order]
@@ -228,7 +228,7 @@ def ordered(family: SetFamily, chosen: Ints) -> Ints:
 
 
 def met(family: SetFamily, chosen: Ints) -> int:
-    """How much of all needs some sets meet: of each element no more than it needs, times its weight."""
+    """Amount of all needs that some sets meet: of each element no more than it needs, times its weight."""
     return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
 
 

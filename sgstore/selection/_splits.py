@@ -77,7 +77,7 @@ def _drawn(digest: str, seed: int) -> bytes:
 def split_table(
     selection: Selection, parts: dict[int, str], shares: dict[str, float]
 ) -> ReportTable:
-    """What each part has, and how much of it is known from each other one.
+    """Table of parts: their content, and the share of it that each other part has too.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What is selected: frames, clips or whole traces; and what each of them holds."""
+"""Units of a selection: frames, clips or whole traces; and the elements that each of them holds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.coverage import UNKNOWN, classed, combined, features, is_of_ego, periods_of, run_begins
+from sgstore.coverage import UNKNOWN, classed, combined, features, periods_of, run_begins
 from sgstore.errors import ConfigError
 from sgstore.selection._sets import SetFamily, distinct, spread
 from sgstore.store import lengths_of_messages, trace_of
@@ -29,7 +29,7 @@ _CELLS: Final = 50_000_000
 
 
 class SelectionUnit(StrEnum):
-    """What is chosen or not: a frame, consecutive frames of some seconds, a whole trace."""
+    """Unit that is chosen or not: a frame, consecutive frames of some seconds, a whole trace."""
 
     frame = "frame"
     clip = "clip"
@@ -37,7 +37,7 @@ class SelectionUnit(StrEnum):
 
 
 class Measure(StrEnum):
-    """What a selection costs."""
+    """Measure of the cost of a selection."""
 
     units = "units"
     frames = "frames"
@@ -47,7 +47,7 @@ class Measure(StrEnum):
 
 @dataclass(frozen=True)
 class Budget:
-    """How much may be selected.
+    """Most that may be selected.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class Units:
 
     @property
     def overlap(self) -> bool:
-        """Whether a frame is in several units."""
+        """True if a frame is in several units."""
         return bool((self.begin[1:] < self.end[:-1]).any())
 
     @property
@@ -195,7 +195,7 @@ class Units:
         return np.maximum(found, 1e-3 if measure is Measure.seconds else 1.0)
 
     def together(self, picked: Ints, measure: Measure) -> float:
-        """What some units cost together: a frame that is in several of them costs once."""
+        """Cost of some units together: a frame that is in several of them costs once."""
         if measure is Measure.units:
             return float(len(picked))
         if not self.overlap:
@@ -278,13 +278,13 @@ def units_of(
 
 
 def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
-    """Where ranges begin and end whose first rows are known."""
+    """Begin and end of ranges whose first rows are known."""
     begin = np.flatnonzero(fresh)
     return begin, np.append(begin[1:], len(fresh))
 
 
 def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tuple[Ints, Ints]:
-    """Where clips begin and end."""
+    """Begin and end of clips."""
     period = periods_of(frames.chosen.store, frames.frame_id)
     fresh = run_begins(frames.chosen.store, frames.frame_id, time_ns)
     starts, ends = _ranges(fresh)
@@ -305,7 +305,7 @@ def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tupl
 
 @dataclass(frozen=True)
 class Holdings:
-    """What units hold: classes, or combinations of features.
+    """Elements of units: classes, or combinations of features.
 
     Attributes
     ----------
@@ -332,7 +332,7 @@ class Holdings:
 
     @property
     def total(self) -> int:
-        """How many classes or combinations there are."""
+        """Number of classes or combinations."""
         return int(self.weight.sum())
 
     def family(self, units: Units, cost: Floats, need: int, rank: Ints) -> SetFamily:
@@ -347,7 +347,7 @@ class Holdings:
 
 
 def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = False) -> Holdings:
-    """What units hold: their classes, or the combinations of so many features that occur in their frames.
+    """Elements of units: their classes, or the combinations of so many features in their frames.
 
     Parameters
     ----------
@@ -370,12 +370,7 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
     if not combos:
         sizes = of.sizes()[of.present()]
         return Holdings(of, pairs, np.ones_like(sizes), sizes, f"classes in {abstraction}")
-    own = features(of, abstraction)
-    if of_ego:
-        keep = [i for i, name in enumerate(own.names) if is_of_ego(name)]
-        names = tuple(own.names[i] for i in keep)
-        own = replace(own, names=names, counts=own.counts[:, keep])
-    found = combined(own, combos)
+    found = combined(features(of, abstraction, of_ego=of_ego), combos)
     inside, weight, frames = _distinct_combinations(found)
     kind = f"combinations of {combos} features{' of the ego' if of_ego else ''} in {abstraction}"
     return Holdings(of, _of_units(pairs, inside), weight, frames, kind, inside)
@@ -460,7 +455,7 @@ def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
 
 
 def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
-    """How many elements are kept after each of some units."""
+    """Number of elements that are kept after each of some units."""
     place = np.full(units, -1)
     place[picked] = np.arange(len(picked))
     rows = place[pairs[0]] >= 0
