@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import time
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
@@ -118,6 +120,29 @@ def test_a_search_that_may_not_end_still_gives_a_cover_and_a_bound_below_it() ->
     assert (of.covered(short.chosen) >= of.need).all()
     assert short.bound <= long.bound <= long.cost <= short.cost
     assert long.exact
+
+
+class EndedError(Exception):
+    """What a handler of signals raises."""
+
+
+@needs_solver
+def test_what_a_handler_of_signals_raises_ends_a_search() -> None:
+    holds = np.random.default_rng(1).random((1_000, 500)) < 0.03  # the solver gives up after 20 s
+    of = SetFamily.of(np.array(np.nonzero(holds)), 1_000, 500)
+
+    def end(*_: object) -> None:
+        raise EndedError
+
+    before, began = signal.signal(signal.SIGALRM, end), time.monotonic()
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    try:
+        with pytest.raises(EndedError):
+            minimal(of)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - began < 15
 
 
 def test_ties_are_broken_by_rank_alone() -> None:

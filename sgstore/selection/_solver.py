@@ -26,6 +26,9 @@ LARGEST: Final = 100_000
 SECONDS: Final = 20.0
 """Time for one part at most: a guard against relaxations that do not end; nodes are used up long before."""
 
+_LOOK_S: Final = 0.1
+"""How often to look for signals while it solves; s."""
+
 ROUNDING: Final = 1e-7
 """Share of a cost that is due to rounding."""
 
@@ -70,7 +73,7 @@ class Solver:
         known = highspy.HighsSolution()
         known.col_value = np.isin(np.arange(len(family)), cover).astype(float).tolist()
         solver.setSolution(known)
-        solver.run()
+        _run(solver)
         info = solver.getInfo()
         self._left -= max(int(info.mip_node_count), 1)
         cost = float(family.cost[cover].sum())
@@ -83,6 +86,18 @@ class Solver:
         low = float(info.mip_dual_bound)
         low = low - ROUNDING * max(abs(low), 1) if math.isfinite(low) else 0.0
         return cover, math.ceil(low) if family.whole else max(low, 0.0)
+
+
+def _run(solver: Any) -> None:
+    """Solve in a thread, so that whatever a handler of signals raises meanwhile ends it."""
+    solver.HandleUserInterrupt = True
+    solver.startSolve()
+    try:
+        while not solver.wait(_LOOK_S)[0]:
+            pass
+    except BaseException:
+        solver.cancelSolve()
+        raise
 
 
 def _programme(family: SetFamily) -> Any:
