@@ -92,7 +92,7 @@ def setting(default: T, comment: str) -> T:
 
 @dataclass(frozen=True, slots=True)
 class RangeSettings:
-    """Which part of the world is in the graph of an ego."""
+    """Part of the world that is in the graph of an ego."""
 
     radius: float = setting(50.0, "shape 'radius': how far from the ego's centre; m")
     shape: str = setting(
@@ -150,7 +150,7 @@ class RangeSettings:
 
 @dataclass(frozen=True, slots=True)
 class LaneSettings:
-    """Which parts of a road map are in a graph, and what is asked of the lanes."""
+    """Parts of a road map that are in a graph, and the relations of its lanes."""
 
     ahead: float = setting(
         100.0,
@@ -240,7 +240,7 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class PairSettings:
-    """Which pairs of entities are related to one another."""
+    """Pairs of entities that are related to one another."""
 
     within: float = setting(
         25.0, "all entities that move, up to this distance from one another; m. 0: none"
@@ -269,7 +269,7 @@ class PairSettings:
 
 @dataclass(frozen=True, slots=True)
 class Payloads:
-    """How sensor messages are joined to frames."""
+    """Join of sensor messages to frames."""
 
     join: str = setting("nearest", "'nearest' in log time, or 'latest' at or before the frame")
     tolerance: float = setting(
@@ -286,7 +286,7 @@ class Payloads:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """How the signals of a road map are read.
+    """Settings of the reading of a road map's signals.
 
     Attributes
     ----------
@@ -379,7 +379,7 @@ class Config:
 
     @property
     def signs(self) -> Signs:
-        """How signals of road maps are read: what :func:`sgstore.opendrive.read_map` takes."""
+        """Settings of the reading of signals of road maps, for :func:`sgstore.opendrive.read_map`."""
         kinds = tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
         return Signs(kinds, self.orientation)
 
@@ -481,7 +481,7 @@ Corner = tuple[float, ...]
 
 
 def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
-    """Whether two sides have a point in common."""
+    """Return whether two sides have a point in common."""
     ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
     turns = [_turn(*three) for three in ends]
     if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
@@ -490,7 +490,7 @@ def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
 
 
 def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
-    """Whether c, on the line through a and b, lies between them; or ``ahead``: beyond b, seen from a."""
+    """Return whether c, on the line through a and b, lies between them; or ``ahead``: beyond b, seen from a."""
     if ahead:
         return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
     return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))

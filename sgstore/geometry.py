@@ -283,7 +283,7 @@ def first_contact(a: Floats, b: Floats) -> Floats:
 
 
 def _reach(boxes: Floats, turn: Floats) -> tuple[Floats, Floats]:
-    """How far boxes that are turned reach from their centres, along two axes; m."""
+    """Reach of boxes that are turned from their centres, along two axes; m."""
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     length, width = boxes[:, 4] / 2, boxes[:, 5] / 2
     return length * cos + width * sin, length * sin + width * cos

@@ -57,7 +57,7 @@ class Edges:
 
 @dataclass(frozen=True, slots=True)
 class LaneGaps:
-    """How far it is along the lanes from who follows to who leads: the attribute of both edges; shape (K,).
+    """Gaps along the lanes from followers to those they follow: the attribute of both edges; shape (K,).
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class LaneGaps:
 
 @dataclass(frozen=True, slots=True)
 class StaticPresence:
-    """Which static nodes are in the graph of which frame; shape (M,).
+    """Pairs of a frame and a static node in its graph; shape (M,).
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class StaticPresence:
 
 @dataclass(frozen=True, slots=True)
 class LaneStates:
-    """How entities lie in lanes: the attributes of their ``isIn`` edges; shape (K,).
+    """States of entities in lanes: the attributes of their ``isIn`` edges; shape (K,).
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ def named_graph(
 
 
 class LaneDistances:
-    """Where lanes begin, measured along others: what tells how far it is along the lanes of a map.
+    """Starts of lanes, measured along others: the table for distances along the lanes of a map.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ class LaneDistances:
         return found
 
     def distance(self, one: Places, other: Places) -> float | None:
-        """How far it is from one entity to another, by their places; see :meth:`SceneGraph.lane_dist`."""
+        """Distance from one entity to another, by their places; see :meth:`SceneGraph.lane_dist`."""
         ahead, behind = math.inf, -math.inf
         for lane, along in one:
             for to, at in other:
@@ -363,7 +363,7 @@ class SceneGraph:
         return f"<SceneGraph {self.trace}#{self.seq}: {size}>"
 
     def places(self) -> dict[int, list[tuple[int, float]]]:
-        """Where entities are along their own lanes: node id → pairs of a lane and the way from its start; m."""
+        """Places of entities along their own lanes: node id → pairs of a lane and the way from its start; m."""
         found: dict[int, list[tuple[int, float]]] = {}
         for src, relation, dst, about in self.edges:
             if relation == "isIn" and about.get("is_own") and "along" in about:
@@ -371,7 +371,7 @@ class SceneGraph:
         return found
 
     def lane_dist(self, a: int, b: int) -> float | None:
-        """How far it is along the lanes from one entity to another; m.
+        """Distance along the lanes from one entity to another; m.
 
         From centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and of those
         that ``travelsTo`` leads through; positive where one drives from a to b, negative where one drives from

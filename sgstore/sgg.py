@@ -315,7 +315,7 @@ class SceneGraphGenerator:
 
     @property
     def losses(self) -> list[Loss]:
-        """What the graphs of the steps so far lack: the pairs of frames that were too crowded."""
+        """Losses in the graphs of the steps so far: the pairs of frames that were too crowded."""
         return self._crowds.losses(self._config)
 
     def class_of(self, abstraction: str = "RSV", number: int = 0) -> str | None:
@@ -345,7 +345,7 @@ class SceneGraphGenerator:
         return found or None
 
     def roles_of(self, number: int = 0) -> dict[int, str]:
-        """What the lanes of the last step are to an ego: ``Ego Lane``, ``Left 1 of Ego Lane`` and so on.
+        """Roles of the lanes of the last step for an ego: ``Ego Lane``, ``Left 1 of Ego Lane`` and so on.
 
         Parameters
         ----------
@@ -471,7 +471,7 @@ def map_of_graphs(road_map: RoadMap | None, config: Config) -> RoadMap | None:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """What is in the range of one ego.
+    """Part of the world in the range of one ego.
 
     Attributes
     ----------
@@ -493,7 +493,7 @@ class _View:
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """What is in the range of any ego, and what of it does not depend on who looks."""
+    """Part of the world in the range of any ego, and all of it that does not depend on the ego."""
 
     keys: Ints
     bodies: Bodies
@@ -537,7 +537,7 @@ def _ego_rows(frames: FrameBlock) -> Rows:
 
 
 def _places(frames: FrameBlock, ego: Rows) -> EgoPoses:
-    """Where the egos of the frames are; NaN where there is none."""
+    """Poses of the egos of the frames; NaN where there is none."""
     of = frames.states
     columns = (of.x, of.y, of.heading, _bottom(of))
     return EgoPoses(*(np.append(column, np.nan)[ego] for column in columns))

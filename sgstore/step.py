@@ -65,7 +65,7 @@ _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
 
 
 class Entity(NamedTuple):
-    """What a frame says of one entity: inside units (rad), codes as in :class:`sgstore.world.States`."""
+    """State of one entity in a frame: inside units (rad), codes as in :class:`sgstore.world.States`."""
 
     ident: str
     kind: int
@@ -79,7 +79,7 @@ class Entity(NamedTuple):
 
     @property
     def constants(self) -> tuple[int, str, str]:
-        """What may not change while it is known."""
+        """Attributes that may not change while the entity is known."""
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
@@ -323,7 +323,7 @@ _MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit
 
 
 class EntityConstants(NamedTuple):
-    """What does not change about an entity."""
+    """Attributes of an entity that do not change."""
 
     node: int
     ident: str
@@ -478,7 +478,7 @@ def _moving(states: States) -> list[Attributes]:
 
 
 def _coded(lights: int, light: int, derived: int) -> Attributes:
-    """What codes say: lights of a vehicle, what a traffic light shows, what was derived."""
+    """Attributes that are kept as codes: lights of a vehicle, state of a traffic light, derived flags."""
     about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
@@ -540,7 +540,7 @@ def _degrees(heading: Floats) -> list[float]:
 
 
 def _numbers(values: dict[str, float]) -> Attributes:
-    """What of numbers is known."""
+    """Numbers that are known."""
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
@@ -558,7 +558,7 @@ SPARE: Final = 2048
 
 
 class Generator(Protocol):
-    """What makes graphs of blocks: :class:`sgstore.sgg.SceneGraphGenerator`."""
+    """Maker of graphs from blocks: :class:`sgstore.sgg.SceneGraphGenerator`."""
 
     @property
     def kinds(self) -> Codes:
@@ -639,7 +639,7 @@ class Stepper:
             return [self._records.graph(graph, self._outer, known) for graph in graphs]
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
-        """What moves in a frame, and what stands in it that was not known.
+        """Entities of a frame that move, and those that stand and were not known.
 
         Everything is checked before anything is remembered: a frame that is refused has not been.
         """

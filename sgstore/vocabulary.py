@@ -286,7 +286,7 @@ def labels() -> tuple[str, ...]:
 
 
 def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
-    """What names of traces are ordered by: as people count, so ``run2`` comes before ``run10``.
+    """Sort key for names of traces: as people count, so ``run2`` comes before ``run10``.
 
     Digits count as the numbers that they are, letters without regard to case; what is the same then is told
     apart by its characters.
@@ -306,7 +306,7 @@ def suggestion(name: str, known: Iterable[str]) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class TypeMeaning:
-    """What the type name of a simulator means.
+    """Meaning of a simulator's type name.
 
     Attributes
     ----------

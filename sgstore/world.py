@@ -1,4 +1,4 @@
-"""What a simulator said: frames of a trace as arrays, and where its messages stand in the file.
+"""Data of a simulator: frames of a trace as arrays, and the places of its messages in the file.
 
 These are the values that readers hand to the scene graph generator and to the store, which rounds them.
 Conventions of axes, units and signs are those of :mod:`sgstore.geometry`: OpenDRIVE's inertial
@@ -40,7 +40,7 @@ TOLERANCE_SHARE: Final = 100
 
 
 def tolerance_ns(period_ns: int) -> int:
-    """How much two times of a trace may differ and still count as the same: clocks jitter, and are truncated.
+    """Greatest difference of two times of a trace that still count as the same: clocks jitter.
 
     Every bound of time is compared with this tolerance, in favour of equality: ``>= 3 s`` holds of 2.9999 s,
     ``< 3 s`` does not.
@@ -86,7 +86,7 @@ POSE: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Entities:
-    """What does not change about the entities that a block sees for the first time, in order of node id.
+    """Constant properties of the entities that a block sees for the first time, in order of node id.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class MessageRefs:
-    """Where messages stand in the file of their trace; one row a message, shape (M,).
+    """Places of messages in the file of their trace; one row a message, shape (M,).
 
     Attributes
     ----------
@@ -311,7 +311,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class TraceInfo:
-    """What is known of a recording before its frames are read.
+    """Properties of a recording that are known before its frames are read.
 
     Attributes
     ----------
@@ -412,7 +412,7 @@ class Event:
 
 @dataclass(slots=True)
 class TraceReport:
-    """What reading a trace brought to light; filled while its blocks are read.
+    """Findings from reading a trace; filled while its blocks are read.
 
     Attributes
     ----------
@@ -476,7 +476,7 @@ _VELOCITY: Final = slice(KEPT.index("vx"), KEPT.index("vz") + 1)
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """What positions of a trace are relative to; whole metres."""
+    """Point that positions of a trace are relative to; whole metres."""
 
     x: float
     y: float

@@ -470,7 +470,7 @@ def _refined(block: _Block) -> Words:
 
 
 def _cells(block: _Block, colour: Words) -> Ints:
-    """How many colours each graph has."""
+    """Number of colours in each graph."""
     order = np.lexsort((colour, block.graph))
     graph, of = block.graph[order], colour[order]
     fresh = np.ones(len(of), np.bool_)

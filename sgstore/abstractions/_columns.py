@@ -91,7 +91,7 @@ class MapColumns:
 
     @classmethod
     def of(cls, road_map: RoadMap) -> MapColumns:
-        """What a road map has of it."""
+        """Columns of a road map's nodes and edges."""
         nodes, edges = road_map.nodes, road_map.edges
         name, lane_type, road, junction = (
             np.array(column, object)
@@ -170,7 +170,7 @@ class GraphColumns:
 
     @classmethod
     def of(cls, graph: GraphBlock, kinds: Codes, grounds: MapColumns | None) -> GraphColumns:
-        """What a block of scene graphs holds.
+        """Columns of a block of scene graphs.
 
         Parameters
         ----------
@@ -443,7 +443,7 @@ def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
 
 
 def repeated(columns: Part) -> Bools:
-    """Which rows have come before."""
+    """Mask of the rows that have come before."""
     again = np.zeros(len(columns[0]), np.bool_)
     if len(again):
         order = np.lexsort(columns)
@@ -540,7 +540,7 @@ def _strands(grounds: MapColumns) -> Ints:
 
 
 def role_name(role: int) -> str:
-    """What the literature calls a role."""
+    """Name of a lane's role in the literature."""
     if role == 0:
         return "Ego Lane"
     if role >= OPPOSING:

@@ -1,4 +1,4 @@
-"""What labelled graphs have in common: their nodes by label, and their edges by the labels of edge and ends.
+"""Common features of labelled graphs: nodes by label, and edges by the labels of edge and ends.
 
 Two graphs are compared as multisets of such features with the weighted Jaccard index (Ruzicka's similarity):
 what both have, by what either has; ``sum(min) / sum(max)`` over the counts. It is 1 for isomorphic graphs, and

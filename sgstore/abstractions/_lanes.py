@@ -82,7 +82,7 @@ def _found(seen: GraphColumns) -> EgoLanes:
 
 
 def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
-    """What the lanes of each frame are to the ego in ``RSV``, as far as that can be said.
+    """Roles of the lanes of each frame, relative to the ego, in ``RSV``; lanes without one are left out.
 
     Returns
     -------

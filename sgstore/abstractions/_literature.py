@@ -69,7 +69,7 @@ OF_JUNCTION: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Subset:
-    """What queries see under an abstraction, whose nodes and edges are some of those of the scene graph.
+    """Part of the scene graph that queries see under an abstraction which adds no nodes or edges.
 
     Attributes
     ----------
@@ -256,7 +256,7 @@ def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
 
 @lru_cache(maxsize=_MAPS)
 def _names(grounds: MapColumns | None) -> dict[int, str]:
-    """What the literature calls parts of the map."""
+    """Names of parts of the map in the literature, by node id."""
     if grounds is None:
         return {}
     names: dict[int, str] = {}

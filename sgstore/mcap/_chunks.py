@@ -136,7 +136,7 @@ def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Lo
 
 
 def name_of(opcode: int) -> str:
-    """What a record is, in words."""
+    """Name of a record's opcode, in words."""
     try:
         return Opcode(opcode).name.lower().replace("_", " ")
     except ValueError:
@@ -283,7 +283,7 @@ class Messages:
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """What a chunk record says before its records come.
+    """Fields of a chunk record that stand before its records.
 
     Attributes
     ----------
@@ -424,7 +424,7 @@ def records_of(
 def decompress(
     stored: Records, compression: str, size: int, into: memoryview | None = None
 ) -> Records:
-    """What a chunk's bytes become: exactly ``size`` bytes, and never more of them in memory.
+    """Decompress a chunk's bytes into exactly ``size`` bytes; never hold more of them in memory.
 
     ``into``: memory of that size that may be used for them.
 

@@ -131,7 +131,7 @@ def _listed(path: Path) -> list[str]:
 
 
 def read_metadata(text: str) -> dict[str, list[str]]:
-    """What the metadata of a bag say of its files and how these are stored; an absent key has no values.
+    """Read the files of a bag and their storage from its metadata; an absent key has no values.
 
     Other keys are passed over, and so is what is nested in them.
     """

@@ -79,7 +79,7 @@ class Buffers:
 
     @property
     def kept(self) -> int:
-        """How much is kept; bytes."""
+        """Size of all buffers that are kept; bytes."""
         return sum(map(len, self._kept))
 
     def clear(self) -> None:
@@ -88,7 +88,7 @@ class Buffers:
 
 
 def _is_free(buffer: bytearray) -> bool:
-    """Whether there is no view of it: only then can its size be changed."""
+    """Return whether a buffer has no view: only then can its size be changed."""
     try:
         buffer.append(buffer.pop())
     except BufferError:
@@ -108,7 +108,7 @@ MAX_SUMMARY: Final = 64 << 20
 
 @dataclass(slots=True)
 class Summary:
-    """What the summary of a file tells; empty where there is none.
+    """Contents of the summary of a file; empty where there is none.
 
     Attributes
     ----------
@@ -247,7 +247,7 @@ class Spool:
         self._size += total
 
     def has(self, path: Path, chunk_offset: int) -> bool:
-        """Whether the messages of a chunk are kept."""
+        """Return whether the messages of a chunk are kept."""
         return (path, chunk_offset) in self._places
 
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
@@ -479,11 +479,11 @@ def _cost(head: ChunkHead) -> int:
 
 
 def _is_apt(head: ChunkHead) -> bool:
-    """Whether a chunk is worth it."""
+    """Return whether it is worth while to decompress a chunk ahead of its turn."""
     compressed = bool(head.compression) and head.data_length < WORTH * head.size
     return compressed and _cost(head) <= LARGEST
 
 
 def _processors() -> int:
-    """How many this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -98,7 +98,7 @@ _HOLDS_CONTENT: Final = frozenset(
 
 @dataclass(slots=True)
 class _FileWalk:
-    """Where a walk is, and what it has found.
+    """Position of a walk through a file, and its findings.
 
     ``pending`` is a chunk that was lost: the message indexes behind it tell what was in it.
     """
@@ -300,7 +300,7 @@ class McapFile:
         self._known_channels[[*self.channels]] = True
 
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
-        """What begins the chunks of a walk before their turn, where they are many and all wanted."""
+        """Start to read the chunks of a walk before their turn, if they are many and all wanted."""
         if wanted is not None or self.size <= SMALL:
             return ReadAhead(self._file)
         offsets = self._chunk_starts or chunks_in(self._file)
@@ -325,7 +325,7 @@ class McapFile:
         return sound
 
     def _step(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """What one record gives; the walk stands behind it afterwards."""
+        """Messages of one record; the walk stands behind the record afterwards."""
         start = walk.position
         stop = start + HEAD.size + length
         if opcode != Opcode.MESSAGE_INDEX:

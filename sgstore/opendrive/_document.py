@@ -271,7 +271,7 @@ def _grammar() -> tuple[dict[str, ElementTable], dict[str, _Node]]:
 
 
 class _Builder:
-    """What expat calls: rows are added to tables as elements start."""
+    """Handler of expat's events: adds rows to tables as elements start."""
 
     def __init__(self, skip: frozenset[int]) -> None:
         self.tables, root = _grammar()

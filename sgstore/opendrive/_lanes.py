@@ -411,7 +411,7 @@ def _stations(
 def _lateral_jumps(
     intervals: _LaneIntervals, borders: _LaneBorders
 ) -> tuple[Floats, Floats, Floats]:
-    """How far borders reach from the reference line at the end of each interval, jump, and turn there."""
+    """Greatest reach of borders from the reference line at the end of each interval, their jumps and turns."""
     n = len(intervals.section)
     length = (intervals.end - intervals.start)[borders.interval]
     reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)

@@ -1,4 +1,4 @@
-"""Where traffic can flow on: links of roads, lanes and junctions → pairs of lanes.
+"""Pairs of lanes along which traffic can flow on, from the links of roads, lanes and junctions.
 
 A lane ends at one end of its section, or at both if traffic runs both ways. What lies beyond is found
 from that *end*: the next section of the road; a linked road at its contact point (or, from a virtual
@@ -88,7 +88,7 @@ class Network:
         return self.first[road] + max(within, 0)
 
     def target(self, attributes: dict[str, str]) -> Target | None:
-        """What a link of a road to a road leads to; ``None`` if there is no such road."""
+        """Section that a link of a road to a road leads to; ``None`` if there is no such road."""
         road = self.roads.get(attributes.get("elementId", ""))
         if road is None:
             return None
@@ -99,7 +99,7 @@ class Network:
         return Target(self.first[road] if contact == START else self.last[road], contact)
 
     def enters(self, lane: int, contact: str) -> bool:
-        """Whether traffic that comes to a section at ``contact`` may enter this lane of it."""
+        """Return whether traffic that comes to a section at ``contact`` may enter this lane of it."""
         if self.lanes.both[lane] or not contact:
             return True
         return bool(self.lanes.forward[lane]) == (contact in {START, "+"})
@@ -135,7 +135,7 @@ def _exits(lanes: LaneTable) -> Iterator[tuple[int, str]]:
 
 
 class _Joints:
-    """What lies beyond the ends of lanes."""
+    """Lanes beyond the ends of lanes."""
 
     def __init__(self, document: Document, network: Network) -> None:
         self._network = network

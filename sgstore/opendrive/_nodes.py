@@ -69,7 +69,7 @@ def junction_of(document: Document, road: int) -> str:
 
 
 def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str, ...]:
-    """How lanes turn on their way through a junction; a road that turns in several sections turns once."""
+    """Turns of lanes on their way through a junction; a road that turns in several sections turns once."""
     sign = np.where(lanes.forward, 1.0, -1.0)
     _, one = np.unique(lanes.section, return_index=True)
     of_road = np.zeros(len(document["road"]))
@@ -241,7 +241,7 @@ _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
-    """Whether a mark lets traffic change towards higher lane ids, and towards lower ids.
+    """Permission of a mark to change towards higher lane ids, and towards lower ids.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
 
 
 def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
-    """Where traffic may change from lane to lane: driving lanes side by side with traffic in one direction."""
+    """Stretches for a change of lane: driving lanes side by side with traffic in one direction."""
     left, right = wide_pairs(lanes, ribbons)
     driving = np.array([kind in DRIVING for kind in lanes.type], bool)
     one_way = lanes.forward[left] == lanes.forward[right]

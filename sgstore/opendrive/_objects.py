@@ -115,7 +115,7 @@ class _Ring(NamedTuple):
 
 @dataclass(slots=True)
 class _Items:
-    """What stands beside the roads, one row a copy or a strip, and the rings that are its outline.
+    """Things beside the roads, one row a copy or a strip, and the rings that are its outline.
 
     The corners of ``local`` are in the item's own axes, those of ``along`` are s and t of its road.
     """
@@ -143,7 +143,7 @@ class _Items:
 
 @dataclass(frozen=True, slots=True)
 class Furniture:
-    """What objects are: crosswalks, all other entities, and parking spaces with the rows of their roads."""
+    """Objects of a map: crosswalks, all other entities, and parking spaces with the rows of their roads."""
 
     crosswalks: Objects
     scenery: Objects
@@ -152,7 +152,7 @@ class Furniture:
 
 
 def read_objects(document: Document, plan: PlanView, warnings: list[str]) -> Furniture:
-    """What the objects of a map are; one whose place is broken is left out with a warning."""
+    """Read the objects of a map; one whose place is broken is left out with a warning."""
     kind = "road/object"
     table = document[kind]
     names, types = table.texts("name"), table.texts("type")
@@ -235,7 +235,7 @@ class _Repeat:
     width: tuple[float, float]
 
     def copies(self) -> int:
-        """How many copies it makes; of a strip, the steps along the road."""
+        """Number of copies that a repetition makes; of a strip, of the steps along the road."""
         step = self.distance if self.distance > 0 else max(_STRIP_STEP, self.length / _MOST_STEPS)
         return int(min(np.floor(self.length / step + 1e-9), MOST_POINTS)) + 1
 

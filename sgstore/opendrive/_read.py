@@ -124,7 +124,7 @@ def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
-    """What is said of records that were left out of roads that are there: a line for each road and kind."""
+    """Warnings of records that were left out of roads that are kept: a line for each road and kind."""
     groups: dict[tuple[str, int], list[MapError]] = {}
     for (kind, road, _), error in odd.items():
         if road not in skip:

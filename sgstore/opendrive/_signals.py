@@ -42,7 +42,7 @@ _READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA read
 
 @dataclass(slots=True)
 class Doubts:
-    """What is found of the signals of a map.
+    """Doubts about the orientation of the signals of a map, as far as they were found.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class Doubts:
             self._odd[signal] = self._odd.get(signal, True) and theirs
 
     def warnings(self) -> list[str]:
-        """What is to be said, in a line or none."""
+        """Warning about the signals whose orientation is in doubt; empty if there are none."""
         if not self._odd:
             return []
         names = ", ".join(map(repr, list(self._odd)[:LISTED]))
@@ -150,7 +150,7 @@ class RoadPoses:
 
 
 def places(document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats) -> RoadPoses:
-    """Where ``s`` along roads and ``t`` to their left is; before or beyond a road, its end is taken."""
+    """Poses of places ``s`` along roads and ``t`` to their left; before or beyond a road, its end is taken."""
     length = document.numbers("road", "length")[road]
     s = np.clip(s, 0.0, length)
     pose = poses(plan, last_before(plan.road, plan.s, road, s), s)
@@ -292,7 +292,7 @@ def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
 
 
 def is_signal_object(name: str) -> bool:
-    """Whether an object of this name is a signal in truth."""
+    """Return whether an object of this name is a signal in truth."""
     return bool(_SPEED_OBJECT.match(name)) or _STOP_STENCIL in name.lower()
 
 
@@ -308,7 +308,7 @@ def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
 
 
 class _Reach:
-    """Which driving lanes lie at a place of a road, by their ids or their direction."""
+    """Look-up of the driving lanes at a place of a road, by their ids or their direction."""
 
     def __init__(self, document: Document, network: Network, orientation: str) -> None:
         self.warnings = network.warnings

@@ -1,4 +1,4 @@
-"""Where a related body is, seen from another: ahead, behind, to the left, to the right.
+"""Direction of a related body as another sees it: ahead, behind, to the left, to the right.
 
 An edge goes from what is seen to who sees: *b is in direct front of a* is b → a, by the bearing of b's
 centre in a's axes. Where a's heading is missing there is no edge.
@@ -50,7 +50,7 @@ def _direction_edges(scene: BlockScene) -> Edges:
 
 
 def _behind(bearing: Floats) -> Bools:
-    """Whether CARLASGG takes what is at a bound for the sector behind it: from abeam to the right backwards.
+    """Mask of bearings that CARLASGG, at a bound, takes for the sector behind: from abeam right backwards.
 
     It looks through its sectors in the order direct front, side front, direct rear, side rear, all of which
     hold both their bounds. Abeam to the left is 180° in its count; abeam to the right is 360°, not 0°.

@@ -1,4 +1,4 @@
-"""Which bodies touch or overlap: a collision, in a simulator.
+"""Pairs of bodies that touch or overlap: a collision, in a simulator.
 
 Footprints meet where their gap is 0, and boxes meet where they do so in height too: a car under a bridge
 touches nothing. Where a height is missing, what counts is the storey (:data:`sgstore.roads.STOREY`), and where
@@ -85,7 +85,7 @@ def _boxes(bodies: Bodies, rows: Rows) -> Floats:
 
 
 def _same_height(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Whether boxes meet in height, as far as it is known."""
+    """Mask of pairs whose boxes meet in height, as far as it is known."""
     apart = np.abs(bodies.z[b] - bodies.z[a])
     reach = (bodies.height[a] + bodies.height[b]) / 2 + TOUCH
     bottoms = np.abs(bodies.bottom[b] - bodies.bottom[a])

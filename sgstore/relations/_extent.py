@@ -1,4 +1,4 @@
-"""Which part of the world is in the graphs: the range of an ego, as areas of the plane and a band of heights.
+"""Part of the world in the graphs: the range of an ego, as areas of the plane and a band of heights.
 
 An area is a disc, the inside of a polygon in the ego's axes, or a strip along lines (the lanes ahead). An
 entity is in it when its footprint meets it, or its centre lies in it, as the settings say; a part of a map when
@@ -42,7 +42,7 @@ CHUNK: Final = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class EgoPoses:
-    """Where the egos of some frames are; shape (F,). NaN where there is none.
+    """Poses of the egos of some frames; shape (F,). NaN where there is none.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class Areas:
         static: bool = False,
         hung: Bools | None = None,
     ) -> Bools:
-        """Whether footprints are in range.
+        """Mask of the footprints that are in range.
 
         Parameters
         ----------
@@ -262,7 +262,7 @@ class Areas:
         return inside
 
     def _meet(self, frame: Ints, boxes: Floats) -> Bools:
-        """Whether boxes meet the areas of their frames."""
+        """Mask of the boxes that meet the areas of their frames."""
         raise NotImplementedError
 
     def _meet_map(self, road_map: RoadMap) -> tuple[Rows, Ints]:
@@ -270,7 +270,7 @@ class Areas:
         raise NotImplementedError
 
     def _level(self, frame: Ints, away: Floats, height: Floats, hung: Bools | None = None) -> Bools:
-        """Whether heights, of things so far away, are on the storey of an ego."""
+        """Mask of the heights, at these distances, that are on the storey of an ego."""
         rise = height - self.egos.ground[frame]
         lowest, highest = self.settings.height
         if hung is not None:  # as low as it may have to be
@@ -301,7 +301,7 @@ class Areas:
         inside[frame[~kept], 1 + lane[~kept]] = False
 
     def _touch_storey(self, heights: LaneHeights, frame: Ints, lane: Ints) -> Bools:
-        """Whether lanes have a point on the storey of the ego of a frame."""
+        """Mask of the lanes that have a point on the storey of the ego of a frame."""
         points, count = heights.points, np.diff(heights.first)[lane]
         owner, point = spread(heights.first[lane], count)
         at = frame[owner]
@@ -362,7 +362,7 @@ class Outlines(Areas):
         return inside
 
     def _inside(self, frame: Ints, x: Floats, y: Floats) -> Bools:
-        """Whether points lie inside: a ray from them to the left crosses an odd number of sides."""
+        """Mask of the points that lie inside: a ray from them to the left crosses an odd number of sides."""
         odd = np.zeros(len(x), np.bool_)
         ends = np.roll(self._corners, -1, axis=1)
         for side in range(self._corners.shape[1]):

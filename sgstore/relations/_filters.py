@@ -1,4 +1,4 @@
-"""What a client wants in its graphs, and what it says that things are: kinds, parts of the map, relations."""
+"""Filters of a client's graphs, by kinds, parts of the map and relations, and the kinds it gives to things."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
 
 
 class Keeping:
-    """What is kept under a config.
+    """Filter of nodes and relations under a config.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class Keeping:
         return (kept | of_map) - lost - ({"isIn"} if self._no_map else set())
 
     def entities(self, kind: Codes) -> Bools:
-        """Whether entities of these kinds are kept."""
+        """Mask of the entities that are kept, by their kinds."""
         return self._kinds[kind]
 
     def edges(self, edges: Edges) -> Edges:

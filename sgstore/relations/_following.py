@@ -109,7 +109,7 @@ def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
 
 
 def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -> Column:
-    """Who follows whom: rows of bodies, and the gap; each pair once.
+    """Pairs of a body and the next one ahead on its way, as rows of bodies, and the gap; each pair once.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def _same_lane(own: OwnLanes) -> list[Column]:
 
 
 def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
-    """Who follows whom, by node ids, and the gaps."""
+    """Pairs of a follower and the one it follows, by node ids, and the gaps."""
     none = np.zeros(0, np.intp)
     a, b, gap = (none, none, np.zeros(0)) if ground is None else ground.following
     return LaneGaps(bodies.frame[a], bodies.node[a], bodies.node[b], gap)
@@ -225,7 +225,7 @@ MOVED: Final = 0.3
 
 
 class Parking:
-    """What a trace tells of its vehicles so far, whoever sees them; it grows with their number, not with time.
+    """Record of a trace's vehicles so far, to tell parked ones; it grows with their number, not with time.
 
     A vehicle is parked if the simulator has it as static; or if it does not move in the whole trace and never
     stands on a lane for driving above all others (its primary lane). Without a map nothing is known of those

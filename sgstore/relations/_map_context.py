@@ -114,7 +114,7 @@ class LaneContact:
         return columns[at] if apart[at] <= SAME_PLACE else None
 
     def standing(self, bodies: Bodies) -> Standing:
-        """What the bodies of a block stand on; asked once for each block."""
+        """Parts of the map that the bodies of a block stand on; asked once for each block."""
         hits, along, parts = self._footing.of(bodies)
         if self._waypoints is not None:
             rows, nodes = self._waypoints.of(hits, along, bodies)
@@ -194,7 +194,7 @@ Table = tuple["NDArray[Any]", ...]
 
 
 class _Footing:
-    """What footprints meet; one that is where it was when it was last seen is not asked about again."""
+    """Lanes and crosswalks under footprints; one that has not moved since it was seen is not asked again."""
 
     def __init__(self, road_map: RoadMap, lines: Centrelines) -> None:
         self._map = road_map

@@ -197,7 +197,7 @@ class StillPairs:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is anything to learn."""
+        """Return whether there is anything to learn."""
         return self._config.pairs.static and self._config.pairs.within > 0
 
     def learn(self, scenery: Bodies) -> None:
@@ -430,7 +430,7 @@ class Crowds:
             self._found[what] = count + 1, seq, most, span
 
     def losses(self, config: Config) -> list[Loss]:
-        """What was left out, each with the first frame, how many bodies it has, and the setting that counts."""
+        """Pairs that were left out, by kind, with the first frame, its bodies, and the setting that counts."""
         found: list[Loss] = []
         for what, (count, seq, bodies, span) in self._found.items():
             if what == NEAR:

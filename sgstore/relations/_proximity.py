@@ -1,4 +1,4 @@
-"""How near related bodies are to one another: one relation of a ladder of distances, or none.
+"""Distance of related bodies from one another: one relation of a ladder of distances, or none.
 
 The distance is between the centres of the boxes, in space. Rungs are half-open, ``(lo, hi]``, as in CARLASGG's
 code (its documentation leaves the bounds open), and the nearest holds its lower bound too.

@@ -156,7 +156,7 @@ class BodyPairs:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What bodies stand on, whoever looks.
+    """Parts of the map that bodies stand on, independent of any ego.
 
     Attributes
     ----------
@@ -290,12 +290,12 @@ class Relation:
     legend: str = ""
 
     def asked(self, config: Config) -> bool:
-        """Whether it is computed under a config, given a map if it needs one."""
+        """Return whether the relation is computed under a config, given a map if it needs one."""
         return self.settings(config) and (not self.of_pairs or relates_pairs(config))
 
 
 def relates_pairs(config: Config) -> bool:
-    """Whether the settings relate any pairs; otherwise nothing is known of them."""
+    """Return whether the settings relate any pairs; otherwise nothing is known of them."""
     return config.pairs.ego or config.pairs.within > 0
 
 

@@ -1,4 +1,4 @@
-"""What the ego sees: whatever is not hidden behind other bodies.
+"""Bodies that the ego sees: all that are not hidden behind other bodies.
 
 The eye is above the centre of the ego, at the height of its roof. A body is seen when the straight line from
 there to its centre, or to one of the four corners of its footprint at the height of its centre, is free. A body
@@ -162,7 +162,7 @@ def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]
 
 
 def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
-    """Whether the line to a point of the target runs through the cover, between its lower and upper side."""
+    """Mask of lines to a point of the target that the cover blocks, between its lower and upper side."""
     cos, sin = views.cos[cover], views.sin[cover]
     x, y = views.x[cover, 0], views.y[cover, 0]
     to_x, to_y = views.x[target, point], views.y[target, point]

@@ -97,7 +97,7 @@ class Feet:
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
-    """Where lines are nearest to places (n, 2); each line has two different points at least."""
+    """Nearest points on lines to places (n, 2); each line has two different points at least."""
     start = np.concatenate([line[:-1, :2] for line in lines])
     way = np.concatenate([line[1:, :2] for line in lines]) - start
     x, y = places.T
@@ -191,7 +191,7 @@ class _Side:
 
 
 def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats]) -> _Side | None:
-    """Where the cross sections through places end on one side; ``None`` if no border is beside any of them."""
+    """Ends of the cross sections through places on one side; ``None`` if no border is beside any of them."""
     if not borders:
         return None
     found = feet(places, borders)

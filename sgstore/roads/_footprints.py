@@ -1,4 +1,4 @@
-"""Which footprints touch which lanes, and how: the look-up that every frame needs most.
+"""Look-up of the lanes that footprints touch, with overlap and offset: the one that every frame needs most.
 
 A lane is a chain of quadrangles (:class:`~sgstore.roads._ribbons.Ribbons`), short where it bends. Footprints
 and quadrangles are brought together by the cells of a grid; separating axes tell which of them touch, and
@@ -132,7 +132,7 @@ def _unfold(x: Floats, y: Floats) -> None:
 
 
 class _Grid:
-    """Which quadrangles lie in which cells of a square grid; only cells with something in them are kept."""
+    """Cells of a square grid, each with the quadrangles that lie in it; empty cells are not kept."""
 
     def __init__(self, quads: _Quads) -> None:
         low = np.stack((quads.x.min(axis=0), quads.y.min(axis=0)))
@@ -227,7 +227,7 @@ class LaneIndex:
         self._storey = storey
 
     def touches(self, boxes: Floats, z: Floats) -> Touches:
-        """What footprints (N, 5) at heights (N,) touch; see :meth:`sgstore.roads.RoadMap.lanes_of`."""
+        """Lanes that footprints (N, 5) at heights (N,) touch; see :meth:`sgstore.roads.RoadMap.lanes_of`."""
         shapes = _Shapes.of(boxes, z)
         parts = [_no_touches()]
         parts += [self._gathered(shapes, row, quad) for row, quad in self._candidates(shapes)]
@@ -323,7 +323,7 @@ class LaneIndex:
 
 
 def _first_least(values: Floats, starts: Ints) -> Ints:
-    """Where each group of values, which start at ``starts``, has its least value for the first time."""
+    """Row of the first least value of each group; the groups start at ``starts``."""
     least = np.minimum.reduceat(values, starts)
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
     rows = np.flatnonzero(values == least[group])[::-1]
@@ -373,7 +373,7 @@ class _Pairs:
         )
 
     def touching(self) -> tuple[Bools, Bools]:
-        """Whether no axis separates them, and whether the footprint's centre lies in the quadrangle."""
+        """Masks of pairs that no axis separates, and of those with the footprint's centre in the quadrangle."""
         a, b = self.a + TOUCH, self.b + TOUCH
         x, y = self.x, self.y
         apart = (x.min(axis=0) > a) | (x.max(axis=0) < -a)
@@ -393,14 +393,14 @@ class _Pairs:
         return x, y, (self.x[1] + self.x[2]) / 2 - x, (self.y[1] + self.y[2]) / 2 - y
 
     def beside(self) -> tuple[Floats, Floats]:
-        """Where the footprint's centre lies along the centre line, 0 … 1 from end to end; squared distance."""
+        """Place of the footprint's centre along the centre line, 0 … 1 from end to end; squared distance."""
         x, y, along_x, along_y = self.middle_line()
         share = -(x * along_x + y * along_y) / np.maximum(along_x**2 + along_y**2, 1e-18)
         at = np.clip(share, 0.0, 1.0)
         return share, (x + at * along_x) ** 2 + (y + at * along_y) ** 2
 
     def between(self) -> Floats:
-        """Where the footprint's centre lies between both cross sections, 0 … 1 from the start to the end.
+        """Place of the footprint's centre between both cross sections, 0 … 1 from the start to the end.
 
         Unlike the feet on straight pieces it runs on from quadrangle to quadrangle without a gap or overlap.
         """
@@ -411,7 +411,7 @@ class _Pairs:
         return np.where(usable, ahead / np.where(usable, both, 1.0), self.beside()[0])
 
     def _ahead(self, right: int, left: int) -> tuple[Floats, Floats]:
-        """How far ahead of a cross section the footprint's centre lies, and how wide the lane is there."""
+        """Distance of the footprint's centre ahead of a cross section, and width of the lane there."""
         across_x, across_y = self.x[left] - self.x[right], self.y[left] - self.y[right]
         width = np.hypot(across_x, across_y)
         ahead = self.y[right] * across_x - self.x[right] * across_y

@@ -1,4 +1,4 @@
-"""How far it is along the lanes: distances and routes over ``travelsTo``, and over lane changes if wanted."""
+"""Distances and routes along the lanes: over ``travelsTo``, and over lane changes if wanted."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class LaneGraph:
         return LaneReach(lane[order], other[order], distance[order])
 
     def _from(self, lanes: Ints, limit: float) -> tuple[Ints, Ints, Floats]:
-        """What lies downstream of some lanes: their fronts advance together, lane by lane."""
+        """Lanes downstream of some lanes: the fronts of all advance together, lane by lane."""
         best = np.full((len(lanes), len(self._lengths)), np.inf)
         source, at, distance = np.arange(len(lanes)), lanes, np.zeros(len(lanes))
         while len(source):
@@ -115,7 +115,7 @@ class LaneGraph:
     def distances(
         self, lane: Ints, along: Floats, other: Ints, other_along: Floats, limit: float
     ) -> Floats:
-        """How far it is along the lanes from one place to another, driving on.
+        """Distances along the lanes from one place to another, driving on.
 
         Parameters
         ----------

@@ -156,28 +156,28 @@ class _Network:
         return 1 if self.lines[lane].forward else -1
 
     def end_of(self, lane: int, contact: str) -> Floats:
-        """Where the line of a lane starts or ends."""
+        """Start or end point of the line of a lane."""
         middle = self.sections[lane].middle
         return middle[0 if contact == START else -1]
 
     def gap(self, lane: int, end: str, other: int, contact: str) -> float:
-        """How far an end of a lane is from an end of another; m."""
+        """Distance between an end of a lane and an end of another; m."""
         return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
 
     def runs_against(self, lane: int, other: int) -> bool:
-        """Whether the lines of two lanes side by side run against one another."""
+        """Return whether the lines of two lanes side by side run against one another."""
         key = (lane, other) if lane < other else (other, lane)
         if key not in self._turned:
             self._turned[key] = _turned_round(*(self.sections[row].middle for row in key))
         return self._turned[key]
 
     def exits(self, lane: int, contact: str) -> bool:
-        """Whether traffic leaves a lane at this end of its line."""
+        """Return whether traffic leaves a lane at this end of its line."""
         line = self.lines[lane]
         return line.both or line.forward == (contact == END)
 
     def enters(self, lane: int, contact: str) -> bool:
-        """Whether traffic comes into a lane at this end of its line."""
+        """Return whether traffic comes into a lane at this end of its line."""
         line = self.lines[lane]
         return line.both or line.forward == (contact == START)
 
@@ -325,7 +325,7 @@ def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
 
 
 def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
-    """Whether a lane's traffic comes from or leaves into an area, as far as the lane tells what it touches."""
+    """Return whether traffic of a lane comes from or leaves into an area, as far as the lane has joints."""
     joints = line.after if line.forward == at_exit else line.before
     joints = (*line.before, *line.after) if line.both else joints
     untold = not line.before and not line.after
@@ -391,7 +391,7 @@ def _joints(network: _Network) -> set[_Joined]:
 
 
 def _contact(network: _Network, lane: int, end: str, other: int) -> str:
-    """Which end of the other lane touches an end of a lane: as it says itself, else the nearer one."""
+    """End of the other lane that touches an end of a lane: as it says itself, else the nearer one."""
     line, ident = network.lines[other], network.lines[lane].ident
     says = {
         contact
@@ -434,7 +434,7 @@ _Sides = tuple[set[int], set[int]]
 
 
 def _beside(network: _Network) -> list[_Sides]:
-    """What lies beside each line: as it says itself, or as the other says of it."""
+    """Neighbours on both sides of each line: as it says itself, or as the other says of it."""
     beside: list[_Sides] = [(set(), set()) for _ in network.lines]
     for row, line in enumerate(network.lines):
         for side, idents in enumerate((line.left_beside, line.right_beside)):
@@ -456,7 +456,7 @@ def _beside(network: _Network) -> list[_Sides]:
 
 
 def _turned_round(one: Floats, other: Floats) -> bool:
-    """Whether two lines side by side run against one another."""
+    """Return whether two lines side by side run against one another."""
     way, back = one[-1] - one[0], other[-1] - other[0]
     same = float(way @ back)
     if abs(same) < 0.5 * float(np.hypot(*way) * np.hypot(*back)):
@@ -501,7 +501,7 @@ def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int
 def _changes(
     network: _Network, row: int, beside: _Sides, against: set[int]
 ) -> Iterator[tuple[int, float, float]]:
-    """Where traffic may change from a lane to those beside it, along its own direction of travel."""
+    """Stretches where traffic may change from a lane to those beside it, along its direction of travel."""
     line, middle = network.lines[row], network.sections[row].middle
     if line.type not in DRIVING:
         return
@@ -525,7 +525,7 @@ def _changes(
 
 
 def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
-    """Where along its line the borders on one side of a lane may be crossed; the nearest border counts."""
+    """Stretches of a lane's line with a border that may be crossed on one side; the nearest border counts."""
     line, middle = network.lines[row], network.sections[row].middle
     borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
     spans: list[tuple[float, float, float, bool]] = []

@@ -361,7 +361,7 @@ _RELATED: Final = ("onto", "left_beside", "right_beside", "against")
 
 
 def is_lane_text(text: str) -> bool:
-    """Whether a text can be one of these, and no OpenDRIVE: it begins as a JSON object does."""
+    """Return whether a text can be a map of plain lanes, and no OpenDRIVE: it begins as a JSON object."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
 
 

@@ -197,7 +197,7 @@ class MapEdges:
 
 @dataclass(frozen=True, slots=True)
 class LaneHits:
-    """Which footprints touch which lanes; one row a touch, ordered by footprint; shape (H,).
+    """Pairs of a footprint and a lane that it touches; one row a touch, ordered by footprint; shape (H,).
 
     Attributes
     ----------
@@ -227,7 +227,7 @@ class LaneHits:
 
 @dataclass(frozen=True, slots=True)
 class LaneChanges:
-    """Where traffic may change from one lane to the one beside it; one row a stretch, shape (n,).
+    """Stretches where traffic may change from one lane to the one beside it; one row each, shape (n,).
 
     Attributes
     ----------
@@ -506,7 +506,7 @@ class RoadMap:
 
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
-        """Where lanes begin, measured along other lanes from whose start one can drive there, or back.
+        """Starts of lanes, measured along other lanes from whose start one can drive there, or back.
 
         Returns
         -------
@@ -575,7 +575,7 @@ _LANES_REF: Final = "lanes:"
 
 
 def lanes_ref(names: Iterable[str]) -> str:
-    """What stands for the id of a signal that a map does not have, but of which the lanes are known by name."""
+    """Stand-in for the id of a signal that a map does not have, but of which the lanes are known by name."""
     return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
 
@@ -644,7 +644,7 @@ class MapCount:
 
 
 def summary(road_map: RoadMap) -> list[MapCount]:
-    """What is in a road map: lanes by type, the most first, and so on; last what was passed over.
+    """Contents of a road map: lanes by type, the most first, and so on; last what was passed over.
 
     A road that is of several types one after another counts under each, with the length that it has of it.
     """

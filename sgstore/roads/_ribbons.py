@@ -299,7 +299,7 @@ def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
 
 
 def _share(src: Ints, dst: Ints, one: Ints, other: Ints) -> Bools:
-    """Whether both lanes of pairs have a common neighbour along ``src → dst``."""
+    """Mask of the pairs of lanes that have a common neighbour along ``src → dst``."""
     after: dict[int, set[int]] = {}
     for lane, onward in zip(src.tolist(), dst.tolist(), strict=True):
         after.setdefault(lane, set()).add(onward)

@@ -62,7 +62,7 @@ class Actor:
 
 
 def meaning_of(type_name: str) -> TypeMeaning:
-    """What a blueprint means: that of its id, or else of the longest beginning of it that ends before a dot.
+    """Meaning of a blueprint: that of its id, else of the longest beginning of it that ends before a dot.
 
     Of a vehicle that nothing maps it is only known that it is one.
     """
@@ -76,7 +76,7 @@ def meaning_of(type_name: str) -> TypeMeaning:
 
 
 def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
-    """What an object is: by its blueprint, else by the class that the bridge gives it.
+    """Meaning of an object: by its blueprint, else by the class that the bridge gives it.
 
     The bridge says "car" whenever it does not know better, so of a blueprint that nothing maps this word is
     not believed.
@@ -92,7 +92,7 @@ def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning
 
 @dataclass(slots=True)
 class Egos:
-    """Who the ego is: a vehicle with one of the bridge's role names, or what the user names.
+    """Choice of the ego: a vehicle with one of the bridge's role names, or the one that the user names.
 
     Attributes
     ----------
@@ -245,7 +245,7 @@ _MAX_SECONDS: Final = 1 << 32
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """What the messages of a channel are; empty where the reader knows nothing of them.
+    """Kind of content that the messages of a channel have; empty where the reader does not know them.
 
     Lights of vehicles are no part of the bridge: they are read from JSON messages ``{"t": s, "lights": {id:
     carla.VehicleLightState}}`` of a schema whose name ends in ``VehicleLights``.

@@ -135,7 +135,7 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOU
 
 @dataclass(frozen=True, slots=True)
 class _Actor:
-    """What is asked of an actor once.
+    """Properties of an actor that do not change.
 
     Attributes
     ----------
@@ -207,13 +207,13 @@ class LiveWorld:
 
     @property
     def warnings(self) -> list[str]:
-        """What was odd up to now: traffic lights that cannot be what they were taken for."""
+        """Oddities up to now: traffic lights that cannot be what they were taken for."""
         if self._at_once is None:
             return []
         return [*shared_signals(self._heads, self.road_map), *self._at_once.warnings]
 
     def frame(self, snapshot: Any = None) -> Frame:
-        """What is in the world now.
+        """Frame of the world as it is now.
 
         Parameters
         ----------
@@ -378,7 +378,7 @@ class LiveWorld:
 
 
 def _described(handle: Any, map_ref: str) -> _Actor:
-    """What is asked of an actor once."""
+    """Ask an actor for its properties that do not change."""
     type_name = str(handle.type_id)
     return _Actor(
         handle=handle,

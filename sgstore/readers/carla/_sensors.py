@@ -51,7 +51,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SensorPicture:
-    """What a camera saw: (height, width, 3) uint8, red green blue; ``fov``: across, degrees."""
+    """Picture of a camera: (height, width, 3) uint8, red green blue; ``fov``: across, degrees."""
 
     pixels: np.ndarray[Any, np.dtype[np.uint8]]
     fov: float
@@ -217,7 +217,7 @@ class Sensors:
         self._actors.clear()
 
     def waiting(self, timeout_s: float = 0.0) -> Iterator[SensorReading]:
-        """What has been measured and not been taken yet.
+        """Take the readings that have been measured and not been taken yet.
 
         Parameters
         ----------
@@ -264,7 +264,7 @@ class Sensors:
 
 
 def reading_of(name: str, data: Any) -> SensorReading:
-    """What a ``carla.SensorData`` of any kind says."""
+    """Reading of a ``carla.SensorData`` of any kind."""
     time_ns = round(data.timestamp * 1e9)
     kind = type(data).__name__
     if hasattr(data, "fov") and hasattr(data, "raw_data"):
@@ -295,7 +295,7 @@ def _radar(data: Any) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 def _values(data: Any) -> dict[str, Any]:
-    """What an inertial unit, a receiver of satellites, or an event says: public values by their names."""
+    """Public values, by name, of the data of an inertial unit, a receiver of satellites, or an event."""
     found: dict[str, Any] = {"type": type(data).__name__}
     for name in dir(data):
         if name.startswith("_") or name in {"transform", "frame_number", "raw_data", "timestamp"}:

@@ -133,7 +133,7 @@ def signals_of(
 
 
 class _Rule(NamedTuple):
-    """How lights may stand to their signals: turned, and so far ahead and to the left in the signal's axes."""
+    """Pose of lights relative to their signals: turn, and offset ahead and to the left in the signal's axes."""
 
     turn: float
     ahead: float
@@ -229,7 +229,7 @@ def _alone(near: _Near) -> dict[int, int]:
 
 
 def _only(rows: Rows) -> Bools:
-    """Whether each value comes once."""
+    """Mask of the values that come once."""
     return np.bincount(rows)[rows] == 1 if len(rows) else np.zeros(0, np.bool_)
 
 
@@ -604,7 +604,7 @@ class Lights:
         return [*self._shared, *self._at_once.warnings]
 
     def of_frame(self) -> Ints:
-        """What they show in the next frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`.
+        """States that they show in the next frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`.
 
         The array is kept by frames: it is not to be written to.
         """

@@ -74,7 +74,7 @@ class CarlaLead:
 
 @dataclass(slots=True)
 class _Whereabouts:
-    """Where the vehicles with a role are, to find them among the objects where no list of actors names them.
+    """Places of the vehicles with a role, to find them among objects that no list of actors names.
 
     ``objects``: stamp, ids and places of those of the last frame; ``tries``: how often it was attempted.
     """
@@ -96,7 +96,7 @@ class _Whereabouts:
 
 
 class CarlaSurvey:
-    """What is known of a recording after the first reading.
+    """Findings of the first reading of a recording.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ class CarlaSurvey:
                 self._lose(run, row, error)
 
     def _meet(self, channel: int) -> str:
-        """What the messages of a channel are; empty if they are of no concern."""
+        """Kind of content that the messages of a channel have; empty if they are of no concern."""
         if channel not in self.contents:
             self.contents[channel] = content = content_of(self._recording, channel)
             try:
@@ -262,7 +262,7 @@ class CarlaSurvey:
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """What takes up messages that last; whether they say anything new."""
+        """Functions that take messages whose contents last; each returns whether they say anything new."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
@@ -320,7 +320,7 @@ class CarlaSurvey:
     # Vehicles under test that no list names -----------------------------------------------------------
 
     def _is_lost(self, channel: int) -> bool:
-        """Whether nobody knows which object the vehicle of an odometry is."""
+        """Return whether nobody knows which object the vehicle of an odometry is."""
         role = role_in(self._recording.channels[channel].topic)
         tried = self._whereabouts.tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
@@ -348,5 +348,5 @@ class CarlaSurvey:
 
 
 def _first(run: Messages, channel: int) -> Ref:
-    """Where the first message of a channel stands."""
+    """Reference to the first message of a channel."""
     return ref_of(run, int(np.argmax(run.channel == channel)))

@@ -93,7 +93,7 @@ class CarlaTrace(Opened):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Whether one of the channels carries lists of objects."""
+        """Return whether one of the channels carries lists of objects."""
         return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
 
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:

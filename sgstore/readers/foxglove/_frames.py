@@ -72,7 +72,7 @@ class EntityNames:
 
     @staticmethod
     def text(place: str, box: Box) -> str:
-        """What stands at a place of an entity."""
+        """Text at a place of an entity."""
         if place.startswith(METADATA):
             return box.metadata.get(place.removeprefix(METADATA), "")
         return box.id if place == "id" else ""

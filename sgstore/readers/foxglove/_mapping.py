@@ -1,4 +1,4 @@
-"""How a Foxglove scene is to be understood: where kind, id, speed and ego stand, as a TOML file says.
+"""Mapping of a Foxglove scene: the places of kind, id, speed and ego in it, as a TOML file gives them.
 
 A ``foxglove.SceneUpdate`` is made to be drawn: it has boxes, but no word of what they are, how fast they
 move or which of them is the ego. Every producer has habits of its own for that, so they are data.
@@ -46,7 +46,7 @@ class Recognise:
 
 @dataclass(frozen=True, slots=True)
 class SceneMapping:
-    """Which messages make the scene.
+    """Choice of the messages that make the scene.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class SceneMapping:
 
 @dataclass(frozen=True, slots=True)
 class EntityMapping:
-    """Where things stand in an entity: ``id``, or ``metadata.KEY``; empty: nowhere.
+    """Places of an entity's values: ``id``, or ``metadata.KEY``; empty: nowhere.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class EntityMapping:
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """Who the ego is: an entity, or axes that move with it.
+    """Choice of the ego: an entity, or axes that move with it.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Mapping:
     types: Map[str, TypeMeaning] = field(default_factory=dict[str, TypeMeaning])
 
     def meaning(self, type_name: str) -> TypeMeaning:
-        """What a type name means; kind ``unknown``, or ``vehicle``, if nobody knows more."""
+        """Meaning of a type name; kind ``unknown``, or ``vehicle``, if nobody knows more."""
         name = type_name.lower()
         if name in self.types:
             return self.types[name]

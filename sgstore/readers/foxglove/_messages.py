@@ -44,7 +44,7 @@ ORIGIN: Final = np.zeros(3)
 
 @dataclass(slots=True)
 class _Track:
-    """Where axes were in their parent: times, ascending, and poses."""
+    """Poses of axes in their parent over time; the times ascend."""
 
     parent: str
     times: list[int] = field(default_factory=list[int])
@@ -254,7 +254,7 @@ class SceneUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Where axes (``child``) are in others (``parent``)."""
+    """Pose of axes (``child``) in others (``parent``)."""
 
     parent: str
     child: str

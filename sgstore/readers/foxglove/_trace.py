@@ -116,7 +116,7 @@ class FoxgloveTrace(Opened):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Whether one of the channels carries Foxglove scenes."""
+        """Return whether one of the channels carries Foxglove scenes."""
         for number, record in recording.channels.items():
             schema = recording.schemas.get(record.schema_id)
             if schema is not None and schema.name == SCENE and encoding_of(recording, number):
@@ -152,7 +152,7 @@ class FoxgloveTrace(Opened):
 
 @dataclass(slots=True)
 class _LossNote:
-    """How often something was told, and where for the first time."""
+    """Number of times that a loss was told, and the first message that it concerns."""
 
     first: Ref
     count: int = 0
@@ -285,7 +285,7 @@ class _Survey:
                 continue
 
     def _meet(self, channel: int) -> bool:
-        """Whether the messages of a channel are read; makes ready for it when it is met for the first time."""
+        """Return whether the messages of a channel are read; make ready for one that is met first."""
         if channel in self.readers:
             return True
         encoding = encoding_of(self._recording, channel)

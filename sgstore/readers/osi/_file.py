@@ -69,7 +69,7 @@ _LITERAL, _REPEATED, _COMPRESSED = 0, 1, 2
 
 
 def is_compressed(file: BinaryIO) -> bool:
-    """Whether a file begins as zstd does."""
+    """Return whether a file begins as zstd does."""
     file.seek(0)
     magic = file.read(4)
     return magic == ZSTD or (len(magic) == 4 and PREFIX.unpack(magic)[0] in _SKIPPABLE)
@@ -314,7 +314,7 @@ class OsiFile:
             yield run.messages()
 
     def _recognise(self) -> str:
-        """What the messages are; learns how they begin."""
+        """Recognise the type of the messages, and learn their common beginning."""
         report = TraceReport()
         likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
         tried = 0
@@ -371,7 +371,7 @@ class _MessageRun:
         self.times.append(self.last_ns)
 
     def is_full(self, place: int) -> bool:
-        """Whether a message of the zstd frame at a place has to go into another run."""
+        """Return whether a message of the zstd frame at a place has to go into another run."""
         return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
 
     def messages(self) -> Messages:
@@ -431,14 +431,14 @@ class _Stream:
             del self._frames[0]
 
     def _overruns(self, at: int, stop: int) -> bool:
-        """Whether a message that would end here seems to swallow others: none begins here, but one before."""
+        """Return whether a message that ends here seems to swallow others: none begins here, but one before."""
         following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
         if self._mark.startswith(following):
             return False
         return self._resume(at + 1, stop) is not None
 
     def _resume(self, start: int, stop: int | None = None) -> int | None:
-        """Where in the buffer, before ``stop``, the next message seems to begin."""
+        """Place in the buffer, before ``stop``, at which the next message seems to begin."""
         end = None if stop is None else stop - 1 + PREFIX.size + len(self._mark)
         while self._mark:
             found = self._buffer.find(self._mark, start + PREFIX.size, end)
@@ -479,7 +479,7 @@ def _lose(report: TraceReport, loss: Loss) -> None:
 
 
 def _beginning(data: bytes) -> bytes:
-    """How messages of a file begin: with the version of OSI and the tag of what follows; empty if without."""
+    """Common beginning of a file's messages: version of OSI and tag of the next field; empty if without."""
     try:
         number, wire, _start, stop = next(fields_of(data, 0, len(data)))
     except (ValueError, StopIteration):
@@ -488,7 +488,7 @@ def _beginning(data: bytes) -> bytes:
 
 
 def _likeness(name: str, data: bytes) -> int:
-    """How much a message looks like being of a type: the things with a place or an id in it; -1: not at all.
+    """Likeness of a message to a type: the number of things with a place or an id in it; -1: not of the type.
 
     A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
     """

@@ -345,7 +345,7 @@ class OsiDecoder:
         frame.controls = (steer, throttle, brake)
 
     def _take_aside(self, message: Any, ground: Any, time_ns: int) -> None:
-        """What another channel tells: of the last frame, of one to come, or of none."""
+        """Take a message of another channel: it tells of the last frame, of one to come, or of none."""
         last = self._open
         self._lights.update(ground)
         contents: list[bytes] = list(ground.moving_object)

@@ -352,7 +352,7 @@ class _LaneBoundaries:
         return tuple(found)
 
     def crossed(self, ident: int) -> bool | None:
-        """Whether a physical boundary may be crossed; ``None``: that is not known."""
+        """Return whether a physical boundary may be crossed; ``None``: that is not known."""
         boundary = self.told["lane_boundary"].get(ident)
         if boundary is None or not boundary.HasField("classification"):
             return None
@@ -383,7 +383,7 @@ class _LaneBoundaries:
         return points[order], s[order], tuple(borders)
 
     def _rule(self, boundary: Any) -> tuple[bool | None, bool | None]:
-        """Whether a logical boundary may be crossed to the left and right; else its own line's type counts."""
+        """Permission to cross a logical boundary to the left and right; else the type of its line counts."""
         rule = _RULES.get(enum_name(boundary, "passing_rule"))
         if rule is not None:
             return rule
@@ -459,7 +459,7 @@ def _physical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _word(message: Any, field: str) -> str:
-    """What stands behind ``TYPE_`` or ``SUBTYPE_`` in the name of a value; empty if there is no such field."""
+    """Part of a value's name behind ``TYPE_`` or ``SUBTYPE_``; empty if there is no such field."""
     known = field in message.DESCRIPTOR.fields_by_name
     return enum_name(message, field).partition("_")[2] if known else ""
 

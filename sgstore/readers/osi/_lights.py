@@ -64,7 +64,7 @@ _SUBKINDS: Final = {
 
 
 def lit(mode: int, colour: int) -> int:
-    """What a bulb shows, by the numbers of its mode and colour, as a bit; 0 if it is off."""
+    """State of a bulb as a bit, by the numbers of its mode and colour; 0 if it is off."""
     if mode == _MODE_OFF:
         return 0
     if mode == _MODE_FLASHING:

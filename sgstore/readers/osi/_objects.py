@@ -93,7 +93,7 @@ class OddError(ValueError):
 
 @dataclass(slots=True)
 class _ObjectLayout:
-    """Where things stand in objects of one shape.
+    """Places of the fields in serialised objects of one shape.
 
     ``compared``, ``mask``, ``expected``: places of all bytes that are no numbers, which of their bits count,
     and what those are. ``runs``: first column, place and number of doubles that follow one another. ``zero``:
@@ -110,13 +110,13 @@ class _ObjectLayout:
     parts: set[str]
 
     def agree(self, objects: Bytes) -> Bools:
-        """Which of some objects, as rows of bytes, have this layout."""
+        """Mask of the objects, as rows of bytes, that have this layout."""
         return ((objects[:, self.compared] & self.mask) == self.expected).all(axis=1)
 
 
 @dataclass(slots=True)
 class _Learned:
-    """What a walk through an object finds; see :class:`_ObjectLayout`."""
+    """Findings of a walk through an object; see :class:`_ObjectLayout`."""
 
     mask: Bytes
     doubles: dict[int, int] = field(default_factory=dict[int, int])
@@ -310,7 +310,7 @@ _TARGETS: Final = {
 
 
 def _meanings(told: Any, bit: int) -> NDArray[np.int64]:
-    """What each state of a light adds to the mask; -1 for states that the recording's OSI has not."""
+    """Bits that each state of a light adds to the mask; -1 for states that the recording's OSI has not."""
     table = np.full(_STATES, -1, np.int64)
     for state in told.enum_type.values_by_number if told.enum_type is not None else ():
         if 0 <= state < _STATES:

@@ -514,7 +514,7 @@ def lights_of(ground: Any) -> list[bytes]:
 
 
 def has_field(message: type[Any], path: str) -> bool:
-    """Whether a message class has a field, given as a path of names with dots between."""
+    """Return whether a message class has a field, given as a path of names with dots between."""
     try:
         _require(message.DESCRIPTOR, (path,))
     except KeyError:

@@ -60,7 +60,7 @@ _MOST_HOSTS: Final = 100
 
 
 def names_of(moving_object: Any) -> list[str]:
-    """What a moving object is called, its name first: ``X`` of ``entity_name:X``, else bare identifiers."""
+    """Names of a moving object, the proper one first: ``X`` of ``entity_name:X``, then bare identifiers."""
     parts = [text.partition(":") for _, text in identifiers(moving_object)]
     named = [value for key, _, value in parts if key == "entity_name" and value]
     bare = [key for key, colon, _ in parts if key and not colon and key not in _SORTS]
@@ -96,7 +96,7 @@ def keys_of(objects: Sequence[bytes]) -> list[bytes]:
 
 
 def is_key(key: bytes, thing: Any) -> bool:
-    """Whether the beginning of a serialised object is its id and nothing else."""
+    """Return whether the beginning of a serialised object is its id and nothing else."""
     ident = thing.id.SerializeToString()
     return len(ident) < 0x80 and key == b"\x0a" + bytes([len(ident)]) + ident
 
@@ -230,7 +230,7 @@ BEGINNING: Final = 1_000_000_000
 
 @dataclass(slots=True)
 class _Latch:
-    """Which messages of a channel later ones depend on, because they do not repeat what these tell.
+    """Messages of a channel on which later ones depend, because they do not repeat their contents.
 
     A static object is told by the first message that has it; if every later one has it too, none
     depends on the first. A light's state is told by the last message before one that lacks the light.
@@ -296,7 +296,7 @@ class OsiLead:
 
 @dataclass(slots=True)
 class OsiSurvey:
-    """What is known of a recording after the first reading.
+    """Findings of the first reading of a recording.
 
     Attributes
     ----------
@@ -438,7 +438,7 @@ def schema_name(recording: Recording, channel: int) -> str:
 def _meet(
     recording: Recording, channel: int, result: OsiSurvey, maps: dict[int, type[Any]]
 ) -> bool:
-    """Whether a channel may lead or carries maps; makes ready for it when it is met for the first time."""
+    """Return whether a channel may lead or carries maps; make ready for one that is met for the first time."""
     if channel in result.leads or channel in maps:
         return True
     name = schema_name(recording, channel)

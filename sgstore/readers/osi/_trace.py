@@ -76,7 +76,7 @@ class OsiTrace(Opened):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Whether one of the channels carries OSI ground truth."""
+        """Return whether one of the channels carries OSI ground truth."""
         names = {schema_name(recording, channel) for channel in recording.channels}
         return bool(names & {GROUND_TRUTH, SENSOR_VIEW})
 
