@@ -7,8 +7,10 @@ import math
 import re
 import sys
 import tomllib
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import carla_recordings
@@ -17,13 +19,19 @@ import pytest
 import recordings
 from foxglove_scenes import SceneRecorder, cube
 from mcap.reader import make_reader
+from opendrive_maps import a_map, a_road, line
+from test_export_mcap import cut
+from test_online import agree
 
 import sgstore
+from sgstore import Frame, SceneGraphGenerator, plugins
+from sgstore.config import Config
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
-from sgstore.readers import READERS, open_trace, read_message
+from sgstore.opendrive import read_map
+from sgstore.readers import READERS, FramesTrace, TraceMessage, open_trace, read_message
 from sgstore.readers.foxglove._mapping import Ego, EntityMapping, SceneMapping, shipped
-from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
+from sgstore.world import Channel, FrameBlock, States, TraceInfo, TraceReport
 
 
 @cache
@@ -177,16 +185,25 @@ def toybox(path: Path, frames: int = 30) -> Path:
     return path
 
 
-@pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The flavour of the page, as a package that is installed beside sgstore."""
+def way(name: str) -> str:
+    """A program of the page: the flavour as plain frames, or in columns."""
     page = PAGE.read_text(encoding="utf-8")
-    (block,) = re.findall(r'```python\n("""Recordings of Toybox.*?)```', page, re.DOTALL)
+    programs = re.findall(r'```python\n("""Recordings of Toybox.*?)```', page, re.DOTALL)
+    assert len(programs) == len(WAYS)
+    return programs[WAYS.index(name)]
+
+
+WAYS = ["frames", "columns"]
+LOST = {"frames": "'world': KeyError('ego')", "columns": "not a world"}
+
+
+def install(site: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A flavour as a package that is installed beside sgstore, with the entry point of the page."""
+    page = PAGE.read_text(encoding="utf-8")
     (entry,) = re.findall(r'\[project.entry-points."sgstore.readers"\]\ntoybox = "(.*)"', page)
-    site = tmp_path / "site"
     about = site / "toybox-1.0.dist-info"
     about.mkdir(parents=True)
-    (site / "toybox.py").write_text(block, encoding="utf-8")
+    (site / "toybox.py").write_text(program, encoding="utf-8")
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toybox\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[sgstore.readers]\ntoybox = {entry}\n")
     monkeypatch.syspath_prepend(str(site))
@@ -195,7 +212,16 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return site
 
 
-def test_a_flavour_of_one_file_is_ingested_and_queried(tmp_path: Path, installed: Path) -> None:
+@pytest.fixture(params=WAYS)
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> Path:
+    """A flavour of the page."""
+    return install(tmp_path / "site", way(request.param), monkeypatch)
+
+
+def test_a_flavour_of_one_file_is_ingested_and_queried(
+    tmp_path: Path, installed: Path, request: pytest.FixtureRequest
+) -> None:
+    lost = LOST[request.node.callspec.params["installed"]]
     path = toybox(tmp_path / "toys.mcap")
     store_path = tmp_path / "toys.sgstore"
     (outcome,) = ingest(store_path, [path])
@@ -203,7 +229,9 @@ def test_a_flavour_of_one_file_is_ingested_and_queried(tmp_path: Path, installed
     assert read(path)[0].flavour == "toybox"
     assert outcome.status == "added", outcome.error
     assert outcome.frames == 30
-    assert [(loss.messages, "not a world" in loss.reason) for loss in outcome.losses] == [(1, True)]
+    (loss,) = outcome.losses
+    assert lost in loss.reason
+    assert (loss.messages, loss.bytes, loss.start_ns, loss.end_ns) == (1, 22, 3 * 10**9, 3 * 10**9)
     store = sgstore.open(store_path)
     matches = list(
         store.find("MATCH (e:Ego)-[:near_coll]->(c:Car {ident: 'b'}) RETURN e.x, e.speed")
@@ -223,6 +251,203 @@ def test_a_flavour_of_one_file_keeps_the_laws(tmp_path: Path, installed: Path) -
         assert (report.frames, len(report.losses)) == (30, 1)
         for name in States.__dataclass_fields__:
             np.testing.assert_array_equal(column(blocks, name), column(whole, name))
+
+
+def test_a_flavour_of_frames_is_short_and_gives_the_same_as_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = toybox(tmp_path / "toys.mcap")
+    assert len(way("frames").splitlines()) <= 30
+    told = []
+    for name in WAYS:
+        read.cache_clear()
+        install(tmp_path / name, way(name), monkeypatch)
+        told.append(read(path, 7))
+    (info, frames, report), (other, columns, _) = told
+
+    assert (info.channels, info.digest) == (other.channels, other.digest)
+    assert (report.frames, report.states) == (30, 60)
+    for ours, theirs in zip(frames, columns, strict=True):
+        np.testing.assert_equal(asdict(ours), asdict(theirs))
+
+
+class PlainTrace(FramesTrace):
+    """Plain frames as JSON, with a map: the arguments of ``Frame`` and of its ``add``."""
+
+    name = "plain"
+
+    @staticmethod
+    def role(channel: Channel) -> str:
+        return {"plain.Frame": "ground_truth", "plain.Map": "map"}.get(channel.schema, "payload")
+
+    def frame(self, message: TraceMessage) -> Frame | None:
+        told = json.loads(message.data)
+        return plain_frame(told) if told else None
+
+
+def plain_frame(told: dict[str, Any]) -> Frame:
+    frame = Frame(told["time_ns"], told.get("ego"))
+    for entity in told["entities"]:
+        frame.add(**entity)
+    return frame
+
+
+def plain_world(i: int) -> dict[str, Any]:
+    """A car follows another on a town's road, past a pole and a light; a person comes late and goes."""
+    still = {"vx": 0.0, "vy": 0.0, "ax": 0.0, "ay": 0.0, "vz": 0.0, "az": 0.0, "yaw_rate": 0.0}
+    body = {"length": 4.5, "width": 1.9, "height": 1.5}
+    drives = still | body | {"kind": "car", "vx": 10.0, "heading": 5.0, "y": 0.0, "z": 0.75}
+    entities = [
+        drives | {"ident": "ego", "x": i, "lights": ["light_brake"], "throttle": i / 100},
+        drives | {"ident": "lead", "x": i + 9.5, "yaw_rate": 1.5, "special": "taxi", "brake": 0.5},
+        still
+        | {"ident": "lamp", "kind": "traffic_light", "x": 30.0, "y": 5.0, "light_state": "red"},
+    ]
+    if 10 <= i < 20:
+        entities.insert(0, still | {"ident": "late", "kind": "person", "x": 25.0, "y": 3.0})
+    if i % 10 == 0:
+        entities.append({"ident": "pole", "kind": "pole", "x": 20, "y": 4, "z": 2, "static": True})
+    return {"time_ns": i * 10**8 + 5, "ego": "ego" if i != 7 else None, "entities": entities}
+
+
+STREET = a_map(a_road("1", line(200, x=-20)))
+
+
+def plain(path: Path, worlds: list[Any], *, map_text: str = "") -> Path:
+    with recordings.Recorder(path, chunk_size=3000) as recorder:
+        if map_text:
+            recorder.write(recorder.channel("map", "plain.Map", b"{}"), 0, map_text.encode())
+        channel = recorder.channel("/frames", "plain.Frame", b"{}")
+        for i, world in enumerate(worlds):
+            data = world if isinstance(world, bytes) else json.dumps(world).encode()
+            recorder.write(channel, i / 10, data)
+            recorder.camera(i / 10 + 0.02)
+    return path
+
+
+@pytest.fixture
+def plain_reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = SimpleNamespace(name="plain", value="here:PlainTrace", load=lambda: PlainTrace)
+    monkeypatch.setattr(
+        plugins, "entry_points", lambda group: [entry] if group == plugins.READERS.group else []
+    )
+    read.cache_clear()
+
+
+@pytest.mark.parametrize("text", ["", STREET], ids=["no map", "map"])
+def test_plain_frames_have_the_graphs_of_the_online_mode(
+    tmp_path: Path, plain_reader: None, text: str
+) -> None:
+    worlds = [plain_world(i) for i in range(70)]
+    path = plain(tmp_path / "plain.mcap", worlds, map_text=text)
+    (outcome,) = ingest(tmp_path / "plain.sgstore", [path])
+    assert (outcome.status, outcome.losses, outcome.ego) == ("added", [], "ego"), outcome.error
+
+    store = sgstore.open(tmp_path / "plain.sgstore")
+    idents = dict(store.sql("SELECT node_id, ident FROM entities").values)
+    online = SceneGraphGenerator(read_map(text, "map") if text else None, Config())
+    relations: set[str] = set()
+    with store.file.snapshot():
+        for i, world in enumerate(worlds):
+            graph = online.step(plain_frame(world))
+            agree(graph, store.file.graph(f"plain#{i}"), idents)
+            relations |= {relation for _, relation, _, _ in graph.edges}
+    assert {"inDFrontOf", "near"} <= relations
+    assert ("isIn" in relations) == bool(text)
+
+
+def test_a_frame_that_contradicts_others_is_a_loss_and_changes_nothing(
+    tmp_path: Path, plain_reader: None
+) -> None:
+    worlds: list[Any] = [plain_world(i) for i in range(20)]
+    person = {"kind": "person", "x": 0.0, "y": 0.0}
+    doubtful = [
+        b"not JSON",
+        b"\xff",
+        b"[" * 100_000,
+        {"time_ns": 1 << 70, "entities": []},
+        {"time_ns": 1, "entities": [person | {"ident": "new"}, person | {"ident": "ego"}]},
+        {"time_ns": 1, "entities": [person | {"ident": "new"}, person | {"ident": "new"}]},
+        {"time_ns": 1, "entities": [person | {"ident": "pole"}]},
+        {"time_ns": 1, "entities": [person | {"ident": "lamp", "static": True}]},
+        {"time_ns": 1, "entities": [person | {"ident": "new", "kind": "prson"}]},
+    ]
+    mixed = [*worlds[:10], *doubtful, b"null", *worlds[10:]]
+    _, whole, _ = read(plain(tmp_path / "whole.mcap", worlds))
+    for size in (7, 60):
+        _, blocks, report = read(plain(tmp_path / "mixed.mcap", mixed), size)
+
+        assert idents(blocks) == idents(whole) == ["pole", "ego", "lead", "lamp", "late"]
+        for name in States.__dataclass_fields__:
+            np.testing.assert_array_equal(column(blocks, name), column(whole, name))
+        assert sum(len(block.messages) for block in blocks) == 2 * len(mixed)
+        assert report.frames == 20
+        assert [loss.messages for loss in report.losses] == [1] * len(doubtful)
+        assert [loss.start_ns for loss in report.losses] == [
+            (10 + i) * 10**8 for i in range(len(doubtful))
+        ]
+        reasons = [loss.reason for loss in report.losses]
+        assert all(reason.startswith("'/frames': ") for reason in reasons)
+        told = [
+            "JSONDecodeError",
+            "UnicodeDecodeError",
+            "Recursion",
+            "no time",
+            "was of kind 'car'",
+        ]
+        told += ["two entities have the id 'new'", "'pole' was static", "'lamp' moved"]
+        for reason, part in zip(reasons, [*told, "unknown kind 'prson'"], strict=True):
+            assert part in reason
+
+
+def test_the_ego_is_that_of_each_frame_unless_another_is_named(
+    tmp_path: Path, plain_reader: None
+) -> None:
+    path = plain(tmp_path / "plain.mcap", [plain_world(i) for i in range(10)])
+    _, (block,), report = read(path)
+    assert block.ego.tolist() == [1] * 7 + [-1] + [1] * 2  # one frame names none
+    assert report.warnings == []
+    with open_trace(path, ego="lead") as trace:
+        (block,) = trace.blocks()
+        assert trace.info.ego == "lead"
+        assert block.ego.tolist() == [2] * 10
+    with open_trace(path, ego="nobody") as trace, pytest.raises(TraceError, match="'nobody'"):
+        list(trace.blocks())
+
+
+def test_what_stands_and_is_told_late_is_there_from_then_on(
+    tmp_path: Path, plain_reader: None
+) -> None:
+    worlds = [plain_world(i) for i in range(30)]
+    worlds[12]["entities"].append(
+        {"ident": "tree", "kind": "vegetation", "x": 15, "y": 4, "static": True}
+    )
+    path = plain(tmp_path / "plain.mcap", worlds)
+    _, whole, _ = read(path)
+    for size in (1, 5, 12, 13):
+        _, blocks, _ = read(path, size)
+        assert idents(blocks) == idents(whole)
+        tree = idents(blocks).index("tree")
+        for name in States.__dataclass_fields__:
+            np.testing.assert_array_equal(column(blocks, name), column(whole, name))
+        frame = np.concatenate([block.seq[block.frame_of] for block in blocks])
+        there = column(blocks, "node") == tree
+        assert frame[there].tolist() == [*range(12, 30)]
+        assert not column(blocks, "vx")[there].any()
+
+
+def test_a_clip_of_plain_frames_brings_what_stands_and_the_map(
+    tmp_path: Path, plain_reader: None
+) -> None:
+    path = plain(tmp_path / "plain.mcap", [plain_world(i) for i in range(40)], map_text=STREET)
+    (clip,) = cut(path, tmp_path / "clips", (1.5, 2.5))
+    info, blocks, report = read(clip)
+
+    assert info.map_text == STREET
+    assert idents(blocks) == ["pole", "late", "ego", "lead", "lamp"]
+    assert sum(len(block.scenery) for block in blocks) == 1
+    assert report.frames == 11
+    assert report.losses == []
 
 
 def test_a_flavour_that_cannot_be_loaded_is_named_only_where_it_is_needed(

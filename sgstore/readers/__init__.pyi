@@ -1,5 +1,7 @@
 # The face of this package: what others may import from it.
 
+from ._frames import FramesTrace as FramesTrace
+from ._frames import TraceMessage as TraceMessage
 from ._media import Media as Media
 from ._media import read_carried as read_carried
 from ._media import read_messages as read_messages
@@ -46,6 +48,7 @@ __all__ = [
     "EntityTable",
     "FrameRefs",
     "FrameRows",
+    "FramesTrace",
     "LiveWorld",
     "Media",
     "NAN",
@@ -60,6 +63,7 @@ __all__ = [
     "SensorPicture",
     "SensorReading",
     "Sensors",
+    "TraceMessage",
     "assemble",
     "camera_of",
     "channels_of",
