@@ -22,7 +22,7 @@ import sgstore.mcap._read_ahead as ahead
 import sgstore.mcap._reader as mcap_file
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
-from sgstore.mcap._read_ahead import MANY, MOST, Buffers
+from sgstore.mcap._read_ahead import MOST_BUFFERED, MOST_BUFFERS, Buffers
 from sgstore.readers import open_trace
 from sgstore.world import TraceReport
 
@@ -332,17 +332,17 @@ def test_memory_is_used_again_and_not_hoarded() -> None:
     assert address(1_000_000) != first
     del view
     assert first in {address(1_000_000), address(1_000_000)}
-    held = [buffers.take(MOST // 4) for _ in range(8)]
-    assert buffers.kept <= MOST
+    held = [buffers.take(MOST_BUFFERED // 4) for _ in range(8)]
+    assert buffers.kept <= MOST_BUFFERED
     del held
-    buffers.take(MOST // 2)
-    assert buffers.kept <= MOST
+    buffers.take(MOST_BUFFERED // 2)
+    assert buffers.kept <= MOST_BUFFERED
     buffers.clear()
     assert buffers.kept == 0
 
     many = [buffers.take(size) for size in (*[0] * 1000, *[1] * 1000)]
     assert all(many[i].nbytes == (i >= 1000) for i in range(2000))
-    assert len(buffers._kept) <= MANY
+    assert len(buffers._kept) <= MOST_BUFFERS
 
 
 # Checksums ----------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from recordings import OSI, Recorder, bulb, car, ground_truth, house, ns, person
 
 from sgstore.errors import TraceError
 from sgstore.readers import OsiFile, descriptors, open_trace, read_message
-from sgstore.readers.osi._file import time_of
+from sgstore.readers.osi._file import time_of_bytes
 from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
@@ -300,7 +300,7 @@ def test_the_log_time_is_the_time_of_the_message_and_else_the_last_one(tmp_path:
     told = [ground_truth(stamp, [car(1)], host=1).SerializeToString() for stamp in stamps]
     _, blocks, _ = read(write(tmp_path / "a.osi", packed(told)))
 
-    assert [time_of(part) for part in told] == [ns(0.5), None, None, ns(0.6)]
+    assert [time_of_bytes(part) for part in told] == [ns(0.5), None, None, ns(0.6)]
     assert blocks[0].log_time_ns.tolist() == [ns(0.5), ns(0.5), ns(0.5), ns(0.6)]
 
 

@@ -90,7 +90,7 @@ class SymmetrySearch:
         alone = sorted((n for n in colour if sizes[colour[n]] == 1), key=colour.__getitem__)
         parts = [
             (_form(part, {n: colour[n] for n in order}, order), order)
-            for part in _parts_of_graph(_telling(arcs, colour, sizes))
+            for part in _components_of_graph(_telling(arcs, colour, sizes))
             for order in [self._connected(part, {n: colour[n] for n in part})]
         ]
         parts.sort(key=lambda part: part[0])
@@ -178,7 +178,7 @@ def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
     }
 
 
-def _parts_of_graph(arcs: Arcs) -> list[Arcs]:
+def _components_of_graph(arcs: Arcs) -> list[Arcs]:
     near: dict[int, set[int]] = {node: set(to) for node, to in arcs.items()}
     for src, to in arcs.items():
         for dst in to:
@@ -491,7 +491,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
     known = np.ones(block.graphs, np.bool_)
     if not nodes or size.max() == 1:
         return order, known
-    part = _components(block, cell, size)
+    part = _components_of_block(block, cell, size)
     order = np.lexsort((part, cell))  # cells are numbered graph after graph
     alike = np.flatnonzero(
         (cell[order][1:] == cell[order][:-1]) & (part[order][1:] == part[order][:-1])
@@ -505,7 +505,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
     return order, known
 
 
-def _components(block: _Block, cell: Ints, size: Ints) -> Ints:
+def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
     """Components of what tells nodes of one colour apart: for each node the least row in its component."""
     part = np.arange(len(cell))
     src, dst = block.src, block.dst

@@ -22,6 +22,7 @@ from ._fetch import message_at as message_at
 from ._fetch import open_regular as open_regular
 from ._fetch import part_at as part_at
 from ._fetch import parts_of as parts_of
+from ._fetch import read_and_digest as read_and_digest
 from ._read_ahead import MAGIC as MAGIC
 from ._read_ahead import read_summary as read_summary
 from ._reader import CLIP as CLIP
@@ -53,6 +54,7 @@ __all__ = [
     "parse_records",
     "part_at",
     "parts_of",
+    "read_and_digest",
     "read_chunk_head",
     "read_records",
     "read_summary",

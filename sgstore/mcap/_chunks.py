@@ -95,7 +95,8 @@ class Recording(Protocol):
 
 MAX_LOSSES: Final = 1000
 """Losses that are listed one by one; the last of them stands for all that follow."""
-_LAST_LOSS_NS: Final = (1 << 63) - 1
+LAST_NS: Final = (1 << 63) - 1
+"""Greatest time that a signed number of 64 bits can hold: the year 2262; ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,7 @@ def lose(report: TraceReport, loss: Loss) -> None:
 
 def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Loss:
     """The loss of a chunk, with the time span that its head tells, if it can be."""
-    known = head is not None and head.start_ns <= head.end_ns <= _LAST_LOSS_NS
+    known = head is not None and head.start_ns <= head.end_ns <= LAST_NS
     return Loss(
         reason,
         bytes=place.length,
@@ -207,9 +208,9 @@ MESSAGE_HEAD: Final = np.dtype(
 CHUNK_FIELDS: Final = struct.Struct("<QQQI")
 _PIECE: Final = 1 << 20
 _LZ4_PIECE: Final = 16 << 20  # its decompressor copies what is left of the input for every piece
-_LAST_NS: Final = (1 << 63) - 1
 _MESSAGE: Final = int(Opcode.MESSAGE)
-_MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
+MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
+"""Bytes of a message record between its head and the data."""
 _DEFINITIONS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
 
 
@@ -575,7 +576,7 @@ def message_columns(
     TraceError
         A log time lies beyond what 64 bits with a sign can hold: the year 2262.
     """
-    if len(heads) and int(heads["log_time"].max()) > _LAST_NS:
+    if len(heads) and int(heads["log_time"].max()) > LAST_NS:
         reason = f"a message bears the log time {int(heads['log_time'].max())} ns"
         raise TraceError(reason, offset=max(chunk_offset, 0))
     return Messages(
@@ -585,7 +586,7 @@ def message_columns(
         log_time_ns=heads["log_time"].astype(np.int64),
         publish_time_ns=heads["publish_time"].astype(np.uint64),
         offset=offsets,
-        length=heads["length"].astype(np.int64) - (MESSAGE_HEAD.itemsize - HEAD.size),
+        length=heads["length"].astype(np.int64) - MESSAGE_FIELDS,
         read=read,
     )
 
@@ -601,7 +602,7 @@ def _frame_records(records: Records) -> tuple[Ints, list[tuple[int, int, int]], 
             break
         opcode, length = head_at(records, position)
         stop = start + length
-        if opcode == _MESSAGE and length >= _MESSAGE_FIELDS and stop <= total:
+        if opcode == _MESSAGE and length >= MESSAGE_FIELDS and stop <= total:
             offsets.append(position)
         elif opcode in {0, _MESSAGE} or stop > total:
             break

@@ -15,9 +15,10 @@ import hashlib
 import os
 import re
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from mcap.opcode import Opcode
 
@@ -25,6 +26,7 @@ from sgstore.errors import TraceError
 from sgstore.mcap._chunks import (
     HEAD,
     MAX_CHUNK,
+    MESSAGE_FIELDS,
     MESSAGE_HEAD,
     READ_ERRORS,
     read_chunk_head,
@@ -32,8 +34,10 @@ from sgstore.mcap._chunks import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from io import BufferedReader
 
+_Found = TypeVar("_Found")
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 16 << 20
@@ -227,11 +231,10 @@ def message_at(path: Path, *, chunk_offset: int, offset: int, length: int) -> by
             raise TraceError(error.reason, path=path, offset=chunk_offset) from error
         except READ_ERRORS:  # an offset outside the file or the chunk
             opcode, found = 0, 0
-    fields = MESSAGE_HEAD.itemsize - HEAD.size
     if (opcode, found, len(record)) != (
         Opcode.MESSAGE,
-        fields + length,
-        HEAD.size + fields + length,
+        MESSAGE_FIELDS + length,
+        MESSAGE_HEAD.itemsize + length,
     ):
         reason = f"no message of {length} bytes at {offset} there: the file was replaced"
         raise TraceError(reason, path=path, offset=max(chunk_offset, 0))
@@ -256,6 +259,33 @@ def digest_of(path: Path) -> str:
             except OSError as error:
                 raise TraceError(f"cannot be read: {error.strerror}", path=one) from error
     return digest.hexdigest()
+
+
+def read_and_digest(path: Path, digest: str, read: Callable[[], _Found]) -> tuple[_Found, str]:
+    """Read a recording and hash its file at the same time, so that it comes from the disk once.
+
+    Parameters
+    ----------
+    path : Path
+    digest : str
+        SHA-256 of the file if it is known; else the empty string, and the file is hashed.
+    read : function
+        First reading of the recording.
+
+    Returns
+    -------
+    tuple
+        Result of the reading, and the digest.
+
+    Raises
+    ------
+    TraceError
+        A file cannot be read; or as ``read`` raises it.
+    """
+    with ThreadPoolExecutor(1) as beside:
+        hashing = None if digest else beside.submit(digest_of, path)
+        found = read()
+        return found, hashing.result() if hashing else digest
 
 
 def check_name(path: Path) -> None:

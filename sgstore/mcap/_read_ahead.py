@@ -49,10 +49,10 @@ if TYPE_CHECKING:
     Read = Callable[[int, int], memoryview]
 
 
-MOST: Final = 48 << 20
-"""Memory that is kept to be used again; bytes."""
-MANY: Final = 128
-"""Pieces of it."""
+MOST_BUFFERED: Final = 48 << 20
+"""Memory of :class:`Buffers` that is kept to be used again, at most; bytes."""
+MOST_BUFFERS: Final = 128
+"""Pieces of that memory, at most."""
 
 
 class Buffers:
@@ -73,7 +73,7 @@ class Buffers:
             1 << max(size.bit_length() - 3, 0), 4096
         )  # chunks of a file differ a little in size
         buffer = bytearray(-(-size // grain) * grain)
-        if len(self._kept) < MANY and self.kept + len(buffer) <= MOST:
+        if len(self._kept) < MOST_BUFFERS and self.kept + len(buffer) <= MOST_BUFFERED:
             self._kept.append(buffer)
         return memoryview(buffer)[:size]
 

@@ -36,6 +36,7 @@ from sgstore.errors import TraceError
 from sgstore.mcap._chunks import (
     HEAD,
     IDS,
+    LAST_NS,
     MAX_CHUNK,
     MAX_LOSSES,
     MESSAGE_HEAD,
@@ -82,8 +83,6 @@ RUN_MESSAGES: Final = 1024
 """Messages outside chunks that are handed on together."""
 
 _PIECE: Final = 1 << 20
-_MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
-_LAST_NS: Final = (1 << 63) - 1
 _HOLDS_CONTENT: Final = frozenset(
     {
         Opcode.SCHEMA,
@@ -213,7 +212,7 @@ class McapFile:
 
         What a clip holds from outside them was carried in because later messages depend on it.
         """
-        window = (0, _LAST_NS)
+        window = (0, LAST_NS)
         for place in sorted(self.metadata, key=lambda place: place.offset):
             record = self.metadata[place]
             start, end = record.metadata.get("start_ns", ""), record.metadata.get("end_ns", "")

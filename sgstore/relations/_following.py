@@ -29,8 +29,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.graph import Edges, LaneGaps
-from sgstore.relations._scene import Relation, edges_between, kinds_mask
-from sgstore.vocabulary import VEHICLES
+from sgstore.relations._scene import IS_VEHICLE, Relation, edges_between
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,8 +47,6 @@ if TYPE_CHECKING:
 
 SAME_WAY: Final = np.pi / 4
 """Greatest difference of heading from a lane of a junction that a vehicle takes; rad."""
-
-IS_VEHICLE: Final = kinds_mask(VEHICLES)
 
 
 @dataclass(frozen=True, slots=True)

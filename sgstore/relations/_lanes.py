@@ -51,7 +51,7 @@ IS_IN = Relation(
 # along the lanes, up to the distance that the settings look.
 
 
-def _signals(scene: BlockScene) -> Edges:
+def _signal_edges(scene: BlockScene) -> Edges:
     ground = scene.ground
     if ground is None:
         raise ValueError("signals need a map")
@@ -84,14 +84,14 @@ def _of_map(ground: MapContext) -> Edges:
 CONTROLS_TRAFFIC_OF = Relation(
     name="controlsTrafficOf",
     doc="signal → lane: a traffic light, or a sign of the map, for the lanes that it applies to",
-    edges=_signals,
+    edges=_signal_edges,
     needs_map=True,
     needs_lanes=True,
 )
 MAY_AFFECT = Relation(
     name="mayAffect",
     doc="signal → lane: for these lanes, and those from which it lies ahead along the lanes",
-    edges=_signals,
+    edges=_signal_edges,
     needs_map=True,
     needs_lanes=True,
     settings=lambda config: config.lanes.ahead > 0,

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import bearings, gap
-from sgstore.relations._scene import IS_SIGNAL, Bodies, BodyPairs, kinds_mask, parts, spread
-from sgstore.vocabulary import KIND_CODE, KINDS, VEHICLES, kinds_labelled, normalize_name
+from sgstore.relations._scene import IS_SIGNAL, IS_VEHICLE, Bodies, BodyPairs, parts, spread
+from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled, normalize_name
 from sgstore.world import Entities, Loss, MessageRefs
 
 if TYPE_CHECKING:
@@ -30,11 +30,9 @@ if TYPE_CHECKING:
 CELLS: Final = 8
 """Strips of the plane to the distance within which bodies are related: more of them cut a little sharper."""
 
-FAR: Final = 1 << 40
+FAR_STRIP: Final = 1 << 40
 """Strips from the origin beyond which positions share a strip: keys fit into 64 bits whatever a trace holds."""
 
-
-IS_VEHICLE: Final = kinds_mask(VEHICLES)
 
 NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
@@ -101,7 +99,7 @@ def of_kinds(bodies: Bodies, ego: Rows, pairs: Halves, settings: PairSettings) -
         return pairs
     listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last one: the ego
     for one, other in settings.kinds:
-        listed[np.ix_(_codes(one), _codes(other))] = True
+        listed[np.ix_(_kind_codes(one), _kind_codes(other))] = True
     listed |= listed.T
     a, b = pairs
     of_a, of_b = bodies.kind[a].astype(np.intp), bodies.kind[b].astype(np.intp)
@@ -111,7 +109,7 @@ def of_kinds(bodies: Bodies, ego: Rows, pairs: Halves, settings: PairSettings) -
     return a[kept], b[kept]
 
 
-def _codes(label: str) -> list[int]:
+def _kind_codes(label: str) -> list[int]:
     if normalize_name(label) == "ego":
         return [len(KINDS)]
     return [KIND_CODE[kind] for kind in kinds_labelled(label) or ()]
@@ -134,8 +132,10 @@ def _near_pairs(
     reach = within
     if between == "footprints":
         reach += float(np.nan_to_num(np.hypot(bodies.length, bodies.width)[rows]).max(initial=0))
-    strip = np.clip(np.floor(bodies.x[rows] * (CELLS / reach)), -FAR, FAR).astype(np.int64)
-    key = (bodies.frame[rows] << 43) + strip + FAR
+    strip = np.clip(np.floor(bodies.x[rows] * (CELLS / reach)), -FAR_STRIP, FAR_STRIP).astype(
+        np.int64
+    )
+    key = (bodies.frame[rows] << 43) + strip + FAR_STRIP
     order = np.argsort(key, kind="stable")
     rows, key = rows[order], key[order]
     start = np.arange(1, len(rows) + 1)

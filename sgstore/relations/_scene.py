@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.graph import Edges
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE, SIGNALS
+from sgstore.vocabulary import KIND_CODE, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -304,7 +304,9 @@ def edges_between(
 ) -> Edges:
     """Edges from body to body (rows), all with one relation or each with its own code."""
     bodies = scene.bodies
-    return Edges(bodies.frame[src], _codes(relation, len(src)), bodies.node[src], bodies.node[dst])
+    return Edges(
+        bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
+    )
 
 
 def edges_to_map(
@@ -312,10 +314,10 @@ def edges_to_map(
 ) -> Edges:
     """Edges from bodies (rows) to nodes of the map (node ids)."""
     bodies = scene.bodies
-    return Edges(bodies.frame[src], _codes(relation, len(src)), bodies.node[src], dst)
+    return Edges(bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], dst)
 
 
-def _codes(relation: str | Codes, count: int) -> Codes:
+def _relation_codes(relation: str | Codes, count: int) -> Codes:
     if isinstance(relation, str):
         return np.full(count, RELATION_CODE[relation], np.int8)
     return relation
@@ -329,6 +331,7 @@ def kinds_mask(names: tuple[str, ...]) -> Bools:
 
 
 IS_SIGNAL: Final = kinds_mask(SIGNALS)
+IS_VEHICLE: Final = kinds_mask(VEHICLES)
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

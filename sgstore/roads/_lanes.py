@@ -116,9 +116,9 @@ def road_map_of(
     """
     ribbons = ribbons_of(lanes)
     surfaces = plain_nodes(lanes, ribbons)
-    roads, junctions = _roads(lanes, ribbons), _junctions(lanes)
+    roads, junctions = _road_nodes(lanes, ribbons), _junction_nodes(lanes)
     off_road = MapNodes.of("off_road", ["off_road"])
-    nodes = MapNodes.joined([off_road, surfaces, roads, junctions, _signals(signals)])
+    nodes = MapNodes.joined([off_road, surfaces, roads, junctions, _signal_nodes(signals)])
     return RoadMap(
         name=name,
         text=text,
@@ -217,7 +217,7 @@ def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
     )
 
 
-def _roads(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+def _road_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
     """Roads in the order of their first lanes; a road is as long as the longest lanes of its sections."""
     junction: dict[str, str] = {}
     longest: dict[str, dict[int, float]] = {}
@@ -235,12 +235,12 @@ def _roads(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
     )
 
 
-def _junctions(lanes: Sequence[PlainLane]) -> MapNodes:
+def _junction_nodes(lanes: Sequence[PlainLane]) -> MapNodes:
     names = tuple(dict.fromkeys(lane.junction for lane in lanes if lane.junction))
     return MapNodes.of("junction", names, junction=names)
 
 
-def _signals(signals: Sequence[PlainSignal]) -> MapNodes:
+def _signal_nodes(signals: Sequence[PlainSignal]) -> MapNodes:
     columns = {
         name: np.array([getattr(signal, name) for signal in signals], np.float64)
         for name in ("x", "y", "z", "heading")
@@ -407,7 +407,7 @@ def read_lane_text(text: str, name: str) -> RoadMap:
     if sum(len(lane.z) for lane in lanes) > MAX_SECTIONS:
         raise MapError(f"more than {MAX_SECTIONS:,} cross sections", element="lanes")
     return road_map_of(
-        lanes, _signal_rows(document, len(lanes)), name=name, text=text, warnings=warnings
+        lanes, _read_signals(document, len(lanes)), name=name, text=text, warnings=warnings
     )
 
 
@@ -442,7 +442,7 @@ def _signal_fields(signal: PlainSignal) -> dict[str, Any]:
     return {"name": signal.name, "kind": signal.kind, **told, "lanes": list(signal.lanes)}
 
 
-def _signal_rows(document: dict[str, Any], lanes: int) -> list[PlainSignal]:
+def _read_signals(document: dict[str, Any], lanes: int) -> list[PlainSignal]:
     rows = document.get("signals", [])
     if not isinstance(rows, list) or len(rows) > MAX_SIGNALS:
         raise MapError(f"expected a list of at most {MAX_SIGNALS:,} signals", element="signals")

@@ -31,7 +31,7 @@ import numpy as np
 from sgstore.errors import MissingExtraError, TraceError
 from sgstore.opendrive import read_map
 from sgstore.readers.carla._actors import EGO_ROLES, meaning_of
-from sgstore.readers.carla._signals import AtOnce, Light, shared_signals, signals_of
+from sgstore.readers.carla._signals import AtOnce, Light, light_state, shared_signals, signals_of
 from sgstore.step import Frame
 from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES
 
@@ -88,9 +88,6 @@ LIGHTS: Final = (
     (0x400, "light_special2"),
 )
 """Bits of ``VehicleLightState`` → lights of a vehicle."""
-
-STATES: Final = ("red", "yellow", "green", "off", "unknown")
-"""``TrafficLightState`` → what a traffic light shows."""
 
 SAME_PLACE: Final = 1.0
 """How far a sign may stand from the signal of the map that it is; m."""
@@ -472,8 +469,7 @@ def _controls(actor: _Actor) -> dict[str, Any]:
 
 
 def _shown(light: Any) -> str:
-    state = int(light.state)
-    return STATES[state] if 0 <= state < len(STATES) else "unknown"
+    return light_state(int(light.state))
 
 
 def _light(actor: Any) -> Light:

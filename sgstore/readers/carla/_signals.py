@@ -521,8 +521,12 @@ def _listed(names: list[Any]) -> str:
 # not have at all applies to the lanes of its box.
 
 TYPE_NAME: Final = "traffic.traffic_light"
-STATES: Final = ("red", "yellow", "green", "off", "unknown")
-"""``CarlaTrafficLightStatus.state`` → name in :data:`sgstore.vocabulary.LIGHT_STATES`."""
+_STATES: Final = ("red", "yellow", "green", "off", "unknown")
+
+
+def light_state(number: int) -> str:
+    """Name in :data:`sgstore.vocabulary.LIGHT_STATES` of a state, as CARLA and its bridge number them."""
+    return _STATES[number] if 0 <= number < len(_STATES) else "unknown"
 
 
 def read_places(message: dict[str, Any]) -> dict[int, Light]:
@@ -620,9 +624,7 @@ class Lights:
                 continue
             row = self._row.get(ident)
             if row is not None:
-                states[row] = LIGHT_STATE_CODE[
-                    STATES[state] if 0 <= state < len(STATES) else "unknown"
-                ]
+                states[row] = LIGHT_STATE_CODE[light_state(state)]
             elif ident not in self._unplaced:
                 self._unplaced.add(ident)
                 self._enter(ident)

@@ -10,11 +10,10 @@ list of actors without a place, and are left out; signs come from the road map.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, ClassVar
 
 from sgstore.errors import MapError, TraceError
-from sgstore.mcap import digest_of
+from sgstore.mcap import read_and_digest
 from sgstore.opendrive import read_map
 from sgstore.readers._base import Opened, channels_of, refs_of
 from sgstore.readers.carla._actors import LASTING, OBJECTS, content_of
@@ -60,11 +59,7 @@ class CarlaTrace(Opened):
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
         self._recording = recording
-        # The file is hashed beside the first reading, so that it comes from the disk once.
-        with ThreadPoolExecutor(1) as beside:
-            hashing = None if digest else beside.submit(digest_of, recording.path)
-            found = CarlaSurvey(recording, ego)
-            digest = hashing.result() if hashing else digest
+        found, digest = read_and_digest(recording.path, digest, lambda: CarlaSurvey(recording, ego))
         leading = found.leading
         if leading is None:
             lost = found.lost.losses()

@@ -10,7 +10,6 @@ Source: foxglove-sdk, schemas.
 from __future__ import annotations
 
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import TYPE_CHECKING, ClassVar, Final
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.mcap import digest_of
+from sgstore.mcap import read_and_digest
 from sgstore.readers._base import Opened, Ref, channels_of, ref_of, refs_of
 from sgstore.readers.foxglove._frames import EntityNames, FoxgloveDecoder
 from sgstore.readers.foxglove._mapping import Mapping, mapping_for
@@ -90,10 +89,9 @@ class FoxgloveTrace(Opened):
         self._recording = recording
         topics = [record.topic for record in recording.channels.values()]
         self._mapping = mapping_for(mapping, topics)
-        with ThreadPoolExecutor(1) as beside:
-            hashing = None if digest else beside.submit(digest_of, recording.path)
-            self._survey = _Survey(recording, self._mapping)
-            digest = hashing.result() if hashing else digest
+        self._survey, digest = read_and_digest(
+            recording.path, digest, lambda: _Survey(recording, self._mapping)
+        )
         self._leading = self._survey.leading()
         self._root = self._survey.root()
         self._notes: list[str] = []

@@ -27,6 +27,7 @@ from sgstore.mcap import MAX_LOSSES, MESSAGE_HEAD, READ_ERRORS, RUN_MESSAGES, Me
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
+    LATEST_NS,
     SENSOR_VIEW,
     descriptors,
     fields_of,
@@ -213,7 +214,6 @@ RUN_BYTES: Final = 4 << 20
 _ENOUGH, _TRIED = 8, 1000
 """Messages that are read to find out what they are: enough if they hold anything, and at most."""
 _VERSION, _TIMESTAMP = 1, 2
-_LATEST: Final = 1 << 62
 
 
 class OsiFile:
@@ -366,7 +366,7 @@ class _MessageRun:
         self.place = place
         self.held[offset] = data
         self.size += len(data)
-        time_ns = time_of(data)
+        time_ns = time_of_bytes(data)
         self.last_ns = self.last_ns if time_ns is None else time_ns
         self.times.append(self.last_ns)
 
@@ -515,7 +515,7 @@ def _things(placed: list[Any], lanes: Any) -> int:
     ) + sum(lane.id.HasField("value") for lane in lanes)
 
 
-def time_of(data: bytes) -> int | None:
+def time_of_bytes(data: bytes) -> int | None:
     """The time of an OSI message in ns, or ``None`` where it has none that can be a log time."""
     seconds, nanos = 0, 0
     try:
@@ -533,7 +533,7 @@ def time_of(data: bytes) -> int | None:
     except ValueError:
         return None
     time_ns = seconds * 1_000_000_000 + nanos
-    return time_ns if 0 <= time_ns < _LATEST else None
+    return time_ns if 0 <= time_ns < LATEST_NS else None
 
 
 def _number(content: bytes) -> int:

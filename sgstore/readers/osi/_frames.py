@@ -20,6 +20,8 @@ from sgstore.readers.osi._lights import TrafficLights
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
+    LATEST_NS,
+    NO_VECTOR,
     enum_name,
     ground_truth_of,
     has_field,
@@ -142,9 +144,7 @@ NO_EGO: Final = "no host vehicle is among the moving objects: there is no ego un
 _VEHICLE: Final = 2
 """``MovingObject.TYPE_VEHICLE``: what it is stands in ``vehicle_classification.type``."""
 _UNSET: Final = "TYPE_UNKNOWN"
-_NO_VECTOR: Final = (NAN, NAN, NAN)
 _HEADING: Final = POSE.index("heading")
-_LATEST: Final = 1 << 62
 _UNKNOWN: Final = -2
 _MOST_AHEAD: Final = 16
 """Times ahead of the leading channel whose messages on other channels are kept until it gets there."""
@@ -170,7 +170,7 @@ class OsiRawFrame:
     time_ns: int
     log_time_ns: int
     heads: tuple[Ints, Floats, Ints]
-    controls: tuple[float, float, float] = _NO_VECTOR
+    controls: tuple[float, float, float] = NO_VECTOR
     nodes: list[int] = field(default_factory=list[int])
     objects: list[bytes] = field(default_factory=list[bytes])
 
@@ -214,7 +214,7 @@ class OsiDecoder:
         self._open: OsiRawFrame | None = None
         self._ahead: dict[int, list[bytes]] = {}
         self._aside: dict[int, int] = {}
-        self._controls = _NO_VECTOR
+        self._controls = NO_VECTOR
         self._unusable = LossTally()
         self._unreadable = LossTally()
         self._untimed = 0
@@ -336,7 +336,7 @@ class OsiDecoder:
                     frame.objects.append(content)
         frame.heads = self._lights.rows()
         data = getattr(message, "host_vehicle_data", None)
-        if data is None and self._controls is _NO_VECTOR:
+        if data is None and self._controls is NO_VECTOR:
             return
         known = zip(frame.controls, controls_of(data), self._controls, strict=True)
         steer, throttle, brake = (
@@ -478,7 +478,7 @@ def time_of(message: Any, ground: Any) -> int | None:
     for part in (ground, message):
         if part.HasField("timestamp"):
             time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
-            if abs(time_ns) < _LATEST:
+            if abs(time_ns) < LATEST_NS:
                 return time_ns
     return None
 

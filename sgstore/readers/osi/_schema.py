@@ -381,7 +381,9 @@ DECODE_ERRORS: Final = (
 )
 """What reading a message raises if it, or the descriptors it came with, are not what they seem."""
 
-_NO_VECTOR: Final = (NAN, NAN, NAN)
+NO_VECTOR: Final = (NAN, NAN, NAN)
+LATEST_NS: Final = 1 << 62
+"""Bound of times that are believed; ns."""
 _GROUND_TRUTH_NEEDS: Final = ("timestamp.seconds", "moving_object")
 _MOVING_OBJECT_NEEDS: Final = (
     "id.value",
@@ -626,7 +628,7 @@ def static_pose(base: Any) -> tuple[float, ...] | None:
     extents = (size.length, size.width, size.height)
     return (
         *position,
-        *(angles if base.HasField("orientation") else _NO_VECTOR),
+        *(angles if base.HasField("orientation") else NO_VECTOR),
         *(NAN,) * 7,
-        *(extents if base.HasField("dimension") else _NO_VECTOR),
+        *(extents if base.HasField("dimension") else NO_VECTOR),
     )

@@ -10,11 +10,10 @@ Source: open-simulation-interface 3.8.0; omega-prime specification.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, ClassVar
 
 from sgstore.errors import TraceError
-from sgstore.mcap import digest_of
+from sgstore.mcap import read_and_digest
 from sgstore.readers._base import Opened, channels_of, refs_of
 from sgstore.readers.osi._frames import OsiDecoder
 from sgstore.readers.osi._schema import GROUND_TRUTH, ROAD_MAP, SENSOR_VIEW
@@ -56,11 +55,7 @@ class OsiTrace(Opened):
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
         self._recording = recording
-        # The file is hashed beside the first reading, so that it comes from the disk once.
-        with ThreadPoolExecutor(1) as beside:
-            hashing = None if digest else beside.submit(digest_of, recording.path)
-            found = survey(recording)
-            digest = hashing.result() if hashing else digest
+        found, digest = read_and_digest(recording.path, digest, lambda: survey(recording))
         leading = found.leading()
         if leading is None:
             topics = [repr(recording.channels[channel].topic) for channel in found.leads]
