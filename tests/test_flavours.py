@@ -29,7 +29,14 @@ from sgstore.config import Config
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
-from sgstore.readers import READERS, FramesTrace, TraceMessage, open_trace, read_message
+from sgstore.readers import (
+    READERS,
+    FramesTrace,
+    TraceMessage,
+    open_recording,
+    open_trace,
+    read_message,
+)
 from sgstore.readers.foxglove._mapping import Ego, EntityMapping, SceneMapping, shipped
 from sgstore.world import Channel, FrameBlock, States, TraceInfo, TraceReport
 
@@ -434,6 +441,35 @@ def test_what_stands_and_is_told_late_is_there_from_then_on(
         there = column(blocks, "node") == tree
         assert frame[there].tolist() == [*range(12, 30)]
         assert not column(blocks, "vx")[there].any()
+
+
+class HalvesTrace(PlainTrace):
+    """Every second message has the entities of the time that the one before it tells."""
+
+    def start(self) -> None:
+        self.time: int | None = None
+
+    def frame(self, message: TraceMessage) -> Frame | None:
+        told = json.loads(message.data)
+        if self.time is None:
+            self.time = told["time_ns"]
+            return None
+        time, self.time = self.time, None
+        return plain_frame({"time_ns": time, **told})
+
+
+def test_a_flavour_of_frames_may_put_messages_together(tmp_path: Path) -> None:
+    worlds = [plain_world(i) for i in range(9)]
+    halves = [{"time_ns": world.pop("time_ns")} for world in worlds]
+    both = [half for pair in zip(halves, worlds, strict=True) for half in pair]
+    path = plain(tmp_path / "halves.mcap", both)
+    with HalvesTrace(open_recording(path)) as trace:
+        for size in (2, 60, 60):
+            blocks = list(trace.blocks(size))
+            times = np.concatenate([block.time_ns for block in blocks])
+            assert times.tolist() == [half["time_ns"] for half in halves]
+            assert sum(len(block.messages) for block in blocks) == 2 * len(both)  # and pictures
+            assert trace.report.losses == []
 
 
 def test_a_clip_of_plain_frames_brings_what_stands_and_the_map(
