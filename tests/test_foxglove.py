@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from foxglove_scenes import SceneRecorder, cube, turn
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from recordings import ns
 
@@ -447,6 +447,8 @@ def matrix(q: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 @settings(max_examples=60, deadline=None)
 @given(turns, turns, places)
+@example(normed(np.array([1.0, 0.0, 1.0, 0.0])), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+@example(normed(np.array([0.3, -0.7, -0.3, -0.7])), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
 def test_turns_are_those_of_the_textbook(
     a: np.ndarray[Any, Any], b: np.ndarray[Any, Any], v: np.ndarray[Any, Any]
 ) -> None:
