@@ -51,7 +51,9 @@ class Edges:
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
-        """One part, of which there is one at least, after another."""
+        """Edges of all parts, one part after another; of no part none."""
+        none = np.empty(0, dtype=np.int64)
+        parts = parts or [cls(none, none.astype(np.int8), none, none)]
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
