@@ -473,6 +473,7 @@ class Killing:
             if state == measured.after and "rebuild" not in name:
                 break
             how = self._chance.choice(("killed", "all killed", "all killed", "terminated"))
+            left = [path.name for path in place.iterdir()]  # by one that was killed
             moment, code = self._hit(verb, place, line, measured, how)
             told.append(f"{how} {moment}: {code}")
             what = "; ".join(told)
@@ -483,7 +484,7 @@ class Killing:
             else:
                 done.kills[how] += 1
                 if how == "terminated":
-                    self._bare(verb, place, what, *verb.keeps)
+                    self._bare(verb, place, what, *verb.keeps, *left)
             try:
                 state = self._state(verb, place)
             except Exception as error:

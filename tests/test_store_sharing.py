@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -179,6 +180,25 @@ def test_who_comes_while_a_writer_waits_comes_after_it(store) -> None:
             reader.stdin.close()
             reader.stdin = None
             writer.join()
+
+
+def test_an_interrupt_just_after_the_gate_was_made_leaves_no_gate(store, monkeypatch) -> None:
+    opened, gate = os.open, f"{store.path}.gate"
+
+    def interrupted(path, *more, **named) -> int:
+        number = opened(path, *more, **named)
+        if str(path) == gate:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        return number
+
+    monkeypatch.setattr(os, "open", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        publish(store, RandomTrace(2, frames=5, path="b"))
+
+    assert not Path(gate).exists()
+    publish(store, RandomTrace(2, frames=5, path="b"))
+    assert len(store.traces()) == 2
 
 
 def test_threads_read_while_one_writes_and_see_whole_traces(store) -> None:

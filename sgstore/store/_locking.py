@@ -693,9 +693,11 @@ class _Gate:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = -1
+        self._begun = False
 
     def close(self, deadline: _Deadline) -> None:
         """Wait until nobody else has closed it, and close it."""
+        self._begun = True
         try:
             self._lock = os.open(_gate(self._path), os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
@@ -705,15 +707,17 @@ class _Gate:
 
     def remove(self) -> None:
         """Open it, unless another process has it now."""
-        if fcntl is None or self._lock < 0:
+        if fcntl is None or not self._begun:
             return
         # Whoever waits has it open and does not mind that it has no name any more.
         with suppress(OSError):
+            if self._lock < 0:  # an interrupt came before its number was noted
+                self._lock = os.open(_gate(self._path), os.O_RDWR)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _gate(self._path).unlink()
         with suppress(OSError):
             os.close(self._lock)
-        self._lock = -1
+        self._lock, self._begun = -1, False
 
 
 def _lock(gate: int, how: int, path: Path, deadline: _Deadline) -> None:
