@@ -473,7 +473,7 @@ class Killing:
             if state == measured.after and "rebuild" not in name:
                 break
             how = self._chance.choice(("killed", "all killed", "all killed", "terminated"))
-            left = [path.name for path in place.iterdir()]  # by one that was killed
+            left = [Path(path).name for path in self._names(place)]  # by one that was killed
             moment, code = self._hit(verb, place, line, measured, how)
             told.append(f"{how} {moment}: {code}")
             what = "; ".join(told)
