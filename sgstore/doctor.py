@@ -12,9 +12,10 @@ import numpy as np
 from sgstore.config import Config
 from sgstore.errors import SgstoreError
 from sgstore.map_files import Maps, lost_lanes
+from sgstore.mcap import Loss
 from sgstore.readers import on_map, open_recording, open_trace
 from sgstore.segments import TraceTally
-from sgstore.world import BUCKET_FRAMES, Loss, TraceReport
+from sgstore.world import BUCKET_FRAMES, TraceReport
 
 if TYPE_CHECKING:
     from sgstore.world import TraceInfo

@@ -7,9 +7,9 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import MapError
+from sgstore.mcap import Loss
 from sgstore.opendrive import SIGNS, read_map
 from sgstore.roads import OF_LANES
-from sgstore.world import Loss
 
 if TYPE_CHECKING:
     from sgstore.config import Signs

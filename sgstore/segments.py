@@ -19,14 +19,14 @@ from sgstore import errors
 from sgstore.config import ALL_EGOS, Config, from_dict
 from sgstore.errors import SgstoreError, TraceError
 from sgstore.map_files import Maps, lost_lanes
-from sgstore.mcap import check_name
+from sgstore.mcap import Loss, check_name
 from sgstore.readers import on_map, open_trace
 from sgstore.relations import Crowds, renamed
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import Place, Segment, StoreFile, new_segment
 from sgstore.trace_parts import TracePart
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled
-from sgstore.world import Loss, longest_step_ns
+from sgstore.world import longest_step_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

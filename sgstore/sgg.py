@@ -60,10 +60,11 @@ if TYPE_CHECKING:
 
     from sgstore.config import Config
     from sgstore.graph import SceneGraph
+    from sgstore.mcap import Loss
     from sgstore.relations import Areas, MapContext, Standing
     from sgstore.roads import RoadMap
     from sgstore.step import Frame
-    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints, Loss
+    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
 
     Rows = NDArray[np.intp]
     Gathered = tuple[tuple[Rows, Rows], Bools]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.geometry import wrapped
+from sgstore.mcap import Findings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -354,30 +355,6 @@ class TraceInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
-    """Something in a recording that could not be used, and was not passed over in silence.
-
-    Attributes
-    ----------
-    reason : str
-        What was wrong.
-    messages, bytes : int
-        How much was lost; -1 where it cannot be known.
-    start_ns, end_ns : int
-        Log times between which it was lost; -1 where they cannot be known.
-    offset : int
-        Byte offset in the file, -1 where there is none.
-    """
-
-    reason: str
-    messages: int = -1
-    bytes: int = -1
-    start_ns: int = -1
-    end_ns: int = -1
-    offset: int = -1
-
-
-@dataclass(frozen=True, slots=True)
 class Event:
     """Something that a simulator says has happened: to one of its vehicles, or to weather and light.
 
@@ -411,7 +388,7 @@ class Event:
 
 
 @dataclass(slots=True)
-class TraceReport:
+class TraceReport(Findings):
     """Findings from reading a trace; filled while its blocks are read.
 
     Attributes
@@ -433,9 +410,7 @@ class TraceReport:
     frames: int = 0
     states: int = 0
     unknown_types: dict[str, int] = field(default_factory=dict[str, int])
-    warnings: list[str] = field(default_factory=list[str])
     about_ego: list[str] = field(default_factory=list[str])
-    losses: list[Loss] = field(default_factory=list[Loss])
     events: list[Event] = field(default_factory=list[Event])
 
 

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Mapping, Sequence
     from pathlib import Path
 
-    from sgstore.world import Loss, MessageRefs
+    from sgstore.mcap import Loss
+    from sgstore.world import MessageRefs
 
 
 MANIFEST: Final = "manifest.json"

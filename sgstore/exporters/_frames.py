@@ -25,9 +25,10 @@ import numpy as np
 from sgstore.errors import ExportError, StoreError, TraceError
 from sgstore.exporters._clips import WrittenFile, clip_name, safe_name
 from sgstore.exporters._sensors import ImageFile, PointCloud, Video, cloud_file, sensor_of
+from sgstore.mcap import Loss
 from sgstore.readers import open_recording
 from sgstore.vocabulary import natural, suggestion
-from sgstore.world import Loss, TraceReport
+from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence

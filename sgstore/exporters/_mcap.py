@@ -35,9 +35,9 @@ from sgstore.exporters._clips import (
 )
 from sgstore.exporters._mcap_graphs import Added, Waiting, is_added
 from sgstore.exporters._mcap_writer import ClipWriter
-from sgstore.mcap import CLIP, McapFile, digest_of
+from sgstore.mcap import CLIP, Loss, McapFile, digest_of
 from sgstore.readers import open_recording
-from sgstore.world import Clip, Loss, TraceReport
+from sgstore.world import Clip, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
+from sgstore.mcap import Loss
 from sgstore.store import FrameSpans
-from sgstore.world import Loss
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -15,10 +15,10 @@ from sgstore.errors import SgstoreError, TraceError
 from sgstore.importing._blocks import Blocks, parts_map
 from sgstore.importing._formats import read_csv, read_nodelink, read_s3c, stem_of
 from sgstore.importing._resolve import Understanding, Words, survey
-from sgstore.mcap import check_name, digest_of, mark_of
+from sgstore.mcap import Loss, check_name, digest_of, mark_of
 from sgstore.store import Folder, Place, StoreFile, new_segment
 from sgstore.vocabulary import DIRECTIONS, KINDS, PROXIMITY, RELATIONS
-from sgstore.world import BUCKET_FRAMES, Loss, MessageRefs, TraceInfo, TraceReport
+from sgstore.world import BUCKET_FRAMES, MessageRefs, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

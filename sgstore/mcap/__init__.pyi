@@ -2,7 +2,6 @@
 
 from ._chunks import HEAD as HEAD
 from ._chunks import IDS as IDS
-from ._chunks import MAX_LOSSES as MAX_LOSSES
 from ._chunks import MESSAGE_HEAD as MESSAGE_HEAD
 from ._chunks import READ_ERRORS as READ_ERRORS
 from ._chunks import Messages as Messages
@@ -19,10 +18,14 @@ from ._fetch import check_name as check_name
 from ._fetch import digest_of as digest_of
 from ._fetch import mark_of as mark_of
 from ._fetch import message_at as message_at
+from ._fetch import messages_at as messages_at
 from ._fetch import open_regular as open_regular
 from ._fetch import part_at as part_at
 from ._fetch import parts_of as parts_of
 from ._fetch import read_and_digest as read_and_digest
+from ._findings import MAX_LOSSES as MAX_LOSSES
+from ._findings import Findings as Findings
+from ._findings import Loss as Loss
 from ._read_ahead import MAGIC as MAGIC
 from ._read_ahead import read_summary as read_summary
 from ._reader import CLIP as CLIP
@@ -32,8 +35,10 @@ from ._reader import McapFile as McapFile
 __all__ = [
     "BagPart",
     "CLIP",
+    "Findings",
     "HEAD",
     "IDS",
+    "Loss",
     "MAGIC",
     "MAX_LOSSES",
     "MESSAGE_HEAD",
@@ -50,6 +55,7 @@ __all__ = [
     "digest_of",
     "mark_of",
     "message_at",
+    "messages_at",
     "open_regular",
     "parse_records",
     "part_at",

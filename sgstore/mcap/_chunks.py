@@ -20,7 +20,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
 from sgstore.errors import TraceError
-from sgstore.world import Loss
+from sgstore.mcap._findings import Loss
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
 
-    from sgstore.world import Ints, TraceReport
+    from sgstore.mcap._findings import Findings
 
+    Ints = NDArray[np.int64]
     Memory = Callable[[int], memoryview]
 
 
@@ -75,7 +76,7 @@ class Recording(Protocol):
 
     def walk(
         self,
-        report: TraceReport,
+        report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
@@ -91,10 +92,6 @@ class Recording(Protocol):
         ...
 
 
-# What of a file could not be read, as its report lists it ---------------------------------------
-
-MAX_LOSSES: Final = 1000
-"""Losses that are listed one by one; the last of them stands for all that follow."""
 LAST_NS: Final = (1 << 63) - 1
 """Greatest time that a signed number of 64 bits can hold: the year 2262; ns."""
 
@@ -105,23 +102,6 @@ class RecordPlace:
 
     offset: int
     length: int
-
-
-def lose(report: TraceReport, loss: Loss) -> None:
-    """Report a loss; when there are very many, the last one stands for the rest."""
-    if len(report.losses) < MAX_LOSSES:
-        report.losses.append(loss)
-        return
-    last = report.losses[-1]
-    many = last.messages >= 0 and loss.messages >= 0
-    report.losses[-1] = Loss(
-        "further damage of the same kinds",
-        messages=last.messages + loss.messages if many else -1,
-        bytes=max(last.bytes, 0) + max(loss.bytes, 0),
-        start_ns=last.start_ns,
-        end_ns=max(last.end_ns, loss.end_ns),
-        offset=last.offset,
-    )
 
 
 def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Loss:

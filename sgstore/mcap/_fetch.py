@@ -34,7 +34,7 @@ from sgstore.mcap._chunks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Iterator
     from io import BufferedReader
 
 _Found = TypeVar("_Found")
@@ -203,9 +203,22 @@ def _size(path: Path) -> int:
 
 
 def message_at(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """The data of one message, by its place; see :class:`sgstore.world.MessageRefs`.
+    """The data of one message, by its place; parameters and errors are those of :func:`messages_at`."""
+    (data,) = messages_at(path, [(chunk_offset, offset, length)])
+    return bytes(data)
 
-    In a bag, places count from the beginning of its first file.
+
+def messages_at(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[memoryview]:
+    """The data of messages, in the order in which they are asked for.
+
+    Parameters
+    ----------
+    path : Path
+        A file, or the folder of a bag, whose places count from the beginning of its first file.
+    places : iterable of (chunk_offset, offset, length)
+        Byte offset of the chunk record in the file, -1 outside chunks; byte offset of the message record in the
+        chunk's records, uncompressed, or in the file; bytes of its data. Those of one chunk should come
+        together: the last chunk alone is kept.
 
     Raises
     ------
@@ -213,32 +226,49 @@ def message_at(path: Path, *, chunk_offset: int, offset: int, length: int) -> by
         The file cannot be opened, the chunk is damaged, or there is no message of that length: the file
         was replaced.
     """
-    record = b""
-    path, base = _file_at(path, offset if chunk_offset < 0 else chunk_offset)
-    chunk_offset, offset = (
-        (-1, offset - base) if chunk_offset < 0 else (chunk_offset - base, offset)
-    )
+    folder = bag_folder(path)
+    parts = None if folder is None else parts_of(folder)
+    known, records = -1, memoryview(b"")
+    for chunk_offset, offset, length in places:
+        place = offset if chunk_offset < 0 else chunk_offset
+        file, base = (path, 0) if parts is None else _part_of(path, parts, place)
+        if chunk_offset < 0:
+            offset -= base  # noqa: PLW2901
+            record = _bytes_at(file, offset, length)
+        else:
+            if chunk_offset != known:
+                records, known = _records_at(file, chunk_offset - base), chunk_offset
+            record = records[offset : offset + MESSAGE_HEAD.itemsize + length]
+        if not _is_message(record, length) or offset < 0:
+            reason = f"no message of {length} bytes at {offset} there: the file was replaced"
+            raise TraceError(reason, path=file, offset=max(chunk_offset - base, 0))
+        yield record[MESSAGE_HEAD.itemsize :]
+
+
+def _bytes_at(path: Path, offset: int, length: int) -> memoryview:
+    """A message record outside chunks; nothing if the offset is outside the file."""
     with open_regular(path) as file:
         try:
-            if chunk_offset < 0:
-                file.seek(offset)
-                record = file.read(min(MESSAGE_HEAD.itemsize + length, MAX_CHUNK))
-            else:
-                records = read_records(file, read_chunk_head(file, chunk_offset))
-                record = bytes(records[offset : offset + MESSAGE_HEAD.itemsize + length])
-            opcode, found = HEAD.unpack_from(record)
+            file.seek(offset)
+            return memoryview(file.read(min(MESSAGE_HEAD.itemsize + length, MAX_CHUNK)))
+        except READ_ERRORS:
+            return memoryview(b"")
+
+
+def _records_at(path: Path, chunk_offset: int) -> memoryview:
+    """The records of a chunk; none if the offset is outside the file."""
+    with open_regular(path) as file:
+        try:
+            return memoryview(read_records(file, read_chunk_head(file, chunk_offset)))
         except TraceError as error:
             raise TraceError(error.reason, path=path, offset=chunk_offset) from error
-        except READ_ERRORS:  # an offset outside the file or the chunk
-            opcode, found = 0, 0
-    if (opcode, found, len(record)) != (
-        Opcode.MESSAGE,
-        MESSAGE_FIELDS + length,
-        MESSAGE_HEAD.itemsize + length,
-    ):
-        reason = f"no message of {length} bytes at {offset} there: the file was replaced"
-        raise TraceError(reason, path=path, offset=max(chunk_offset, 0))
-    return record[MESSAGE_HEAD.itemsize :]
+        except READ_ERRORS:
+            return memoryview(b"")
+
+
+def _is_message(record: memoryview, length: int) -> bool:
+    whole = length >= 0 and len(record) == MESSAGE_HEAD.itemsize + length
+    return whole and HEAD.unpack_from(record) == (Opcode.MESSAGE, MESSAGE_FIELDS + length)
 
 
 def digest_of(path: Path) -> str:
@@ -325,12 +355,9 @@ def mark_of(path: Path) -> tuple[int, int]:
     return sum(part.size for part in files), max(part.path.stat().st_mtime_ns for part in files)
 
 
-def _file_at(path: Path, place: int) -> tuple[Path, int]:
-    """The file in which a place of a recording lies, and the place at which that file begins."""
-    folder = bag_folder(path)
-    if folder is None:
-        return path, 0
-    part = part_at(parts_of(folder), place)
+def _part_of(path: Path, parts: tuple[BagPart, ...], place: int) -> tuple[Path, int]:
+    """The file of a bag in which a place lies, and the place at which that file begins."""
+    part = part_at(parts, place)
     if part is None:
         raise TraceError("no file of the bag is there: it was replaced", path=path, offset=place)
     return part.path, part.base

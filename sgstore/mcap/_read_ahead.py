@@ -43,9 +43,11 @@ if TYPE_CHECKING:
     from io import BufferedReader
     from pathlib import Path
 
-    from sgstore.mcap._chunks import ChunkHead, Records
-    from sgstore.world import Bools, Ints
+    from numpy.typing import NDArray
 
+    from sgstore.mcap._chunks import ChunkHead, Records
+
+    Ints = NDArray[np.int64]
     Read = Callable[[int, int], memoryview]
 
 
@@ -212,7 +214,7 @@ class Spool:
         self._size = 0
         self._most = MOST_SPOOLED
 
-    def put(self, path: Path, messages: Messages, kept: Bools) -> None:
+    def put(self, path: Path, messages: Messages, kept: NDArray[np.bool_]) -> None:
         """Keep where all messages of a chunk stand, and the data of some of them.
 
         Nothing is kept of a chunk that is known already, or for which there is no room.

@@ -8,7 +8,7 @@ a record that is damaged. Without a summary the walk is all there is, and enough
 What can be wrong, and what comes of it:
 
 * A chunk is damaged, lies about its size, or is too large: it is passed over and reported as a
-  :class:`~sgstore.world.Loss` (bytes, time span, messages where message indexes tell), and the walk
+  :class:`~sgstore.mcap.Loss` (bytes, time span, messages where message indexes tell), and the walk
   goes on behind it.
 * The file ends early: every whole record is kept, and of a chunk that is cut the whole messages.
 * A record's length leads astray: the walk goes on at the next chunk that the summary names.
@@ -38,7 +38,6 @@ from sgstore.mcap._chunks import (
     IDS,
     LAST_NS,
     MAX_CHUNK,
-    MAX_LOSSES,
     MESSAGE_HEAD,
     READ_ERRORS,
     ChunkHead,
@@ -47,7 +46,6 @@ from sgstore.mcap._chunks import (
     StrictStream,
     decompress_head,
     head_of_cut_chunk,
-    lose,
     loss_of_chunk,
     message_columns,
     name_of,
@@ -63,8 +61,8 @@ from sgstore.mcap._fetch import (
     part_at,
     parts_of,
 )
+from sgstore.mcap._findings import MAX_LOSSES, Findings, Loss
 from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, Summary, chunks_in, read_summary
-from sgstore.world import Loss, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -102,7 +100,7 @@ class _FileWalk:
     ``pending`` is a chunk that was lost: the message indexes behind it tell what was in it.
     """
 
-    report: TraceReport
+    report: Findings
     ahead: ReadAhead
     wanted: Callable[[int], bool] | None = None
     keep: Callable[[int], bool] | None = None
@@ -222,7 +220,7 @@ class McapFile:
 
     def walk(
         self,
-        report: TraceReport,
+        report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
@@ -230,7 +228,7 @@ class McapFile:
 
         Parameters
         ----------
-        report : TraceReport
+        report : Findings
         wanted : callable, optional
             Whether the chunk at an offset is wanted; others are passed over.
         keep : callable, optional
@@ -351,7 +349,7 @@ class McapFile:
     def _single(self, walk: _FileWalk, start: int, length: int) -> Iterator[Messages]:
         if length < MESSAGE_HEAD.itemsize - HEAD.size or length > MAX_CHUNK:
             reason = f"a message of {length} bytes"
-            lose(walk.report, Loss(reason, 1, length + HEAD.size, offset=start))
+            walk.report.lose(Loss(reason, 1, length + HEAD.size, offset=start))
             return
         walk.run.append(start)
         if len(walk.run) >= RUN_MESSAGES:
@@ -369,7 +367,7 @@ class McapFile:
             messages = message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
         except TraceError as error:
             loss = Loss(error.reason, len(offsets), offset=int(offsets[0]))
-            lose(walk.report, loss)
+            walk.report.lose(loss)
             return
         yield from self._known(walk, messages)
 
@@ -380,7 +378,7 @@ class McapFile:
         walk.closed = resume is None
         if resume is not None:
             reason = "damage: the data seem to end here, but the summary names chunks behind"
-            lose(walk.report, Loss(reason, bytes=resume - start, offset=start))
+            walk.report.lose(Loss(reason, bytes=resume - start, offset=start))
             walk.position = resume
 
     def _chunk(self, walk: _FileWalk, place: RecordPlace, astray: int | None) -> Iterator[Messages]:
@@ -440,7 +438,7 @@ class McapFile:
                 end_ns=int(times.max()),
                 offset=max(messages.chunk_offset, -1),
             )
-            lose(walk.report, loss)
+            walk.report.lose(loss)
             messages = messages.take(~lost)
         if len(messages):
             yield messages
@@ -471,16 +469,16 @@ class McapFile:
             reason = (
                 f"damage: a record ({name}) of {length} bytes where at most {stop - start} are left"
             )
-            lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+            walk.report.lose(Loss(reason, bytes=stop - start, offset=start))
         elif opcode == Opcode.CHUNK:
             yield from self._cut_chunk(walk, start)
         elif opcode in _HOLDS_CONTENT:
             reason = f"the file ends inside a record ({name}): {stop - start} of {length + HEAD.size} bytes"
             messages = 1 if opcode == Opcode.MESSAGE else 0
-            lose(walk.report, Loss(reason, messages, stop - start, offset=start))
+            walk.report.lose(Loss(reason, messages, stop - start, offset=start))
         elif opcode == 0 or opcode > Opcode.DATA_END:
             reason = f"the bytes from here to the end are no MCAP records (opcode {opcode})"
-            lose(walk.report, Loss(reason, bytes=stop - start, offset=start))
+            walk.report.lose(Loss(reason, bytes=stop - start, offset=start))
 
     def _cut_chunk(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
         """The whole messages of a chunk whose end is missing."""
@@ -499,7 +497,7 @@ class McapFile:
         walk.messages += count
         reason = f"the file ends inside a chunk; its first {count} messages were kept"
         place = RecordPlace(start, self.size - start)
-        lose(walk.report, loss_of_chunk(reason, place, found[0] if found else None))
+        walk.report.lose(loss_of_chunk(reason, place, found[0] if found else None))
         if kept is not None:
             yield from self._known(walk, kept)
 
@@ -513,7 +511,7 @@ class McapFile:
     def _settle(self, walk: _FileWalk) -> None:
         """Report a chunk that was lost, now that its message indexes are read."""
         if walk.pending is not None:
-            lose(walk.report, walk.pending)
+            walk.report.lose(walk.pending)
             walk.pending = None
 
     def _closing_words(self, walk: _FileWalk) -> None:
@@ -522,14 +520,14 @@ class McapFile:
         left = self.size - walk.position
         if not walk.closed:
             if 0 < left < HEAD.size:
-                lose(walk.report, Loss("the file ends inside the head of a record", bytes=left))
+                walk.report.lose(Loss("the file ends inside the head of a record", bytes=left))
             warn("the recording was not closed: it has no end of data")
         elif self._summary_fault:
             warn(self._summary_fault)
         told = sum(self.counts.values()) if self.counts else 0
         if told > walk.messages and not walk.report.losses and walk.wanted is None:
             reason = f"the file's statistics tell of {told} messages, {walk.messages} were found"
-            lose(walk.report, Loss(reason, told - walk.messages))
+            walk.report.lose(Loss(reason, told - walk.messages))
         if walk.chunks and walk.unverified == walk.chunks:
             warn("no chunk has a checksum: damage that leaves a chunk readable cannot be noticed")
 
@@ -542,7 +540,7 @@ class McapFile:
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
             if place.length > MAX_DEFINITION:
                 reason = f"a definition ({name_of(opcode)}) of {place.length} bytes"
-                lose(walk.report, Loss(reason, 0, place.length, offset=place.offset))
+                walk.report.lose(Loss(reason, 0, place.length, offset=place.offset))
                 return
             content = self._at(place.offset + HEAD.size, place.length - HEAD.size)
             self._define(walk, opcode, content, place.offset, place)
@@ -560,7 +558,7 @@ class McapFile:
             odd = self._take_up(opcode, content, place)
         except READ_ERRORS as error:
             reason = f"a definition ({name_of(opcode)}) is malformed: {error!r}"
-            lose(walk.report, Loss(reason, 0, len(content), offset=offset))
+            walk.report.lose(Loss(reason, 0, len(content), offset=offset))
             return
         if odd and odd not in walk.report.warnings:
             walk.report.warnings.append(odd)
@@ -690,14 +688,14 @@ class McapBag(McapFile):
 
     def walk(
         self,
-        report: TraceReport,
+        report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
         """All messages, file by file; what cannot be read goes to ``report``."""
         report.losses += self._faults
         for base, file in self._files.items():
-            found = TraceReport()
+            found = Findings()
             here = None if wanted is None else _moved(wanted, base)
             kept = None if keep is None else self._meant(keep, file)
             file.reopen()
@@ -782,7 +780,7 @@ def _moved(wanted: Callable[[int], bool], base: int) -> Callable[[int], bool]:
     return lambda offset: wanted(offset + base)
 
 
-def _take_up(found: TraceReport, report: TraceReport, name: str, base: int) -> None:
+def _take_up(found: Findings, report: Findings, name: str, base: int) -> None:
     """Say in a report of the bag what reading a file brought to light."""
     report.warnings += [f"{name}: {warning}" for warning in found.warnings]
     for loss in found.losses[: max(MAX_LOSSES - len(report.losses), 1)]:

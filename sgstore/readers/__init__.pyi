@@ -4,7 +4,6 @@ from ._frames import FramesTrace as FramesTrace
 from ._frames import TraceMessage as TraceMessage
 from ._media import Media as Media
 from ._media import read_carried as read_carried
-from ._media import read_messages as read_messages
 from ._registry import ENDINGS as ENDINGS
 from ._registry import READERS as READERS
 from ._registry import OpenTrace as OpenTrace
@@ -13,6 +12,7 @@ from ._registry import on_map as on_map
 from ._registry import open_recording as open_recording
 from ._registry import open_trace as open_trace
 from ._registry import read_message as read_message
+from ._registry import read_messages as read_messages
 from ._registry import readers as readers
 from ._ros2 import decode as decode
 from ._ros2 import parse_definition as parse_definition

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, ClassVar, Final, Protocol, Self, TypeVar
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.mcap import IDS
+from sgstore.mcap import IDS, Loss
 from sgstore.vocabulary import KIND_CODE
-from sgstore.world import POSE, Channel, Entities, FrameBlock, Loss, MessageRefs, States
+from sgstore.world import POSE, Channel, Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping

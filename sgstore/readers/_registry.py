@@ -13,35 +13,19 @@ from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
 
 from sgstore import plugins
 from sgstore.errors import TraceError
-from sgstore.mcap import MAGIC, McapFile, check_name, digest_of, mark_of
-from sgstore.mcap import message_at as _read_message
+from sgstore.mcap import MAGIC, McapFile, messages_at
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_message as _read_osi_message
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from sgstore.mcap import Recording
     from sgstore.roads import RoadMap
     from sgstore.world import FrameBlock, TraceInfo
 
-
-__all__ = [
-    "ENDINGS",
-    "READERS",
-    "OpenTrace",
-    "RecordingReader",
-    "check_name",
-    "digest_of",
-    "mark_of",
-    "on_map",
-    "open_recording",
-    "open_trace",
-    "read_message",
-    "readers",
-]
 
 ENDINGS: Final = (".mcap", *_OSI_ENDINGS)
 """How the names of recordings end, where a folder is searched for them."""
@@ -115,9 +99,7 @@ def open_recording(path: str | Path) -> McapFile | OsiFile:
         There is no such file, or it is neither.
     """
     path = Path(path)
-    if path.name.lower().endswith(_OSI_ENDINGS) and not _is_mcap(path):
-        return OsiFile(path)
-    return McapFile(path)
+    return OsiFile(path) if _is_single_channel(path) else McapFile(path)
 
 
 def open_trace(
@@ -181,12 +163,14 @@ def _takes_mapping(reader: RecordingReader) -> bool:
     return "mapping" in inspect.signature(reader).parameters
 
 
-def _is_mcap(path: Path) -> bool:
+def _is_single_channel(path: Path) -> bool:
+    if not path.name.lower().endswith(_OSI_ENDINGS):
+        return False
     try:
         with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
+            return file.read(len(MAGIC)) != MAGIC
     except OSError:
-        return False
+        return True
 
 
 def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
@@ -198,10 +182,33 @@ def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: in
         The file cannot be opened, the chunk is damaged, or there is no message of that length there: the
         file was replaced.
     """
-    path = Path(path)
-    single = path.name.lower().endswith(_OSI_ENDINGS) and not _is_mcap(path)
-    read = _read_osi_message if single else _read_message
-    return read(path, chunk_offset=chunk_offset, offset=offset, length=length)
+    (data,) = read_messages(Path(path), [(chunk_offset, offset, length)])
+    return bytes(data)
+
+
+def read_messages(
+    path: Path, places: Iterable[tuple[int, int, int]]
+) -> Iterator[bytes | memoryview]:
+    """The data of messages, in the order in which they are asked for.
+
+    Parameters
+    ----------
+    path : Path
+        A recording: a file, or the folder of a bag.
+    places : iterable of (chunk_offset, offset, length)
+        As :class:`sgstore.world.MessageRefs` has them. Those of one chunk should come together: the last one
+        alone is kept.
+
+    Raises
+    ------
+    TraceError
+        As :func:`read_message`.
+    """
+    if not _is_single_channel(path):
+        yield from messages_at(path, places)
+        return
+    for chunk_offset, offset, length in places:
+        yield _read_osi_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
 
 
 def _no_reader(recording: Recording) -> str:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import bearings, gap
+from sgstore.mcap import Loss
 from sgstore.relations._scene import IS_SIGNAL, IS_VEHICLE, Bodies, BodyPairs, parts, spread
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled, normalize_name
-from sgstore.world import Entities, Loss, MessageRefs
+from sgstore.world import Entities, MessageRefs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

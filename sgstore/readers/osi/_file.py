@@ -23,7 +23,16 @@ import zstandard
 from mcap.records import Channel, Schema
 
 from sgstore.errors import TraceError
-from sgstore.mcap import MAX_LOSSES, MESSAGE_HEAD, READ_ERRORS, RUN_MESSAGES, Messages, open_regular
+from sgstore.mcap import (
+    MAX_LOSSES,
+    MESSAGE_HEAD,
+    READ_ERRORS,
+    RUN_MESSAGES,
+    Findings,
+    Loss,
+    Messages,
+    open_regular,
+)
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
@@ -38,7 +47,6 @@ from sgstore.readers.osi._schema import (
     object_class,
     parse,
 )
-from sgstore.world import Loss, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -285,7 +293,7 @@ class OsiFile:
 
     def walk(
         self,
-        report: TraceReport,
+        report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
     ) -> Iterator[Messages]:
@@ -315,7 +323,7 @@ class OsiFile:
 
     def _recognise(self) -> str:
         """Recognise the type of the messages, and learn their common beginning."""
-        report = TraceReport()
+        report = Findings()
         likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
         tried = 0
         for _, _, data in islice(self._messages(report), _TRIED):
@@ -334,7 +342,7 @@ class OsiFile:
             reason = f"no message of ASAM OSI: {told}"
         raise TraceError(reason, path=self.path)
 
-    def _messages(self, report: TraceReport) -> Iterator[tuple[int, int, bytes]]:
+    def _messages(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
         """Place of the zstd frame, offset in it, and data of every message."""
         stream = _Stream(self._mark)
         content = pieces(self._file)
@@ -404,7 +412,7 @@ class _Stream:
             self._frames.append((self._start + len(self._buffer), place))
         self._buffer += piece
 
-    def take(self, report: TraceReport, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
+    def take(self, report: Findings, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
         """The messages that are whole. ``ends``: no more pieces come."""
         at = 0
         while (left := len(self._buffer) - at) >= PREFIX.size or (ends and left):
@@ -466,7 +474,7 @@ class _Stream:
         return place, position - start
 
 
-def _lose(report: TraceReport, loss: Loss) -> None:
+def _lose(report: Findings, loss: Loss) -> None:
     """Report a loss, as one with the loss before it where that is of the same kind and adjoins."""
     last = report.losses[-1] if report.losses else None
     if last and last.messages == loss.messages == -1 and last.offset + last.bytes == loss.offset:

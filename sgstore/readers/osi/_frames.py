@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from google.protobuf import message_factory
 
+from sgstore.mcap import Loss
 from sgstore.readers._base import NAN, EntityTable, FrameRows, LossTally
 from sgstore.readers.osi._lights import TrafficLights
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects
@@ -30,7 +31,7 @@ from sgstore.readers.osi._schema import (
 )
 from sgstore.readers.osi._survey import is_key, keys_of
 from sgstore.vocabulary import TypeMeaning, type_meanings
-from sgstore.world import POSE, Event, Loss
+from sgstore.world import POSE, Event
 
 if TYPE_CHECKING:
     from sgstore.mcap import Messages
