@@ -109,7 +109,7 @@ def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
     scope = names.scope.finished()  # after RETURN, where the ego may be named, as anywhere
     where = tuple(settled(part, session) for part in scope.where)
     when = tuple(part for part in where if b.is_temporal(part))
-    if not when and not any(b.is_temporal(value) for value in values_of(result)):
+    if not when and not any(b.is_temporal(value) for value in result.values):
         return b.Query(replace(scope, where=where), result, frozenset())
     still = replace(scope, where=tuple(part for part in where if not b.is_temporal(part)))
     step = o.BoundStep(still, when, None, absent=False, span=match.block.span)
@@ -135,14 +135,6 @@ def _told(scope: b.Scope) -> b.Scope:
     }
     nodes = {key: node for key, node in scope.nodes.items() if key in told}
     return replace(scope, nodes=nodes, edges=edges, where=(), distinct=frozenset())
-
-
-def values_of(result: b.Result) -> tuple[b.Bound, ...]:
-    """The expressions that a result speaks of: what it returns, orders by and samples by."""
-    values = [column.value for column in result.columns]
-    values += [key.value for key in result.order if not isinstance(key.value, str)]
-    per = result.sample.per if result.sample else None
-    return (*values, *([per] if per is not None and not isinstance(per, str) else []))
 
 
 def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchClause:
@@ -300,7 +292,7 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
     for pattern, key in pending:
         _inline(pattern, key, names)
     if block.where is not None:
-        names.scope.where += conjuncts(names.condition(block.where))
+        names.scope.where += b.conjuncts(names.condition(block.where))
 
 
 def _block(e: s.BlockExpression, names: SymbolTable) -> b.BlockValue:
@@ -320,13 +312,6 @@ _BINDERS: Final[Binders] = {
     s.Temporal: tense,
 }
 """The binder of every kind of expression."""
-
-
-def conjuncts(expression: b.Bound) -> list[b.Bound]:
-    """The conditions that an expression joins by ``AND``."""
-    if isinstance(expression, b.Operation) and expression.word == "AND":
-        return [part for operand in expression.operands for part in conjuncts(operand)]
-    return [expression]
 
 
 def _node(node: s.NodePattern, names: SymbolTable) -> str:
@@ -435,7 +420,7 @@ def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable
         attribute = attribute_of(key, prop.name, prop.name_span, names)
         names.scope.where.append(_equality(attribute, prop, names))
     if pattern.where is not None:
-        names.scope.where += conjuncts(names.condition(pattern.where))
+        names.scope.where += b.conjuncts(names.condition(pattern.where))
 
 
 def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:

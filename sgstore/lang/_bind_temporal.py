@@ -238,14 +238,8 @@ def _settled(expression: b.Bound) -> b.Bound:
             if word in COMPARISONS:
                 parts = _compared(parts)
             return b.Operation(word, parts, kind)
-        case b.Tense(operands=operands):
-            return replace(expression, operands=tuple(_settled(operand) for operand in operands))
-        case b.SignalCall(operand=operand):
-            return replace(expression, operand=_settled(operand))
-        case b.Aggregate(operand=operand) if operand is not None:
-            return replace(expression, operand=_settled(operand))
         case _:
-            return expression
+            return b.with_operands(expression, _settled)
 
 
 def _compared(parts: tuple[b.Bound, ...]) -> tuple[b.Bound, ...]:
@@ -279,8 +273,8 @@ def _lengths(expression: b.Bound) -> Iterator[b.Value]:
         match part:
             case b.Value():
                 yield part
-            case b.BlockValue(scope=scope, value=value):
-                for inner in (*scope.where, *([value] if value is not None else [])):
+            case b.BlockValue():
+                for inner in part.inside:
                     yield from _lengths(inner)
             case _:
                 pass
@@ -560,7 +554,8 @@ def _bind_step(
             bind_block(step.block, names)
         elif step.block.where is not None:
             scope.where.append(names.condition(step.block.where))
-        where = [part for whole in scope.where for part in _settled_parts(whole, session)]
+        parts = [part for whole in scope.where for part in b.conjuncts(whole)]
+        where = [settled(part, session) for part in parts]
         hold = _hold(step.hold, names) if step.hold else None
     scope.where = [part for part in where if not b.is_temporal(part)]
     when = tuple(part for part in where if b.is_temporal(part))
@@ -574,14 +569,6 @@ def _bind_step(
     found.ends |= {end: scope.nodes[end] for edge in named for end in (edge.src, edge.dst)}
     found.meanings |= names.meanings
     _name_step(step, found)
-
-
-def _settled_parts(expression: b.Bound, session: Session) -> Iterator[b.Bound]:
-    if isinstance(expression, b.Operation) and expression.word == "AND":
-        for operand in expression.operands:
-            yield from _settled_parts(operand, session)
-    else:
-        yield settled(expression, session)
 
 
 def _name_step(step: s.StepClause, found: BoundSequence) -> None:

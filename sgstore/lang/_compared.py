@@ -63,10 +63,8 @@ def _compared(values: Iterable[b.Bound], scope: b.Scope) -> Iterator[Compared]:
     for value in values:
         for part in b.walk(value):
             match part:
-                case b.BlockValue(scope=inner, value=told):
-                    yield from _compared(
-                        [*inner.where, *([told] if told is not None else [])], inner
-                    )
+                case b.BlockValue(scope=inner):
+                    yield from _compared(part.inside, inner)
                 case b.Operation(word="=" | "<>", operands=(left, right)):
                     yield from _texts(left, (right,), scope)
                     yield from _texts(right, (left,), scope)

@@ -178,7 +178,7 @@ class Layout:
 
 def _bound_variables(query: Query) -> Scope:
     """The pattern with all its nodes and single edges bound, those of a path of exactly n edges too."""
-    scope = unfold_paths(query, Catalog()).scope
+    scope = unfold_paths(query.scope, Catalog(), injective=query.injective)
     nodes = {
         key: replace(node, role="unnamed") if node.role == "hidden" else node
         for key, node in scope.nodes.items()

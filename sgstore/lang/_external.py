@@ -34,13 +34,11 @@ from sgstore.lang._rewrite import rewritten
 from sgstore.lang._sql_frames import PATTERN, Frames, Join, column_of
 from sgstore.lang._sql_masks import folded
 from sgstore.lang.ir import (
-    Aggregate,
     BlockValue,
     FrameAttribute,
     Kinds,
     NodeAttribute,
     NodeValue,
-    Operation,
     Result,
     ReturnColumn,
     Scope,
@@ -48,6 +46,7 @@ from sgstore.lang.ir import (
     StepTime,
     Tense,
     TraceAttribute,
+    with_operands,
 )
 from sgstore.quoting import quoted
 from sgstore.vocabulary import KINDS
@@ -393,11 +392,7 @@ def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
                     attribute = Attribute(name, value.type, {}, "", DisplayUnit.whole)
                     places[value] = FrameAttribute(attribute, value.type)
                 return places[value]
-            case Operation(operands=operands):
-                return replace(value, operands=tuple(placed(operand) for operand in operands))
-            case Aggregate(operand=operand) if operand is not None:
-                return replace(value, operand=placed(operand))
             case _:
-                return value
+                return with_operands(value, placed)
 
     return replace(query, result=query.result.changed(placed)), places

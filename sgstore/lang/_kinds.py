@@ -139,7 +139,7 @@ _STRICT: Final = frozenset(
 """Operations that are unknown where one operand is."""
 
 
-def entities_of_pairs(scope: Scope) -> Scope:
+def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
     """Nodes whose pair is compared are entities: of others the number is unknown, and a comparison never true.
 
     Else a node without a label would be tried with every part of the map around.

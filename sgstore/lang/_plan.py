@@ -197,19 +197,14 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
 
 def blocked(query: Query) -> frozenset[str]:
     """Nodes that blocks speak of from inside, anywhere in a query."""
-    values = [column.value for column in query.result.columns]
-    values += [key.value for key in query.result.order if not isinstance(key.value, str)]
-    sample = query.result.sample
-    if sample and sample.per and not isinstance(sample.per, str):
-        values.append(sample.per)
-    return frozenset(_blocked([*query.scope.where, *values]))
+    return frozenset(_blocked((*query.scope.where, *query.result.values)))
 
 
-def _blocked(expressions: list[Bound]) -> Iterator[str]:
+def _blocked(expressions: tuple[Bound, ...]) -> Iterator[str]:
     for expression in expressions:
         for block in blocks_of(expression):
             yield from block.scope.outer
-            yield from _blocked([*block.scope.where, *([block.value] if block.value else [])])
+            yield from _blocked(block.inside)
 
 
 def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:

@@ -48,6 +48,7 @@ from sgstore.lang.ir import (
     TraceAttribute,
     Value,
     walk,
+    with_operands,
 )
 from sgstore.quoting import quoted
 
@@ -95,10 +96,8 @@ def _apart(value: Bound) -> Bound:
         case Aggregate(distinct=True, operand=NodeValue(node=node) as operand):
             whose = Operation("whose", (operand, owner_of(node)), Type.node)
             return replace(value, operand=whose)
-        case Operation(operands=operands):
-            return replace(value, operands=tuple(_apart(operand) for operand in operands))
         case _:
-            return value
+            return with_operands(value, _apart)
 
 
 def _tells_trace(keys: Iterable[Bound]) -> bool:
@@ -581,8 +580,8 @@ def _spelled(query: Query, catalog: Catalog) -> Query:
                 attribute.unit is DisplayUnit.label
             ):
                 return _name_of(node, query, catalog)
-            case Operation(operands=operands):
-                return replace(value, operands=tuple(spelled(operand) for operand in operands))
+            case Operation():
+                return with_operands(value, spelled)
             case _:
                 return value
 

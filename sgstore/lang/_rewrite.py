@@ -1,12 +1,14 @@
-"""Bound query → bound query of the same meaning that is cheaper to answer: an ordered tuple of rules.
+"""Bound query → bound query of the same meaning that is cheaper to answer: rules, one after the other.
 
-Each rule says what it does and why the meaning stays. None can fail.
+Each rule makes a scope of a scope; it says what it does and why the meaning stays. None can fail.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations, count, pairwise
+from functools import partial
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang._catalog import NODE_ATTRIBUTES, Catalog, Triple, Type
@@ -29,12 +31,14 @@ from sgstore.lang.ir import (
     Query,
     Scope,
     Value,
+    conjuncts,
     walk,
+    with_operands,
 )
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
 
 FALSE: Final = Value(value=False, type=Type.boolean)
@@ -47,25 +51,38 @@ _MIRRORED: Final = {"=": "=", "<>": "<>", "<": ">", ">=": "<=", ">": "<", "<=": 
 
 def rewritten(query: Query, catalog: Catalog) -> Query:
     """The query after all rules."""
-    for rule in RULES:
-        query = rule(query, catalog)
-    return query
+    unfold = partial(unfold_paths, injective=query.injective)
+    for rule in (
+        push_negations,
+        counts_to_existence,
+        unfold,
+        labels_from_conditions,
+        open_exists,
+        labels_from_conditions,
+        labels_to_conditions,
+        entities_of_pairs,
+        narrowed,
+        ordered,
+    ):
+        query = _in_scopes(rule, query, catalog)
+    query = replace(query, result=query.result.changed(_attributes))
+    return count_by_buckets(query, catalog)
 
 
-def _scopes(change: Callable[[Scope], Scope], query: Query) -> Query:
-    """A query with a change made to every scope, the inner ones first."""
+_Rule = Callable[[Scope, Catalog], Scope]
+
+
+def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
+    """A query with a rule applied to every scope, the inner ones first."""
 
     def inside(expression: Bound) -> Bound:
-        match expression:
-            case Operation(word, operands, kind):
-                return Operation(word, tuple(inside(operand) for operand in operands), kind)
-            case BlockValue(scope=scope, value=value):
-                return replace(expression, scope=deep(scope), value=value and inside(value))
-            case _:
-                return expression
+        if isinstance(expression, BlockValue):
+            value = expression.value and inside(expression.value)
+            return replace(expression, scope=deep(expression.scope), value=value)
+        return with_operands(expression, inside)
 
     def deep(scope: Scope) -> Scope:
-        return change(replace(scope, where=tuple(inside(condition) for condition in scope.where)))
+        return rule(replace(scope, where=tuple(map(inside, scope.where))), catalog)
 
     return replace(query, scope=deep(query.scope), result=query.result.changed(inside))
 
@@ -73,22 +90,14 @@ def _scopes(change: Callable[[Scope], Scope], query: Query) -> Query:
 # Conditions ----------------------------------------------------------------------------------------
 
 
-def push_negations(query: Query, _: Catalog) -> Query:
+def push_negations(scope: Scope, _: Catalog) -> Scope:
     """``NOT`` moves inwards to what cannot be split, so that more conditions stand alone.
 
     De Morgan's laws and ``NOT a < b`` = ``a >= b`` hold in three-valued logic too.
     """
-    return _scopes(
-        lambda scope: replace(scope, where=tuple(_flat(_positive(c) for c in scope.where))), query
+    return replace(
+        scope, where=tuple(part for c in scope.where for part in conjuncts(_positive(c)))
     )
-
-
-def _flat(conditions: Iterator[Bound]) -> Iterator[Bound]:
-    for condition in conditions:
-        if isinstance(condition, Operation) and condition.word == "AND":
-            yield from _flat(iter(condition.operands))
-        else:
-            yield condition
 
 
 def _positive(condition: Bound) -> Bound:
@@ -129,11 +138,9 @@ def _negated_operation(word: str, operands: tuple[Bound, ...]) -> Bound:
     return Operation("NOT", (Operation(word, operands, Type.boolean),), Type.boolean)
 
 
-def counts_to_existence(query: Query, _: Catalog) -> Query:
+def counts_to_existence(scope: Scope, _: Catalog) -> Scope:
     """``COUNT {…} > 0`` is ``EXISTS {…}``, which need not count; ``COUNT {…} = 0`` is its negation."""
-    return _scopes(
-        lambda scope: replace(scope, where=tuple(_existence(c) for c in scope.where)), query
-    )
+    return replace(scope, where=tuple(map(_existence, scope.where)))
 
 
 def _existence(condition: Bound) -> Bound:
@@ -174,28 +181,21 @@ def complement(sign: str) -> str:
 # Patterns ------------------------------------------------------------------------------------------
 
 
-def unfold_paths(query: Query, _: Catalog) -> Query:
+def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
     """A path of exactly n edges becomes n edges with hidden nodes between them.
 
     As in a path of m to n edges, these nodes differ from one another and from both ends, if nodes must
     differ at all; with the other nodes of the pattern they may coincide.
     """
-    numbers = count(1)
-
-    def unfold(scope: Scope) -> Scope:
-        for edge in scope.edges:
-            if edge.low == edge.high > 1:
-                scope = chain(scope, edge, edge.low, numbers, injective=query.injective)
-        return scope
-
-    return _scopes(unfold, query)
+    for edge in scope.edges:
+        if edge.low == edge.high > 1:
+            scope = chain(scope, edge, edge.low, injective=injective)
+    return scope
 
 
-def chain(
-    scope: Scope, edge: Edge, length: int, numbers: Iterator[int], *, injective: bool
-) -> Scope:
+def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
     """A scope in which a path has become ``length`` edges with hidden nodes between them."""
-    between = [f"#{edge.key}.{next(numbers)}" for _ in range(length - 1)]
+    between = [f"#{edge.key}.{number}" for number in range(1, length)]
     stops = [edge.src, *between, edge.dst]
     hidden = {key: Node(key, ANY, "hidden", edge.span) for key in between}
     links = tuple(
@@ -211,20 +211,16 @@ def chain(
     )
 
 
-def labels_from_conditions(query: Query, _: Catalog) -> Query:
+def labels_from_conditions(scope: Scope, _: Catalog) -> Scope:
     """``v.kind = 'car'``, ``v.is_ego`` and the like say what a node may be, which the edges know too."""
-
-    def narrow(scope: Scope) -> Scope:
-        nodes, rest = dict(scope.nodes), list[Bound]()
-        for condition in scope.where:
-            key, kinds = _label(condition)
-            if key in nodes:
-                nodes[key] = replace(nodes[key], kinds=nodes[key].kinds & kinds)
-            else:
-                rest.append(condition)
-        return replace(scope, nodes=nodes, where=tuple(rest))
-
-    return _scopes(narrow, query)
+    nodes, rest = dict(scope.nodes), list[Bound]()
+    for condition in scope.where:
+        key, kinds = _label(condition)
+        if key in nodes:
+            nodes[key] = replace(nodes[key], kinds=nodes[key].kinds & kinds)
+        else:
+            rest.append(condition)
+    return replace(scope, nodes=nodes, where=tuple(rest))
 
 
 def _label(condition: Bound) -> tuple[str, Kinds]:
@@ -245,27 +241,31 @@ def _label(condition: Bound) -> tuple[str, Kinds]:
             return "", ANY
 
 
-def open_exists(query: Query, _: Catalog) -> Query:
+def open_exists(scope: Scope, _: Catalog) -> Scope:
     """An ``EXISTS {…}`` that must be true joins the pattern around it, its nodes hidden, if that binds a node.
 
     A node that no edge of the pattern binds would otherwise be tried with every entity of the frame.
     """
-    return _scopes(_opened, query)
-
-
-def _opened(scope: Scope) -> Scope:
     while True:
-        bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
-        free = set(scope.nodes) - bound_nodes
-        for condition in scope.where:
-            if isinstance(condition, BlockValue) and condition.word == "EXISTS":
-                inner = condition.scope
-                ends = {key for edge in inner.edges for key in (edge.src, edge.dst)}
-                if ends & free:
-                    scope = _merged(scope, condition)
-                    break
-        else:
+        free = set(scope.nodes) - _ends(scope)
+        opened = next(
+            (
+                condition
+                for condition in scope.where
+                if isinstance(condition, BlockValue)
+                and condition.word == "EXISTS"
+                and _ends(condition.scope) & free
+            ),
+            None,
+        )
+        if opened is None:
             return scope
+        scope = _merged(scope, opened)
+
+
+def _ends(scope: Scope) -> set[str]:
+    """Nodes that edges of a scope bind."""
+    return {key for edge in scope.edges for key in (edge.src, edge.dst)}
 
 
 def _merged(scope: Scope, block: BlockValue) -> Scope:
@@ -282,24 +282,14 @@ def _merged(scope: Scope, block: BlockValue) -> Scope:
     )
 
 
-def pairs_of_entities(query: Query, _: Catalog) -> Query:
-    """Nodes whose pair is compared are entities; see :mod:`sgstore.lang._kinds`."""
-    return _scopes(entities_of_pairs, query)
-
-
 # What the store holds ------------------------------------------------------------------------------
 
 
-def narrow_kinds(query: Query, catalog: Catalog) -> Query:
+def narrowed(scope: Scope, catalog: Catalog) -> Scope:
     """Nodes are narrowed to the kinds that occur at the ends of such edges in the store.
 
     A pattern whose edges do not occur at all has no match: its condition becomes false.
     """
-    return _scopes(lambda scope: narrowed(scope, catalog), query)
-
-
-def narrowed(scope: Scope, catalog: Catalog) -> Scope:
-    """A scope whose nodes are narrowed to what its edges have at their ends in the store."""
     triples = tuple({**catalog.map_edges, **catalog.edges})
     held = catalog.moving | catalog.fixed | catalog.mapped
     kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
@@ -338,13 +328,8 @@ def possible(
             yield relation, other, one
 
 
-def order_edges(query: Query, catalog: Catalog) -> Query:
-    """Edges in an order that starts with the rarest and goes on with the rarest that is connected."""
-    return _scopes(lambda scope: ordered(scope, catalog), query)
-
-
 def ordered(scope: Scope, catalog: Catalog) -> Scope:
-    """A scope with its edges in that order."""
+    """Edges in an order that starts with the rarest and goes on with the rarest that is connected."""
     counts = {**catalog.map_edges, **catalog.edges}
 
     def rows(edge: Edge) -> int:
@@ -362,24 +347,15 @@ def ordered(scope: Scope, catalog: Catalog) -> Scope:
     return replace(scope, edges=tuple(result))
 
 
-def labels_to_conditions(query: Query, _: Catalog) -> Query:
-    """A label that a block asks of a node outside it is a condition on that node's attributes.
-
-    So is one that a value which is returned is made of.
-    """
-    query = _scopes(
-        lambda scope: replace(scope, where=tuple(_attributes(c) for c in scope.where)), query
-    )
-    return replace(query, result=query.result.changed(_attributes))
+def labels_to_conditions(scope: Scope, _: Catalog) -> Scope:
+    """A label that a block asks of a node outside it is a condition on that node's attributes."""
+    return replace(scope, where=tuple(map(_attributes, scope.where)))
 
 
 def _attributes(condition: Bound) -> Bound:
-    if isinstance(condition, Operation):
-        return replace(condition, operands=tuple(_attributes(o) for o in condition.operands))
-    if isinstance(condition, Aggregate) and condition.operand is not None:
-        return replace(condition, operand=_attributes(condition.operand))
+    """The same, if it is not a label; values that are returned are made of labels, too."""
     if not isinstance(condition, LabelTest):
-        return condition
+        return with_operands(condition, _attributes)
     kind = NodeAttribute(condition.node, NODE_ATTRIBUTES["kind"], Type.text)
     ego = NodeAttribute(condition.node, NODE_ATTRIBUTES["isego"], Type.boolean)
     other = Operation("NOT", (ego,), Type.boolean)
@@ -404,8 +380,7 @@ def count_by_buckets(query: Query, catalog: Catalog) -> Query:
     are only those to which it is all the same how often a value comes.
     """
     result = query.result
-    values = [column.value for column in result.columns]
-    values += [key.value for key in result.order if not isinstance(key.value, str)]
+    values = result.values
     parts = [part for value in values for part in walk(value)]
     counts = [part for part in parts if isinstance(part, Aggregate)]
     listed = result.form != "rows" or result.whole or result.framed or result.sample is not None
@@ -419,12 +394,7 @@ def count_by_buckets(query: Query, catalog: Catalog) -> Query:
         is_lasting(leaf, query.scope, catalog) for value in values for leaf in leaves(value)
     ):
         return query
-    columns = tuple(replace(column, value=_weighed(column.value)) for column in result.columns)
-    order = tuple(
-        key if isinstance(key.value, str) else replace(key, value=_weighed(key.value))
-        for key in result.order
-    )
-    return replace(query, result=replace(result, columns=columns, order=order))
+    return replace(query, result=result.changed(_weighed))
 
 
 def _counts_all(part: Aggregate) -> bool:
@@ -435,22 +405,5 @@ def _weighed(value: Bound) -> Bound:
     match value:
         case Aggregate() if _counts_all(value):
             return replace(value, operand=INVARIANT)
-        case Operation(operands=operands):
-            return replace(value, operands=tuple(_weighed(operand) for operand in operands))
         case _:
-            return value
-
-
-RULES: Final[tuple[Callable[[Query, Catalog], Query], ...]] = (
-    push_negations,
-    counts_to_existence,
-    unfold_paths,
-    labels_from_conditions,
-    open_exists,
-    labels_from_conditions,
-    labels_to_conditions,
-    pairs_of_entities,
-    narrow_kinds,
-    order_edges,
-    count_by_buckets,
-)
+            return with_operands(value, _weighed)

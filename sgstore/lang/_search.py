@@ -294,12 +294,7 @@ def _all(tests: list[Evaluate], at: Binding) -> bool:
 
 def _needs(condition: b.Bound) -> tuple[frozenset[str], frozenset[str]]:
     """Nodes and edges that must be bound before a condition can be tested."""
-    edges = {
-        part.edge
-        for part in b.walk(condition)
-        if isinstance(part, b.EdgeRelation | b.EdgeAttribute)
-    }
-    return b.nodes_of(condition), frozenset(edges)
+    return b.nodes_of(condition), b.edges_of(condition)
 
 
 def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:

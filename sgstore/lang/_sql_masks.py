@@ -661,7 +661,7 @@ class Masks(PresenceSql, ABC):
         for chosen in lengths:
             inner = scope
             for path, length in zip(paths, chosen, strict=True):
-                inner = chain(inner, path, length, self._numbers, injective=self.query.injective)
+                inner = chain(inner, path, length, injective=self.query.injective)
             inner = ordered(narrowed(inner, self.catalog), self.catalog)
             if inner.where != (FALSE,):
                 branches.append(self._base(inner, parts, given, nodes, edges))
@@ -682,7 +682,7 @@ class Masks(PresenceSql, ABC):
         branches: list[str] = []
         for length in range(edge.low, edge.high + 1):
             inner = Scope(nodes, {}, (single,), (), frozenset())
-            inner = chain(inner, single, length, self._numbers, injective=self.query.injective)
+            inner = chain(inner, single, length, injective=self.query.injective)
             inner = ordered(narrowed(inner, self.catalog), self.catalog)
             if inner.where != (FALSE,):
                 rows = self._base(inner, Phases(), None, frozenset(nodes), frozenset())

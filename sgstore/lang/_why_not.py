@@ -248,8 +248,7 @@ def _blocks(conditions: Iterable[b.Bound]) -> Iterator[b.BlockValue]:
 
 def _edges_spoken_of(scope: b.Scope) -> set[str]:
     values = [*scope.where, *(block.value for block in _blocks(scope.where) if block.value)]
-    parts = (part for value in values for part in b.walk(value))
-    return {part.edge for part in parts if isinstance(part, b.EdgeAttribute | b.EdgeRelation)}
+    return {edge for value in values for edge in b.edges_of(value)}
 
 
 # Why a graph does not match a pattern: the first part that fails with those before it, and how near it came

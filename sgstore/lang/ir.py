@@ -235,6 +235,11 @@ class BlockValue:
     type: Type
     number: int
 
+    @property
+    def inside(self) -> tuple[Bound, ...]:
+        """The conditions in its braces, and the value behind them."""
+        return self.scope.where if self.value is None else (*self.scope.where, self.value)
+
 
 @dataclass(frozen=True, slots=True)
 class Aggregate:
@@ -441,6 +446,13 @@ class Result:
         return FRAME_COLUMNS if self.whole or self.framed else ()
 
     @property
+    def values(self) -> list[Bound]:
+        """The expressions in it: what it returns, orders by and samples by."""
+        sample = self.sample and self.sample.per
+        values = [*(column.value for column in self.columns), *(key.value for key in self.order)]
+        return [v for v in (*values, sample) if v is not None and not isinstance(v, str)]
+
+    @property
     def aggregated(self) -> bool:
         """Tell whether it counts or sums over matches, rather than listing them."""
         return any(isinstance(e, Aggregate) for c in self.columns for e in walk(c.value))
@@ -500,22 +512,40 @@ class Query:
     gaps: str = "break"
 
 
+def operands_of(expression: Bound) -> tuple[Bound, ...]:
+    """The expressions that one is made of, but not what stands in the braces of a block."""
+    match expression:
+        case Operation(operands=operands) | Tense(operands=operands):
+            return operands
+        case Aggregate(operand=operand) | SignalCall(operand=operand) if operand is not None:
+            return (operand,)
+        case _:
+            return ()
+
+
+def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
+    """An expression with a change made to each of its :func:`operands_of`."""
+    match expression:
+        case Operation(operands=operands) | Tense(operands=operands):
+            return replace(expression, operands=tuple(map(change, operands)))
+        case Aggregate(operand=operand) | SignalCall(operand=operand) if operand is not None:
+            return replace(expression, operand=change(operand))
+        case _:
+            return expression
+
+
 def walk(expression: Bound) -> Iterator[Bound]:
     """An expression and all its parts, but not what stands in the blocks in it."""
     yield expression
-    match expression:
-        case Operation(operands=operands):
-            for operand in operands:
-                yield from walk(operand)
-        case Aggregate(operand=operand) if operand is not None:
-            yield from walk(operand)
-        case Tense(operands=operands):
-            for operand in operands:
-                yield from walk(operand)
-        case SignalCall(operand=operand):
-            yield from walk(operand)
-        case _:
-            pass
+    for operand in operands_of(expression):
+        yield from walk(operand)
+
+
+def conjuncts(expression: Bound) -> list[Bound]:
+    """The conditions that an expression joins by ``AND``."""
+    if isinstance(expression, Operation) and expression.word == "AND":
+        return [part for operand in expression.operands for part in conjuncts(operand)]
+    return [expression]
 
 
 def is_temporal(expression: Bound) -> bool:

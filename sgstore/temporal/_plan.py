@@ -217,7 +217,7 @@ class Plan:
         What speaks of no more entities than another condition, which is false where one of these is absent, is
         asked together with it: one question finds few, where each alone might find many.
         """
-        flat = [part for operand in operands for part in _flat(operand)]
+        flat = [part for operand in operands for part in b.conjuncts(operand)]
         if self.absent:
             return flat
         nodes = {id(part): self._things(part) for part in flat}
@@ -253,7 +253,7 @@ class Plan:
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = f"a{len(self.atoms) + 1}"
-            where = () if expression == TRUE else tuple(_flat(_two_valued(expression)))
+            where = () if expression == TRUE else tuple(b.conjuncts(_two_valued(expression)))
             self.atoms[name] = Atom(name, self._query(things, where), self._variables(things))
         return self._lapsing(name, frozenset() if expression == TRUE else things)
 
@@ -321,12 +321,6 @@ class Plan:
             self.whole.ego,
             self.whole.unknown_is_false,
         )
-
-
-def _flat(expression: b.Bound) -> list[b.Bound]:
-    if isinstance(expression, b.Operation) and expression.word == "AND":
-        return [part for operand in expression.operands for part in _flat(operand)]
-    return [expression]
 
 
 def _all(parts: list[b.Bound]) -> b.Bound:
