@@ -17,7 +17,7 @@ from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
 from sgstore.store._locking import spill_folder
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP, plain
-from sgstore.store._staging import Checksum, Staging, expressions, scratch
+from sgstore.store._staging import Checksum, Staging, columns_of, expressions, scratch
 from sgstore.store._traces import already_stored, free_name, stored_name
 from sgstore.world import BUCKET_FRAMES
 
@@ -127,11 +127,7 @@ def _insert(
     connection: DuckDBPyConnection, sealed: Sealed, table: str, given: dict[str, Any]
 ) -> None:
     """Insert the files of a table, with the values that only the store can give."""
-    of_store = (
-        "SELECT column_name FROM duckdb_columns()"
-        " WHERE database_name = 'store' AND schema_name = 'main' AND table_name = ?"
-    )
-    columns = {name for (name,) in connection.execute(of_store, [table]).fetchall()}
+    columns = {name for name, _ in columns_of(connection, table, "store")}
     values = {name: value for name, value in given.items() if name in columns}
     replaced = ", ".join(f"${name} AS {name}" for name in values)
     select = f"SELECT * REPLACE ({replaced})" if replaced else "SELECT *"
@@ -325,11 +321,7 @@ def _ranges(
     connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
 ) -> Iterator[tuple[str, list[int]]]:
     """Conditions on the rows of a trace, each of so many as fit into memory."""
-    sql = (
-        "SELECT column_name FROM duckdb_columns()"
-        " WHERE table_name = ? AND schema_name = 'main' AND database_name = ?"
-    )
-    names = {name for (name,) in connection.execute(sql, [table, database]).fetchall()}
+    names = {name for name, _ in columns_of(connection, table, database)}
     bits = {"bucket": 0, "frame_id": FRAME_BITS}
     column = next((name for name in bits if name in names), None)
     if column is None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
@@ -353,6 +353,12 @@ def _words(sql: str) -> list[str]:
     return found
 
 
+@lru_cache(maxsize=256)
+def _statement(sql: str) -> Tokens:
+    """A statement as words; those of one store are mostly those of the next."""
+    return tuple(_words(sql))
+
+
 def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
     """The words of a table, its types as the database writes them down: enumerations with all their values."""
     before = ""
@@ -386,9 +392,7 @@ def _made(connection: DuckDBPyConnection, what: str, database: str) -> dict[str,
         " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
         [database],
     ).fetchall()
-    return {
-        name.lower(): tuple(_words((sql or "").rstrip().removesuffix(";"))) for name, sql in rows
-    }
+    return {name.lower(): _statement((sql or "").rstrip().removesuffix(";")) for name, sql in rows}
 
 
 def _enum(labels: Iterable[str]) -> str:

@@ -19,7 +19,7 @@ import duckdb
 import numpy as np
 
 from sgstore.errors import StoreError
-from sgstore.quoting import literal
+from sgstore.quoting import literal, quoted
 from sgstore.store._locking import Folder, memory_setting, translated
 from sgstore.store._packing import MISSING
 from sgstore.store._schema import code_sql, tables_sql
@@ -89,16 +89,21 @@ def _words(values: NDArray[Any]) -> Words:
     return np.where(missing, _MISSING, words.astype(np.uint64))
 
 
+def columns_of(
+    connection: DuckDBPyConnection, table: str, catalog: str = ""
+) -> list[tuple[str, str]]:
+    """Names and types of the columns of a table of the schema; ``duckdb_columns()`` would bind every view."""
+    place = f"{quoted(catalog)}.main" if catalog else "main"
+    rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
+    return [(name, kind) for name, kind, *_ in rows]
+
+
 def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
     """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them."""
-    sql = (
-        "SELECT column_name, data_type FROM duckdb_columns()"
-        " WHERE table_name = ? AND schema_name = 'main' AND NOT internal"
-    )
-    where = " AND database_name = ?" if catalog else ""
-    rows = connection.execute(sql + where, [table, catalog] if catalog else [table]).fetchall()
     return ", ".join(
-        f'{_expression(name, kind)} AS "{name}"' for name, kind in rows if name not in _ASSIGNED
+        f'{_expression(name, kind)} AS "{name}"'
+        for name, kind in columns_of(connection, table, catalog)
+        if name not in _ASSIGNED
     )
 
 
