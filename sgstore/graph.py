@@ -6,16 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from itertools import starmap
+from itertools import pairwise, starmap
 from operator import eq
 from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
-from sgstore.vocabulary import RELATIONS
+from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     import networkx as nx
     from numpy.typing import NDArray
@@ -24,7 +24,15 @@ if TYPE_CHECKING:
 
     Places = Sequence[tuple[int, float]]
     Whole = NDArray[np.integer[Any]]
-    EdgeRecord = tuple[int, str, int, dict[str, Any]]
+    Attributes = dict[str, Any]
+    EdgeRecord = tuple[int, str, int, Attributes]
+
+MOST_RECORDS: Final = 1 << 16
+"""Edges of a graph of which records are made at once; where there are more, they stay columns."""
+
+_IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
+_TELLS: Final = np.isin(np.arange(MOST_RELATIONS), (_IS_IN, _LEADS, _FOLLOWS))
+"""Of each relation whether its edges may have attributes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +56,14 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def distinct(self) -> Edges:
+        """Each edge once, by frame, and in it in the order of source, relation and destination."""
+        order = np.lexsort((self.dst, self.relation, self.src, self.frame))
+        columns = [getattr(self, f.name)[order] for f in fields(self)]
+        new = np.ones(len(order), np.bool_)
+        new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+        return Edges(*(column[new] for column in columns))
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
@@ -417,3 +433,163 @@ class SceneGraph:
                 more = known[src, dst]
             graph.add_edge(src, dst, key=relation, relation=relation, **attributes, **more)
         return graph
+
+
+# Columns of many frames → scene graphs, one after another: out of a store, or of a generator ----
+
+
+class MapRecords:
+    """A road map, as graphs have its parts: attributes of its nodes, and its edges.
+
+    Parameters
+    ----------
+    about : callable
+        Node id → attributes.
+    src, dst : (n,) int64
+        Node ids; below zero.
+    relation : (n,) int8
+        Codes of :data:`sgstore.vocabulary.RELATIONS`.
+    reach : LaneDistances
+
+    Attributes
+    ----------
+    about, reach
+        As above.
+    src, relation, dst
+        The edges, ordered by source, relation and destination; the parts of a map count downwards.
+    """
+
+    def __init__(
+        self,
+        about: Callable[[int], Attributes],
+        src: Ints,
+        relation: Codes,
+        dst: Ints,
+        reach: LaneDistances,
+    ) -> None:
+        self.about, self.reach = about, reach
+        order = np.lexsort((-dst, relation, -src))
+        self.src, self.relation, self.dst = src[order], relation[order], dst[order]
+        self._lowest = min(src.min(initial=0), dst.min(initial=0))
+
+    def among(self, present: Ints) -> Ints:
+        """Rows of the edges whose ends are both present."""
+        if not len(present):
+            return np.zeros(0, np.intp)
+        here = np.zeros(1 - min(present.min(), self._lowest), np.bool_)
+        here[-present] = True
+        return np.flatnonzero(here[-self.src] & here[-self.dst])
+
+
+@dataclass(frozen=True, slots=True)
+class SceneColumns:
+    """Scene graphs of some frames of a trace, as columns of all of them.
+
+    Attributes
+    ----------
+    trace : str
+    frame_id, seq, time_ns : (F,) int64
+    ego : sequence of int or None, F long
+    moving : tuple of Ints, Ints and sequence of dict
+        Frame, counted from 0, node id and attributes of what moves; in any order.
+    presence : StaticPresence
+        What stands, and parts of the map.
+    standing : mapping
+        Node id → attributes of what stands.
+    edges : Edges
+        Edges with an end in the trace, in any order; one may come twice.
+    about : mapping
+        Frame, relation, source and destination → attributes; see :func:`edge_attributes`.
+    map : MapRecords or None
+    """
+
+    trace: str
+    frame_id: Ints
+    seq: Ints
+    time_ns: Ints
+    ego: Sequence[int | None]
+    moving: tuple[Ints, Ints, Sequence[Attributes]]
+    presence: StaticPresence
+    standing: Mapping[int, Attributes]
+    edges: Edges
+    about: Mapping[tuple[int, int, int, int], Attributes]
+    map: MapRecords | None
+
+    def graphs(self) -> Iterator[SceneGraph]:
+        """The graph of each frame: what moves, what stands and the map; edges of the trace before the map's."""
+        frame, node, about = self.moving
+        order = np.lexsort((node, frame))
+        moving = _divided(frame[order], len(self.frame_id))
+        present = self.presence
+        by_place = np.lexsort((abs(present.node), present.node < 0, present.frame))
+        standing = _divided(present.frame[by_place], len(self.frame_id))
+        edges = self.edges.distinct()
+        related = _divided(edges.frame, len(self.frame_id))
+        for row in range(len(self.frame_id)):
+            rows = order[moving[row]].tolist()
+            nodes = dict(zip(node[rows].tolist(), (about[i] for i in rows), strict=True))
+            still = present.node[by_place[standing[row]]]
+            for one in still[still >= 0].tolist():
+                if (known := self.standing.get(one)) is not None:
+                    nodes[one] = dict(known)
+            mapped = still[still < 0]
+            if self.map is not None:
+                nodes |= {one: dict(self.map.about(one)) for one in mapped.tolist()}
+            yield SceneGraph(
+                frame_id=int(self.frame_id[row]),
+                trace=self.trace,
+                seq=int(self.seq[row]),
+                time_ns=int(self.time_ns[row]),
+                ego=self.ego[row],
+                nodes=nodes,
+                edges=self._edges(row, edges, related[row], mapped),
+                reach=self.map.reach if self.map is not None and len(mapped) else None,
+            )
+
+    def _edges(self, row: int, edges: Edges, own: slice, mapped: Ints) -> Sequence[EdgeRecord]:
+        src, relation, dst = edges.src[own], edges.relation[own], edges.dst[own]
+        about: dict[int, Attributes] = {}
+        tells = np.flatnonzero(_TELLS[relation])
+        ends = (column[tells].tolist() for column in (relation, src, dst))
+        for place, *key in zip(tells.tolist(), *ends, strict=True):
+            if (found := self.about.get((row, *key))) is not None:
+                about[place] = found
+        if self.map is not None:
+            rows = self.map.among(mapped)
+            src = np.concatenate([src, self.map.src[rows]])
+            dst = np.concatenate([dst, self.map.dst[rows]])
+            relation = np.concatenate([relation, self.map.relation[rows]])
+        found = EdgeColumns(_narrow(src), relation, _narrow(dst), about)
+        return found if len(found) > MOST_RECORDS else found[:]
+
+
+def edge_attributes(
+    lanes: Iterable[tuple[int, int, int, Attributes]],
+    gaps: Iterable[tuple[int, int, int, Attributes]],
+) -> dict[tuple[int, int, int, int], Attributes]:
+    """Attributes of edges by frame, relation, source and destination.
+
+    Parameters
+    ----------
+    lanes : iterable of (int, int, int, dict)
+        Frame, entity, lane, and how it lies in the lane: for ``isIn``.
+    gaps : iterable of (int, int, int, dict)
+        Frame, who follows, whom, and the gap: for ``follows`` and ``leads``.
+    """
+    known = {(frame, _IS_IN, node, lane): about for frame, node, lane, about in lanes}
+    for frame, one, other, about in gaps:
+        known[frame, _FOLLOWS, one, other] = about
+        known[frame, _LEADS, other, one] = dict(about)
+    return known
+
+
+def _divided(frame: Ints, frames: int) -> list[slice]:
+    """Rows of each frame, of a column that ascends."""
+    ends = np.searchsorted(frame, np.arange(frames + 1)).tolist()
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def _narrow(nodes: Ints) -> Whole:
+    """The same node ids in half the space, unless one of them is larger than it takes."""
+    narrow = nodes.astype(np.int32)
+    return narrow if np.array_equal(narrow, nodes) else nodes

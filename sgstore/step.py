@@ -8,13 +8,20 @@ from __future__ import annotations
 import gc
 import math
 from collections import OrderedDict
-from operator import itemgetter
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
 from sgstore.geometry import wrapped
-from sgstore.graph import EdgeColumns, LaneDistances, SceneGraph
+from sgstore.graph import (
+    Edges,
+    LaneDistances,
+    MapRecords,
+    SceneColumns,
+    StaticPresence,
+    edge_attributes,
+)
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     KIND_CODE,
@@ -22,8 +29,6 @@ from sgstore.vocabulary import (
     LIGHT_STATE_CODE,
     LIGHT_STATES,
     MAP_KINDS,
-    MOST_RELATIONS,
-    RELATION_CODE,
     SPECIALS,
     VEHICLE_LIGHTS,
     kind_named,
@@ -44,9 +49,7 @@ from sgstore.world import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from sgstore.graph import GraphBlock
+    from sgstore.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph
     from sgstore.roads import RoadMap
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Codes, Floats, Ints
@@ -303,15 +306,9 @@ class Replay:
 
 # A block's graph of one frame as records: the same as a store gives of it, and each entity's own id ----
 
-MOST_RECORDS: Final = 1 << 16
-"""Edges of a graph of which records are made at once; where there are more, they stay columns."""
-
 TRACE: Final = "online"
 """What the graphs of the online mode have for the name of a trace."""
 
-_IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
-_TELLS: Final = np.isin(np.arange(MOST_RELATIONS), (_IS_IN, _LEADS, _FOLLOWS))
-"""Of each relation whether its edges may have attributes."""
 _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _STILL: Final = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
@@ -354,15 +351,13 @@ class Records:
     """
 
     def __init__(self, road_map: RoadMap | None) -> None:
-        self._map = road_map
-        self._reach = None if road_map is None else LaneDistances(*road_map.reach)
-        self._map_nodes: dict[int, Attributes] = {}
         self._standing: dict[int, Attributes] = {}
+        self._map: MapRecords | None = None
         if road_map is not None:
             edges = road_map.edges
-            order = np.lexsort((-edges.dst, edges.relation, -edges.src))
-            self._src, self._dst = edges.src[order], edges.dst[order]
-            self._relation = edges.relation[order]
+            about = cache(partial(_map_node, road_map))
+            reach = LaneDistances(*road_map.reach)
+            self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
         """Take note of what stands: its pose comes once."""
@@ -385,73 +380,43 @@ class Records:
         known : dict
             Node id of the records → entity, of all that move in the frame.
         """
-        frames = graph.frames
+        frames, states, edges = graph.frames, graph.frames.states, graph.edges
         ego = int(outer[frames.ego[0]]) if frames.ego[0] >= 0 else None
-        nodes: dict[int, Attributes] = {}
-        moving = zip(outer[frames.states.node].tolist(), _moving(frames.states), strict=True)
-        for node, told in sorted(moving, key=itemgetter(0)):
-            about = known[node].attributes(is_ego=node == ego, is_static=False)
-            nodes[node] = about | told
-        present = graph.presence.node
-        for node in np.sort(outer[present[present >= 0]]).tolist():
-            nodes[node] = dict(self._standing[node])
-        mapped = -np.sort(-present[present < 0])
-        for node in mapped.tolist():
-            nodes[node] = dict(self._map_node(node))
-        return SceneGraph(
-            frame_id=int(frames.seq[0]),
+        node = outer[states.node]
+        moving = [
+            known[one].attributes(is_ego=one == ego, is_static=False) | told
+            for one, told in zip(node.tolist(), _moving(states), strict=True)
+        ]
+        src, dst = _outward(edges.src, outer), _outward(edges.dst, outer)
+        columns = SceneColumns(
             trace=TRACE,
-            seq=int(frames.seq[0]),
-            time_ns=int(frames.time_ns[0]),
-            ego=ego,
-            nodes=nodes,
-            edges=self._edges(graph, outer, mapped),
-            reach=self._reach,
+            frame_id=frames.seq,
+            seq=frames.seq,
+            time_ns=frames.time_ns,
+            ego=[ego],
+            moving=(np.zeros_like(node), node, moving),
+            presence=StaticPresence(graph.presence.frame, _outward(graph.presence.node, outer)),
+            standing=self._standing,
+            edges=Edges(edges.frame, edges.relation, src, dst),
+            about=edge_attributes(_lanes(graph.lanes, outer), _gaps(graph.gaps, outer)),
+            map=self._map,
         )
+        return next(columns.graphs())
 
-    def _map_node(self, node: int) -> Attributes:
-        found = self._map_nodes.get(node)
-        if found is not None or self._map is None:
-            return found or {}
-        nodes, row = self._map.nodes, -1 - node
-        texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
-        numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
-        numbers["heading"] = math.degrees(numbers["heading"])
-        about: Attributes = {"kind": KINDS[nodes.kind[row]], "is_ego": False, "is_static": True}
-        about |= {name: text for name, text in texts.items() if text} | _numbers(numbers)
-        if about["kind"] not in MAP_KINDS:
-            about |= _STILL
-        if nodes.lane_type[row]:
-            about |= {"section": int(nodes.section[row]), "lane": int(nodes.lane[row])}
-        self._map_nodes[node] = about
-        return about
 
-    def _edges(self, graph: GraphBlock, outer: Ints, present: Ints) -> Sequence[Edge]:
-        """Edges that have an end in the trace, in the order of their ends, then those of the map."""
-        src, relation, dst = _distinct(graph, outer)
-        about: dict[int, Attributes] = {}
-        known = _attributes(graph, outer)
-        rows = np.flatnonzero(_TELLS[relation])
-        keys = zip(relation[rows].tolist(), src[rows].tolist(), dst[rows].tolist(), strict=True)
-        for row, key in zip(rows.tolist(), keys, strict=True):
-            if key in known:
-                about[row] = known[key]
-        rows = self._map_edges(present)
-        if len(rows):
-            src, dst = (
-                np.concatenate(of) for of in ((src, self._src[rows]), (dst, self._dst[rows]))
-            )
-            relation = np.concatenate([relation, self._relation[rows]])
-        edges = EdgeColumns(_narrow(src), relation, _narrow(dst), about)
-        return edges if len(edges) > MOST_RECORDS else edges[:]
-
-    def _map_edges(self, present: Ints) -> Ints:
-        """Rows of the edges of the map whose ends are both present."""
-        if self._map is None or not len(present):
-            return np.zeros(0, np.intp)
-        here = np.zeros(len(self._map.nodes), np.bool_)
-        here[-1 - present] = True
-        return np.flatnonzero(here[-1 - self._src] & here[-1 - self._dst])
+def _map_node(road_map: RoadMap, node: int) -> Attributes:
+    """Attributes of a part of a map."""
+    nodes, row = road_map.nodes, -1 - node
+    texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
+    numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
+    numbers["heading"] = math.degrees(numbers["heading"])
+    about: Attributes = {"kind": KINDS[nodes.kind[row]], "is_ego": False, "is_static": True}
+    about |= {name: text for name, text in texts.items() if text} | _numbers(numbers)
+    if about["kind"] not in MAP_KINDS:
+        about |= _STILL
+    if nodes.lane_type[row]:
+        about |= {"section": int(nodes.section[row]), "lane": int(nodes.lane[row])}
+    return about
 
 
 def _moving(states: States) -> list[Attributes]:
@@ -487,51 +452,38 @@ def _coded(lights: int, light: int, derived: int) -> Attributes:
     return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(_DERIVED)}
 
 
-def _distinct(graph: GraphBlock, outer: Ints) -> tuple[Ints, Codes, Ints]:
-    """Ends and relations of the edges that have an end in the trace, each once, in the order of their ends."""
-    edges = graph.edges
-    src, dst = _outward(edges.src, outer), _outward(edges.dst, outer)
-    order = np.lexsort((dst, edges.relation, src))
-    src, relation, dst = src[order], edges.relation[order], dst[order]
-    new = np.ones(len(src), np.bool_)
-    new[1:] = (np.diff(src) != 0) | (np.diff(relation) != 0) | (np.diff(dst) != 0)
-    return src[new], relation[new], dst[new]
-
-
-def _attributes(graph: GraphBlock, outer: Ints) -> dict[tuple[int, int, int], Attributes]:
-    """Attributes of the edges that have any, by relation and ends."""
-    lanes, gaps = graph.lanes, graph.gaps
+def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
+    """Attributes of ``isIn`` edges, with their frame and ends."""
     told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
     columns = (
-        *(_outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
+        *(lanes.frame.tolist(), _outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
         *(number(column).tolist() for column in told),
         *(lanes.primary.tolist(), lanes.own.tolist()),
     )
-    known: dict[tuple[int, int, int], Attributes] = {}
-    for node, lane, overlap, offset, error, along, primary, own in zip(*columns, strict=True):
+    for frame, node, lane, overlap, offset, error, along, primary, own in zip(
+        *columns, strict=True
+    ):
         numbers = {
             "overlap": overlap,
             "lane_offset": offset,
             "heading_error": math.degrees(error),
             "along": along,
         }
-        known[_IS_IN, node, lane] = _numbers(numbers) | {"is_primary": primary, "is_own": own}
-    columns = (_outward(gaps.src, outer), _outward(gaps.dst, outer), number(gaps.gap))
-    for a, b, gap in zip(*(column.tolist() for column in columns), strict=True):
-        known[_FOLLOWS, a, b] = _numbers({"gap": gap})
-        known[_LEADS, b, a] = _numbers({"gap": gap})
-    return known
+        yield frame, node, lane, _numbers(numbers) | {"is_primary": primary, "is_own": own}
+
+
+def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
+    """Attributes of ``follows`` edges, with their frame and ends."""
+    src, dst = _outward(gaps.src, outer).tolist(), _outward(gaps.dst, outer).tolist()
+    for frame, a, b, gap in zip(
+        gaps.frame.tolist(), src, dst, number(gaps.gap).tolist(), strict=True
+    ):
+        yield frame, a, b, _numbers({"gap": gap})
 
 
 def _outward(nodes: Ints, outer: Ints) -> Ints:
     """Node ids of the records for those of a block."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
-
-
-def _narrow(nodes: Ints) -> NDArray[np.integer[Any]]:
-    """The same node ids in half the space, unless one of them is larger than it takes."""
-    narrow = nodes.astype(np.int32)
-    return narrow if np.array_equal(narrow, nodes) else nodes
 
 
 def _degrees(heading: Floats) -> list[float]:

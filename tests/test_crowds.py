@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ import sgstore
 import sgstore.relations._pairs as crowds
 import sgstore.store._packing as packing
 import sgstore.store._staging as staging
-from sgstore import step as records
+from sgstore import graph as graphs
 from sgstore.cli import run
 from sgstore.config import Config, configured
 from sgstore.derive import derive
@@ -31,6 +31,7 @@ from sgstore.step import Frame
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from sgstore.graph import GraphBlock
     from sgstore.world import FrameBlock
 
 VIEWS = ("edges", "nodes", "lane_states", "lane_gaps", "frames", "entities", "events", "payloads")
@@ -161,7 +162,7 @@ def test_edges_that_stay_columns_are_the_same_edges(monkeypatch: pytest.MonkeyPa
         frame.add(f"v{i}", "car", x=3.0 * i, y=i % 3, heading=30.0 * i, length=4.0, width=2.0)
     road = crossroads()
     listed = SceneGraphGenerator(road, Config()).step(frame)
-    monkeypatch.setattr(records, "MOST_RECORDS", 10)
+    monkeypatch.setattr(graphs, "MOST_RECORDS", 10)
     monkeypatch.setattr(EdgeColumns, "AT_ONCE", 7)
     columns = SceneGraphGenerator(road, Config()).step(frame)
 
@@ -248,7 +249,7 @@ def test_the_ego_in_a_heap_still_touches_what_it_touches(tmp_path: Path) -> None
 def test_what_is_a_crowd_for_one_ego_is_none_for_another() -> None:
     """Two heaps far apart, an ego in each; one has more bodies than are related."""
 
-    def heap(name: str, x: float, count: int) -> list:
+    def heap(name: str, x: float, count: int) -> list[Any]:
         rng = np.random.default_rng(count)
         places = rng.uniform(-8, 8, (count, 2)).tolist()
         return [thing(f"{name}{i}", x + dx, dy) for i, (dx, dy) in enumerate(places)]
@@ -385,7 +386,7 @@ def test_a_piece_has_no_more_pairs_than_it_may(monkeypatch: pytest.MonkeyPatch) 
     assert len(pieces) > 3
 
 
-def edge_pairs(graph) -> list[tuple[int, int, int]]:
+def edge_pairs(graph: GraphBlock) -> list[tuple[int, int, int]]:
     of = graph.edges
     named = zip(of.frame.tolist(), of.src.tolist(), of.dst.tolist(), strict=True)
     return list({(frame, min(a, b), max(a, b)) for frame, a, b in named})

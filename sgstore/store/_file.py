@@ -13,7 +13,7 @@ import sgstore.store._rows as rows
 from sgstore.errors import StoreError, TraceError
 from sgstore.store._classes import Abstracted
 from sgstore.store._derive import Deriving
-from sgstore.store._graphs import Scenes
+from sgstore.store._graphs import Graphs
 from sgstore.store._locking import (
     WAIT_S,
     Access,
@@ -41,7 +41,7 @@ from sgstore.store._write import Segment
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from duckdb import DuckDBPyConnection
@@ -107,7 +107,7 @@ class StoreFile:
         self.access = Access(
             self.path, memory=most, wait_s=wait_s, tables=tables, spill=spill, diagnose=_damage
         )
-        self._scenes = Scenes()
+        self._graphs = Graphs()
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
         with self._reading():  # what is no store of ours is refused there
@@ -281,7 +281,13 @@ class StoreFile:
             There is no such frame.
         """
         with self._reading() as connection:
-            return self._scenes.graph(connection, frame_named(connection, ref))
+            frame = frame_named(connection, ref)
+            return next(self._graphs.scenes(connection, np.array([frame.frame_id])))
+
+    def graphs(self, frame_id: NDArray[np.int64]) -> Iterator[SceneGraph]:
+        """Scene graphs of some frames of one trace, whose ids ascend; their columns are in memory together."""
+        with self._reading() as connection:
+            yield from self._graphs.scenes(connection, frame_id)
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
         """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""

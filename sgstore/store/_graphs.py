@@ -1,20 +1,25 @@
-"""Scene graphs read from the store: one frame, or columns of many.
-
-Graphs out of a store again, as columns of many frames: what abstractions are made of.
-"""
+"""Graphs read from the store, many frames at a time: columns for abstractions, scene graphs for all else."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
 from sgstore.abstractions import GraphColumns, MapColumns
-from sgstore.graph import LaneDistances, SceneGraph
+from sgstore.graph import (
+    Edges,
+    LaneDistances,
+    MapRecords,
+    SceneColumns,
+    StaticPresence,
+    edge_attributes,
+)
+from sgstore.quoting import literal
 from sgstore.store._packing import FRAME_BITS, SEQ_BITS, frames_of, trace_of
-from sgstore.store._rows import arrays, run
+from sgstore.store._rows import run
 from sgstore.store._schema import relation_codes
 from sgstore.vocabulary import MAP_KINDS
 
@@ -24,8 +29,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.store._traces import FrameRef
-    from sgstore.world import Ints
+    from sgstore.graph import SceneGraph
 
     Numbers = NDArray[np.unsignedinteger[Any]]
 
@@ -76,32 +80,53 @@ SELECT trace_id, origin_x, origin_y, origin_z, coalesce(map_id, -1) AS map_id
 FROM trace WHERE trace_id BETWEEN $first >> 24 AND $last >> 24 ORDER BY trace_id
 """
 
+# Of scene graphs there are all columns of the views.
+_SCENES: Final = f"""
+SELECT f.frame_id, f.seq, f.time_ns, f.ego, t.name, f.map_id, m.digest
+FROM frame f JOIN {_WANTED} ON f.frame_id = w.frame_id JOIN trace t ON t.trace_id = f.trace_id
+     LEFT JOIN map m ON m.map_id = f.map_id
+WHERE f.frame_id BETWEEN $first AND $last ORDER BY f.frame_id
+"""
+_NODES: Final = f"""
+SELECT n.* FROM nodes n JOIN {_WANTED} ON n.frame_id = w.frame_id
+WHERE n.frame_id BETWEEN $first AND $last AND NOT n.is_static
+"""
+_ENTITIES: Final = """
+SELECT e.node_id, e.kind, false AS is_ego, e.name, e.special, e.subkind, true AS is_static, e.x, e.y, e.z,
+       e.heading, 0e0 AS speed, 0e0 AS vx, 0e0 AS vy, 0e0 AS vz, e.length, e.width, e.height
+FROM entities e JOIN (SELECT unnest($nodes) AS node_id) w ON w.node_id = e.node_id WHERE e.trace_id = $trace_id
+"""
+_LANES: Final = f"""
+SELECT l.frame_id, l.src, l.dst, l.overlap, l.lane_offset, l.heading_error, l.is_primary, l.along, l.is_own
+FROM lane_states l JOIN {_WANTED} ON l.frame_id = w.frame_id WHERE l.frame_id BETWEEN $first AND $last
+"""
+_GAPS: Final = f"""
+SELECT g.frame_id, g.src, g.dst, g.gap
+FROM lane_gaps g JOIN {_WANTED} ON g.frame_id = w.frame_id WHERE g.frame_id BETWEEN $first AND $last
+"""
+_STILL: Final = f"CASE WHEN kind NOT IN ({', '.join(map(literal, sorted(MAP_KINDS)))}) THEN 0e0 END"
+_MAP_NODES: Final = f"""
+SELECT node_id, kind, false AS is_ego, name, true AS is_static, x, y, z, degrees(heading) AS heading,
+       {_STILL} AS speed, {_STILL} AS vx, {_STILL} AS vy, {_STILL} AS vz, length, width,
+       lane_type, road, section, lane, junction, turn, speed_limit, curvature
+FROM map_node WHERE map_id = $map_id
+"""
+_MAP_REACH: Final = "SELECT src, dst, start FROM map_reach WHERE map_id = $map_id"
+
 FIRST: Final = 2_000
 """Frames of any traces that are read first; then as many as have about so many edges together:"""
 _EDGES_TOGETHER: Final = 2_000_000
 
 
-class _RecentMaps(Generic[T]):
-    """Maps by their digests; of more than :data:`_MAPS` those that were used last."""
-
-    def __init__(self) -> None:
-        self._maps: OrderedDict[str, T] = OrderedDict()
-
-    def get(self, digest: str, read: Callable[[], T]) -> T:
-        """Return a map; it is read if it is not remembered."""
-        if digest not in self._maps:
-            self._maps[digest] = read()
-            while len(self._maps) > _MAPS:
-                self._maps.popitem(last=False)
-        self._maps.move_to_end(digest)
-        return self._maps[digest]
-
-
 class Graphs:
-    """Graphs of the traces of a store, some buckets at a time. Maps are remembered."""
+    """Graphs of the traces of a store, some frames at a time: as columns, or one scene graph after another.
+
+    The maps that were used last are remembered.
+    """
 
     def __init__(self) -> None:
-        self._maps = _RecentMaps[MapColumns]()
+        self._columns: OrderedDict[str, MapColumns] = OrderedDict()
+        self._records: OrderedDict[str, MapRecords] = OrderedDict()
 
     def of_trace(
         self, connection: DuckDBPyConnection, trace_id: int
@@ -154,17 +179,7 @@ class Graphs:
 
         Of no frame there is a graph without frames, if it is said of which trace.
         """
-        bucket, bit = ids >> FRAME_BITS, ids & ((1 << FRAME_BITS) - 1)
-        starts = np.flatnonzero(np.append(True, np.diff(bucket) != 0)) if len(ids) else bucket
-        masks = np.bitwise_or.reduceat(1 << bit, starts) if len(ids) else bucket
-        whole = (trace_id or 0) << SEQ_BITS
-        where = (
-            {"first": int(ids[0]), "last": int(ids[-1])}
-            if len(ids)
-            else {"first": whole, "last": whole}
-        )
-        by_frame = where | {"frames": ids.tolist()}
-        by_mask = where | {"buckets": bucket[starts].tolist(), "masks": masks.tolist()}
+        by_frame, by_mask = _asked(ids, (trace_id or 0) << SEQ_BITS)
         moving, own = (
             connection.execute(sql, by_frame).fetchnumpy() for sql in (_MOVING, _EGO_LANES)
         )
@@ -175,7 +190,7 @@ class Graphs:
         edges["relation"] = relation_codes(connection)[edges["relation"]]
         for of in (moving, standing, edges, own):
             of["frame"] = np.searchsorted(ids, of.pop("frame_id").astype(np.int64))
-        traces = _Traces.of(connection, where)
+        traces = _Traces.of(connection, {name: by_frame[name] for name in ("first", "last")})
         trace = traces.rows(ids)
         for axis in "xyz":
             origin = traces.origin[axis][trace[moving["frame"]]]
@@ -198,7 +213,123 @@ class Graphs:
         (digest,) = connection.execute(
             "SELECT digest FROM map WHERE map_id = ?", [map_id]
         ).fetchall()[0]
-        return self._maps.get(digest, lambda: _map_columns(connection, map_id))
+        return _remembered(self._columns, digest, lambda: _map_columns(connection, map_id))
+
+    def scenes(
+        self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64]
+    ) -> Iterator[SceneGraph]:
+        """Scene graphs of some frames of one trace, whose ids ascend: all that the views show of them.
+
+        Their columns are in memory together, and the records of one graph.
+        """
+        by_frame, by_mask = _asked(frame_id)
+        frames = connection.execute(_SCENES, by_frame).fetchall()
+        _, seq, time_ns, ego, names, map_ids, digests = zip(*frames, strict=True)
+        moving = list(_records(connection, _NODES, by_frame))
+        standing, edges = (
+            _each_frame(connection.execute(sql, by_mask).fetchnumpy())
+            for sql in (_STANDING, _EDGES)
+        )
+        here = standing["node_id"].astype(np.int64)
+        mapped = [(one, digest) for one, digest in zip(map_ids, digests, strict=True) if digest]
+        ground = None
+        if mapped and (here < 0).any():
+            map_id, digest = mapped[0]
+            ground = _remembered(self._records, digest, lambda: _map_records(connection, map_id))
+        lanes, gaps = (
+            (
+                (int(np.searchsorted(frame_id, frame)), src, dst, about)
+                for (frame, src, dst), about in _records(connection, sql, by_frame)
+            )
+            for sql in (_LANES, _GAPS)
+        )
+        columns = SceneColumns(
+            trace=names[0],
+            frame_id=frame_id,
+            seq=np.array(seq),
+            time_ns=np.array(time_ns),
+            ego=ego,
+            moving=(
+                np.searchsorted(frame_id, [frame for (frame, _), _ in moving]),
+                np.array([node for (_, node), _ in moving], np.int64),
+                [about for _, about in moving],
+            ),
+            presence=StaticPresence(np.searchsorted(frame_id, standing["frame_id"]), here),
+            standing=_standing(connection, by_frame["first"] >> SEQ_BITS, here),
+            edges=Edges(
+                np.searchsorted(frame_id, edges["frame_id"]),
+                relation_codes(connection)[edges["relation"]],
+                edges["src"].astype(np.int64),
+                edges["dst"].astype(np.int64),
+            ),
+            about=edge_attributes(lanes, gaps),
+            map=ground,
+        )
+        yield from columns.graphs()
+
+
+def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -> T:
+    """A map by its digest, which is read if it is not remembered; those that were used last stay."""
+    if digest not in maps:
+        maps[digest] = read()
+        while len(maps) > _MAPS:
+            maps.popitem(last=False)
+    maps.move_to_end(digest)
+    return maps[digest]
+
+
+def _asked(
+    frame_id: NDArray[np.int64], otherwise: int = 0
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Values of statements that ask for frames, and of those that ask for masks of buckets.
+
+    ``otherwise``: the bounds where there is no frame.
+    """
+    bucket, bit = frame_id >> FRAME_BITS, frame_id & ((1 << FRAME_BITS) - 1)
+    starts, masks = bucket, bucket
+    bounds = {"first": otherwise, "last": otherwise}
+    if len(frame_id):
+        starts = np.flatnonzero(np.append(True, np.diff(bucket) != 0))
+        masks = np.bitwise_or.reduceat(1 << bit, starts)
+        bounds = {"first": int(frame_id[0]), "last": int(frame_id[-1])}
+    return (
+        {**bounds, "frames": frame_id.tolist()},
+        {**bounds, "buckets": bucket[starts].tolist(), "masks": masks.tolist()},
+    )
+
+
+def _records(
+    connection: DuckDBPyConnection, sql: str, values: dict[str, Any]
+) -> Iterator[tuple[tuple[int, ...], dict[str, Any]]]:
+    """Rows of a statement: ids of the frame and of nodes, and what is known of their attributes."""
+    found = run(connection, sql, values)
+    ids = sum(name in {"frame_id", "node_id", "src", "dst"} for name in found.columns)
+    names = found.columns[ids:]
+    for row in found:
+        known = zip(names, row[ids:], strict=True)
+        yield row[:ids], {name: value for name, value in known if value is not None}
+
+
+def _standing(
+    connection: DuckDBPyConnection, trace_id: int, here: NDArray[np.int64]
+) -> dict[int, dict[str, Any]]:
+    """Attributes of what stands."""
+    nodes = np.unique(here[here >= 0]).tolist()
+    asked = {"trace_id": trace_id, "nodes": nodes}
+    return {node: about for (node,), about in _records(connection, _ENTITIES, asked)}
+
+
+def _map_records(connection: DuckDBPyConnection, map_id: int) -> MapRecords:
+    where = {"map_id": map_id}
+    nodes = {node: about for (node,), about in _records(connection, _MAP_NODES, where)}
+    edges = connection.execute(_GROUND_EDGES, where).fetchnumpy()
+    reach = connection.execute(_MAP_REACH, where).fetchnumpy()
+    src, dst, along, other = (
+        of[name].astype(np.int64) for of in (edges, reach) for name in ("src", "dst")
+    )
+    relation = relation_codes(connection)[edges["relation"]]
+    starts = LaneDistances(along, other, reach["start"].astype(np.float64))
+    return MapRecords(nodes.__getitem__, src, relation, dst, starts)
 
 
 def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
@@ -293,153 +424,3 @@ def _seen(
 def filled(values: NDArray[Any]) -> NDArray[np.float64]:
     """Numbers, NaN where there is none."""
     return np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
-
-
-# The scene graph of one frame, looked up by its bucket; the same as the views show of it --------
-
-_FRAME: Final = """
-SELECT f.ego, f.map_id, m.digest
-FROM frame f LEFT JOIN map m ON m.map_id = f.map_id WHERE f.frame_id = $frame_id
-"""
-_MOVING_OF_FRAME: Final = (
-    "SELECT * FROM nodes WHERE frame_id = $frame_id AND NOT is_static ORDER BY node_id"
-)
-_STANDING_OF_FRAME: Final = """
-SELECT n.node_id, n.kind, e.name, e.special, e.subkind, e.x, e.y, e.z, e.heading, e.length, e.width, e.height,
-       0e0 AS speed, 0e0 AS vx, 0e0 AS vy, 0e0 AS vz
-FROM node n JOIN entities e ON e.trace_id = $trace_id AND e.node_id = n.node_id
-WHERE n.bucket = $bucket AND n.node_id >= 0 AND n.mask & $bit <> 0
-ORDER BY n.node_id
-"""
-_PRESENT: Final = """
-SELECT node_id FROM node WHERE bucket = $bucket AND node_id < 0 AND mask & $bit <> 0 ORDER BY node_id DESC
-"""
-_EDGES_OF_FRAME: Final = """
-SELECT DISTINCT src, relation, dst FROM edge
-WHERE bucket = $bucket AND mask & $bit <> 0 ORDER BY src, relation, dst
-"""
-_LANES: Final = """
-SELECT src, dst, overlap, lane_offset, heading_error, is_primary, along, is_own
-FROM lane_states WHERE frame_id = $frame_id
-"""
-_GAPS: Final = "SELECT src, dst, gap FROM lane_gaps WHERE frame_id = $frame_id"
-_MAP_NODES: Final = """
-SELECT node_id, kind, name, x, y, z, degrees(heading) AS heading, length, width, lane_type, road, section,
-       lane, junction, turn, speed_limit, curvature
-FROM map_node WHERE map_id = $map_id
-"""
-_MAP_EDGES: Final = """
-SELECT src, relation::VARCHAR AS relation, dst FROM map_edge WHERE map_id = $map_id
-ORDER BY src DESC, map_edge.relation, dst DESC
-"""
-_FIXED: Final = {"is_ego": False, "is_static": True}
-_MAP_REACH: Final = "SELECT src, dst, start FROM map_reach WHERE map_id = $map_id"
-
-
-@dataclass(frozen=True, slots=True)
-class _Map:
-    """Nodes and edges of a map; ``src`` and ``dst`` are -1 less the node id."""
-
-    nodes: dict[int, dict[str, Any]]
-    src: Ints
-    dst: Ints
-    relation: list[str]
-    reach: LaneDistances
-
-
-class Scenes:
-    """Scene graphs of a store, one at a time. Maps are remembered."""
-
-    def __init__(self) -> None:
-        self._maps = _RecentMaps[_Map]()
-
-    def graph(self, connection: DuckDBPyConnection, frame: FrameRef) -> SceneGraph:
-        """The scene graph of a frame."""
-        where = {
-            "frame_id": frame.frame_id,
-            "trace_id": frame.trace_id,
-            "bucket": frame.frame_id >> FRAME_BITS,
-            "bit": 1 << frame.frame_id % (1 << FRAME_BITS),
-        }
-
-        def rows(sql: str) -> list[dict[str, Any]]:
-            return run(connection, sql, {k: v for k, v in where.items() if f"${k}" in sql}).dicts()
-
-        (about,) = rows(_FRAME)
-        nodes = {row["node_id"]: _known(row) for row in rows(_MOVING_OF_FRAME)}
-        nodes |= {row["node_id"]: _known(row | _FIXED) for row in rows(_STANDING_OF_FRAME)}
-        lanes = {(row.pop("src"), row.pop("dst")): _known(row) for row in rows(_LANES)}
-        gaps = {(row.pop("src"), row.pop("dst")): _known(row) for row in rows(_GAPS)}
-        known = {("isIn", *ends): about for ends, about in lanes.items()}
-        known |= {("follows", *ends): about for ends, about in gaps.items()}
-        known |= {("leads", b, a): dict(about) for (a, b), about in gaps.items()}
-        edges = [
-            (src, relation, dst, known.get((relation, src, dst), {}))
-            for src, relation, dst in run(
-                connection, _EDGES_OF_FRAME, {k: where[k] for k in ("bucket", "bit")}
-            ).values
-        ]
-        present = [row["node_id"] for row in rows(_PRESENT)]
-        reach = None
-        if present:
-            map_id = about["map_id"]
-            road_map = self._maps.get(about["digest"], lambda: _read_map(connection, map_id))
-            reach = road_map.reach
-            nodes |= {node: dict(road_map.nodes[node]) for node in present}
-            edges += _edges_among(road_map, present)
-        return SceneGraph(
-            frame_id=frame.frame_id,
-            trace=frame.trace,
-            seq=frame.seq,
-            time_ns=frame.time_ns,
-            ego=about["ego"],
-            nodes=nodes,
-            edges=edges,
-            reach=reach,
-        )
-
-
-def _read_map(connection: DuckDBPyConnection, map_id: int) -> _Map:
-    where = {"map_id": map_id}
-    edges = arrays(connection, _MAP_EDGES, where)
-    reach = arrays(connection, _MAP_REACH, where)
-    return _Map(
-        nodes={
-            row["node_id"]: _known(row | _FIXED | _velocity(row))
-            for row in run(connection, _MAP_NODES, where).dicts()
-        },
-        src=-1 - edges["src"].astype(np.int64),
-        dst=-1 - edges["dst"].astype(np.int64),
-        relation=edges["relation"].tolist(),
-        reach=LaneDistances(
-            reach["src"].astype(np.int64),
-            reach["dst"].astype(np.int64),
-            reach["start"].astype(np.float64),
-        ),
-    )
-
-
-def _velocity(row: dict[str, Any]) -> dict[str, Any]:
-    """That of a sign or light of the map, which stands; lanes and roads have none."""
-    return {} if row["kind"] in MAP_KINDS else dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
-
-
-def _known(row: dict[str, Any]) -> dict[str, Any]:
-    """Attributes of a node or of an edge, without those that are NULL."""
-    return {
-        name: value
-        for name, value in row.items()
-        if value is not None and name not in {"frame_id", "node_id"}
-    }
-
-
-def _edges_among(road_map: _Map, present: list[int]) -> list[tuple[int, str, int, dict[str, Any]]]:
-    """Edges of a map whose ends are both present."""
-    here = np.zeros(len(road_map.nodes), np.bool_)
-    here[-1 - np.array(present)] = True
-    rows = np.flatnonzero(here[road_map.src] & here[road_map.dst])
-    src, dst = (-1 - road_map.src[rows]).tolist(), (-1 - road_map.dst[rows]).tolist()
-    return [
-        (a, road_map.relation[row], b, {})
-        for a, row, b in zip(src, rows.tolist(), dst, strict=True)
-    ]
