@@ -20,7 +20,7 @@ from sgstore.lang._catalog import (
     Type,
     class_attribute,
 )
-from sgstore.lang._hints import TOLD, comparison_hint, hint_at
+from sgstore.lang._hints import comparison_hint, hint_at, said_of
 from sgstore.lang._operators import TEXT_TESTS
 from sgstore.lang._symbols import (
     CLASSES,
@@ -199,7 +199,7 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
     possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds]
     found = NODE_ATTRIBUTES.get(normalize_name(name))
     if found is None:
-        hint = TOLD.get(normalize_name(name)) or _no_attribute(name)
+        hint = said_of("attributes", name) or _no_attribute(name)
         names.session.unknown("attribute", name, span, possible, hint)
     if not found.kinds & kinds:
         what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"

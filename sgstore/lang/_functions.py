@@ -9,7 +9,7 @@ from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_temporal import course
 from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_FUNCTIONS, PAIR_NAMES, Type
-from sgstore.lang._hints import FUNCTIONS_TOLD
+from sgstore.lang._hints import said_of
 from sgstore.lang._needs import in_range
 from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
@@ -81,8 +81,8 @@ def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
 def _no_function(name: str) -> str | None:
     """Return a hint for a name that is an attribute, a relation or a sequence; ``None``: no idea."""
     word = normalize_name(name)
-    if word in FUNCTIONS_TOLD:
-        return FUNCTIONS_TOLD[word]
+    if (said := said_of("functions", name)) is not None:
+        return said
     if relation_named(name):
         return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
     if word in NODE_ATTRIBUTES:

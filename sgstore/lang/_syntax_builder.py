@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sgstore.errors import TextSpan
 from sgstore.lang import syntax as s
-from sgstore.lang._hints import METHODS, TOLD
+from sgstore.lang._hints import said_of
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
@@ -90,9 +90,7 @@ def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
     owner, name = children
     if not isinstance(owner, s.Variable):
         inner = owner.name if isinstance(owner, s.AttributeOf) else ""
-        hint = (
-            TOLD.get(normalize_name(inner)) or "what is of a value is a function: abs(x), lower(x)"
-        )
+        hint = said_of("attributes", inner) or "what is of a value is a function: abs(x), lower(x)"
         if isinstance(owner, s.Call):
             hint = f"the attribute stands in the brackets: {owner.name}(x.{name.text})"
         raise BuildError(
@@ -105,9 +103,7 @@ def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
     """``frame.class('E')``: another way to write ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
-        hint = METHODS.get(
-            normalize_name(name.text), f"what is called stands first: {name.text}(x)"
-        )
+        hint = said_of("methods", name.text) or f"what is called stands first: {name.text}(x)"
         raise BuildError(
             f"'.{name.text}' takes nothing in parentheses; only frame.class does", hint=hint
         )
