@@ -12,14 +12,18 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from bench.measure import Measure
 from sgstore.step import Frame
-from sgstore.temporal import Monitor, MonitorEvent, OnlineFormula, evaluate, formula_of
+from sgstore.temporal import Monitor, MonitorEvent, evaluate
 from sgstore.temporal._verdicts import Settled
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+from formulas import OnlineFormula, formula_of  # pyright: ignore[reportMissingImports]
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

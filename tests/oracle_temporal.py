@@ -7,8 +7,9 @@ import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
+from formulas import OnlineFormula, prefix_verdicts
 
-from sgstore.temporal import Formula, OnlineFormula, evaluate, prefix_verdicts
+from sgstore.temporal import Formula, evaluate
 from sgstore.temporal._formula import (
     And,
     Bound,

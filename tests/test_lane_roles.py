@@ -1,15 +1,17 @@
 """What lanes are to the ego: in queries, in memory and online as in the abstraction RSV."""
 
+# pyright: basic
+
 from __future__ import annotations
 
 from importlib import resources
 from itertools import islice
 
 import pytest
+from matching import Matcher
 
 from sgstore.config import Config
 from sgstore.lang import compile_query
-from sgstore.lang._search import Matcher
 from sgstore.opendrive import read_map
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator

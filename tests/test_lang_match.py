@@ -1,11 +1,14 @@
 """Patterns over one graph in memory, against exhaustive search and against SQL."""
 
+# pyright: basic, reportPossiblyUnboundVariable=false, reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from matching import Matcher
 from oracle import answer
 from oracle_patterns import Writer
 from oracle_worlds import World, random_world
@@ -17,7 +20,6 @@ from sgstore.errors import QueryError
 from sgstore.graph import SceneGraph
 from sgstore.ingest import ingest
 from sgstore.lang import Catalog, FrameView, compile_query, parse, why_not
-from sgstore.lang._search import Matcher
 from sgstore.query import Store
 
 if TYPE_CHECKING:

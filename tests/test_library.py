@@ -1,5 +1,7 @@
 """The library of named patterns: each finds the scene that is drawn beside it, and not its counter-example."""
 
+# pyright: basic, reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import re
@@ -8,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import library_page
 import pytest
+from formulas import formula_of
 from library_scenes import SCENES, is_of_the_ego, traces
 from scenes import APART, store_of
 from test_sample import told
@@ -20,7 +23,6 @@ from sgstore.lang import parse, pattern_named, patterns
 from sgstore.lang.library import entries, predicates
 from sgstore.lang.syntax import CheckClause, Define, MatchClause
 from sgstore.query import Store
-from sgstore.temporal import formula_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

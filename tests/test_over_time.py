@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from formulas import OnlineFormula, formula_of, prefix_verdicts
 from oracle_over_time import (
     compare_check,
     compare_condition,
@@ -25,7 +26,7 @@ from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang import pattern_named
 from sgstore.lang.ir import BoundHold, Length
-from sgstore.temporal import OnlineFormula, evaluate, formula_of, prefix_verdicts
+from sgstore.temporal import evaluate
 from sgstore.temporal._formula import And
 from sgstore.temporal._sequences import BindingLine, Leg, matches_of
 from sgstore.temporal._signals import Clock, PropositionTable

@@ -1,5 +1,7 @@
 """Temporal formulas: both engines against the textbook, and against the published verdicts of SGSM."""
 
+# pyright: basic
+
 from __future__ import annotations
 
 import csv
@@ -11,10 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from formulas import OnlineFormula, formula_of, prefix_verdicts
 from oracle_temporal import try_formulas
 
 from sgstore.errors import QueryError
-from sgstore.temporal import OnlineFormula, evaluate, formula_of, prefix_verdicts
+from sgstore.temporal import evaluate
 from sgstore.temporal._formula import And, Next, Not, eventually
 from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
 

@@ -107,11 +107,13 @@ class Layout:
         As bound; it returns frames with values, and each match is one row.
     columns : tuple of str
         Names of the columns of :meth:`row`.
+    places : tuple of _ValuePlace
+        Where the values of each node and edge stand in a row of the query.
     """
 
     query: Query
     columns: tuple[str, ...]
-    _places: tuple[_ValuePlace, ...]
+    places: tuple[_ValuePlace, ...]
     _width: int
 
     @classmethod
@@ -143,37 +145,9 @@ class Layout:
 
     def row(self, row: Sequence[Any]) -> tuple[Any, ...]:
         """A row of the query as a row with a graph."""
-        bound = {place.part.key: place.known(row) for place in self._places}
-        parts = [(place.part, bound[place.part.key]) for place in self._places]
+        bound = {place.part.key: place.known(row) for place in self.places}
+        parts = [(place.part, bound[place.part.key]) for place in self.places]
         return (*row[: self._width], *graph_of(parts))
-
-    def graph(
-        self,
-        nodes: Mapping[str, int],
-        edges: Mapping[str, tuple[str, Mapping[str, Any]]],
-        known: Mapping[int, Mapping[str, Any]],
-    ) -> tuple[list[Record], list[Record]]:
-        """The graph of a match that was found in memory.
-
-        Parameters
-        ----------
-        nodes : mapping of str to int
-            Ids by key.
-        edges : mapping of str to (str, mapping)
-            Relation and attributes by key.
-        known : mapping of int to mapping
-            Attributes of the nodes of the frame.
-        """
-        parts: list[tuple[Node | Edge, Record]] = []
-        for place in self._places:
-            key, part = place.part.key, place.part
-            if isinstance(part, Node):
-                about: Mapping[str, Any] = {"id": nodes[key], **known[nodes[key]]}
-            else:
-                relation, attributes = edges.get(key, ("", {}))
-                about = {"relation": relation, **attributes}
-            parts.append((part, {name: about[name] for name in place.names if name in about}))
-        return graph_of(parts)
 
 
 def _bound_variables(query: Query) -> Scope:

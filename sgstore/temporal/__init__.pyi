@@ -4,15 +4,12 @@ from ._checks import CheckRun as CheckRun
 from ._checks import Verdict as Verdict
 from ._checks import unknown_notes as unknown_notes
 from ._formula import Formula as Formula
-from ._formula import formula_of as formula_of
 from ._matches import TemporalMatches as TemporalMatches
 from ._monitor import Monitor as Monitor
 from ._monitor import opened as opened
-from ._progression import OnlineFormula as OnlineFormula
 from ._sequence_monitor import FrameTime as FrameTime
 from ._sequence_monitor import MonitorEvent as MonitorEvent
 from ._signals import evaluate as evaluate
-from ._signals import prefix_verdicts as prefix_verdicts
 
 __all__ = [
     "CheckRun",
@@ -20,12 +17,9 @@ __all__ = [
     "FrameTime",
     "Monitor",
     "MonitorEvent",
-    "OnlineFormula",
     "TemporalMatches",
     "Verdict",
     "evaluate",
-    "formula_of",
     "opened",
-    "prefix_verdicts",
     "unknown_notes",
 ]

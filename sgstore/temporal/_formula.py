@@ -11,10 +11,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from sgstore.errors import QueryError
-from sgstore.lang import parse
-from sgstore.lang import syntax as s
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
@@ -146,20 +142,10 @@ def release(left: Formula, right: Formula, bound: Bound = WHOLE) -> Formula:
 @lru_cache(maxsize=256)
 def tolerant(formula: Formula, by: int) -> Formula:
     """A formula whose bounds of time let in what misses them by no more than a tolerance; ns."""
-    match formula:
-        case TruthConstant() | Proposition():
-            return formula
-        case Not(operand=operand):
-            return Not(tolerant(operand, by))
-        case And(operands=operands):
-            return And(tuple(tolerant(operand, by) for operand in operands))
-        case Or(operands=operands):
-            return Or(tuple(tolerant(operand, by) for operand in operands))
-        case Next() | Previous():
-            return replace(formula, operand=tolerant(formula.operand, by))
-        case Until() | Since():
-            left, right = tolerant(formula.left, by), tolerant(formula.right, by)
-            return replace(formula, left=left, right=right, bound=formula.bound.widened(by))
+    found = with_operands(formula, lambda operand: tolerant(operand, by))
+    if isinstance(found, Until | Since):
+        return replace(found, bound=found.bound.widened(by))
+    return found
 
 
 def propositions(formula: Formula) -> frozenset[str]:
@@ -187,67 +173,22 @@ def operands_of(formula: Formula) -> tuple[Formula, ...]:
             return ()
 
 
+def with_operands(formula: Formula, change: Callable[[Formula], Formula]) -> Formula:
+    """A formula with a change made to each of its :func:`operands_of`."""
+    match formula:
+        case And() | Or():
+            return replace(formula, operands=tuple(map(change, formula.operands)))
+        case Not() | Next() | Previous():
+            return replace(formula, operand=change(formula.operand))
+        case Until() | Since():
+            return replace(formula, left=change(formula.left), right=change(formula.right))
+        case TruthConstant() | Proposition():
+            return formula
+
+
 def looks_ahead(formula: Formula) -> bool:
     """Tell whether a formula depends on later frames."""
     return any(isinstance(part, Next | Until) for part in walk(formula))
-
-
-# From text --------------------------------------------------------------------------------------------------
-
-
-def formula_of(text: str) -> Formula:
-    """The formula that a text of the query language says; its variables are propositions.
-
-    Parameters
-    ----------
-    text : str
-        ``ALWAYS (braking IMPLIES EVENTUALLY[0s, 2s] stopped)``.
-
-    Raises
-    ------
-    QueryError
-        It is no formula, or has something else than propositions, logic and time.
-    """
-    prefix = "CHECK "
-    try:
-        (statement,) = parse(prefix + text)
-    except QueryError as error:
-        raise _shifted(error, text, len(prefix)) from None
-    if not isinstance(statement, s.CheckClause):
-        raise QueryError("expected a formula", text=text)
-    try:
-        return _formula(statement.formula)
-    except _Refused as refused:
-        span = refused.span
-        at = type(span)(span.start - len(prefix), span.end - len(prefix))
-        raise QueryError(refused.reason, text=text, span=at) from None
-
-
-class _Refused(Exception):  # noqa: N818 - not an error of its own: it carries a place
-    def __init__(self, reason: str, span: s.TextSpan) -> None:
-        super().__init__(reason)
-        self.reason = reason
-        self.span = span
-
-
-def _shifted(error: QueryError, text: str, by: int) -> QueryError:
-    span = error.span
-    moved = type(span)(max(span.start - by, 0), max(span.end - by, 0)) if span else None
-    return type(error)(error.reason, text=text, span=moved, hint=error.hint)
-
-
-def _formula(e: s.Expression) -> Formula:
-    match e:
-        case s.Variable(name=name):
-            return Proposition(name)
-        case s.Constant(value=bool() as value):
-            return TruthConstant(value)
-        case s.Logic(word=word, operands=operands):
-            return LOGIC[word](*map(_formula, operands))
-        case s.Temporal(word=word, operands=operands):
-            return _temporal(word, tuple(map(_formula, operands)), e)
-        case _:
-            raise _Refused("expected propositions, logic and time only", e.span)
 
 
 def _xor(*operands: Formula) -> Formula:
@@ -276,38 +217,71 @@ LOGIC: Final[dict[str, Callable[..., Formula]]] = {
     "XOR": _xor,
     "IMPLIES": _implies,
 }
-_BOUNDED: Final[dict[str, Callable[..., Formula]]] = {
+"""What makes a formula of operands, by word."""
+
+
+def _next(operand: Formula, _: Bound) -> Formula:
+    return Next(operand)
+
+
+def _weak_next(operand: Formula, _: Bound) -> Formula:
+    return Next(operand, weak=True)
+
+
+def _previous(operand: Formula, _: Bound) -> Formula:
+    return Previous(operand)
+
+
+TEMPORAL: Final[dict[str, Callable[..., Formula]]] = {
     "ALWAYS": always,
     "EVENTUALLY": eventually,
     "HISTORICALLY": historically,
     "ONCE": once,
+    "NEXT": _next,
+    "WEAKNEXT": _weak_next,
+    "PREVIOUS": _previous,
     "UNTIL": Until,
     "SINCE": Since,
     "RELEASE": release,
 }
+"""What makes a formula of operands and a bound, by word."""
 
 
-def _temporal(word: str, operands: tuple[Formula, ...], e: s.Temporal) -> Formula:
-    if word in _BOUNDED:
-        return _BOUNDED[word](*operands, _bound(e))
-    if e.bound is not None:
-        raise _Refused(f"{word} has no bound", e.span)
-    if word == "PREVIOUS":
-        return Previous(*operands)
-    return Next(*operands, weak=word == "WEAKNEXT")
+# As text, for ``explain`` -------------------------------------------------------------------------
 
 
-def _bound(e: s.Temporal) -> Bound:
-    if e.bound is None:
-        return WHOLE
-    low, high = e.bound
-    if isinstance(low, s.Parameter) or isinstance(high, s.Parameter):
-        raise _Refused("a formula over given propositions has no parameters", e.span)
-    units = {end.unit == "frames" for end in (low, high) if end is not None and end.amount}
-    if len(units) > 1:
-        raise _Refused("a bound is either in time or in frames", e.span)
-    frames = units == {True}
-    ends = [None if end is None else int(end.amount) if frames else end.ns for end in (low, high)]
-    if ends[1] is not None and ends[1] < (ends[0] or 0):
-        raise _Refused("the bound ends before it begins", e.span)
-    return Bound(ends[0] or 0, ends[1], frames)
+def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
+    """A formula as one would write it, with the names of its propositions."""
+    match formula:
+        case TruthConstant(value=value):
+            return str(value).upper()
+        case Proposition(name=name):
+            return name
+        case Not(operand=Not(operand=operand)):
+            return formula_text(operand)
+        case Not(operand=operand):
+            return f"NOT {formula_text(operand)}"
+        case And(operands=operands):
+            return "(" + " AND ".join(map(formula_text, operands)) + ")"
+        case Or(operands=operands):
+            return "(" + " OR ".join(map(formula_text, operands)) + ")"
+        case Next(operand=operand, weak=weak):
+            return f"{'WEAK' * weak}NEXT {formula_text(operand)}"
+        case Previous(operand=operand):
+            return f"PREVIOUS {formula_text(operand)}"
+        case Until(left=left, right=right, bound=bound):
+            return f"({formula_text(left)} UNTIL{bound_text(bound)} {formula_text(right)})"
+        case Since(left=left, right=right, bound=bound):
+            return f"({formula_text(left)} SINCE{bound_text(bound)} {formula_text(right)})"
+
+
+def bound_text(bound: Bound) -> str:
+    """A bound; nothing for one that is none."""
+    if bound == Bound():
+        return ""
+    ends = [_length(bound.low, bound), "INF" if bound.high is None else _length(bound.high, bound)]
+    return f"[{', '.join(ends)}]"
+
+
+def _length(amount: int, bound: Bound) -> str:
+    return f"{amount}frames" if bound.frames else f"{amount / 1e9:g}s"

@@ -4,7 +4,7 @@ A :class:`Plan` has all that an expression, or several of one statement, need of
 
 * an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a query of its own:
   its matches say in which frames, and for which entities, it is true. A store answers it by SQL; in memory
-  :class:`sgstore.lang._search.Matcher` does, with the same ``query``.
+  :class:`sgstore.lang._search.ScopeSearch` does, with its scope.
 * a **signal** is a value of one frame, of the same kind: a query, and the value that is asked of its matches.
   An edge variable stands for the edges of its relations from its source to its destination in that frame: a
   condition is true if it is of one of these, a value is that of the one whose relation comes first in the
@@ -27,7 +27,6 @@ none can be copied when it comes. Values of signals at former frames are kept as
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
@@ -35,19 +34,7 @@ from typing import TYPE_CHECKING, Final
 import sgstore.temporal._formula as f
 from sgstore.lang import Type, relation, unnumbered_text, value_text
 from sgstore.lang import ir as b
-from sgstore.temporal._formula import (
-    And,
-    Bound,
-    Formula,
-    Next,
-    Not,
-    Or,
-    Previous,
-    Proposition,
-    Since,
-    TruthConstant,
-    Until,
-)
+from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -192,7 +179,7 @@ class Plan:
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
-                return _TENSES[word](tuple(self.formula(operand) for operand in operands), bound)
+                return f.TEMPORAL[word](*map(self.formula, operands), bound)
             case b.SignalCall(word="exists_now", operand=operand):
                 return self.present(next(iter(b.nodes_of(operand))))
             case b.Operation(word=word) if word in _CONNECTIVES:
@@ -365,95 +352,11 @@ def _never_unknown(expression: b.Bound) -> bool:
             return False
 
 
-# Operators --------------------------------------------------------------------------------------------------
-
-
-_Operands = tuple[f.Formula, ...]
-_Operator = Callable[[_Operands, f.Bound], f.Formula]
-
-
-def _one(make: Callable[[f.Formula, f.Bound], f.Formula]) -> _Operator:
-    def operator(operands: _Operands, bound: f.Bound) -> f.Formula:
-        return make(operands[0], bound)
-
-    return operator
-
-
-def _two(make: Callable[[f.Formula, f.Formula, f.Bound], f.Formula]) -> _Operator:
-    def operator(operands: _Operands, bound: f.Bound) -> f.Formula:
-        return make(operands[0], operands[1], bound)
-
-    return operator
-
-
-def _next(operand: f.Formula, _: f.Bound) -> f.Formula:
-    return f.Next(operand)
-
-
-def _weak_next(operand: f.Formula, _: f.Bound) -> f.Formula:
-    return f.Next(operand, weak=True)
-
-
-def _previous(operand: f.Formula, _: f.Bound) -> f.Formula:
-    return f.Previous(operand)
-
-
-_TENSES: Final[dict[str, _Operator]] = {
-    "ALWAYS": _one(f.always),
-    "EVENTUALLY": _one(f.eventually),
-    "HISTORICALLY": _one(f.historically),
-    "ONCE": _one(f.once),
-    "NEXT": _one(_next),
-    "WEAKNEXT": _one(_weak_next),
-    "PREVIOUS": _one(_previous),
-    "UNTIL": _two(f.Until),
-    "SINCE": _two(f.Since),
-    "RELEASE": _two(f.release),
-}
-
-
-# Formulas and plans as text, for ``explain`` ----------------------------------------------------
-
-
-def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
-    """A formula as one would write it, with the names of its propositions."""
-    match formula:
-        case TruthConstant(value=value):
-            return str(value).upper()
-        case Proposition(name=name):
-            return name
-        case Not(operand=Not(operand=operand)):
-            return formula_text(operand)
-        case Not(operand=operand):
-            return f"NOT {formula_text(operand)}"
-        case And(operands=operands):
-            return "(" + " AND ".join(map(formula_text, operands)) + ")"
-        case Or(operands=operands):
-            return "(" + " OR ".join(map(formula_text, operands)) + ")"
-        case Next(operand=operand, weak=weak):
-            return f"{'WEAK' * weak}NEXT {formula_text(operand)}"
-        case Previous(operand=operand):
-            return f"PREVIOUS {formula_text(operand)}"
-        case Until(left=left, right=right, bound=bound):
-            return f"({formula_text(left)} UNTIL{bound_text(bound)} {formula_text(right)})"
-        case Since(left=left, right=right, bound=bound):
-            return f"({formula_text(left)} SINCE{bound_text(bound)} {formula_text(right)})"
-
-
-def bound_text(bound: Bound) -> str:
-    """A bound; nothing for one that is none."""
-    if bound == Bound():
-        return ""
-    ends = [_length(bound.low, bound), "INF" if bound.high is None else _length(bound.high, bound)]
-    return f"[{', '.join(ends)}]"
-
-
-def _length(amount: int, bound: Bound) -> str:
-    return f"{amount}frames" if bound.frames else f"{amount / 1e9:g}s"
+# Plans as text, for ``explain`` ----------------------------------------------------
 
 
 def plan_text(
-    plan: Plan, formula: Formula, reset: Formula | None, catalog: Catalog | None = None
+    plan: Plan, formula: f.Formula, reset: f.Formula | None, catalog: Catalog | None = None
 ) -> str:
     """A plan: the formula, and what each of its propositions is; with a catalog, also the SQL of the atoms."""
     lines = [f"formula {formula_text(formula)}"]

@@ -44,10 +44,6 @@ if TYPE_CHECKING:
     Array = NDArray[Any]
 
 
-CELLS: Final = 4_000_000
-"""Frames times prefixes that are worked on at once."""
-
-
 def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
     """Evaluate a formula at each frame of a trace.
 
@@ -94,29 +90,6 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
     """
     last = np.full((rows, 1), len(times) - 1)
     return PropositionTable(columns, times).value(formula, last)
-
-
-def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
-    """The value of a formula at the first frame, if the trace ended at each of its frames in turn.
-
-    Parameters
-    ----------
-    formula, columns, times
-        As in :func:`evaluate`.
-
-    Returns
-    -------
-    (F,) bool
-        The verdict over the frames 0 … f. Time grows with the square of F; memory does not.
-    """
-    table = PropositionTable.of(formula, columns, times)
-    frames = len(times)
-    rows = max(CELLS // max(frames, 1), 1)
-    parts = [
-        table.value(formula, np.arange(start, min(start + rows, frames))[:, None])[:, 0]
-        for start in range(0, frames, rows)
-    ]
-    return np.concatenate([np.zeros(0, np.bool_), *parts])
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,10 +30,10 @@ from sgstore.temporal._formula import (
     TruthConstant,
     Until,
     looks_ahead,
-    propositions,
     walk,
+    with_operands,
 )
-from sgstore.temporal._progression import OnlineFormula
+from sgstore.temporal._progression import Progression, ProgressionFrame, Term, Tick
 from sgstore.temporal._signals import PropositionTable, evaluate_rows
 
 if TYPE_CHECKING:
@@ -490,24 +490,28 @@ class Settled:
 
     def _stepped(self) -> Bools:
         """The value at the first frame if the trace ended at each frame, one after the other."""
-        engine = OnlineFormula(self.formula, every=False)
-        names = sorted(propositions(self.formula))
+        progression = Progression(self.formula)
+        names, plain = progression.names, progression.untimed and not progression.past
         end = min(int(self._known.true[0]), int(self._known.false[0]), self._frames - 1) + 1
         letters = np.array([self._table.columns[name][:end] for name in names], np.bool_)
         letters = letters.reshape(len(names), end)
         changes = np.ones(end, np.bool_)
-        if engine.plain:
+        if plain:
             changes[1:] = np.any(letters[:, 1:] != letters[:, :-1], axis=0)
         ended = np.zeros(self._frames, np.bool_)
+        term: Term | None = None
+        past = progression.begun
         for first, following in pairwise([*np.flatnonzero(changes).tolist(), end]):
             letter = dict(zip(names, letters[:, first].tolist(), strict=True))
-            before: object = None
             for number in range(first, following):
-                engine.step(letter, int(self._table.times[number]))
-                ended[number:following] = engine.verdict
-                if engine.plain and engine.state is before:
+                tick, before = Tick(int(self._table.times[number]), number), term
+                frame = ProgressionFrame(progression, past, letter, tick)
+                now = progression.formula
+                term = frame.now(now) if term is None else frame.resolved(term)
+                past = frame.past()
+                ended[number:following] = term.ended
+                if plain and term is before:
                     break  # nothing changes as long as the letter stays the same
-                before = engine.state
         return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:
@@ -575,27 +579,12 @@ def within_bounds(
     return least, most
 
 
-def _taken(formula: Formula, *, upper: bool) -> Formula:  # noqa: PLR0911 - a case each
+def _taken(formula: Formula, *, upper: bool) -> Formula:
     """A formula whose propositions are those that make it true most easily, or least."""
-    match formula:
-        case Proposition(name=name):
-            return Proposition(name + ("+" if upper else "-"))
-        case Not(operand=operand):
-            return Not(_taken(operand, upper=not upper))
-        case And(operands=operands):
-            return And(tuple(_taken(operand, upper=upper) for operand in operands))
-        case Or(operands=operands):
-            return Or(tuple(_taken(operand, upper=upper) for operand in operands))
-        case Next(operand=operand, weak=weak):
-            return Next(_taken(operand, upper=upper), weak)
-        case Previous(operand=operand):
-            return Previous(_taken(operand, upper=upper))
-        case Until(left=left, right=right, bound=bound):
-            return Until(_taken(left, upper=upper), _taken(right, upper=upper), bound)
-        case Since(left=left, right=right, bound=bound):
-            return Since(_taken(left, upper=upper), _taken(right, upper=upper), bound)
-        case _:
-            return formula
+    if isinstance(formula, Proposition):
+        return Proposition(formula.name + ("+" if upper else "-"))
+    inner = upper != isinstance(formula, Not)
+    return with_operands(formula, lambda operand: _taken(operand, upper=inner))
 
 
 def always_true(formula: Formula) -> Formula | None:
