@@ -18,26 +18,22 @@ from sgstore.cli._options import (
     LOSS,
     NO_MATCH,
     AsJson,
-    Config,
-    Expressions,
+    AskOptions,
     Parameters,
     PatternNames,
-    Preset,
     QueryLimits,
-    RoadMap,
-    RowOptions,
-    SgsmCompat,
+    ReadingOptions,
+    Statements,
     StorePath,
-    all_asked_of,
+    Traces,
     app,
     parameters_of,
     say_notes,
     say_unknown,
     seconds_of,
-    settings_of,
     text_of,
 )
-from sgstore.cli._output import Format, json_text, say, write_rows
+from sgstore.cli._output import json_text, say
 from sgstore.files import without_controls, write_bytes
 
 if TYPE_CHECKING:
@@ -119,10 +115,6 @@ def check(
         list[Path] | None,
         typer.Argument(metavar="[FILE…]", help="Files of CHECK statements; - is stdin."),
     ] = None,
-    names: PatternNames = None,
-    texts: Expressions = None,
-    parameters: Parameters = None,
-    sgsm_compat: SgsmCompat = False,
     explain: Annotated[
         bool, typer.Option("--explain", help="Print how the checks are understood, and their SQL.")
     ] = False,
@@ -136,8 +128,8 @@ def check(
         ),
     ] = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    statements: Statements,
+    ask: AskOptions,
 ) -> int:
     """Check what must be true of every trace.
 
@@ -146,11 +138,9 @@ def check(
     """
     from sgstore.lang import joined
 
-    given = parameters_of(parameters)
-    asked, values = all_asked_of(files or (), names or (), texts or (), given)
+    asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
-    opened = bounds.opened(store)
-    run = opened.check(text, sgsm_compat=sgsm_compat, **values)
+    run = ask.opened(store).check(text, sgsm_compat=statements.sgsm_compat, **values)
     if explain:
         typer.echo(run.explain())
         return 0
@@ -165,27 +155,15 @@ def check(
             tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
             yield verdict
 
-    form = out.chosen()
-    _write(counted(), form, out.output)
-    if form is Format.table:
+    if ask.for_people:
+        ask.write(COLUMNS, (row for one in counted() for row in _rows(one)))
         say(", ".join(f"{count} {word}" for word, count in tally.items()))
-    say_unknown((one.check, one.trace, one.reason) for one in kept)
-    _write_junit(junit, kept)
-    return NO_MATCH if require and tally["false"] else 0
-
-
-def _write(verdicts: Iterator[Verdict], form: Format, output: Path | None) -> None:
-    """Write verdicts: for people a row for each violation, else one for each verdict."""
-    if form is Format.table:
-        write_rows(COLUMNS, (row for one in verdicts for row in _rows(one)), form, output)
     else:
-        values = (tuple(_document(one).values()) for one in verdicts)
-        write_rows(tuple(_document(None)), values, form, output)
-
-
-def _write_junit(file: Path | None, verdicts: list[Verdict]) -> None:
-    if file is not None:
-        write_junit(file, verdicts)
+        ask.write(tuple(_document(None)), (tuple(_document(one).values()) for one in counted()))
+    say_unknown((one.check, one.trace, one.reason) for one in kept)
+    if junit is not None:
+        write_junit(junit, kept)
+    return NO_MATCH if require and tally["false"] else 0
 
 
 def _rows(verdict: Verdict) -> Iterator[tuple[Any, ...]]:
@@ -255,38 +233,33 @@ def monitor(
         list[Path] | None,
         typer.Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - is stdin."),
     ] = None,
-    names: PatternNames = None,
-    texts: Expressions = None,
-    parameters: Parameters = None,
-    road_map: RoadMap = None,
-    config: Config = None,
-    preset: Preset = None,
     ego: Annotated[
         str, typer.Option("--ego", help="Id, role or name of the ego; else as the recording says.")
     ] = "",
     duration: Annotated[
         str | None, typer.Option("--duration", metavar="TIME", help="Simulation time: 60s.")
     ] = None,
-    sgsm_compat: SgsmCompat = False,
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if a check is violated.")
     ] = False,
     as_json: AsJson = False,
+    *,
+    statements: Statements,
+    reading: ReadingOptions,
 ) -> int:
     """Watch a recording as if it were live, or a running CARLA.
 
     One line for each violation and each match, as soon as it is known; then the verdicts. The answers are
     those of check and find over a store.
     """
-    from sgstore.config import Config as Settings
+    from sgstore.config import Config
     from sgstore.lang import joined
     from sgstore.temporal import Monitor, opened
 
-    given = parameters_of(parameters)
-    asked, values = all_asked_of(files or (), names or (), texts or (), given)
-    settings = settings_of(config, preset) or Settings()
+    asked, values = statements.asked(files)
+    settings = reading.settings() or Config()
     tell = _as_json if as_json else _for_people
-    with opened(trace, settings, road_map=road_map, ego=ego) as source:
+    with opened(trace, settings, road_map=reading.road_map, ego=ego) as source:
         watched = Monitor(
             joined([*chain.from_iterable(asked.values())]),
             source.road_map,
@@ -295,7 +268,7 @@ def monitor(
             parameters=values,
             trace=source.name,
             called=_called(asked),
-            sgsm_compat=sgsm_compat,
+            sgsm_compat=statements.sgsm_compat,
         )
         longest = seconds_of(duration, "--duration") if duration else None
         verdicts = watched.run(source.frames, duration_s=longest)
@@ -387,14 +360,9 @@ def timeline(
         list[Path] | None,
         typer.Option("--file", "-f", help="Read a query, or checks, from a file; repeatable."),
     ] = None,
-    names: Annotated[
-        list[str] | None,
-        typer.Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
-    ] = None,
+    names: PatternNames = None,
     parameters: Parameters = None,
-    traces: Annotated[
-        list[str] | None, typer.Option("--trace", help="Only this trace; repeatable.")
-    ] = None,
+    traces: Traces = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
     ] = None,

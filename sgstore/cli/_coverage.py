@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from sgstore.cli._options import QueryLimits, RowOptions, Verbs, app, say_left_out
-from sgstore.cli._output import Format, say, write_rows
+from sgstore.cli._options import Abstraction, AskOptions, Picture, Verbs, app, say_left_out
+from sgstore.cli._output import say
 
 if TYPE_CHECKING:
-    from sgstore.coverage import ChosenFrames, Classed, ReportTable
+    from sgstore.coverage import Classed, ReportTable
 
 PANEL: Final = "Coverage and test sets"
 
@@ -36,19 +35,17 @@ A = Annotated[
     ),
 ]
 B = Annotated[str, typer.Argument(metavar="B", help="Frames, as A.")]
-Abstraction = Annotated[
-    str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
+Limit = Annotated[
+    int | None,
+    typer.Option("--limit", min=0, help="Rows at most; 0: all.", show_default="40 in a table"),
+]
+Unit = Annotated[
+    Literal["frame", "run", "trace"],
+    typer.Option("--unit", help="Count frames, runs of frames of one class, or traces with it."),
 ]
 Window = Annotated[
     int,
     typer.Option("--window", "-t", min=1, help="Number of frames that form one class together."),
-]
-Picture = Annotated[
-    Path | None, typer.Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
-]
-Limit = Annotated[
-    int | None,
-    typer.Option("--limit", min=0, help="Rows at most; 0: all.", show_default="40 in a table"),
 ]
 Slots = Annotated[
     Path | None, typer.Option("--slots", metavar="FILE", help="TOML file with declared slots.")
@@ -58,76 +55,81 @@ Missing = Annotated[
 ]
 Covered = Annotated[bool, typer.Option("--covered", help="List what is covered, with its frames.")]
 
-IN_TABLE = 40
 
-
-class UnitOption(StrEnum):
-    """Unit of counts."""
-
-    frame = "frame"
-    run = "run"
-    trace = "trace"
-
-
-class Incomplete(StrEnum):
-    """Treatment of windows with missing frames."""
-
-    equal = "equal"
-    distinct = "distinct"
-    drop = "drop"
-
-
-class Listing(StrEnum):
-    """Form of a list of novel scenes."""
-
-    classes = "classes"
-    frames = "frames"
-    clips = "clips"
-
-
-Unit = Annotated[
-    UnitOption,
-    typer.Option("--unit", help="Count frames, runs of frames of one class, or traces with it."),
-]
-WhenIncomplete = Annotated[
-    Incomplete,
-    typer.Option("--incomplete", help="Windows with missing frames: equal, distinct, or dropped."),
-]
-
-
-@dataclass(frozen=True, slots=True)
-class SceneOptions:
+@dataclass(frozen=True)
+class WindowOptions:
     """Options for the classes of frames."""
 
     abstraction: Abstraction = "RSV"
-    window: Window = 1
-    incomplete: WhenIncomplete = Incomplete.equal
-    slots: Slots = None
+    window: Annotated[
+        int,
+        typer.Option(
+            "--window", "-t", min=1, help="Number of frames that form one class together."
+        ),
+    ] = 1
+    incomplete: Annotated[
+        Literal["equal", "distinct", "drop"],
+        typer.Option(
+            "--incomplete", help="Windows with missing frames: equal, distinct, or dropped."
+        ),
+    ] = "equal"
 
-    def of(self, text: str, spill: int) -> Classed:
-        """Return the frames that a text means, with their classes."""
-        seen = self.abstraction, self.window, self.incomplete, self.slots
-        return _classed(text, *seen, spill=spill)
+    def of(self, ask: AskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
+        """Frames that texts mean, with their classes; says which traces cannot answer a query."""
+        from sgstore.coverage import Missing, classed, read_specifications, selection_of
+
+        spill = ask.spill()
+        found: list[Classed] = []
+        for text in texts:
+            chosen = selection_of(text, max_spill=spill)
+            say_left_out(chosen)
+            declared = None
+            if slots is not None:
+                declared, *more = read_specifications(slots)
+                if more:
+                    raise typer.BadParameter(
+                        f"--slots {slots}: several specifications; expected one here"
+                    )
+            missing = Missing(self.incomplete)
+            found.append(classed(chosen, self.abstraction, self.window, missing, declared))
+        return found
+
+
+@dataclass(frozen=True)
+class LongWindowOptions(WindowOptions):
+    """Options for the classes of windows."""
+
+    window: Annotated[
+        int,
+        typer.Option(
+            "--window", "-t", min=1, help="Number of frames that form one class together."
+        ),
+    ] = 10
+
+
+@dataclass(frozen=True)
+class SceneOptions(WindowOptions):
+    """Options for the classes of frames, by declared slots, too."""
+
+    slots: Slots = None
 
 
 @coverage.command("classes")
 def classes_(
     a: A,
-    unit: Unit = UnitOption.frame,
+    unit: Unit = "frame",
     picture: Picture = None,
     limit: Limit = None,
     *,
     scenes: SceneOptions,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """List the classes of scenes, the most frequent first, and estimate what is unseen."""
     from sgstore.coverage import CountedUnit, classes, rank_sizes
 
-    form, spill = out.chosen(), bounds.spill()
-    frames = scenes.of(a, spill)
+    (frames,) = scenes.of(ask, a, slots=scenes.slots)
     counted = CountedUnit(unit)
-    _write(classes(frames, counted), limit, form, out.output)
+    ask.report(classes(frames, counted), limit)
     if picture is not None:
         from sgstore.draw import draw_rank_sizes
 
@@ -144,15 +146,12 @@ def of_(
     by: Annotated[str, typer.Option("--by", metavar="B", help="Frames that cover it, as A.")],
     *,
     scenes: SceneOptions,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """Measure how much of A is covered by B, by classes and by frames."""
     from sgstore.coverage import covered
 
-    form, spill = out.chosen(), bounds.spill()
-    of, other = (scenes.of(one, spill) for one in (a, by))
-    _write(covered(of, other), 0, form, out.output)
+    ask.report(covered(*scenes.of(ask, a, by, slots=scenes.slots)))
 
 
 @coverage.command("novel")
@@ -160,25 +159,19 @@ def novel_(
     a: A,
     than: Annotated[str, typer.Option("--not-in", metavar="B", help="Known frames, as A.")],
     listing: Annotated[
-        Listing, typer.Option("--list", help="Classes, frames, or clips of consecutive frames.")
-    ] = Listing.classes,
+        Literal["classes", "frames", "clips"],
+        typer.Option("--list", help="Classes, frames, or clips of consecutive frames."),
+    ] = "classes",
     limit: Limit = None,
     *,
     scenes: SceneOptions,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """List the scenes of A that are not in B, the rarest first."""
     from sgstore.coverage import novel, novel_clips, novel_frames
 
-    form, spill = out.chosen(), bounds.spill()
-    of, other = (scenes.of(one, spill) for one in (a, than))
-    listed = {
-        Listing.classes: novel,
-        Listing.frames: novel_frames,
-        Listing.clips: novel_clips,
-    }[listing]
-    _write(listed(of, other), limit, form, out.output)
+    listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[listing]
+    ask.report(listed(*scenes.of(ask, a, than, slots=scenes.slots)), limit)
 
 
 @coverage.command("venn")
@@ -187,35 +180,30 @@ def venn_(
     b: B,
     *,
     scenes: SceneOptions,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """Count what A and B share, and what only one of them has."""
     from sgstore.coverage import venn
 
-    form, spill = out.chosen(), bounds.spill()
-    one, other = (scenes.of(text, spill) for text in (a, b))
-    _write(venn(one, other), 0, form, out.output)
+    ask.report(venn(*scenes.of(ask, a, b, slots=scenes.slots)))
 
 
 @coverage.command("growth")
 def growth_(
     a: A,
-    unit: Unit = UnitOption.frame,
+    unit: Unit = "frame",
     points: Annotated[int, typer.Option("--points", min=2, help="Rows of the curve.")] = 40,
     picture: Picture = None,
     *,
     scenes: SceneOptions,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """Show how the number of classes grows, beside a random order, to tell if more data helps."""
     from sgstore.coverage import CountedUnit, growth
 
-    form, spill = out.chosen(), bounds.spill()
-    frames = scenes.of(a, spill)
+    (frames,) = scenes.of(ask, a, slots=scenes.slots)
     table = growth(frames, CountedUnit(unit), points)
-    _write(table, 0, form, out.output)
+    ask.report(table)
     if picture is not None and table.rows:
         from sgstore.draw import draw_growth
 
@@ -245,28 +233,24 @@ def combos_(
     picture: Picture = None,
     limit: Limit = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """Count the combinations of k features, such as (car near ego), or of values of declared slots."""
-    from sgstore.coverage import combos, selection_of
+    from sgstore.coverage import combos
 
-    form, spill = out.chosen(), bounds.spill()
     if slots is not None:
         if by or picture or of_ego:
             raise typer.BadParameter(
                 "--slots declares what there is: not with --by, --ego or --picture"
             )
-        _write_slots(
-            selection_of(a, max_spill=spill), slots, k, (covered, missing), limit, form, out.output
-        )
+        ask.report(_slot_table(a, slots, k, ask, covered=covered, missing=missing), limit)
         return
-    reference = None if by is None else _classed(by, abstraction, spill=spill)
-    found = combos(_classed(a, abstraction, spill=spill), abstraction, k, reference, of_ego=of_ego)
+    ours, *others = WindowOptions(abstraction).of(ask, a, *([] if by is None else [by]))
+    found = combos(ours, abstraction, k, *others, of_ego=of_ego)
     listed = found.missing if missing else found.covered() if covered else found.shares
     for text in found.shares.said if listed is not found.shares else ():
         say(text)
-    _write(listed, limit, form, out.output)
+    ask.report(listed, limit)
     if picture is not None:
         from sgstore.draw import draw_matrix
 
@@ -295,52 +279,40 @@ def spec_(
     covered: Covered = False,
     limit: Limit = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """Measure how much of a specification is covered: the cells of a query, or declared slots."""
     from sgstore.coverage import selection_of, specification
 
-    form, spill = out.chosen(), bounds.spill()
     if (query is None) == (slots is None):
         raise typer.BadParameter("give a query, or a file with --slots FILE")
     if query is None or slots is not None:
         if by or cells:
             raise typer.BadParameter("--slots declares what there is: not with --by or --cells")
-        _write_slots(
-            selection_of(a, max_spill=spill),
-            slots or Path(),
-            0,
-            (covered, missing),
-            limit,
-            form,
-            out.output,
-        )
+        declared = slots or Path()
+        ask.report(_slot_table(a, declared, 0, ask, covered=covered, missing=missing), limit)
         return
     if by and cells:
         raise typer.BadParameter("give one of --by and --cells")
+    spill = ask.spill()
     reference = selection_of(by, max_spill=spill) if by else ""
     tables = specification(selection_of(a, max_spill=spill), query, cells, reference)
-    _write(tables[2 if missing else 1 if covered else 0], limit, form, out.output)
+    ask.report(tables[2 if missing else 1 if covered else 0], limit)
 
 
 @coverage.command("windows")
 def windows_(
     a: A,
-    window: Window = 10,
-    incomplete: WhenIncomplete = Incomplete.equal,
-    abstraction: Abstraction = "RSV",
     limit: Limit = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    windows: LongWindowOptions,
+    ask: AskOptions,
 ) -> None:
     """List the classes of windows: of a frame together with those recorded before it."""
     from sgstore.coverage import classes
 
-    form, spill = out.chosen(), bounds.spill()
-    table = classes(_classed(a, abstraction, window, incomplete, spill=spill))
-    _write(table, limit, form, out.output)
+    (frames,) = windows.of(ask, a)
+    ask.report(classes(frames), limit)
 
 
 @coverage.command("explain")
@@ -357,18 +329,16 @@ def explain_(
     ] = False,
     limit: Limit = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> None:
     """Explain how the scenes of B differ from those of A: the features that differ most."""
     from sgstore.coverage import explain
 
-    form, spill = out.chosen(), bounds.spill()
-    ours, theirs = (_classed(one, abstraction, spill=spill) for one in (b, versus))
+    ours, theirs = WindowOptions(abstraction).of(ask, b, versus)
     tables = explain(ours, theirs, abstraction, by_frame=frames, depth=depth)
     for text in tables[0].said if tree else ():
         say(text)
-    _write(tables[1] if tree else tables[0], limit, form, out.output)
+    ask.report(tables[1] if tree else tables[0], limit)
 
 
 @coverage.command("failures")
@@ -389,28 +359,22 @@ def failures_(
             "--threshold", help="Errors above it are failures.", show_default="5/140, as S3C"
         ),
     ] = None,
-    abstraction: Abstraction = "RSV",
-    window: Window = 1,
-    incomplete: WhenIncomplete = Incomplete.equal,
     novel: Annotated[bool, typer.Option("--novel", help="List the novel failures.")] = False,
     limit: Limit = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    windows: WindowOptions,
+    ask: AskOptions,
 ) -> None:
     """List failures of a system that are novel, and those that coverage would have predicted (S3C)."""
     from sgstore.coverage import S3C_THRESHOLD, Outcomes, failures
 
-    form, spill = out.chosen(), bounds.spill()
     limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)
     told = Outcomes.read(outcomes, limits)
-    one, other = (
-        _classed(text, abstraction, window, incomplete, spill=spill) for text in (train, test)
-    )
-    shares, listed = failures(one, other, told)
+    known, tested = windows.of(ask, train, test)
+    shares, listed = failures(known, tested, told)
     for text in shares.said if novel else ():
         say(text)
-    _write(listed if novel else shares, limit, form, out.output)
+    ask.report(listed if novel else shares, limit)
 
 
 def _fraction(text: str) -> float:
@@ -423,52 +387,14 @@ def _fraction(text: str) -> float:
     return value
 
 
-def _classed(
-    text: str,
-    abstraction: str,
-    window: int = 1,
-    incomplete: Incomplete = Incomplete.equal,
-    slots: Path | None = None,
-    *,
-    spill: int = 0,
-) -> Classed:
-    """The frames that a text means, with their classes; says which traces cannot answer a query."""
-    from sgstore.coverage import Missing, classed, read_specifications, selection_of
+def _slot_table(
+    text: str, slots: Path, k: int, ask: AskOptions, *, covered: bool, missing: bool
+) -> ReportTable:
+    from sgstore.coverage import read_specifications, selection_of, slot_coverage
 
-    chosen = selection_of(text, max_spill=spill)
-    say_left_out(chosen)
-    declared = None
-    if slots is not None:
-        declared, *more = read_specifications(slots)
-        if more:
-            raise typer.BadParameter(f"--slots {slots}: several specifications; expected one here")
-    return classed(chosen, abstraction, window, Missing(incomplete), declared)
-
-
-def _write_slots(
-    chosen: ChosenFrames,
-    slots: Path,
-    k: int,
-    listing: tuple[bool, bool],
-    limit: int | None,
-    form: Format,
-    output: Path | None,
-) -> None:
-    from sgstore.coverage import read_specifications, slot_coverage
-
-    shares, covered, missing = slot_coverage(chosen, read_specifications(slots), k)
-    _write(covered if listing[0] else missing if listing[1] else shares, limit, form, output)
-
-
-def _write(table: ReportTable, limit: int | None, form: Format, output: Path | None) -> None:
-    """Print rows, and say what they are of."""
-    most = limit if limit is not None else IN_TABLE if form is Format.table and not output else 0
-    rows = table.rows[:most] if most else table.rows
-    write_rows(table.columns, rows, form, output)
-    if len(rows) < len(table.rows):
-        say(f"{len(table.rows) - len(rows)} more rows; --limit 0 shows all")
-    for text in table.said:
-        say(text)
+    chosen = selection_of(text, max_spill=ask.spill())
+    tables = slot_coverage(chosen, read_specifications(slots), k)
+    return tables[1 if covered else 2 if missing else 0]
 
 
 def _short(text: str) -> str:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from sgstore.cli._options import (
     LOSS,
     AsJson,
-    Parameters,
-    PatternName,
-    QueryFile,
     QueryLimits,
-    QueryText,
+    Question,
     StorePath,
     app,
-    asked_of,
     form_of,
     lines_of,
     parameters_of,
@@ -31,84 +27,75 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from sgstore.exporters import WrittenClip, WrittenFile
+    from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.world import Clip
 
 PANEL: Final = "Pictures and exports"
 
 
-BEFORE_AFTER: Final = "2s"
+@dataclass(frozen=True)
+class ClipOptions:
+    """Options for the content of clips."""
 
-
-class Clouds(StrEnum):
-    """Format of point clouds."""
-
-    pcd = "pcd"
-    npy = "npy"
-    bin = "bin"
-
-
-Folder = Annotated[
-    Path, typer.Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten.")
-]
-Frames = Annotated[
-    Path | None,
-    typer.Option("--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."),
-]
-LockFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
-    ),
-]
-Form = Annotated[
-    str, typer.Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package.")
-]
-Before = Annotated[
-    str, typer.Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
-]
-After = Annotated[str, typer.Option("--after", metavar="TIME", help="Time after each match.")]
-LabelTexts = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--label",
-        metavar="NAME=TEXT",
-        help="A value for each frame: an expression, or a query that is true where it matches.",
-    ),
-]
-WithGraph = Annotated[
-    bool, typer.Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw.")
-]
-Abstraction = Annotated[
-    str, typer.Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs.")
-]
-Channels = Annotated[
-    list[str] | None,
-    typer.Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
-]
-CloudForm = Annotated[Clouds, typer.Option("--clouds", help="frames: format of point clouds.")]
+    before: Annotated[
+        str, typer.Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
+    ] = "2s"
+    after: Annotated[
+        str, typer.Option("--after", metavar="TIME", help="Time after each match.")
+    ] = "2s"
+    labels: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--label",
+            metavar="NAME=TEXT",
+            help="A value for each frame: an expression, or a query that is true where it matches.",
+        ),
+    ] = None
+    with_graph: Annotated[
+        bool,
+        typer.Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw."),
+    ] = False
+    abstraction: Annotated[
+        str, typer.Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs.")
+    ] = ""
+    channels: Annotated[
+        list[str] | None,
+        typer.Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
+    ] = None
+    clouds: Annotated[
+        Literal["pcd", "npy", "bin"],
+        typer.Option("--clouds", help="frames: format of point clouds."),
+    ] = "pcd"
 
 
 @app.command(rich_help_panel=PANEL)
 def export(
     store: StorePath,
-    query: QueryText = None,
-    to: Folder = Path("clips"),
-    file: QueryFile = None,
-    name: PatternName = None,
-    parameters: Parameters = None,
-    frames: Frames = None,
-    lock: LockFile = None,
-    form: Form = "mcap",
-    before: Before = BEFORE_AFTER,
-    after: After = BEFORE_AFTER,
-    labels: LabelTexts = None,
-    with_graph: WithGraph = False,
-    abstraction: Abstraction = "",
-    channels: Channels = None,
-    clouds: CloudForm = Clouds.pcd,
+    question: Question,
+    to: Annotated[
+        Path,
+        typer.Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten."),
+    ] = Path("clips"),
+    frames: Annotated[
+        Path | None,
+        typer.Option(
+            "--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."
+        ),
+    ] = None,
+    lock: Annotated[
+        Path | None,
+        typer.Option(
+            "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
+        ),
+    ] = None,
+    form: Annotated[
+        str,
+        typer.Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package."),
+    ] = "mcap",
     as_json: AsJson = False,
     *,
+    clip: ClipOptions,
     bounds: QueryLimits,
 ) -> int:
     """Cut matches out of their recordings, as clips with the original messages.
@@ -120,15 +107,15 @@ def export(
     from sgstore.exporters import Export, exporter_named, labelled, parse_labels, write_export
 
     exporter_named(form)  # before anything is searched
-    texts = parse_labels(labels or [])
+    texts = parse_labels(clip.labels or [])
     opened = bounds.opened(store)
-    values = parameters_of(parameters)
-    margins = seconds_of(before, "--before"), seconds_of(after, "--after")
-    if sum((frames is not None, lock is not None, bool(query or file or name))) > 1:
+    values = parameters_of(question.parameters)
+    margins = seconds_of(clip.before, "--before"), seconds_of(clip.after, "--after")
+    if sum((frames is not None, lock is not None, bool(question))) > 1:
         raise typer.BadParameter("give one of: a QUERY, --frames, --lock")
     text, held = "", {}
     if frames is None and lock is None:
-        text, held = asked_of(query, file, name, values)
+        text, held = question.asked()
     clips = _clips(opened, (frames, lock), text, held, margins)
     if not clips:
         say("nothing matches: nothing to export")
@@ -137,10 +124,10 @@ def export(
         order = Export(
             opened,
             tuple(clips),
-            abstraction=abstraction,
-            with_graph=with_graph,
-            channels=tuple(channels or ()),
-            clouds=clouds.value,
+            abstraction=clip.abstraction,
+            with_graph=clip.with_graph,
+            channels=tuple(clip.channels or ()),
+            clouds=clip.clouds,
             provenance=({"query": text} if text else {"lock": lock.name} if lock else {}),
             progress=progress,
         )
@@ -184,83 +171,81 @@ def _clips(
 # Verbs that draw --------------------------------------------------------------------------------
 
 
-class DrawnRelations(StrEnum):
-    """Edges that a picture shows."""
+@dataclass(frozen=True)
+class DrawOptions:
+    """Options for a picture."""
 
-    ego = "ego"
-    all = "all"
-    none = "none"
+    relations: Annotated[
+        Literal["ego", "all", "none"], typer.Option("--relations", help="Which edges are drawn.")
+    ] = "ego"
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera", help="Channel of a picture to put beside it; 'none' for no picture."
+        ),
+    ] = None
+    radius: Annotated[
+        float | None, typer.Option("--radius", help="Half the side of the window, in metres.")
+    ] = None
+    north_up: Annotated[
+        bool, typer.Option("--north-up", help="North is up, not the ego's heading.")
+    ] = False
+    graph: Annotated[
+        bool, typer.Option("--graph", help="Beside it the graph as nodes and edges.")
+    ] = False
+    fps: Annotated[
+        float, typer.Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
+    ] = 10.0
 
-
-Frame = Annotated[
-    str,
-    typer.Argument(
-        metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s."
-    ),
-]
-Picture = Annotated[
-    Path | None,
-    typer.Option(
-        "--output",
-        "-o",
-        help="The picture: .png or .svg; of a clip: .gif.",
-        show_default="frame.png, clip.gif",
-    ),
-]
-DrawnEdges = Annotated[DrawnRelations, typer.Option("--relations", help="Which edges are drawn.")]
-Camera = Annotated[
-    str | None,
-    typer.Option("--camera", help="Channel of a picture to put beside it; 'none' for no picture."),
-]
-Radius = Annotated[
-    float | None, typer.Option("--radius", help="Half the side of the window, in metres.")
-]
-NorthUp = Annotated[bool, typer.Option("--north-up", help="North is up, not the ego's heading.")]
-Diagram = Annotated[bool, typer.Option("--graph", help="Beside it the graph as nodes and edges.")]
-PicturesASecond = Annotated[
-    float, typer.Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
-]
+    def options(self, matches: Matches | None) -> dict[str, Any]:
+        """Make what the functions that draw take."""
+        return {
+            "matches": matches,
+            "camera": self.camera,
+            "relations": self.relations,
+            "radius": self.radius,
+            "north_up": self.north_up,
+            "diagram": self.graph,
+        }
 
 
 @app.command(rich_help_panel=PANEL)
 def show(
     store: StorePath,
-    frame: Frame,
-    query: QueryText = None,
-    output: Picture = None,
-    file: QueryFile = None,
-    name: PatternName = None,
-    parameters: Parameters = None,
-    relations: DrawnEdges = DrawnRelations.ego,
-    camera: Camera = None,
-    radius: Radius = None,
-    north_up: NorthUp = False,
-    graph: Diagram = False,
-    fps: PicturesASecond = 10.0,
+    frame: Annotated[
+        str,
+        typer.Argument(
+            metavar="FRAME",
+            help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.",
+        ),
+    ],
+    question: Question,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="The picture: .png or .svg; of a clip: .gif.",
+            show_default="frame.png, clip.gif",
+        ),
+    ] = None,
     *,
+    drawn: DrawOptions,
     bounds: QueryLimits,
 ) -> int:
     """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
     from sgstore.draw import draw_clip, draw_stored, range_of
 
     opened = bounds.opened(store)
-    asked = query or file or name
-    text, values = asked_of(query, file, name, parameters_of(parameters)) if asked else ("", {})
+    text, values = question.asked() if question else ("", {})
     clip = range_of(frame)
     output = output or Path("clip.gif" if clip else "frame.png")
-    options: dict[str, Any] = {
-        "matches": opened.find(text, **values) if text else None,
-        "camera": camera,
-        "relations": relations.value,
-        "radius": radius,
-        "north_up": north_up,
-        "diagram": graph,
-    }
+    options = drawn.options(opened.find(text, **values) if text else None)
     if clip is None:
         marked = int(draw_stored(opened, frame, output, **options))
     else:
         with count_bar(output.name, "pictures") as bar:
-            marked = draw_clip(opened, clip, output, fps=fps, on_frame=bar, **options)
+            marked = draw_clip(opened, clip, output, fps=drawn.fps, on_frame=bar, **options)
     if text and not marked:
         say(f"the query does not match in {frame}: nothing is marked")
     typer.echo(output)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import sys
 from collections import Counter
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
@@ -14,15 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 import typer
 from typer.core import TyperCommand
 
-from sgstore.cli._output import Format, say
+from sgstore.cli._output import Format, say, write_rows
 from sgstore.cli._process import set_deadline
 from sgstore.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sgstore.config import Config as Settings
-    from sgstore.coverage import ChosenFrames
+    from sgstore.config import Config
+    from sgstore.coverage import ChosenFrames, ReportTable
     from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.sandbox import Answer
@@ -72,28 +73,23 @@ class Verbs(typer.Typer):
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Make a function that takes the fields of dataclasses in place of these."""
     hints = get_type_hints(function, include_extras=True)
+    bundles: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[inspect.Parameter] = []
-    homes: dict[str, str] = {}
     for one in inspect.signature(function).parameters.values():
-        kind = hints[one.name]
-        if not is_dataclass(kind):
-            parameters.append(one.replace(annotation=kind, kind=one.KEYWORD_ONLY))
+        bundle = bundles.get(one.name)
+        if bundle is None:
+            parameters.append(one.replace(annotation=hints[one.name], kind=one.KEYWORD_ONLY))
             continue
-        own = get_type_hints(kind, include_extras=True)
-        for field in fields(kind):
-            homes[field.name] = one.name
-            default = one.empty if field.default is MISSING else field.default
-            option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=default)
+        own = get_type_hints(bundle, include_extras=True)
+        for field in fields(bundle):
+            option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=field.default)
             parameters.append(option.replace(annotation=own[field.name]))
-    if not homes:
-        return function
 
     @wraps(function)
     def verb(**values: Any) -> Any:
-        given: dict[str, dict[str, Any]] = {bundle: {} for bundle in homes.values()}
-        for name in homes.keys() & values.keys():
-            given[homes[name]][name] = values.pop(name)
-        return function(**values, **{name: hints[name](**own) for name, own in given.items()})
+        for name, bundle in bundles.items():
+            values[name] = bundle(**{one.name: values.pop(one.name) for one in fields(bundle)})
+        return function(**values)
 
     verb.__annotations__ = {one.name: one.annotation for one in parameters}
     vars(verb)["__signature__"] = inspect.Signature(parameters)
@@ -111,44 +107,12 @@ app = Verbs(
 ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
 """Exit codes; 0 is done."""
 
-RoadMap = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        help="OpenDRIVE file, or folder of NAME.xodr, for recordings that carry no map of their own.",
-    ),
-]
-Config = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with settings of the scene graphs.")
-]
-Preset = Annotated[
-    str | None,
-    typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
-]
+IN_TABLE: Final = 40
+"""Rows of a report on a terminal, unless more are asked for."""
 
 StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="The store: one DuckDB file.")]
 FrameName = Annotated[
     str, typer.Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")
-]
-QueryText = Annotated[
-    str | None, typer.Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")
-]
-QueryFile = Annotated[
-    Path | None, typer.Option("--file", "-f", help="Read the query from a file; - is stdin.")
-]
-PatternName = Annotated[
-    str | None,
-    typer.Option(
-        "--pattern", "-p", metavar="NAME", help="A pattern of the library, in place of a query."
-    ),
-]
-PatternNames = Annotated[
-    list[str] | None,
-    typer.Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
-]
-Expressions = Annotated[
-    list[str] | None,
-    typer.Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
 ]
 Parameters = Annotated[
     list[str] | None,
@@ -167,17 +131,29 @@ With = Annotated[
         " or t; repeatable.",
     ),
 ]
+QueryText = Annotated[
+    str | None, typer.Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")
+]
+QueryFile = Annotated[
+    Path | None, typer.Option("--file", "-f", help="Read the query from a file; - is stdin.")
+]
+PatternNames = Annotated[
+    list[str] | None,
+    typer.Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
+]
+Abstraction = Annotated[
+    str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
+]
+Picture = Annotated[
+    Path | None, typer.Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
+]
+Traces = Annotated[list[str] | None, typer.Option("--trace", help="Only this trace; repeatable.")]
+Jobs = Annotated[
+    int,
+    typer.Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."),
+]
 ROWS: Final = "Rows"
 LIMITS: Final = "Limits"
-RowFormat = Annotated[
-    Format, typer.Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
-]
-SgsmCompat = Annotated[
-    bool,
-    typer.Option(
-        "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
-    ),
-]
 AsJson = Annotated[
     bool, typer.Option("--json", help="Short for --format json.", rich_help_panel=ROWS)
 ]
@@ -189,54 +165,228 @@ Output = Annotated[
 ]
 
 
-Timeout = Annotated[
-    str | None,
-    typer.Option(
-        "--timeout",
-        metavar="TIME",
-        help="Stop after this time, such as 30s.",
-        rich_help_panel=LIMITS,
-    ),
-]
-MaxSpill = Annotated[
-    str | None,
-    typer.Option(
-        "--max-spill",
-        metavar="SIZE",
-        help="Most disk space for what does not fit into memory: 500MB, 50GB.",
-        show_default="10GB",
-        rich_help_panel=LIMITS,
-    ),
-]
+@dataclass(frozen=True)
+class PrintedRows:
+    """Options for the format of rows, and the one way in which verbs write rows."""
+
+    form: Annotated[
+        Format, typer.Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
+    ] = Format.table
+    as_json: AsJson = False
+
+    def __post_init__(self) -> None:
+        form_of(self.form, as_json=self.as_json)  # refuses before anything is done
+
+    @property
+    def file(self) -> Path | None:
+        """File that the rows go to; ``None``: stdout."""
+        return None
+
+    @property
+    def chosen(self) -> Format:
+        """Format that the options mean together."""
+        return form_of(self.form, self.file, as_json=self.as_json)
+
+    @property
+    def for_people(self) -> bool:
+        """True if the rows are a table."""
+        return self.chosen is Format.table
+
+    def write(
+        self,
+        columns: Sequence[str],
+        rows: Iterable[Sequence[Any]],
+        types: Sequence[str] | None = None,
+    ) -> int:
+        """Write rows, and return how many; see :func:`sgstore.cli._output.write_rows`."""
+        return write_rows(columns, rows, self.chosen, self.file, types)
+
+    def report(self, table: ReportTable, limit: int | None = 0) -> None:
+        """Write a table and the remarks on it; with ``limit`` 0 all rows, with ``None`` some for people."""
+        if limit is None:
+            limit = IN_TABLE if self.for_people and self.file is None else 0
+        rows = table.rows[:limit] if limit else table.rows
+        self.write(table.columns, rows)
+        if len(rows) < len(table.rows):
+            say(f"{len(table.rows) - len(rows)} more rows; --limit 0 shows all")
+        for text in table.said:
+            say(text)
 
 
-@dataclass(frozen=True, slots=True)
-class RowOptions:
+@dataclass(frozen=True)
+class RowOptions(PrintedRows):
     """Options for the format of rows and their file."""
 
-    form: RowFormat = Format.table
-    as_json: AsJson = False
     output: Output = None
 
-    def chosen(self) -> Format:
-        """Return the form that these options mean together."""
-        return form_of(self.form, self.output, as_json=self.as_json)
+    @property
+    def file(self) -> Path | None:
+        """File that the rows go to; ``None``: stdout."""
+        return self.output
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class QueryLimits:
     """Most time and disk that a question may take."""
 
-    timeout: Timeout = None
-    max_spill: MaxSpill = None
+    timeout: Annotated[
+        str | None,
+        typer.Option(
+            "--timeout",
+            metavar="TIME",
+            help="Stop after this time, such as 30s.",
+            rich_help_panel=LIMITS,
+        ),
+    ] = None
+    max_spill: Annotated[
+        str | None,
+        typer.Option(
+            "--max-spill",
+            metavar="SIZE",
+            help="Most disk space for what does not fit into memory: 500MB, 50GB.",
+            show_default="10GB",
+            rich_help_panel=LIMITS,
+        ),
+    ] = None
 
     def spill(self) -> int:
-        """Bound whatever is done from here on; return the bytes on disk, as :func:`bounded` does."""
-        return bounded(self.timeout, self.max_spill)
+        """Bound whatever is done from here on.
+
+        Returns
+        -------
+        int
+            Most that a question may put on disk, in bytes; 0: what a store allows by itself.
+        """
+        spill = 0 if self.max_spill is None else bytes_of(self.max_spill, "--max-spill")
+        if self.timeout is not None:
+            set_deadline(seconds_of(self.timeout, "--timeout"))
+        return spill
 
     def opened(self, store: Path, tables: Mapping[str, Path] | None = None) -> Store:
-        """Open a store within these bounds; see :func:`open_store`."""
-        return open_store(store, tables, timeout=self.timeout, max_spill=self.max_spill)
+        """Open a store within these bounds, with tables of the user's own.
+
+        Rows of these that belong to no frame are told.
+        """
+        from sgstore.query import Store
+
+        opened = Store(store, tables=tables, max_spill=self.spill())
+        for name, joined in opened.file.joined().items():
+            if joined.matched < joined.rows:
+                lost = joined.rows - joined.matched
+                say(f"{name}: {lost} of {joined.rows} rows belong to no frame of the store")
+        return opened
+
+
+@dataclass(frozen=True)
+class AskOptions(QueryLimits, RowOptions):
+    """Options of a verb that asks a store: format of the rows, their file, and limits."""
+
+    def __post_init__(self) -> None:
+        _ = self.chosen  # refuses what does not fit together before anything is searched
+
+
+@dataclass(frozen=True)
+class Question:
+    """A query: a text, a file, or a pattern of the library; and values for it."""
+
+    query: QueryText = None
+    file: QueryFile = None
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--pattern", "-p", metavar="NAME", help="A pattern of the library, in place of a query."
+        ),
+    ] = None
+    parameters: Parameters = None
+
+    def __bool__(self) -> bool:
+        """Return true if something is asked."""
+        return bool(self.query or self.file or self.name)
+
+    def asked(self) -> tuple[str, Mapping[str, Any]]:
+        """The text of the query, and values that it does not hold yet."""
+        return asked_of(self.query, self.file, self.name, parameters_of(self.parameters))
+
+
+@dataclass(frozen=True)
+class Statements:
+    """Statements of the library and of the command line, which are asked together with files of them."""
+
+    names: PatternNames = None
+    texts: Annotated[
+        list[str] | None,
+        typer.Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
+    ] = None
+    parameters: Parameters = None
+    sgsm_compat: Annotated[
+        bool,
+        typer.Option(
+            "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
+        ),
+    ] = False
+
+    def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
+        """Texts of files, of the library and of the command line; and values that these do not hold yet.
+
+        Returns
+        -------
+        asked : dict
+            What a pattern is called → texts: by its name in the library, else ``pattern``.
+        values : dict
+            A pattern of the library takes the values of its own parameters; all the others belong to the texts.
+        """
+        from sgstore.lang.library import pattern_named
+
+        values, texts = parameters_of(self.parameters), self.texts or []
+        if not (files or self.names or texts):
+            raise typer.BadParameter("give a FILE, -p NAME or -e TEXT; several are asked together")
+        found = {one.name: one for one in map(pattern_named, self.names or ())}
+        taken = {name for one in found.values() for name in one.parameters}
+        rest = {name: value for name, value in values.items() if name not in taken}
+        if rest and not (files or texts):
+            found[next(iter(found))].written(**rest)  # which says what it would take
+        asked = {"pattern": [*map(text_of, files or ()), *texts]} if files or texts else {}
+        for name, one in found.items():
+            own = {key: value for key, value in values.items() if key in one.parameters}
+            asked[name] = [one.written(**own)]
+        return asked, rest
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """Options for the settings of the scene graphs."""
+
+    config: Annotated[
+        Path | None, typer.Option("--config", help="TOML file with settings of the scene graphs.")
+    ] = None
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
+    ] = None
+
+    def settings(self) -> Config | None:
+        """Settings of ``--config`` or ``--preset``; ``None`` if neither is given."""
+        from sgstore.config import load
+        from sgstore.config import preset as preset_named
+
+        if self.config and self.preset:
+            raise typer.BadParameter("give --config or --preset; a file may name a preset itself")
+        if self.preset:
+            return preset_named(self.preset)
+        return load(self.config) if self.config else None
+
+
+@dataclass(frozen=True)
+class ReadingOptions(GraphOptions):
+    """Options for a recording that is read: its road map, and the settings of the scene graphs."""
+
+    road_map: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            help="OpenDRIVE file, or folder of NAME.xodr, for recordings that carry no map of their own.",
+        ),
+    ] = None
 
 
 @app.callback(invoke_without_command=True)
@@ -255,41 +405,6 @@ def sgstore(
         typer.echo(f"sgstore {version_of('sgstore')}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-def open_store(
-    store: Path,
-    tables: Mapping[str, Path] | None = None,
-    *,
-    timeout: str | None = None,
-    max_spill: str | None = None,
-) -> Store:
-    """The store at a path, with tables of the user's own; rows of these that belong to no frame are told.
-
-    With a timeout whatever is done from here on ends when that is over.
-    """
-    from sgstore.query import Store
-
-    opened = Store(store, tables=tables, max_spill=bounded(timeout, max_spill))
-    for name, joined in opened.file.joined().items():
-        if joined.matched < joined.rows:
-            lost = joined.rows - joined.matched
-            say(f"{name}: {lost} of {joined.rows} rows belong to no frame of the store")
-    return opened
-
-
-def bounded(timeout: str | None, max_spill: str | None) -> int:
-    """Bound whatever is done from here on.
-
-    Returns
-    -------
-    int
-        Most that a question may put on disk, in bytes; 0: what a store allows by itself.
-    """
-    spill = 0 if max_spill is None else bytes_of(max_spill, "--max-spill")
-    if timeout is not None:
-        set_deadline(seconds_of(timeout, "--timeout"))
-    return spill
 
 
 _ENDINGS: Final = {
@@ -355,34 +470,6 @@ def asked_of(
     return pattern_named(name).written(**values), {}
 
 
-def all_asked_of(
-    files: Sequence[Path], names: Sequence[str], texts: Sequence[str], values: Mapping[str, Any]
-) -> tuple[dict[str, list[str]], Mapping[str, Any]]:
-    """Texts of files, of the library and of the command line; and values that these do not hold yet.
-
-    Returns
-    -------
-    asked : dict
-        What a pattern is called → texts: by its name in the library, else ``pattern``.
-    values : mapping
-        A pattern of the library takes the values of its own parameters; all the others belong to the texts.
-    """
-    from sgstore.lang.library import pattern_named
-
-    if not (files or names or texts):
-        raise typer.BadParameter("give a FILE, -p NAME or -e TEXT; several are asked together")
-    found = {one.name: one for one in map(pattern_named, names)}
-    taken = {name for one in found.values() for name in one.parameters}
-    rest = {name: value for name, value in values.items() if name not in taken}
-    if rest and not (files or texts):
-        found[next(iter(found))].written(**rest)  # which says what it would take
-    asked = {"pattern": [*map(text_of, files), *texts]} if files or texts else {}
-    for name, one in found.items():
-        own = {key: value for key, value in values.items() if key in one.parameters}
-        asked[name] = [one.written(**own)]
-    return asked, rest
-
-
 def text_of(file: Path) -> str:
     """The text in a file; ``-`` is stdin."""
     try:
@@ -436,6 +523,11 @@ _TIME: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min)?")
 _UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
 
 
+def jobs_of(number: int) -> int:
+    """``--jobs`` as a number of processes; 0 is one for each core."""
+    return number or os.cpu_count() or 1
+
+
 def seconds_of(text: str, option: str) -> float:
     """A time such as ``2s`` in seconds."""
     match = _TIME.fullmatch(text.strip())
@@ -478,13 +570,3 @@ def say_notes(notes: Iterable[str]) -> None:
     """Say what may be a mistake in a query."""
     for note in notes:
         say(f"note: {note}")
-
-
-def settings_of(config: Path | None, preset: str | None) -> Settings | None:
-    """Settings of ``--config`` or ``--preset``; ``None`` if neither is given."""
-    from sgstore.config import load
-    from sgstore.config import preset as preset_named
-
-    if config and preset:
-        raise typer.BadParameter("give --config or --preset; a file may name a preset itself")
-    return preset_named(preset) if preset else load(config) if config else None

@@ -5,26 +5,26 @@ from __future__ import annotations
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from sgstore.cli._options import (
     NO_MATCH,
+    Abstraction,
     AsJson,
+    AskOptions,
     FrameName,
     Output,
-    Parameters,
-    PatternName,
     QueryFile,
     QueryLimits,
-    QueryText,
+    Question,
     RowOptions,
+    Statements,
     StorePath,
     Verbs,
     With,
     app,
-    asked_of,
     parameters_of,
     query_of,
     say_left_out,
@@ -32,7 +32,7 @@ from sgstore.cli._options import (
     tables_of,
     text_of,
 )
-from sgstore.cli._output import Format, say, write_document, write_rows, write_text
+from sgstore.cli._output import Format, say, write_document, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -58,10 +58,7 @@ MaxRows = Annotated[
 @app.command(rich_help_panel=PANEL)
 def find(
     store: StorePath,
-    query: QueryText = None,
-    file: QueryFile = None,
-    name: PatternName = None,
-    parameters: Parameters = None,
+    question: Question,
     count: Annotated[
         bool, typer.Option("--count", help="Print the number of distinct frames and nothing else.")
     ] = False,
@@ -75,27 +72,22 @@ def find(
     max_rows: MaxRows = 10_000,
     tables: With = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> int:
     """Find frames by a pattern of their scene graphs.
 
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
     """
-    text, values = asked_of(query, file, name, parameters_of(parameters))
+    text, values = question.asked()
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
-        _refuse_spill(bounds.max_spill)
-        form = out.chosen()
-        with _sandbox(store, bounds.timeout, max_rows, tables) as box:
+        with _sandbox(store, ask, max_rows, tables) as box:
             answer = box.find(text, **values)
         _say_all(answer)
-        number = write_rows(*_as_shown(answer, form), form, out.output)
-        if not number and form is Format.table:
-            say("nothing matches")
-        return NO_MATCH if require and not number else 0
-    opened = bounds.opened(store, tables_of(tables))
+        number = ask.write(*_as_shown(answer, ask.chosen))
+        return _ended(number, ask, require=require)
+    opened = ask.opened(store, tables_of(tables))
     with opened.file.snapshot():  # it is opened once
         matches = opened.find(text, **values)
         if explain:
@@ -105,12 +97,15 @@ def find(
         if count:
             number = matches.count()
             typer.echo(number)
-        else:
-            form = out.chosen()
-            columns, rows = _as_shown(matches, form)
-            number = write_rows(columns, rows, form, out.output)
-            if not number and form is Format.table:
-                say("nothing matches")
+            return NO_MATCH if require and not number else 0
+        number = ask.write(*_as_shown(matches, ask.chosen))
+    return _ended(number, ask, require=require)
+
+
+def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
+    """Tell people that there are no rows; the exit code."""
+    if not number and ask.for_people:
+        say("nothing matches")
     return NO_MATCH if require and not number else 0
 
 
@@ -144,16 +139,12 @@ def _node_link(
 def why_not(
     store: StorePath,
     frame: FrameName,
-    query: QueryText = None,
-    file: QueryFile = None,
-    name: PatternName = None,
-    parameters: Parameters = None,
-    as_json: AsJson = False,
-    *,
+    question: Question,
     bounds: QueryLimits,
+    as_json: AsJson = False,
 ) -> int:
     """Explain why a pattern does not match a frame: the first condition that fails, and by how much."""
-    text, values = asked_of(query, file, name, parameters_of(parameters))
+    text, values = question.asked()
     answer = bounds.opened(store).why_not(frame, text, **values)
     if as_json:
         write_document(answer.as_dict(), Format.json)
@@ -170,12 +161,7 @@ def like(
         list[str] | None,
         typer.Option("--ignore", metavar="NAME", help="Ignore a relation or a kind; repeatable."),
     ] = None,
-    abstraction: Annotated[
-        str,
-        typer.Option(
-            "--abstraction", metavar="NAME", help="Abstraction whose graphs are compared."
-        ),
-    ] = "RSV",
+    abstraction: Abstraction = "RSV",
     limit: Annotated[int, typer.Option("--limit", min=1, help="Number of runs of frames.")] = 10,
     pattern: Annotated[
         bool, typer.Option("--pattern", help="Print a pattern that describes the frame instead.")
@@ -193,9 +179,8 @@ def like(
     if pattern:
         write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
         return 0
-    form = out.chosen()
     found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
-    if form is Format.table:
+    if out.for_people:
         columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
         rows = (
             (
@@ -209,7 +194,7 @@ def like(
             )
             for one in found
         )
-        write_rows(columns, rows, form, out.output)
+        out.write(columns, rows)
         return 0
     columns = ("frame_id", "trace", "seq", "time_ns", "t", "frames", "similarity", "same")
     columns += ("shared", "missing", "extra")
@@ -220,7 +205,7 @@ def like(
         )
         for one in found
     )
-    write_rows(columns, rows, form, out.output)
+    out.write(columns, rows)
     return 0
 
 
@@ -229,18 +214,12 @@ def _counted(features: dict[str, int]) -> str:
     return ", ".join(f"{n} x {text}" if n > 1 else text for text, n in features.items())
 
 
-class Language(StrEnum):
-    """Languages that are translated."""
-
-    sgl = "sgl"
-
-
 @app.command(rich_help_panel=PANEL)
 def translate(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What to translate; - is stdin.")],
     language: Annotated[
-        Language, typer.Option("--from", help="sgl: properties of SGSM, as Python.")
-    ] = Language.sgl,
+        Literal["sgl"], typer.Option("--from", help="sgl: properties of SGSM, as Python.")
+    ] = "sgl",
     output: Output = None,
 ) -> int:
     """Translate properties of other tools into the query language; nothing of the file is run."""
@@ -261,39 +240,33 @@ def sql(
     max_rows: MaxRows = 10_000,
     tables: With = None,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> int:
     """Ask a store in SQL, read only.
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     """
-    form = out.chosen()
     if safe:
-        _refuse_spill(bounds.max_spill)
-        with _sandbox(store, bounds.timeout, max_rows, tables) as box:
+        with _sandbox(store, ask, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))
         _say_all(answer)
-        write_rows(answer.columns, answer.rows, form, out.output)
+        ask.write(answer.columns, answer.rows)
         return 0
-    opened = bounds.opened(store, tables_of(tables)).file
+    opened = ask.opened(store, tables_of(tables)).file
     with opened.user_batches(query_of(statement, file)) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
-        write_rows(batches.columns, rows, form, out.output, batches.types)
+        ask.write(batches.columns, rows, batches.types)
     return 0
 
 
-def _refuse_spill(max_spill: str | None) -> None:
-    if max_spill is not None:
-        raise typer.BadParameter("--max-spill: with --safe nothing is put on disk")
-
-
-def _sandbox(store: Path, timeout: str | None, max_rows: int, tables: list[str] | None) -> Sandbox:
+def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] | None) -> Sandbox:
     from sgstore.sandbox import Sandbox
 
+    if bounds.max_spill is not None:
+        raise typer.BadParameter("--max-spill: with --safe nothing is put on disk")
     return Sandbox(
         store,
-        timeout_s=seconds_of(timeout or "5s", "--timeout"),
+        timeout_s=seconds_of(bounds.timeout or "5s", "--timeout"),
         max_rows=max_rows,
         tables=tables_of(tables),
     )
@@ -318,10 +291,6 @@ app.add_typer(
 
 LibraryName = Annotated[
     str, typer.Argument(metavar="NAME", help="Of a pattern, such as cut_in or ParkingExit.")
-]
-Chosen = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
 ]
 
 
@@ -349,15 +318,14 @@ def list_patterns(
     """
     from sgstore.lang.library import patterns
 
-    form = out.chosen()
     found = [p for p in patterns().values() if not kinds or p.kind in kinds]
-    if form is Format.table:
+    if out.for_people:
         columns = ("name", "kind", "from", "sentence")
         rows = [(p.name, p.kind, p.library, p.sentence) for p in found]
     else:
         columns = ("name", "kind", "library", "sentence", "parameters", "source", "query")
         rows = [(*_told(p).values(),) for p in found]
-    write_rows(columns, rows, form, out.output)
+    out.write(columns, rows)
     return 0
 
 
@@ -381,7 +349,10 @@ def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = No
 def run_pattern(
     store: StorePath,
     name: LibraryName,
-    chosen: Chosen = None,
+    chosen: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
+    ] = None,
     clips: Annotated[
         bool, typer.Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
     ] = False,
@@ -399,8 +370,7 @@ def run_pattern(
         ),
     ] = False,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> int:
     """Find a pattern of the library in a store: when it holds, and who takes part.
 
@@ -415,21 +385,18 @@ def run_pattern(
     if found.is_check:
         if clips:
             raise typer.BadParameter(f"{found.name} is a property, which has verdicts and no clips")
-        asked = {"names": [found.name], "parameters": chosen, "require": require}
-        return _check(store, **asked, out=out, bounds=bounds)
+        statements = Statements([found.name], parameters=chosen)
+        return _check(store, statements=statements, require=require, ask=ask)
     text = found.written(**parameters_of(chosen))
-    form = out.chosen()
-    matches = bounds.opened(store).find(text)
+    matches = ask.opened(store).find(text)
     say_left_out(matches)
     if clips:
         offsets = seconds_of(before, "--before"), seconds_of(after, "--after")
         rows = ((c.trace, c.start_ns, c.end_ns) for c in matches.clips(*offsets))
-        number = write_rows(("trace", "start_ns", "end_ns"), rows, form, out.output)
+        number = ask.write(("trace", "start_ns", "end_ns"), rows)
     else:
-        number = _write_intervals(matches.intervals(), form, out.output)
-    if not number and form is Format.table:
-        say("nothing matches")
-    return NO_MATCH if require and not number else 0
+        number = _write_intervals(matches.intervals(), ask)
+    return _ended(number, ask, require=require)
 
 
 def _check(store: Path, **options: Any) -> int:
@@ -438,19 +405,19 @@ def _check(store: Path, **options: Any) -> int:
     return check(store, **options)
 
 
-def _write_intervals(intervals: Iterator[Interval], form: Format, output: Any) -> int:
+def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
     """Intervals as rows; for people, with a name for each that takes part instead of its node id."""
     first = next(intervals, None)
     if first is None:
-        return write_rows((), [], form, output)
+        return ask.write((), [])
     every = chain([first], intervals)
-    if form is not Format.table:
+    if not ask.for_people:
         columns = ("trace", "start_seq", "end_seq", "start", "end", "frames", *first.values)
         rows = (
             (i.trace, i.start_seq, i.end_seq, i.start, i.end, i.frames, *i.values.values())
             for i in every
         )
-        return write_rows(columns, rows, form, output)
+        return ask.write(columns, rows)
     named = {name.removesuffix(".name") for name in first.values if name.endswith(".name")}
     keep = [name for name in first.values if name.removesuffix(".id") not in named]
     columns = ("from", "start", "end", "frames", *(name.removesuffix(".name") for name in keep))
@@ -464,7 +431,7 @@ def _write_intervals(intervals: Iterator[Interval], form: Format, output: Any) -
         )
         for i in every
     )
-    return write_rows(columns, shown, form, output)
+    return ask.write(columns, shown)
 
 
 def _told(found: NamedPattern) -> dict[str, Any]:

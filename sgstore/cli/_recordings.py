@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from contextlib import contextmanager
-from dataclasses import asdict, fields
-from enum import StrEnum
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -17,78 +15,64 @@ from sgstore.cli._options import (
     ERROR,
     LOSS,
     AsJson,
-    Config,
-    Preset,
-    RoadMap,
-    RowFormat,
+    Jobs,
+    PrintedRows,
+    ReadingOptions,
     StorePath,
     app,
-    form_of,
+    jobs_of,
     lines_of,
     seconds_of,
-    settings_of,
 )
-from sgstore.cli._output import Format, say, write_document, write_report, write_rows
+from sgstore.cli._output import Format, say, write_document, write_report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
-    from sgstore.importing import Imported
     from sgstore.segments import TraceOutcome
     from sgstore.store import StoreFile
 
 PANEL: Final = "Recordings"
 
 
-Traces = Annotated[
+Recordings = Annotated[
     list[str],
     typer.Argument(
         metavar="TRACE…",
         help="Recordings, folders of them, patterns ('drives/**/day?.mcap'); - reads a list from stdin.",
     ),
 ]
-Ego = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--ego",
-        help="Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.",
-    ),
-]
-Jobs = Annotated[
-    int,
-    typer.Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."),
-]
-Since = Annotated[
-    str | None, typer.Option("--since", help="Start at this time of a recording: 10s.")
-]
-Until = Annotated[str | None, typer.Option("--until", help="Stop at this time: 1min.")]
-Rate = Annotated[
-    float | None, typer.Option("--rate", min=0, help="Frames per second to keep; 0: all.")
-]
 Force = Annotated[
     bool, typer.Option("--force", help="Read again and replace what is in the store already.")
-]
-DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Report what would be done, and do nothing.")
 ]
 
 
 @app.command(rich_help_panel=PANEL)
 def ingest(
     store: StorePath,
-    traces: Traces,
-    road_map: RoadMap = None,
-    config: Config = None,
-    preset: Preset = None,
-    ego: Ego = None,
+    traces: Recordings,
+    reading: ReadingOptions,
+    ego: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ego",
+            help="Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.",
+        ),
+    ] = None,
     jobs: Jobs = 1,
-    since: Since = None,
-    until: Until = None,
-    rate: Rate = None,
+    since: Annotated[
+        str | None, typer.Option("--since", help="Start at this time of a recording: 10s.")
+    ] = None,
+    until: Annotated[str | None, typer.Option("--until", help="Stop at this time: 1min.")] = None,
+    rate: Annotated[
+        float | None, typer.Option("--rate", min=0, help="Frames per second to keep; 0: all.")
+    ] = None,
     force: Force = False,
-    dry_run: DryRun = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Report what would be done, and do nothing.")
+    ] = False,
+    *,
+    out: PrintedRows,
 ) -> int:
     """Read recordings into a store; those that are in it already are skipped."""
     from sgstore.cli._output import ingest_bar
@@ -99,10 +83,10 @@ def ingest(
         outcomes = ingest_traces(
             store,
             recordings(_names(traces)),
-            road_map=road_map,
-            config=settings_of(config, preset),
+            road_map=reading.road_map,
+            config=reading.settings(),
             egos=ego or (),
-            jobs=jobs or os.cpu_count() or 1,
+            jobs=jobs_of(jobs),
             since=None if since is None else seconds_of(since, "--since"),
             until=None if until is None else seconds_of(until, "--until"),
             rate=rate,
@@ -113,7 +97,7 @@ def ingest(
     for outcome in outcomes:
         _say_what_was_odd(outcome)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
-    write_rows(columns, map(_outcome_row, outcomes), form_of(form, as_json=as_json))
+    out.write(columns, map(_outcome_row, outcomes))
     if any(outcome.error for outcome in outcomes):
         return ERROR
     return LOSS if any(outcome.losses for outcome in outcomes) else 0
@@ -166,19 +150,18 @@ def info(
             "--trace", help="A trace in full: a name, id, or beginning of one; repeatable."
         ),
     ] = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    out: PrintedRows,
 ) -> int:
     """List the traces of a store, or describe one in full."""
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
-    form = form_of(form, as_json=as_json)
     if traces:
-        _tell_all_of(file, traces, form)
+        _tell_all_of(file, traces, out)
         return 0
     columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
-    write_rows(
+    out.write(
         columns,
         (
             (
@@ -194,12 +177,11 @@ def info(
             )
             for one in file.traces()
         ),
-        form,
     )
     return 0
 
 
-def _tell_all_of(file: StoreFile, names: list[str], form: Format) -> None:
+def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
     """Print all that is known of traces: one as a document, several as rows."""
     with file.snapshot():
         found = [file.trace(name) for name in names]
@@ -207,33 +189,26 @@ def _tell_all_of(file: StoreFile, names: list[str], form: Format) -> None:
     documents = [
         one.as_dict() | {"channels": its} for one, its in zip(found, channels, strict=True)
     ]
-    if form is Format.table:
+    if out.for_people:
         for number, (one, about) in enumerate(zip(found, documents, strict=True)):
             sys.stdout.write("\n" if number else "")
             write_report(about | one.report | {"frames": one.frames})
     elif len(documents) == 1:
-        write_document(documents[0], form)
+        write_document(documents[0], out.chosen)
     else:
-        write_rows(tuple(documents[0]), [tuple(one.values()) for one in documents], form)
+        out.write(tuple(documents[0]), [tuple(one.values()) for one in documents])
 
 
 @app.command(rich_help_panel=PANEL)
-def doctor(
-    traces: Traces,
-    road_map: RoadMap = None,
-    config: Config = None,
-    preset: Preset = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
-) -> int:
+def doctor(traces: Recordings, reading: ReadingOptions, out: PrintedRows) -> int:
     """Check recordings: report what can be read, and any damage. Needs no store."""
     from sgstore.doctor import Examination, examine
     from sgstore.ingest import recordings
 
-    form = form_of(form, as_json=as_json)
-    settings = settings_of(config, preset)
+    settings = reading.settings()
     found = (
-        examine(path, config=settings, road_map=road_map) for path in recordings(_names(traces))
+        examine(path, config=settings, road_map=reading.road_map)
+        for path in recordings(_names(traces))
     )
     codes: set[int] = set()
 
@@ -242,13 +217,13 @@ def doctor(
             codes.add(ERROR if one.error else LOSS if one.losses else 0)
             yield one.as_dict()
 
-    if form is Format.table:
+    if out.for_people:
         for number, values in enumerate(seen()):
             sys.stdout.write("\n" if number else "")
             write_report(values)
     else:
         columns = [column.name for column in fields(Examination)]
-        write_rows(columns, (tuple(values.values()) for values in seen()), form)
+        out.write(columns, (tuple(values.values()) for values in seen()))
     return ERROR if ERROR in codes else max(codes, default=0)
 
 
@@ -333,88 +308,86 @@ def _counter() -> Generator[Callable[[int, float], None] | None]:
 # Verbs about graphs that other tools made -------------------------------------------------------
 
 
-class GraphFormat(StrEnum):
-    """Format of files of graphs."""
+@dataclass(frozen=True)
+class ImportOptions:
+    """Options for the meaning of names in graphs."""
 
-    s3c = "s3c"
-    nodelink = "nodelink"
-    csv = "csv"
-
-
-Files = Annotated[
-    list[Path],
-    typer.Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
-]
-WrittenIn = Annotated[
-    GraphFormat,
-    typer.Option(
-        "--format", help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx."
-    ),
-]
-Kinds = Annotated[
-    list[str] | None,
-    typer.Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
-]
-Relations = Annotated[
-    list[str] | None,
-    typer.Option("--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."),
-]
-UnknownAs = Annotated[
-    str,
-    typer.Option(
-        "--unknown-as",
-        metavar="KIND",
-        help="Take labels that nobody knows for this kind ('other': unknown), leave out relations.",
-    ),
-]
-Answers = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--answers",
-        metavar="RELATION",
-        help="A relation that the graphs can hold, even if none of them does; repeatable.",
-    ),
-]
-Period = Annotated[
-    str,
-    typer.Option("--period", metavar="TIME", help="Time between frames, where the file has none."),
-]
-Rows = Annotated[Format, typer.Option("--rows", help="Format of the rows.")]
+    kind: Annotated[
+        list[str] | None,
+        typer.Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
+    ] = None
+    relation: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."
+        ),
+    ] = None
+    unknown_as: Annotated[
+        str,
+        typer.Option(
+            "--unknown-as",
+            metavar="KIND",
+            help="Take labels that nobody knows for this kind ('other': unknown), leave out relations.",
+        ),
+    ] = ""
+    answers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--answers",
+            metavar="RELATION",
+            help="A relation that the graphs can hold, even if none of them does; repeatable.",
+        ),
+    ] = None
+    period: Annotated[
+        str,
+        typer.Option(
+            "--period", metavar="TIME", help="Time between frames, where the file has none."
+        ),
+    ] = "1s"
 
 
 @app.command("import", rich_help_panel=PANEL)
 def import_(
     store: StorePath,
-    files: Files,
-    form_of_graphs: WrittenIn,
-    kind: Kinds = None,
-    relation: Relations = None,
-    unknown_as: UnknownAs = "",
-    answers: Answers = None,
-    period: Period = "1s",
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."
+        ),
+    ],
+    form_of_graphs: Annotated[
+        Literal["s3c", "nodelink", "csv"],
+        typer.Option(
+            "--format",
+            help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx.",
+        ),
+    ],
     force: Force = False,
-    form: Rows = Format.table,
+    form: Annotated[Format, typer.Option("--rows", help="Format of the rows.")] = Format.table,
     as_json: AsJson = False,
+    *,
+    meaning: ImportOptions,
 ) -> int:
     """Import graphs of other tools into a store: each becomes a frame."""
     from sgstore.importing import Words, import_graphs
     from sgstore.vocabulary import relation_named
 
-    words = Words(_pairs(kind, "--kind"), _pairs(relation, "--relation"), unknown_as)
-    known = [relation_named(name) for name in answers or ()]
-    if None in known:
-        raise typer.BadParameter(
-            f"--answers {(answers or [''])[known.index(None)]}: no such relation"
-        )
-    seconds = seconds_of(period, "--period")
+    words = Words(
+        _pairs(meaning.kind, "--kind"), _pairs(meaning.relation, "--relation"), meaning.unknown_as
+    )
+    answers = {name: relation_named(name) for name in meaning.answers or ()}
+    for name, known in answers.items():
+        if known is None:
+            raise typer.BadParameter(f"--answers {name}: no such relation")
+    seconds = seconds_of(meaning.period, "--period")
     if seconds <= 0:
         raise typer.BadParameter("--period: expected more than 0s")
     done = import_graphs(
         store,
         files,
-        str(form_of_graphs),
+        form_of_graphs,
         words=words,
-        relations=[name for name in known if name is not None],
+        relations=[name for name in answers.values() if name is not None],
         period_s=seconds,
         force=force,
     )
@@ -425,8 +398,10 @@ def import_(
             say(f"{one.path.name}: {what}: {often} times, cannot be kept")
     columns = ("file", "status", "trace", "frames", "entities", "edges")
     rows = ((str(o.path), o.status, o.name, o.frames, o.entities, o.edges) for o in done)
-    write_rows(columns, rows, form_of(form, as_json=as_json))
-    return _code(done)
+    PrintedRows(form, as_json).write(columns, rows)
+    if any(one.error is not None for one in done):
+        return ERROR
+    return LOSS if any(one.lost for one in done) else 0
 
 
 def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
@@ -439,9 +414,3 @@ def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
             raise typer.BadParameter(f"{option} {text!r}: {name} means {pairs[name]} already")
         pairs[name] = value
     return pairs
-
-
-def _code(done: list[Imported]) -> int:
-    if any(one.error is not None for one in done):
-        return ERROR
-    return LOSS if any(one.lost for one in done) else 0

@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from sgstore.cli._options import (
     ERROR,
     NO_MATCH,
-    AsJson,
-    Output,
+    Abstraction,
+    AskOptions,
     Parameters,
+    PrintedRows,
     QueryLimits,
     QueryText,
-    RowFormat,
     RowOptions,
     StorePath,
     Verbs,
     app,
     asked_of,
-    form_of,
     parameters_of,
     say_left_out,
     seconds_of,
 )
-from sgstore.cli._output import Format, count_bar, say, write_rows
+from sgstore.cli._output import count_bar, say
 
 if TYPE_CHECKING:
-    from sgstore.coverage import ChosenFrames, ReportTable
+    from sgstore.coverage import ChosenFrames
     from sgstore.locks import Lock
     from sgstore.query import Store
-    from sgstore.selection import Selection, Strategy
+    from sgstore.selection import Selection, SelectionSpec, Strategy
 
 PANEL: Final = "Coverage and test sets"
 
@@ -47,23 +46,6 @@ app.add_typer(
 )
 
 
-class ChosenUnit(StrEnum):
-    """Unit of a choice."""
-
-    frame = "frame"
-    clip = "clip"
-    trace = "trace"
-
-
-class Least(StrEnum):
-    """Quantity that a minimal choice minimizes."""
-
-    units = "units"
-    frames = "frames"
-    seconds = "seconds"
-    bytes = "bytes"
-
-
 LockPath = Annotated[Path, typer.Argument(metavar="LOCK", help="A lock that select wrote.")]
 LockA = Annotated[Path, typer.Argument(metavar="A", help="A lock.")]
 LockB = Annotated[Path, typer.Argument(metavar="B", help="A lock.")]
@@ -72,95 +54,118 @@ NoPayloads = Annotated[
     bool,
     typer.Option("--no-payloads", help="Skip sensor messages: recordings are not read."),
 ]
+Objective = Literal["units", "frames", "seconds", "bytes"]
 
 
-Minimal = Annotated[
-    bool, typer.Option("--minimal", help="The fewest that keep everything that occurs.")
-]
-PerClass = Annotated[
-    int | None,
-    typer.Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times."),
-]
-Rarest = Annotated[bool, typer.Option("--rarest", help="Rarest classes first.")]
-Stratify = Annotated[
-    str, typer.Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
-]
-BudgetText = Annotated[
-    str, typer.Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
-]
-UnitName = Annotated[ChosenUnit, typer.Option("--unit", help="Frames, clips, or whole traces.")]
-ClipLength = Annotated[
-    str, typer.Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")
-]
-Stride = Annotated[
-    str,
-    typer.Option(
-        "--stride",
-        metavar="TIME",
-        help="Time from the start of a clip to that of the next; below --clip, they overlap.",
-        show_default="--clip",
-    ),
-]
-Abstraction = Annotated[
-    str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
-]
-Combos = Annotated[
-    int, typer.Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
-]
-OfEgo = Annotated[bool, typer.Option("--ego", help="--combos: only features of the ego.")]
-ObjectiveName = Annotated[
-    Least, typer.Option("--objective", help="Quantity that --minimal minimizes.")
-]
-Alpha = Annotated[
-    float,
-    typer.Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal."),
-]
-OldLeast = Annotated[Least | None, typer.Option("--least", hidden=True)]  # until 0.3
-OldTemper = Annotated[float | None, typer.Option("--temper", hidden=True)]  # until 0.3
-SplitText = Annotated[
-    str, typer.Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
-]
-Seed = Annotated[int, typer.Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")]
-LockFile = Annotated[
-    Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write a lock.")
-]
-WithCurve = Annotated[
-    bool, typer.Option("--curve", help="Print how much is kept by how many, beside a random order.")
-]
-Picture = Annotated[
-    Path | None, typer.Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
-]
+@dataclass(frozen=True)
+class ChoiceOptions:
+    """Options for a choice: its strategy, its units, and its limits."""
+
+    minimal: Annotated[
+        bool, typer.Option("--minimal", help="The fewest that keep everything that occurs.")
+    ] = False
+    per_class: Annotated[
+        int | None,
+        typer.Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times."),
+    ] = None
+    rarest: Annotated[bool, typer.Option("--rarest", help="Rarest classes first.")] = False
+    stratify: Annotated[
+        str, typer.Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
+    ] = ""
+    budget: Annotated[
+        str, typer.Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
+    ] = ""
+    unit: Annotated[
+        Literal["frame", "clip", "trace"],
+        typer.Option("--unit", help="Frames, clips, or whole traces."),
+    ] = "frame"
+    clip: Annotated[
+        str, typer.Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")
+    ] = "2s"
+    stride: Annotated[
+        str,
+        typer.Option(
+            "--stride",
+            metavar="TIME",
+            help="Time from the start of a clip to that of the next; below --clip, they overlap.",
+            show_default="--clip",
+        ),
+    ] = ""
+    abstraction: Abstraction = "RSV"
+    combos: Annotated[
+        int, typer.Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
+    ] = 0
+    ego: Annotated[bool, typer.Option("--ego", help="--combos: only features of the ego.")] = False
+    objective: Annotated[
+        Objective, typer.Option("--objective", help="Quantity that --minimal minimizes.")
+    ] = "units"
+    alpha: Annotated[
+        float,
+        typer.Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal."),
+    ] = 1.0
+    least: Annotated[Objective | None, typer.Option("--least", hidden=True)] = None  # until 0.3
+    temper: Annotated[float | None, typer.Option("--temper", hidden=True)] = None  # until 0.3
+    seed: Annotated[int, typer.Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
+
+    def spec(self) -> SelectionSpec:
+        """Make what the options say together."""
+        from sgstore.selection import Budget, Measure, SelectionSpec, SelectionUnit
+
+        return SelectionSpec(
+            self._strategy(),
+            SelectionUnit(self.unit),
+            seconds_of(self.clip, "--clip"),
+            self.abstraction,
+            self.combos,
+            of_ego=self.ego,
+            each=self.per_class or (0 if self.stratify else 1),
+            by=self.stratify,
+            alpha=self.alpha if self.temper is None else self.temper,
+            budget=Budget.parse(self.budget) if self.budget else None,
+            objective=Measure(self.least or self.objective),
+            seed=self.seed,
+            stride_s=seconds_of(self.stride, "--stride") if self.stride else None,
+        )
+
+    def _strategy(self) -> Strategy:
+        from sgstore.selection import Strategy
+
+        per_class = self.per_class is not None and not self.stratify
+        ways = {
+            Strategy.minimal: self.minimal,
+            Strategy.rarest: self.rarest,
+            Strategy.stratify: bool(self.stratify),
+            Strategy.per_class: per_class,
+        }
+        asked = [way for way, wanted in ways.items() if wanted]
+        if len(asked) > 1:
+            raise typer.BadParameter("give one of --minimal, --per-class, --rarest, --stratify")
+        return asked[0] if asked else Strategy.every
 
 
 @app.command(rich_help_panel=PANEL)
 def select(
     store: StorePath,
+    choice: ChoiceOptions,
     query: QueryText = None,
-    minimal: Minimal = False,
-    per_class: PerClass = None,
-    rarest: Rarest = False,
-    stratify: Stratify = "",
-    budget: BudgetText = "",
-    unit: UnitName = ChosenUnit.frame,
-    clip: ClipLength = "2s",
-    stride: Stride = "",
-    abstraction: Abstraction = "RSV",
-    combos: Combos = 0,
-    ego: OfEgo = False,
-    objective: ObjectiveName = Least.units,
-    alpha: Alpha = 1.0,
-    least: OldLeast = None,
-    temper: OldTemper = None,
-    split: SplitText = "",
-    seed: Seed = 0,
     parameters: Parameters = None,
-    output: LockFile = None,
+    split: Annotated[
+        str, typer.Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
+    ] = "",
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write a lock.")
+    ] = None,
     no_payloads: NoPayloads = False,
-    curve: WithCurve = False,
-    picture: Picture = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    curve: Annotated[
+        bool,
+        typer.Option("--curve", help="Print how much is kept by how many, beside a random order."),
+    ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg."),
+    ] = None,
     *,
+    out: PrintedRows,
     bounds: QueryLimits,
 ) -> None:
     """Choose frames, clips or traces for tests, rate the choice, and lock it.
@@ -168,53 +173,27 @@ def select(
     Without --minimal, --per-class, --rarest or --stratify all are taken, or some at
     random within the --budget.
     """
-    from sgstore.selection import Budget, Measure, SelectionSpec, SelectionUnit, parse_split
+    from sgstore.locks import ENDING
+    from sgstore.selection import listed, parse_split, split_table
     from sgstore.selection import select as choose
+    from sgstore.selection import split as split_up
 
-    spec = SelectionSpec(
-        _strategy(minimal=minimal, per_class=per_class, rarest=rarest, stratify=stratify),
-        SelectionUnit(unit.value),
-        seconds_of(clip, "--clip"),
-        abstraction,
-        combos,
-        of_ego=ego,
-        each=per_class or (0 if stratify else 1),
-        by=stratify,
-        alpha=alpha if temper is None else temper,
-        budget=Budget.parse(budget) if budget else None,
-        objective=Measure((least or objective).value),
-        seed=seed,
-        stride_s=seconds_of(stride, "--stride") if stride else None,
-    )
-    _check_output(output)
+    spec = choice.spec()
+    if output is not None and output.suffix != ENDING:  # before anything is searched
+        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     shares = parse_split(split) if split else {}
     opened = bounds.opened(store)
     found = choose(_chosen(opened, str(store), query, parameters), spec)
-    parts, table = _parts(found, shares)
-    _show(found, table, picture, form_of(form, as_json=as_json), curve=curve)
+    parts = split_up(found, shares) if shares else {}
+    for text in found.said:
+        say(text)
+    if curve or picture is not None:
+        _curve(found, picture, out, printed=curve)
+    else:
+        out.report(split_table(found, parts, shares) if shares else listed(found))
     if output is not None:
         asked = query or "", parameters_of(parameters)
         _lock(found, asked, parts, output, payloads=not no_payloads)
-
-
-def _strategy(*, minimal: bool, per_class: int | None, rarest: bool, stratify: str) -> Strategy:
-    """Strategy that the options name."""
-    from sgstore.selection import Strategy
-
-    ways = {Strategy.minimal: minimal, Strategy.rarest: rarest, Strategy.stratify: bool(stratify)}
-    ways[Strategy.per_class] = per_class is not None and not stratify
-    asked = [way for way, wanted in ways.items() if wanted]
-    if len(asked) > 1:
-        raise typer.BadParameter("give one of --minimal, --per-class, --rarest, --stratify")
-    return asked[0] if asked else Strategy.every
-
-
-def _check_output(output: Path | None) -> None:
-    """Refuse a name that no lock can have, before anything is searched."""
-    from sgstore.locks import ENDING
-
-    if output is not None and output.suffix != ENDING:
-        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
 
 
 def _chosen(
@@ -235,41 +214,14 @@ def _chosen(
     )
 
 
-def _parts(found: Selection, shares: dict[str, float]) -> tuple[dict[int, str], ReportTable | None]:
-    from sgstore.selection import split, split_table
-
-    if not shares:
-        return {}, None
-    parts = split(found, shares)
-    return parts, split_table(found, parts, shares)
-
-
-def _listed(found: Selection) -> ReportTable:
-    from sgstore.selection import listed
-
-    return listed(found)
-
-
-def _show(
-    found: Selection, parts: ReportTable | None, picture: Path | None, form: Format, *, curve: bool
-) -> None:
-    """Print what was chosen, its parts, or the curve of what is kept."""
-    for text in found.said:
-        say(text)
-    if curve or picture is not None:
-        _curve(found, picture, form, printed=curve)
-    else:
-        _write(parts or _listed(found), form)
-
-
-def _curve(found: Selection, picture: Path | None, form: Format, *, printed: bool) -> None:
-    from sgstore.selection import curve
+def _curve(found: Selection, picture: Path | None, out: PrintedRows, *, printed: bool) -> None:
+    from sgstore.selection import curve, listed
 
     drawn = curve(found)
     if printed:
-        _write(drawn.table, form)
+        out.report(drawn.table)
     else:
-        _write(_listed(found), form)
+        out.report(listed(found))
         say(drawn.table.said[0])
     if picture is not None and found.holdings is not None:
         from sgstore.draw import draw_curve
@@ -312,8 +264,7 @@ def verify_(
         bool, typer.Option("--strict", help="Count another version of sgstore as a difference.")
     ] = False,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> int:
     """Verify that a store holds the cases of a lock: recordings, settings, graphs, sensor messages.
 
@@ -322,12 +273,9 @@ def verify_(
     """
     from sgstore.locks import read_lock, verify
 
-    form = out.chosen()
     known = read_lock(path)
-    opened = bounds.opened(store)
-    found = list(verify(known, opened, payloads=not no_payloads))
-    rows = [(one.where, one.what, one.detail) for one in found]
-    write_rows(("where", "what", "detail"), rows, form, out.output)
+    found = list(verify(known, ask.opened(store), payloads=not no_payloads))
+    ask.write(("where", "what", "detail"), [(one.where, one.what, one.detail) for one in found])
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
     if unread or no_payloads:
@@ -338,15 +286,13 @@ def verify_(
 
 
 @lock.command("list")
-def list_(
-    path: LockPath, form: RowFormat = Format.table, as_json: AsJson = False, output: Output = None
-) -> None:
+def list_(path: LockPath, out: RowOptions) -> None:
     """List the cases of a lock."""
     from sgstore.locks import read_lock
 
     columns = ("id", "trace", "first", "last", "frames", "split", "start_ns", "end_ns", "graph")
     rows = [tuple(getattr(c, name) for name in columns) for c in read_lock(path).cases]
-    write_rows(columns, rows, form_of(form, output, as_json=as_json), output)
+    out.write(columns, rows)
 
 
 @lock.command("union")
@@ -378,15 +324,6 @@ def _made(made: Lock, output: Path) -> None:
     say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
 
 
-def _write(table: ReportTable | None, form: Format, output: Path | None = None) -> None:
-    """Print rows, and say what they are of."""
-    if table is None:
-        return
-    write_rows(table.columns, table.rows, form, output)
-    for text in table.said:
-        say(text)
-
-
 @app.command(rich_help_panel=PANEL)
 def diff(
     a: Annotated[str, typer.Argument(metavar="A", help="Before: a store, STORE:QUERY, or a lock.")],
@@ -404,16 +341,13 @@ def diff(
     by_frame: Annotated[
         bool, typer.Option("--by-frame", help="Scenes of traces of one name, frame by frame.")
     ] = False,
-    abstraction: Annotated[
-        str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
-    ] = "RSV",
+    abstraction: Abstraction = "RSV",
     parameters: Parameters = None,
     require: Annotated[
         bool, typer.Option("--require", help="End with exit code 4 if anything is different.")
     ] = False,
     *,
-    out: RowOptions,
-    bounds: QueryLimits,
+    ask: AskOptions,
 ) -> int:
     """Compare two stores or runs: which scenes, verdicts or matches appeared, vanished, changed."""
     from sgstore import diff as differences
@@ -422,8 +356,7 @@ def diff(
 
     if (name is not None) + (query is not None) + by_frame > 1:
         raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
-    form = out.chosen()
-    values, spill = parameters_of(parameters), bounds.spill()
+    values, spill = parameters_of(parameters), ask.spill()
     if name is not None or query is not None:
         text, values = asked_of(query, None, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
@@ -435,6 +368,6 @@ def diff(
             *(classed(selection_of(one, max_spill=spill), abstraction) for one in (a, b))
         )
     # People read the reasons below the table, each once.
-    _write(table.without(*differences.REASONS) if form is Format.table else table, form, out.output)
+    ask.report(table.without(*differences.REASONS) if ask.for_people else table)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0

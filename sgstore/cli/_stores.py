@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from sgstore.cli._options import ERROR, LOSS, AsJson, Output, RowFormat, StorePath, app, form_of
-from sgstore.cli._output import Format, say, write_rows
+from sgstore.cli._options import (
+    ERROR,
+    LOSS,
+    GraphOptions,
+    Jobs,
+    Output,
+    PrintedRows,
+    StorePath,
+    app,
+    jobs_of,
+)
+from sgstore.cli._output import say
 from sgstore.errors import ExportError
 from sgstore.files import write_bytes
 
@@ -28,15 +37,15 @@ def verify(
     payloads: Annotated[
         bool, typer.Option("--payloads", help="Also hash the recordings again.")
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    out: PrintedRows,
 ) -> int:
     """Verify that a store is as it was published; list every fault."""
     from sgstore.store import verify_file
 
     found = verify_file(store, recordings=payloads)
     rows = [(fault.trace, fault.check, fault.detail) for fault in found.faults]
-    write_rows(("trace", "check", "detail"), rows, form_of(form, as_json=as_json))
+    out.write(("trace", "check", "detail"), rows)
     hashed = f", {found.recordings} recordings" if payloads else ""
     wrong = f"{len(rows)} faults" if rows else "no fault"
     if found.others:
@@ -56,8 +65,8 @@ def remove(
         bool,
         typer.Option("--compact", help="Rewrite the file to free its space; also without a TRACE."),
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    out: PrintedRows,
 ) -> int:
     """Remove traces from a store, all or none; the recordings are not touched."""
     from sgstore.store import StoreFile
@@ -71,7 +80,7 @@ def remove(
     if compact:
         file.compact()
     rows = [(trace.name, trace.frames, str(trace.path)) for trace in gone]
-    write_rows(("trace", "frames", "file"), rows, form_of(form, as_json=as_json))
+    out.write(("trace", "frames", "file"), rows)
     return 0
 
 
@@ -94,14 +103,9 @@ def rebuild(
             help="Leave out a trace that cannot be rebuilt; repeatable.",
         ),
     ] = None,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            "--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."
-        ),
-    ] = 1,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    jobs: Jobs = 1,
+    *,
+    out: PrintedRows,
 ) -> None:
     """Rebuild a store from its recordings; the old one stays until the new one is complete."""
     from sgstore.cli._output import ingest_bar
@@ -112,11 +116,11 @@ def rebuild(
             store,
             look_in=look_in or (),
             leave_out=leave_out or (),
-            jobs=jobs or os.cpu_count() or 1,
+            jobs=jobs_of(jobs),
             on_progress=on_progress,
         )
     rows = [(one.trace, one.status, one.frames, str(one.path)) for one in made]
-    write_rows(("trace", "status", "frames", "file"), rows, form_of(form, as_json=as_json))
+    out.write(("trace", "status", "frames", "file"), rows)
 
 
 # Verbs about graphs: other relations from the states of a store ---------------------------------
@@ -128,13 +132,6 @@ def derive(
     name: Annotated[
         str | None,
         typer.Option("--as", metavar="NAME", help="Name of the set: USING ABSTRACTION NAME."),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="TOML file with settings of the relations.")
-    ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
     ] = None,
     abstraction: Annotated[
         str | None,
@@ -153,41 +150,40 @@ def derive(
     remove: Annotated[
         str | None, typer.Option("--remove", metavar="NAME", help="Delete a set instead.")
     ] = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    graphs: GraphOptions,
+    out: PrintedRows,
 ) -> int:
     """Derive another set of relations from the stored states; without --as, list the sets."""
-    from sgstore.config import Config, load
-    from sgstore.config import preset as preset_named
+    from sgstore.config import Config
     from sgstore.derive import derive as derive_set
     from sgstore.derive import keep_abstraction
     from sgstore.store import StoreFile
 
+    given = graphs.config or graphs.preset
     if abstraction is not None:
-        if name is not None or remove is not None or config or preset or force:
+        if name is not None or remove is not None or given or force:
             raise typer.BadParameter("--abstraction NAME stands alone, or with --trace")
         kept = keep_abstraction(store, abstraction, trace or ())
-        return _write_derived(kept, form_of(form, as_json=as_json))
+        return _write_derived(kept, out)
     if name is None or remove is not None:
-        if name is not None or config or preset or (remove is None and (trace or force)):
+        if name is not None or given or (remove is None and (trace or force)):
             raise typer.BadParameter("give --as NAME with settings, --remove NAME, or nothing")
         deriving = StoreFile(store).deriving
         if remove is not None:
             say(f"removed {remove} of {', '.join(deriving.remove(remove))}")
             return 0
         rows = ((one.name, one.trace, len(one.answers)) for one in deriving.sets())
-        write_rows(("name", "trace", "relations"), rows, form_of(form, as_json=as_json))
+        out.write(("name", "trace", "relations"), rows)
         return 0
-    if config and preset:
-        raise typer.BadParameter("give one of --config and --preset")
-    settings = preset_named(preset) if preset else load(config) if config else Config()
+    settings = graphs.settings() or Config()
     done = derive_set(store, settings, name, trace or (), replace_old=force)
-    return _write_derived(done, form_of(form, as_json=as_json))
+    return _write_derived(done, out)
 
 
-def _write_derived(done: list[Derivation], form: Format) -> int:
+def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
     rows = ((one.trace, one.status, one.frames, one.edges) for one in done)
-    write_rows(("trace", "status", "frames", "edges"), rows, form)
+    out.write(("trace", "status", "frames", "edges"), rows)
     for one in done:
         for loss in one.losses:
             say(f"{one.trace}: {loss}")
@@ -209,8 +205,8 @@ def map_(
         Path | None,
         typer.Option("--output", "-o", help="Draw it there, north up: .png or .svg."),
     ] = None,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    out: PrintedRows,
 ) -> int:
     """Summarize a road map: lanes by type, junctions, signals, and problems."""
     from sgstore.roads import summary
@@ -221,18 +217,17 @@ def map_(
 
         draw_map(road_map, picture)
         say(f"drawn: {picture}")
-    form = form_of(form, as_json=as_json)
     rows = [
         (one.part, one.kind, one.count, None if one.length is None else round(one.length, 1))
         for one in summary(road_map)
     ]
-    if form is Format.table:  # sentences have no room in a table
+    if out.for_people:  # sentences have no room in a table
         for _, text, _, _ in (row for row in rows if row[0] == "warning"):
             say(text)
         rows = [row for row in rows if row[0] != "warning"]
     columns = ("part", "kind", "count", "length_m")
     types = ("VARCHAR", "VARCHAR", "BIGINT", "DOUBLE")
-    write_rows(columns, rows, form, types=types)
+    out.write(columns, rows, types)
     return 0
 
 
@@ -275,15 +270,15 @@ def payload(
         bool,
         typer.Option("--message", help="The message as it was recorded, not the picture in it."),
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    out: PrintedRows,
 ) -> int:
     """Fetch the sensor data of a frame: a picture, a video up to it, or the message."""
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
     if channel is None:
-        _list_channels(file, frame, form_of(form, as_json=as_json))
+        _list_channels(file, frame, out)
         return 0
     if output is None and sys.stdout.isatty():
         raise ExportError(
@@ -304,7 +299,7 @@ def payload(
     return 0
 
 
-def _list_channels(file: StoreFile, frame: str, form: Format) -> None:
+def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
     with file.snapshot():
         wanted = file.frame(frame)
         found = file.rows(
@@ -312,7 +307,7 @@ def _list_channels(file: StoreFile, frame: str, form: Format) -> None:
             " WHERE frame_id = ? ORDER BY channel",
             [wanted.frame_id],
         )
-    write_rows(found.columns, found, form)
+    out.write(found.columns, found)
 
 
 # The verb about settings: print them, with what each means --------------------------------------
@@ -331,8 +326,8 @@ def config(
     page: Annotated[
         bool, typer.Option("--page", help="Print the page docs/parameters.md instead.")
     ] = False,
-    form: RowFormat = Format.table,
-    as_json: AsJson = False,
+    *,
+    out: PrintedRows,
 ) -> None:
     """Print all settings as commented TOML, to be changed and given to ingest."""
     from sgstore.config import PRESETS, Config, as_markdown, as_toml, load
@@ -342,7 +337,7 @@ def config(
         raise typer.BadParameter("give one of FILE, --preset, --list and --page")
     if every:
         rows = ((name, one.summary) for name, one in PRESETS.items())
-        write_rows(("preset", "what it is"), rows, form_of(form, as_json=as_json))
+        out.write(("preset", "what it is"), rows)
         return
     if page:
         typer.echo(as_markdown(PRESETS), nl=False)
