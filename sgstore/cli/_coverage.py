@@ -366,10 +366,10 @@ def failures_(
     ask: AskOptions,
 ) -> None:
     """List failures of a system that are novel, and those that coverage would have predicted (S3C)."""
-    from sgstore.coverage import S3C_THRESHOLD, Outcomes, failures
+    from sgstore.coverage import S3C_THRESHOLD, failures, read_outcomes
 
     limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)
-    told = Outcomes.read(outcomes, limits)
+    told = read_outcomes(outcomes, limits)
     known, tested = windows.of(ask, train, test)
     shares, listed = failures(known, tested, told)
     for text in shares.said if novel else ():

@@ -16,8 +16,8 @@ from ._compare import rank_sizes as rank_sizes
 from ._compare import venn as venn
 from ._explain import explain as explain
 from ._failures import S3C_THRESHOLD as S3C_THRESHOLD
-from ._failures import Outcomes as Outcomes
 from ._failures import failures as failures
+from ._failures import read_outcomes as read_outcomes
 from ._features import Combinations as Combinations
 from ._features import Combos as Combos
 from ._features import combined as combined
@@ -42,7 +42,6 @@ __all__ = [
     "Combos",
     "CountedUnit",
     "Missing",
-    "Outcomes",
     "ReportTable",
     "S3C_THRESHOLD",
     "UNKNOWN",
@@ -63,6 +62,7 @@ __all__ = [
     "of_unknown",
     "periods_of",
     "rank_sizes",
+    "read_outcomes",
     "read_specifications",
     "run_begins",
     "selection_of",

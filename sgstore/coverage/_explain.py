@@ -5,7 +5,7 @@ S3C asked so what failing test inputs have that training inputs have not. (Woodl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from sgstore.coverage._classes import Classed
     from sgstore.coverage._features import Feature
-    from sgstore.world import Bools, Floats
+    from sgstore.world import Bools, Floats, Ints
 
 
 DEPTH: Final = 4
@@ -32,37 +32,13 @@ _THRESHOLDS: Final = (0, 1, 2, 3)
 """How often a feature must occur at least, less one, for the answer yes."""
 
 
-@dataclass(frozen=True, slots=True)
-class TreeQuestion:
-    """A question of a tree, whether a feature occurs more often than so; and the answer."""
-
-    feature: Feature
-    more_than: int
-    answer: bool
-
-    def __str__(self) -> str:
-        text = " ".join(self.feature)
-        if self.more_than == 0:
-            return text if self.answer else f"no {text}"
-        return f"{text} {'>' if self.answer else '<='} {self.more_than}"
-
-
-@dataclass(frozen=True, slots=True)
-class Leaf:
-    """Leaf of a decision tree: the weight of both selections in it."""
-
-    questions: tuple[TreeQuestion, ...]
-    ours: float
-    theirs: float
-
-
 def tree(
     counts: NDArray[np.integer[Any]],
     names: tuple[Feature, ...],
     ours: Bools,
     weight: Floats,
     depth: int = DEPTH,
-) -> list[Leaf]:
+) -> list[tuple[tuple[str, ...], float, float]]:
     """A decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
 
     Parameters
@@ -76,74 +52,57 @@ def tree(
 
     Returns
     -------
-    list of Leaf
-        Those with the most of ours for what they have of theirs first.
+    list of tuple
+        Of each leaf the answers that lead to it, and its weight of ours and of the others; those with the most
+        of ours for what they have of the others first.
     """
-    leaves: list[Leaf] = []
-    _grow(counts, names, ours, weight, depth, (), leaves)
-    leaves.sort(key=lambda leaf: (-leaf.ours / max(leaf.ours + leaf.theirs, 1e-12), -leaf.ours))
+    leaves: list[tuple[tuple[str, ...], float, float]] = []
+
+    def grow(rows: Ints, asked: tuple[str, ...]) -> None:
+        known = counts[rows]
+        best = _best(known, ours[rows], weight[rows]) if len(asked) < depth else None
+        if best is None:
+            good, other = weight[rows[ours[rows]]].sum(), weight[rows[~ours[rows]]].sum()
+            leaves.append((asked, float(good), float(other)))
+            return
+        feature, more_than = best
+        yes, text = known[:, feature] > more_than, " ".join(names[feature])
+        grow(rows[yes], (*asked, f"{text} > {more_than}" if more_than else text))
+        grow(rows[~yes], (*asked, f"{text} <= {more_than}" if more_than else f"no {text}"))
+
+    grow(np.arange(len(counts)), ())
+    leaves.sort(key=lambda leaf: (-leaf[1] / max(leaf[1] + leaf[2], 1e-12), -leaf[1]))
     return leaves
 
 
-def _grow(
-    counts: NDArray[np.integer[Any]],
-    names: tuple[Feature, ...],
-    ours: Bools,
-    weight: Floats,
-    depth: int,
-    asked: tuple[TreeQuestion, ...],
-    leaves: list[Leaf],
-) -> None:
-    best = _best(counts, ours, weight) if depth else None
-    if best is None:
-        leaves.append(Leaf(asked, float(weight[ours].sum()), float(weight[~ours].sum())))
-        return
-    feature, more_than = best
-    yes = counts[:, feature] > more_than
-    for answer in (True, False):
-        side = yes if answer else ~yes
-        question = TreeQuestion(names[feature], more_than, answer)
-        _grow(
-            counts[side],
-            names,
-            ours[side],
-            weight[side],
-            depth - 1,
-            (*asked, question),
-            leaves,
-        )
-
-
 def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
-    """The question that makes both sides purest; ``None`` if none makes them purer."""
+    """The question that makes both sides purest: a feature, and how often it occurs at most without it."""
     good = np.where(ours, weight, 0.0)
     total, positive = float(weight.sum()), float(good.sum())
     if min(positive, total - positive) < 1e-9:
         return None
-    before = _impurity(np.array([positive]), np.array([total]))[0]
-    best: tuple[float, int, int] = (1e-9 * total, -1, 0)
-    most = counts.max(axis=0, initial=0)
+    best, most = None, 1e-9 * total
+    highest = counts.max(axis=0, initial=0)
     for more_than in _THRESHOLDS:
-        columns = np.flatnonzero(most > more_than)
+        columns = np.flatnonzero(highest > more_than)
         if not len(columns):
             break
-        all_yes, good_yes = np.zeros((2, counts.shape[1]))
-        own = counts if len(columns) == counts.shape[1] else counts[:, columns]
-        all_yes[columns], good_yes[columns] = weighted(own, np.stack([weight, good]), more_than)
+        yes, good_yes = weighted(counts[:, columns], np.stack([weight, good]), more_than)
         gain = (
-            before - _impurity(good_yes, all_yes) - _impurity(positive - good_yes, total - all_yes)
+            _impurity(positive, total)
+            - _impurity(good_yes, yes)
+            - _impurity(positive - good_yes, total - yes)
         )
-        gain[np.minimum(all_yes, total - all_yes) < SMALLEST] = -np.inf
-        feature = int(np.argmax(gain)) if len(gain) else -1
-        if feature >= 0 and gain[feature] > best[0]:
-            best = (float(gain[feature]), feature, more_than)
-    return None if best[1] < 0 else best[1:]
+        gain[np.minimum(yes, total - yes) < SMALLEST] = -np.inf
+        first = int(np.argmax(gain))
+        if gain[first] > most:
+            best, most = (int(columns[first]), more_than), float(gain[first])
+    return best
 
 
-def _impurity(positive: Floats, total: Floats) -> Floats:
+def _impurity(positive: Floats | float, total: Floats | float) -> Floats:
     """Gini's impurity times the weight."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.where(total > 0, positive / total, 0.0)
+    share = positive / np.maximum(total, 1e-12)
     return 2 * share * (1 - share) * total
 
 
@@ -207,12 +166,12 @@ def explain(
     grown = tree(counts, names, ours, np.concatenate(weights), depth)
     leaves = [
         (
-            " and ".join(map(str, leaf.questions)) or "(all)",
-            leaf.ours,
-            leaf.theirs,
-            leaf.ours / (leaf.ours + leaf.theirs) if leaf.ours + leaf.theirs else None,
+            " and ".join(asked) or "(all)",
+            good,
+            other,
+            good / (good + other) if good + other else None,
         )
-        for leaf in grown
+        for asked, good, other in grown
     ]
     return (
         ReportTable(("feature", "share_of_b", "share_of_a", "difference", "query"), rows, said),

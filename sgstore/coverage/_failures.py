@@ -17,14 +17,12 @@ import numpy as np
 from sgstore.coverage._classes import shared
 from sgstore.coverage._frames import SHARES, ReportTable, names_of, of_unknown, share
 from sgstore.errors import ConfigError
-from sgstore.store import seq_of, trace_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from sgstore.coverage._classes import Classed
     from sgstore.coverage._frames import Row
-    from sgstore.query import Store
     from sgstore.world import Bools, Ints
 
 
@@ -35,69 +33,51 @@ paper says 5°."""
 _ID: Final = re.compile(r"[0-9]{1,18}")
 
 
-class Outcomes:
-    """Inputs of a system that failed, by the names of frames.
+def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:
+    """The outcomes in a CSV file: which inputs of a system failed.
 
-    Attributes
+    Parameters
     ----------
-    failed : dict
+    path : str or Path
+        Columns ``frame`` (or S3C's ``town`` and ``filename``) and ``failed``, or ``error``, or ``label`` and
+        ``pred``.
+    threshold : float
+        An error above it is a failure; of ``label`` and ``pred`` their difference.
+
+    Returns
+    -------
+    dict
         Name → whether it failed. A name is ``TRACE#SEQ``, a ``frame_id``, or what an imported file calls a
         graph.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, a column is missing, or a row is not what it must be.
     """
-
-    def __init__(self, failed: dict[str, bool]) -> None:
-        self.failed = failed
-
-    @classmethod
-    def read(cls, path: str | Path, threshold: float = S3C_THRESHOLD) -> Outcomes:
-        """The outcomes in a CSV file.
-
-        Parameters
-        ----------
-        path : str or Path
-            Columns ``frame`` (or S3C's ``town`` and ``filename``) and ``failed``, or ``error``, or ``label``
-            and ``pred``.
-        threshold : float
-            An error above it is a failure; of ``label`` and ``pred`` their difference.
-
-        Raises
-        ------
-        ConfigError
-            It cannot be read, a column is missing, or a row is not what it must be.
-        """
-        path = Path(path)
-        try:
-            with path.open(encoding="utf-8-sig", newline="") as file:
-                return cls(dict(_outcomes(path, csv.reader(file, strict=True), threshold)))
-        except OSError as error:
-            raise ConfigError(f"{path}: {error.strerror}") from error
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: no CSV: {error}") from error
-
-    def of(self, a: Classed) -> tuple[Bools, Bools]:
-        """(N,): which frames of a selection failed, and of which an outcome is known."""
-        failed, known = (np.zeros(len(a.frame_id), np.bool_) for _ in range(2))
-        place = {int(frame): row for row, frame in enumerate(a.frame_id.tolist())}
-        names = _FrameNames(a.chosen.store)
-        for name, fails in self.failed.items():
-            row = place.get(names.get(name, int(name) if _ID.fullmatch(name) else -1))
-            if row is not None:
-                failed[row], known[row] = fails, True
-        return failed, known
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return dict(_outcomes(path, csv.reader(file, strict=True), threshold))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: no CSV: {error}") from error
 
 
-class _FrameNames(dict[str, int]):
-    """Frames by what they are called, in a store and in the files that they were imported from."""
-
-    def __init__(self, store: Store) -> None:
-        super().__init__()
-        ids = store.file.abstracted.times()[0]
-        traces = {trace.trace_id: trace.name for trace in store.info()}
-        for frame, trace, seq in zip(
-            ids.tolist(), trace_of(ids).tolist(), seq_of(ids).tolist(), strict=True
-        ):
-            self[f"{traces[trace]}#{seq}"] = frame
-        self |= store.file.abstracted.imported_names()
+def _told(outcomes: Mapping[str, bool], a: Classed) -> tuple[Bools, Bools]:
+    """(N,): which frames of a selection failed, and of which an outcome is known."""
+    failed, known = (np.zeros(len(a.frame_id), np.bool_) for _ in range(2))
+    place = {int(frame): row for row, frame in enumerate(a.frame_id.tolist())}
+    store = a.chosen.store
+    ids = store.file.abstracted.times()[0]
+    called = dict(zip(names_of(store, ids), ids.tolist(), strict=True))
+    called |= store.file.abstracted.imported_names()
+    for name, fails in outcomes.items():
+        row = place.get(called.get(name, int(name) if _ID.fullmatch(name) else -1))
+        if row is not None:
+            failed[row], known[row] = fails, True
+    return failed, known
 
 
 def _outcomes(
@@ -143,8 +123,16 @@ def _failed(where: str, columns: list[str], told: list[str], threshold: float) -
     return abs(numbers[0] if len(numbers) == 1 else numbers[1] - numbers[0]) > threshold
 
 
-def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[ReportTable, ReportTable]:
+def failures(
+    train: Classed, test: Classed, outcomes: Mapping[str, bool]
+) -> tuple[ReportTable, ReportTable]:
     """Compare the failures of test inputs with the classes of training inputs.
+
+    Parameters
+    ----------
+    train, test : Classed
+    outcomes : mapping
+        Name of a frame → whether the system failed; see :func:`read_outcomes`.
 
     Returns
     -------
@@ -159,16 +147,15 @@ def failures(train: Classed, test: Classed, outcomes: Outcomes) -> tuple[ReportT
         No outcome is about a frame of either.
     """
     _, (train, test) = shared(train, test)
-    failed_train, known_train = outcomes.of(train)
-    failed, known = outcomes.of(test)
+    failed_train, known_train = _told(outcomes, train)
+    failed, known = _told(outcomes, test)
     if not known.any():
         raise ConfigError(
-            f"none of the {len(outcomes.failed)} outcomes is about a frame of {test.chosen.text}"
+            f"none of the {len(outcomes)} outcomes is about a frame of {test.chosen.text}"
         )
     failed &= test.known
-    inputs = np.append(train.sizes(), 0)[
-        test.code
-    ]  # training inputs of the class of each test input
+    # Training inputs of the class of each test input.
+    inputs = np.append(train.sizes(), 0)[test.code]
     fails = np.bincount(train.code[failed_train & train.known], minlength=len(train.names) + 1)
     novel = failed & (fails[test.code] == 0)
     ours, theirs = test.chosen.text, train.chosen.text

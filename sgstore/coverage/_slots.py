@@ -137,7 +137,8 @@ def specification(
     else:
         values = [list(dict.fromkeys(column)) for column in zip(*found, strict=True)]
         of = int(np.prod([len(column) for column in values])) if values else 0
-        missing = _product(values, found) if of <= _LISTED else []
+        listed = product(*values) if of <= _LISTED else ()
+        missing = [cell for cell in listed if cell not in found]
         denominator = f"combinations of the values that occur in {chosen.text} (product)"
     shares = ReportTable(
         SHARES, [share("cells", len(found), of, denominator)], [f"frames of {chosen.text}"]
@@ -147,12 +148,6 @@ def specification(
 
 
 _LISTED: Final = 1_000_000
-
-
-def _product(values: list[list[Any]], found: dict[tuple[Any, ...], int]) -> list[tuple[Any, ...]]:
-    from itertools import product
-
-    return [cell for cell in product(*values) if cell not in found]
 
 
 # Declared slots ----------------------------------------------------------------------------------
@@ -286,23 +281,6 @@ def _slot(path: Path, given: Any) -> Slot:
     return Slot(name, values)
 
 
-@dataclass(frozen=True)
-class Tuples:
-    """Combinations of values of k slots, and in how many frames each occurs.
-
-    Attributes
-    ----------
-    slots : list of tuple of Slot
-        Of each combination.
-    values : list of tuple of str
-    frames : (M,) int64
-    """
-
-    slots: list[tuple[Slot, ...]]
-    values: list[tuple[str, ...]]
-    frames: Ints
-
-
 class _Held:
     """The frames of a selection in which patterns hold; each is asked for once."""
 
@@ -378,64 +356,34 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
         return _Held(chosen).sets(specification)
 
 
-def tuples(
-    chosen: ChosenFrames, specification: Specification, k: int = 0, held: _Held | None = None
-) -> Tuples:
-    """All combinations of values of k slots that can be, and how many frames have each.
-
-    Parameters
-    ----------
-    chosen : ChosenFrames
-    specification : Specification
-    k : int
-        How many slots are combined; 0: all of them.
-    held : optional
-        What has been asked of the selection before.
+def _combined(
+    specification: Specification, k: int, held: _Held
+) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
+    """All combinations of values of k slots that can be, and the number of frames that have each.
 
     Raises
     ------
     ConfigError
         There are fewer slots than k, or too many combinations.
-    QueryError
-        A pattern is none.
     """
     slots = specification.slots
-    k = k or len(slots)
     if k > len(slots):
         raise ConfigError(f"{specification.name}: combinations of {k}, but {len(slots)} slots")
-    values_held = (held or _Held(chosen)).values(specification)
-    subsets = comb(len(slots), k)
-    most = (
-        sum(prod(len(s.domain) for s in some) for some in combinations(slots, k))
-        if subsets <= MOST
-        else subsets
-    )
+    most = comb(len(slots), k)
+    if most <= MOST:
+        most = sum(prod(len(s.domain) for s in some) for some in combinations(slots, k))
     if most > MOST:
         raise ConfigError(
             f"{specification.name}: {most:,} combinations; {MOST:,} can be gone through"
         )
-    found = Tuples([], [], np.zeros(0, np.int64))
-    frames: list[int] = []
+    there = held.values(specification)
     for some in combinations(slots, k):
-        for values, often in _counted(some, values_held):
+        for values in product(*(slot.domain for slot in some)):
             named = {slot.name: value for slot, value in zip(some, values, strict=True)}
             if any(one.items() <= named.items() for one in specification.impossible):
                 continue
-            found.slots.append(some)
-            found.values.append(values)
-            frames.append(often)
-    return Tuples(found.slots, found.values, np.array(frames, np.int64))
-
-
-def _counted(
-    slots: Sequence[Slot], held: Mapping[tuple[str, str], Bits]
-) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Each combination of values of some slots, with its frames."""
-    for values in product(*(slot.domain for slot in slots)):
-        both = np.bitwise_and.reduce(
-            [held[slot.name, value] for slot, value in zip(slots, values, strict=True)]
-        )
-        yield values, int(np.bitwise_count(both).sum())
+            both = np.bitwise_and.reduce([there[item] for item in named.items()])
+            yield some, values, int(np.bitwise_count(both).sum())
 
 
 def slot_coverage(
@@ -458,27 +406,23 @@ def slot_coverage(
     shares: list[Row] = []
     covered: list[Row] = []
     missing: list[Row] = []
-    parts = [0, 0]
     held = _Held(chosen)
     for one in specifications:
-        with chosen.store.file.snapshot():
-            found = tuples(chosen, one, k, held)
-        many, of = int((found.frames > 0).sum()), len(found.frames)
-        parts = [parts[0] + many, parts[1] + of]
         size = k or len(one.slots)
+        with chosen.store.file.snapshot():
+            found = list(_combined(one, size, held))
+        many = sum(frames > 0 for _, _, frames in found)
         denominator = f"combinations of values of {size} of {len(one.slots)} declared slots"
         denominator += f", less {len(one.impossible)} impossible" if one.impossible else ""
-        shares.append(share(one.name, many, of, denominator))
-        for slots, values, frames in zip(
-            found.slots, found.values, found.frames.tolist(), strict=True
-        ):
+        shares.append(share(one.name, many, len(found), denominator))
+        for slots, values, frames in found:
             text = ", ".join(f"{s.name}={v}" for s, v in zip(slots, values, strict=True))
             if frames:
                 covered.append((one.name, text, frames))
             else:
                 missing.append((one.name, text, _query(one, slots, values)))
     if len(specifications) > 1:
-        shares.append(share("all", parts[0], parts[1], "the sum of these"))
+        shares.append(share("all", len(covered), len(covered) + len(missing), "the sum of these"))
     said = [f"frames of {chosen.text}"]
     return (
         ReportTable(SHARES, shares, said),
