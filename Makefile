@@ -111,7 +111,7 @@ oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle.py 100000 0 2
 	$(BIN)/python tests/oracle_over_time.py 3000
 	$(BIN)/python tests/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces
-	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py tests/test_ttc.py tests/test_geometry.py \
+	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py tests/test_ttc.py tests/test_geometry.py tests/test_pair_numbers.py \
 	  tests/test_crowds.py tests/test_cli_ending.py
 	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
 	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py

@@ -246,57 +246,11 @@ SELECT frame_id, src, dst, gap FROM lane_gap;
 
 COMMENT ON VIEW lane_gaps IS 'How far it is along the lanes: one row for each edge src follows dst (and dst leads src). gap: from bumper to bumper along the centre lines, m; 0 where they overlap, NULL where a length is not known.';
 
--- Pairs are not stored: they are functions of two states. The same formulas as geometry.py (a test holds them together);
--- each layer names what the next one needs, because DuckDB shares named columns and not repeated expressions. Around the
--- centre of a lies the octagon that both boxes make (Minkowski sum). Its edges lie at r1 and r2 along and across a's axis and
--- at r3 and r4 along and across b's; s1 … s4: how far b's centre is beyond them, t1 … t4: how far past their ends; o1 … o4
--- and w1 … w4: b's centre and its speed against a's along each axis, which is turned so that the speed is positive (and never
--- 0: what stands on an axis meets there in ages or has met for ages). On axis 1 the boxes overlap from (-r1 - o1) / w1 to
--- (r1 - o1) / w1; they touch while they overlap on all four.
-CREATE VIEW pairs AS
-SELECT frame_id, src, dst, sqrt(dd + dz * dz) AS distance, gap, bearing - 360 * ceil((bearing - 180) / 360) AS bearing,
-       turned - 360 * ceil((turned - 180) / 360) AS rel_heading, px AS lon, py AS lat, closing_speed,
-       CASE WHEN meets <= parts AND parts >= 0 AND (rel_speed >= 1e-6 OR meets <= 0) AND r1 + r2 IS NOT NULL THEN greatest(meets, 0) END AS ttc,
-       CASE WHEN px > 0 AND va > 0.1 AND la + lb IS NOT NULL THEN greatest(px - la - lb, 0) / va END AS headway, rel_speed,
-       src_kind, dst_kind, src_is_ego, dst_is_ego,
-       CASE WHEN s1 < 0 THEN 0 ELSE s1 END AS lon_gap, CASE WHEN s2 < 0 THEN 0 ELSE s2 END AS lat_gap,
-       CASE WHEN dd > 0 THEN sighted - 360 * ceil((sighted - 180) / 360) END AS apparent_heading,
-       CASE WHEN closing_speed > 0 THEN gap / closing_speed END AS closing_time
-FROM (
-  SELECT *, greatest((-r1 - o1) / w1, (-r2 - o2) / w2, (-r3 - o3) / w3, (-r4 - o4) / w4) AS meets,
-      least((r1 - o1) / w1, (r2 - o2) / w2, (r3 - o3) / w3, (r4 - o4) / w4) AS parts,
-      CASE WHEN r1 + r2 IS NULL THEN NULL WHEN greatest(s1, s2, s3, s4) <= 0 THEN 0 ELSE sqrt(least(
-      CASE WHEN s1 > 0 THEN s1 * s1 + greatest(t1, 0) * greatest(t1, 0) END, CASE WHEN s2 > 0 THEN s2 * s2 + greatest(t2, 0) * greatest(t2, 0) END,
-      CASE WHEN s3 > 0 THEN s3 * s3 + greatest(t3, 0) * greatest(t3, 0) END, CASE WHEN s4 > 0 THEN s4 * s4 + greatest(t4, 0) * greatest(t4, 0) END)) END AS gap
-  FROM (
-    SELECT *,
-        abs(px) - r1 AS s1, abs(CASE WHEN px < 0 THEN -py ELSE py END - k * (lb * si - wb * co)) - wa AS t1,
-        abs(py) - r2 AS s2, abs(CASE WHEN py < 0 THEN -px ELSE px END - k * (lb * co - wb * si)) - la AS t2,
-        abs(qx) - r3 AS s3, abs(CASE WHEN qx < 0 THEN -qy ELSE qy END + k * (la * si - wa * co)) - wb AS t3,
-        abs(qy) - r4 AS s4, abs(CASE WHEN qy < 0 THEN -qx ELSE qx END + k * (la * co - wa * si)) - lb AS t4,
-        CASE WHEN ux < 0 THEN -px ELSE px END AS o1, CASE WHEN uy < 0 THEN -py ELSE py END AS o2,
-        CASE WHEN vx < 0 THEN -qx ELSE qx END AS o3, CASE WHEN vy < 0 THEN -qy ELSE qy END AS o4,
-        abs(ux) + 1e-200 AS w1, abs(uy) + 1e-200 AS w2, abs(vx) + 1e-200 AS w3, abs(vy) + 1e-200 AS w4
-    FROM (
-      SELECT *, dx * ca + dy * sa AS px, dy * ca - dx * sa AS py, dx * cb + dy * sb AS qx, dy * cb - dx * sb AS qy,
-          dvx * ca + dvy * sa AS ux, dvy * ca - dvx * sa AS uy, dvx * cb + dvy * sb AS vx, dvy * cb - dvx * sb AS vy,
-          la + lb * co + wb * si AS r1, wa + lb * si + wb * co AS r2, lb + la * co + wa * si AS r3, wb + la * si + wa * co AS r4,
-          CASE WHEN c * s < 0 THEN -1 ELSE 1 END AS k, -(dx * dvx + dy * dvy) / nullif(sqrt(dd), 0) AS closing_speed
-      FROM (
-        SELECT *, abs(c) AS co, abs(s) AS si
-        FROM (
-          SELECT *, ca * cb + sa * sb AS c, ca * sb - sa * cb AS s, dx * dx + dy * dy AS dd, sqrt(dvx * dvx + dvy * dvy) AS rel_speed,
-            CASE WHEN dx = 0 AND dy = 0 THEN 0 * ha ELSE degrees(atan2(dy, dx) - ha) END AS bearing, degrees(hb - ha) AS turned, degrees(hb - atan2(dy, dx)) AS sighted
-        FROM (
-          SELECT b.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
-              b.x::DOUBLE - a.x AS dx, b.y::DOUBLE - a.y AS dy, b.z::DOUBLE - a.z AS dz, b.vx::DOUBLE - a.vx AS dvx, b.vy::DOUBLE - a.vy AS dvy,
-              a.heading::DOUBLE AS ha, b.heading::DOUBLE AS hb,
-              cos(a.heading::DOUBLE) AS ca, sin(a.heading::DOUBLE) AS sa, cos(b.heading::DOUBLE) AS cb, sin(b.heading::DOUBLE) AS sb,
-              a.length::DOUBLE / 2 AS la, a.width::DOUBLE / 2 AS wa, b.length::DOUBLE / 2 AS lb, b.width::DOUBLE / 2 AS wb,
-              sqrt(a.vx::DOUBLE * a.vx + a.vy::DOUBLE * a.vy) AS va
-          FROM state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id))))));
+-- Pairs are not stored: they are functions of two states. Their numbers are declared in sgstore/pair_numbers.py, which also
+-- writes the SELECT of this view, with a column for each of them, and what its comment says of them.
+CREATE VIEW pairs AS {{pairs}};
 
-COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart. distance: between the centres, in space, m; gap: between the footprints, m; bearing: of dst''s centre from src, positive to the left, degrees; rel_heading: dst''s less src''s, degrees; lon, lat: dst''s centre ahead of src and to its left, m; closing_speed: m/s; ttc: time until the footprints first touch if both keep their velocity, s, 0 where they overlap, NULL where they never touch or their velocities differ by less than 1e-6 m/s; headway: from bumper to bumper at src''s speed, s, NULL where dst is not ahead or src stands; rel_speed: m/s; lon_gap, lat_gap: between the footprints along src''s axis and across it, 0 where they overlap in it, m; apparent_heading: dst''s less the direction from src to dst, degrees; closing_time: gap at closing_speed, s, NULL where the centres do not approach; for how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart; a is src, b is dst. {{numbers}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
 
 -- A view of its own, and no column of pairs: who asks for other numbers should not pay for these joins.
 CREATE VIEW lane_dists AS

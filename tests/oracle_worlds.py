@@ -10,7 +10,6 @@ import math
 import random
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import duckdb
@@ -18,12 +17,13 @@ import networkx as nx
 
 from sgstore.lang import Catalog, TraceFacts
 from sgstore.store._locking import without_faults
+from sgstore.store._schema import schema_sql
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-SCHEMA = resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
+SCHEMA = schema_sql()
 
 MAP_NODES: dict[int, dict[str, Any]] = {
     -1: {"kind": "off_road", "name": "off_road"},
@@ -124,7 +124,7 @@ class Frame:
     edges: list[tuple[int, str, int, dict[str, Any]]]
 
     @cached_property
-    def graph(self) -> nx.MultiDiGraph:
+    def graph(self) -> nx.MultiDiGraph[int]:
         """The frame as the store's own graphs are: attributes in outward units, missing ones left out."""
         graph = nx.MultiDiGraph(
             frame_id=self.frame_id,

@@ -32,6 +32,7 @@ SHORT = (
     "test_graph.py",
     "test_lang_parser.py",
     "test_lang_sql.py",
+    "test_pair_numbers.py",
     "test_query.py",
     "test_schema.py",
     "test_store.py",

@@ -1,5 +1,7 @@
 """Each attribute of nodes, frames and traces is the same in SQL and in memory."""
 
+# pyright: basic
+
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
@@ -12,12 +14,12 @@ from sgstore.lang._catalog import (
     ENV_ATTRIBUTES,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
-    PAIR_FUNCTIONS,
     TRACE_ATTRIBUTES,
     DisplayUnit,
 )
 from sgstore.lang._evaluate import evaluator
 from sgstore.lang.ir import FrameAttribute, NodeAttribute, TraceAttribute
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:

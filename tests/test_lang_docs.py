@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -13,12 +14,13 @@ from test_lang_golden import CATALOG
 import sgstore.lang._catalog as catalog
 from sgstore.errors import QueryError
 from sgstore.lang import compile_checks, compile_query, patterns
-from sgstore.lang._catalog import PAIR_FUNCTIONS
 from sgstore.lang._functions import FUNCTIONS
 from sgstore.lang.library import predicates
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import KINDS, RELATIONS
 
-PAGE = (Path(__file__).parents[1] / "docs" / "language.md").read_text(encoding="utf-8")
+PATH = Path(__file__).parents[1] / "docs" / "language.md"
+PAGE = PATH.read_text(encoding="utf-8")
 QUERIES = re.findall(r"```sgql\n(.*?)```", PAGE, re.DOTALL)
 WORDS = set(re.findall(r"[A-Za-z_][\w]*", PAGE))
 
@@ -59,6 +61,20 @@ def test_there_are_queries_on_the_page() -> None:
 )
 def test_what_the_language_knows_is_on_the_page(known: list[str]) -> None:
     assert set(known) - WORDS == set()
+
+
+def test_the_table_of_numbers_of_pairs_is_that_of_the_declarations() -> None:
+    page = PATH.read_text(encoding="utf-8")
+    begin, end = "<!-- numbers of pairs, made from sgstore/pair_numbers.py -->\n", "<!-- end -->"
+    rows = [f"| `{name}(a, b)` | {one.meaning} |\n" for name, one in PAIR_FUNCTIONS.items()]
+    table = "".join(["| function | is |\n|---|---|\n", *rows])
+    head, rest = page.split(begin)
+    expected = f"{head}{begin}{table}{end}{rest.partition(end)[2]}"
+    if os.environ.get("SGSTORE_UPDATE_GOLDEN"):
+        PATH.write_text(expected, encoding="utf-8")
+        page = expected
+
+    assert page == expected
 
 
 def test_every_function_is_on_the_page() -> None:

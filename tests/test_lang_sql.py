@@ -14,33 +14,18 @@ from oracle_worlds import World, random_world
 
 import sgstore.lang._rewrite as rewrite
 from sgstore.errors import QueryError
-from sgstore.geometry import pair_numbers
 from sgstore.lang import EXTENTS, SqlStatement, Window, compile_query
-from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_FUNCTIONS, DisplayUnit
+from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
 from sgstore.matches import FIRST_WINDOW, Windows
+from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sgstore.lang import Catalog
 
-NUMBERS = {
-    "dist": "distance",
-    "gap": "gap",
-    "lon": "lon",
-    "lat": "lat",
-    "bearing": "bearing",
-    "rel_heading": "rel_heading",
-    "lon_gap": "lon_gap",
-    "lat_gap": "lat_gap",
-    "apparent_heading": "apparent_heading",
-    "closing_speed": "closing_speed",
-    "closing_time": "closing_time",
-    "ttc": "ttc",
-    "headway": "headway",
-    "rel_speed": "rel_speed",
-}
-"""Functions of pairs, and what geometry and the view ``pairs`` call them."""
+NUMBERS = {name: one.column or name for name, one in PAIR_FUNCTIONS.items() if one.sql}
+"""Functions of pairs, and what the view ``pairs`` calls them; ``lane_dist`` has a file of tests of its own."""
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +44,7 @@ def found(world: World, text: str, **parameters: Any) -> list[tuple[Any, ...]]:
 # Formulas
 
 
-def test_every_function_of_pairs_is_compared() -> None:
-    looked_up = {"lane_dist"}  # it has a file of tests of its own
-    assert set(NUMBERS) | looked_up == set(PAIR_FUNCTIONS)
-
-
-def test_numbers_of_pairs_are_those_of_geometry(world: World) -> None:
+def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
     columns = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
     calls = ", ".join(f"{function}(a, b)" for function in NUMBERS)
     states = {(frame.frame_id, n): s for frame in world.frames for n, s in frame.states.items()}
@@ -77,14 +57,12 @@ def test_numbers_of_pairs_are_those_of_geometry(world: World) -> None:
         return np.array([[np.nan if s[c] is None else s[c] for c in columns] for s in chosen])
 
     # FLOAT in the tables, as in every store
-    numbers = pair_numbers(
+    numbers = PairNumbers(
         boxes(1).astype(np.float32).astype(float), boxes(2).astype(np.float32).astype(float)
     )
     assert len(rows) > 300
-    for column, name in enumerate(NUMBERS.values(), start=3):
-        expected = getattr(numbers, name)
-        if name in {"bearing", "rel_heading", "apparent_heading"}:
-            expected = np.degrees(expected)
+    for column, name in enumerate(NUMBERS, start=3):
+        expected = numbers[name]
         ours = np.array([np.nan if row[column] is None else row[column] for row in rows])
         np.testing.assert_allclose(ours, expected, atol=1e-9, err_msg=name)
 

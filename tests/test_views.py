@@ -1,5 +1,7 @@
 """The public views against the blocks that were stored, and against one another."""
 
+# pyright: basic, reportReturnType=false
+
 from __future__ import annotations
 
 import json
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 from graph_blocks import RandomTrace, map_stub, publish
 
-from sgstore.geometry import pair_numbers
+from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers
 from sgstore.store import StoreFile
 from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATIONS
 from sgstore.world import BUCKET_FRAMES
@@ -225,18 +227,8 @@ def test_two_edges_joined_in_plain_sql_are_two_edges_of_one_frame(store) -> None
     assert expected
 
 
-NUMBERS = ("distance", "gap", "bearing", "rel_heading", "lon", "lat")
-NUMBERS += (
-    "closing_speed",
-    "closing_time",
-    "ttc",
-    "headway",
-    "rel_speed",
-    "lon_gap",
-    "lat_gap",
-    "apparent_heading",
-)
-ANGLES = {"bearing", "rel_heading", "apparent_heading"}
+NUMBERS = {one.column or name: name for name, one in PAIR_FUNCTIONS.items() if one.sql}
+"""Columns of the view ``pairs`` that are numbers, and what they are called elsewhere."""
 
 
 def boxes(store: StoreFile, frame: int) -> tuple[list[int], Any]:
@@ -256,7 +248,7 @@ def test_numbers_of_pairs_are_those_of_the_geometry(store, name) -> None:
         frame = frame_id(store, name, seq)
         nodes, states = boxes(store, frame)
         a, b = np.nonzero(~np.eye(len(nodes), dtype=bool))
-        expected = pair_numbers(states[a], states[b])
+        expected = PairNumbers(states[a], states[b])
         sql = (
             f"SELECT src, dst, {', '.join(NUMBERS)} FROM pairs WHERE frame_id = ? ORDER BY src, dst"
         )
@@ -265,12 +257,13 @@ def test_numbers_of_pairs_are_those_of_the_geometry(store, name) -> None:
         assert [row[:2] for row in found] == [
             (nodes[i], nodes[j]) for i, j in zip(a, b, strict=True)
         ]
-        for column, number in enumerate(NUMBERS, 2):
-            wanted = getattr(expected, number)
+        for column, number in enumerate(NUMBERS.values(), 2):
+            wanted = expected[number]
             value = np.array([row[column] for row in found], float)
             assert (np.isnan(value) == np.isnan(wanted)).all(), number
-            apart = value - np.degrees(wanted) if number in ANGLES else value - wanted
-            apart = (apart + 180) % 360 - 180 if number in ANGLES else apart
+            apart = value - wanted
+            if PAIR_FUNCTIONS[number].unit == "degrees":
+                apart = (apart + 180) % 360 - 180
             assert np.nanmax(np.abs(apart), initial=0) <= 1e-4, number
 
 

@@ -14,6 +14,7 @@ from sgstore.lang._catalog import (
     FOLLOWING,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
+    PAIR_NAMES,
     TRACE_ATTRIBUTES,
     Attribute,
     DisplayUnit,
@@ -225,9 +226,6 @@ def _no_attribute(name: str) -> str | None:
     return call_hint(name)
 
 
-_OF_PAIRS: Final = frozenset(
-    {"dist", "distance", "bearing", "ttc", "lon", "lat", "headway", "relspeed"}
-)
 FOLLOWED: Final = tuple(frozenset({relation}) for relation in FOLLOWING)
 
 
@@ -245,7 +243,7 @@ def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
     if found is None:
         known = [attribute.name for attribute in EDGE_ATTRIBUTES.values()]
         hint = (
-            f"{name}(a, b) is a number of two nodes" if normalize_name(name) in _OF_PAIRS else None
+            f"{name}(a, b) is a number of two nodes" if normalize_name(name) in PAIR_NAMES else None
         )
         if normalize_name(name) in {"type", "label", "relation", "name", "kind"}:
             hint = "the relation of an edge d is type(d)"

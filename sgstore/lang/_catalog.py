@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     KINDS,
@@ -509,29 +510,11 @@ TRACE_ATTRIBUTES: Final = _named(
 """Attributes of ``trace`` by folded name (table ``trace``)."""
 
 
-PAIR_FUNCTIONS: Final[Mapping[str, str]] = {
-    "dist": "distance between the centres, in space; m",
-    "gap": "shortest distance between the footprints; m",
-    "lon": "how far b's centre lies ahead of a's, in a's axes; m",
-    "lat": "how far b's centre lies to the left of a's, in a's axes; m",
-    "bearing": "direction of b's centre in a's axes, positive to the left; degrees",
-    "rel_heading": "b's heading less a's; degrees",
-    "lon_gap": "how far the footprints are apart along a's axis; 0 where they overlap in it; m",
-    "lat_gap": "how far the footprints are apart across a's axis; 0 where they overlap in it; m",
-    "apparent_heading": "b's heading less the direction from a to b: 0 is a tail, 180 a front; degrees",
-    "lane_dist": "from centre to centre along the lanes, negative where b is behind; m; NULL beyond 200 m",
-    "closing_speed": "how fast the centres approach one another; m/s",
-    "closing_time": "the gap at the closing speed; s; NULL where the centres do not approach",
-    "ttc": "time until the footprints touch if both keep their velocity; s; 0 where they overlap, NULL: never",
-    "headway": "time until a has come as far as b is now, from bumper to bumper; s; NULL if b is not ahead",
-    "rel_speed": "length of the difference of the velocities; m/s",
-}
-"""Functions of two entities a and b; NULL where a number is missing."""
-
 PAIR_NAMES: Final[Mapping[str, str]] = {
-    **{normalize_name(name): name for name in PAIR_FUNCTIONS},
-    "distance": "dist",
-    "thw": "headway",
+    normalize_name(word): name
+    for name, one in PAIR_FUNCTIONS.items()
+    for word in (name, one.column, one.alias)
+    if word
 }
 """The functions of two entities by folded name, aliases included."""
 

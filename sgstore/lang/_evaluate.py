@@ -15,15 +15,13 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from sgstore.geometry import pair_numbers
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
-from sgstore.lang._formulas import WAY
 from sgstore.lang._operators import OPERATORS, Column
+from sgstore.pair_numbers import COLUMNS, LANE_DIST, PairNumbers
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
-    from sgstore.geometry import PairNumbers
     from sgstore.graph import SceneGraph
     from sgstore.lang._catalog import Attribute
     from sgstore.world import Bools, Floats
@@ -121,7 +119,7 @@ class FrameView:
 
     def pair(self, name: str, one: int, other: int) -> float | None:
         """A number of a pair of entities; ``None`` where something that it needs is missing."""
-        if name == WAY:
+        if name == LANE_DIST:
             reach = self.graph.reach
             places = self._places.get(one, ()), self._places.get(other, ())
             return None if reach is None else reach.distance(*places)
@@ -145,11 +143,9 @@ class FrameView:
         key = one, ahead
         if key not in self._pairs:
             boxes = self._boxes
-            with np.errstate(invalid="ignore", divide="ignore"):
-                own = np.broadcast_to(boxes[place], boxes.shape)
-                self._pairs[key] = pair_numbers(own, boxes) if ahead else pair_numbers(boxes, own)
-        column, scale = PAIR_NUMBERS[name]
-        return scale * getattr(self._pairs[key], column)
+            own = np.broadcast_to(boxes[place], boxes.shape)
+            self._pairs[key] = PairNumbers(own, boxes) if ahead else PairNumbers(boxes, own)
+        return self._pairs[key][name]
 
     @cached_property
     def _places(self) -> Mapping[int, Sequence[tuple[int, float]]]:
@@ -172,32 +168,11 @@ class FrameView:
     @cached_property
     def _boxes(self) -> Floats:
         """(E, 8) what numbers of pairs are made of."""
-        rows = [[self.nodes[n].get(name, math.nan) for name in _BOX] for n in self.rows]
-        boxes = np.array(rows, np.float64).reshape(-1, len(_BOX))
-        boxes[:, 3] = np.radians(boxes[:, 3])
+        rows = [[self.nodes[n].get(name, math.nan) for name in COLUMNS] for n in self.rows]
+        boxes = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+        heading = COLUMNS.index("heading")
+        boxes[:, heading] = np.radians(boxes[:, heading])
         return boxes
-
-
-_BOX: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
-
-_DEGREES: Final = 180 / math.pi
-PAIR_NUMBERS: Final = {
-    "dist": ("distance", 1.0),
-    "gap": ("gap", 1.0),
-    "lon": ("lon", 1.0),
-    "lat": ("lat", 1.0),
-    "bearing": ("bearing", _DEGREES),
-    "rel_heading": ("rel_heading", _DEGREES),
-    "lon_gap": ("lon_gap", 1.0),
-    "lat_gap": ("lat_gap", 1.0),
-    "apparent_heading": ("apparent_heading", _DEGREES),
-    "closing_speed": ("closing_speed", 1.0),
-    "closing_time": ("closing_time", 1.0),
-    "ttc": ("ttc", 1.0),
-    "headway": ("headway", 1.0),
-    "rel_speed": ("rel_speed", 1.0),
-}
-"""Numbers of two boxes: what :func:`sgstore.geometry.pair_numbers` calls them, and what they are seen in."""
 
 
 @dataclass(slots=True)
@@ -445,7 +420,7 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
                 return _of_others(part)
             name, truth = attribute.name, attribute.type is Type.boolean
             return lambda asked: asked[1].attribute(asked[0].view, name, truth=truth)
-        case b.PairNumber(function=function, a=one, b=other) if function in PAIR_NUMBERS:
+        case b.PairNumber(function=function, a=one, b=other) if function != LANE_DIST:
             if key not in {one, other}:
                 return _of_others(part)
             if one == other:

@@ -1,17 +1,8 @@
-"""SQL expressions: values, attributes, conditions and numbers of pairs.
-
-The numbers of a pair of entities as SQL, each in terms of others: the formulas of the view ``pairs``.
-
-A *raw* column belongs to one of the two, ``a`` or ``b``: position about the trace's origin, heading in
-radians, velocity, box. Numbers are computed in layers, one statement within the other, because DuckDB shares
-named columns and not repeated expressions.
-"""
+"""SQL expressions: values, attributes, conditions and numbers of pairs."""
 
 from __future__ import annotations
 
-import string
 from dataclasses import dataclass, field
-from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import DERIVED, Attribute, DisplayUnit, Home, Type
@@ -35,6 +26,7 @@ from sgstore.lang.ir import (
     TraceAttribute,
     Value,
 )
+from sgstore.pair_numbers import pair_sql, stage_of
 from sgstore.quoting import literal, quoted
 from sgstore.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
 
@@ -43,102 +35,6 @@ if TYPE_CHECKING:
 
     from sgstore.lang._kinds import Profile
     from sgstore.lang.ir import Edge
-
-
-_HALF: Final = {
-    "la": "{alength} / 2",
-    "wa": "{awidth} / 2",
-    "lb": "{blength} / 2",
-    "wb": "{bwidth} / 2",
-}
-_PAIR: Final = {
-    "dx": "{bx} - {ax}",
-    "dy": "{by} - {ay}",
-    "dz": "{bz} - {az}",
-    "dvx": "{bvx} - {avx}",
-    "dvy": "{bvy} - {avy}",
-    "turn": "{bheading} - {aheading}",
-    **_HALF,
-    "ca": "cos({aheading})",
-    "sa": "sin({aheading})",
-    "cb": "cos({bheading})",
-    "sb": "sin({bheading})",
-    "planar": "sqrt({dx} * {dx} + {dy} * {dy})",
-    "dist": "sqrt({dx} * {dx} + {dy} * {dy} + {dz} * {dz})",
-    "lon": "{dx} * {ca} + {dy} * {sa}",
-    "lat": "{dy} * {ca} - {dx} * {sa}",
-    "back": "{dx} * {cb} + {dy} * {sb}",
-    "side": "{dy} * {cb} - {dx} * {sb}",
-    "course": "CASE WHEN {dx} = 0 AND {dy} = 0 THEN 0 * {aheading}"
-    " ELSE degrees(atan2({dy}, {dx}) - {aheading}) END",
-    "turned": "degrees({turn})",
-    "bearing": "{course} - 360 * ceil(({course} - 180) / 360)",
-    "rel_heading": "{turned} - 360 * ceil(({turned} - 180) / 360)",
-    # What is not known stays so: greatest() would pass over it.
-    "lon_gap": "CASE WHEN {out1} < 0 THEN 0 ELSE {out1} END",
-    "lat_gap": "CASE WHEN {out2} < 0 THEN 0 ELSE {out2} END",
-    "sighted": "degrees({bheading} - atan2({dy}, {dx}))",
-    "apparent_heading": "CASE WHEN {planar} > 0"
-    " THEN {sighted} - 360 * ceil(({sighted} - 180) / 360) END",
-    "rel_speed": "sqrt({dvx} * {dvx} + {dvy} * {dvy})",
-    "closing_speed": "-({dx} * {dvx} + {dy} * {dvy}) / nullif({planar}, 0)",
-    "pace": "sqrt({avx} * {avx} + {avy} * {avy})",
-    "headway": "CASE WHEN {lon} > 0 AND {pace} > 0.1 AND {la} + {lb} IS NOT NULL"
-    " THEN greatest({lon} - {la} - {lb}, 0) / {pace} END",
-    # No two boxes are nearer than their circumscribed circles; a micrometre makes up for rounding.
-    "at_least": "{planar} - sqrt({la} * {la} + {wa} * {wa}) - sqrt({lb} * {lb} + {wb} * {wb}) - 1e-6",
-    "co": "abs(cos({turn}))",
-    "si": "abs(sin({turn}))",
-    "hand": "CASE WHEN cos({turn}) * sin({turn}) < 0 THEN -1 ELSE 1 END",
-    # Distance from the octagon that the two boxes make: out and past each of its four near edges.
-    "reach1": "{la} + {lb} * {co} + {wb} * {si}",
-    "reach2": "{wa} + {lb} * {si} + {wb} * {co}",
-    "reach3": "{lb} + {la} * {co} + {wa} * {si}",
-    "reach4": "{wb} + {la} * {si} + {wa} * {co}",
-    "out1": "abs({lon}) - {reach1}",
-    "out2": "abs({lat}) - {reach2}",
-    "out3": "abs({back}) - {reach3}",
-    "out4": "abs({side}) - {reach4}",
-    "past1": "abs(CASE WHEN {lon} < 0 THEN -{lat} ELSE {lat} END"
-    " - {hand} * ({lb} * {si} - {wb} * {co})) - {wa}",
-    "past2": "abs(CASE WHEN {lat} < 0 THEN -{lon} ELSE {lon} END"
-    " - {hand} * ({lb} * {co} - {wb} * {si})) - {la}",
-    "past3": "abs(CASE WHEN {back} < 0 THEN -{side} ELSE {side} END"
-    " + {hand} * ({la} * {si} - {wa} * {co})) - {wb}",
-    "past4": "abs(CASE WHEN {side} < 0 THEN -{back} ELSE {back} END"
-    " + {hand} * ({la} * {co} - {wa} * {si})) - {lb}",
-    "gap": "CASE WHEN {la} + {wa} + {lb} + {wb} IS NULL THEN NULL"
-    " WHEN greatest({out1}, {out2}, {out3}, {out4}) <= 0 THEN 0 ELSE sqrt(least("
-    + ", ".join(
-        f"CASE WHEN {{out{i}}} > 0 THEN {{out{i}}} * {{out{i}}}"
-        f" + greatest({{past{i}}}, 0) * greatest({{past{i}}}, 0) END"
-        for i in (1, 2, 3, 4)
-    )
-    + ")) END",
-    "closing_time": "CASE WHEN {closing_speed} > 0 THEN {gap} / {closing_speed} END",
-    # When the boxes overlap on each axis of both, which is turned so that b moves along it: from … to …
-    "drift1": "{dvx} * {ca} + {dvy} * {sa}",
-    "drift2": "{dvy} * {ca} - {dvx} * {sa}",
-    "drift3": "{dvx} * {cb} + {dvy} * {sb}",
-    "drift4": "{dvy} * {cb} - {dvx} * {sb}",
-    "place1": "CASE WHEN {drift1} < 0 THEN -{lon} ELSE {lon} END",
-    "place2": "CASE WHEN {drift2} < 0 THEN -{lat} ELSE {lat} END",
-    "place3": "CASE WHEN {drift3} < 0 THEN -{back} ELSE {back} END",
-    "place4": "CASE WHEN {drift4} < 0 THEN -{side} ELSE {side} END",
-    # Never 0: what stands on an axis meets there in ages, or has met for ages.
-    **{f"rate{i}": f"abs({{drift{i}}}) + 1e-200" for i in (1, 2, 3, 4)},
-    "meets": f"greatest({', '.join(f'(-{{reach{i}}} - {{place{i}}}) / {{rate{i}}}' for i in (1, 2, 3, 4))})",
-    "parts": f"least({', '.join(f'({{reach{i}}} - {{place{i}}}) / {{rate{i}}}' for i in (1, 2, 3, 4))})",
-    "ttc": "CASE WHEN {meets} <= {parts} AND {parts} >= 0 AND ({rel_speed} >= 1e-6 OR {meets} <= 0)"
-    " AND {reach1} + {reach2} IS NOT NULL THEN greatest({meets}, 0) END",
-    # Of two that move straight on, the distance shrinks by no more than this in a second, now or later.
-    "approach": "greatest(coalesce({closing_speed}, 0), 0)",
-}
-"""Numbers of a pair (a, b) in terms of the columns of both and of one another, as in the view ``pairs``."""
-
-
-WAY: Final = "lane_dist"
-"""The number that no layer computes: it is looked up, by lanes and what lies between them."""
 
 
 def way_text(frame: str, a: str, b: str, conditions: Iterable[str]) -> str:
@@ -168,37 +64,16 @@ def way_text(frame: str, a: str, b: str, conditions: Iterable[str]) -> str:
   )"""  # noqa: S608  columns that the compiler named
 
 
-@cache
-def parts_of(name: str) -> tuple[str, ...]:
-    """The numbers and raw columns that a number of a pair is made of."""
-    return tuple(sorted({f for _, f, _, _ in string.Formatter().parse(_PAIR[name]) if f}))
-
-
-@cache
-def stage_of(name: str) -> int:
-    """Return the number of layers before a number of a pair; 0 for a raw column."""
-    return 1 + max(stage_of(part) for part in parts_of(name)) if name in _PAIR else 0
-
-
-@cache
-def needed_for(name: str) -> frozenset[str]:
-    """A number of a pair with all that it is made of."""
-    if name not in _PAIR:
-        return frozenset({name})
-    return frozenset({name}).union(*(needed_for(part) for part in parts_of(name)))
-
-
 def pair_column(name: str, a: str, b: str) -> str:
-    """The column of a number of a pair, or of a raw column (``ax``: x of a)."""
-    if name in _PAIR:
+    """The column of a number of a pair, or of a column of one of the two (``a_x``: x of a)."""
+    if stage_of(name):
         return quoted(f"{name}({a}, {b})")
-    return quoted(f"{a if name[0] == 'a' else b}:{name[1:]}")
+    return quoted(f"{a if name[0] == 'a' else b}:{name[2:]}")
 
 
 def pair_text(name: str, a: str, b: str) -> str:
     """A number of a pair in terms of the columns of the layers before."""
-    columns = {part: pair_column(part, a, b) for part in parts_of(name)}
-    return _PAIR[name].format_map(columns)
+    return pair_sql(name, lambda part: pair_column(part, a, b))
 
 
 # Pieces of SQL text: values, attributes, conditions, and the numbers of pairs of entities -------

@@ -8,12 +8,13 @@ from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_temporal import course
-from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_FUNCTIONS, PAIR_NAMES, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_NAMES, Type
 from sgstore.lang._hints import said_of
 from sgstore.lang._needs import in_range
 from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import ENTITY_KINDS, normalize_name, relation_named
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
 def _signature(name: str) -> str | None:
     """Return the signature and the meaning of a function of two entities or of a library predicate."""
     if name in PAIR_NAMES:
-        return f"{PAIR_NAMES[name]}(a, b): {PAIR_FUNCTIONS[PAIR_NAMES[name]]}"
+        return f"{PAIR_NAMES[name]}(a, b): {PAIR_FUNCTIONS[PAIR_NAMES[name]].meaning}"
     found = predicates().get(name)
     if found is None:
         return None

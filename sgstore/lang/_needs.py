@@ -34,6 +34,7 @@ from sgstore.lang.ir import (
     TraceAttribute,
     Value,
 )
+from sgstore.pair_numbers import columns_needed
 from sgstore.vocabulary import (
     ENTITY_KINDS,
     SIGNALS,
@@ -216,14 +217,6 @@ MEASURED: Final = MOTION | {
 }
 """Attributes of nodes that are unknown where nobody told them."""
 
-_SIZE: Final = ("length", "width")
-_OF_PAIRS: Final[Mapping[str, tuple[str, ...]]] = {
-    **dict.fromkeys(("gap", "lon_gap", "lat_gap"), _SIZE),
-    **dict.fromkeys(("closing_speed", "rel_speed", "closing_time"), ("vx",)),
-    **dict.fromkeys(("ttc", "headway"), ("vx", "length")),
-}
-"""What numbers of two nodes are made of, beside their places."""
-
 _TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce"})
 """What is known even of what is not."""
 
@@ -323,8 +316,14 @@ def _needed(  # noqa: C901, PLR0911 - a case each
         case b.NodeAttribute(node=node, attribute=attribute):
             return of_node(node, attribute.name)
         case b.PairNumber(function=function, a=one, b=other):
-            parts = _OF_PAIRS.get(function, ())
-            return {need for node in (one, other) for name in parts for need in of_node(node, name)}
+            of_two = zip((one, other), columns_needed(function), strict=True)
+            # Both parts of a velocity are known, or none.
+            return {
+                need
+                for node, parts in of_two
+                for name in parts - {"vy"}
+                for need in of_node(node, name)
+            }
         case b.FrameAttribute(attribute=attribute) if attribute.unit in {
             DisplayUnit.weather,
             DisplayUnit.clock,

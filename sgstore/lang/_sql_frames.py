@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final, TypeGuard
 from sgstore.lang._catalog import DisplayUnit, Home, Type
 from sgstore.lang._formulas import (
     PLACES,
-    WAY,
     Aliases,
     Leaf,
     Select,
@@ -27,14 +26,11 @@ from sgstore.lang._formulas import (
     is_position,
     lane_text,
     leaves,
-    needed_for,
     nested,
     owner_text,
     pair_column,
     pair_text,
-    parts_of,
     role_text,
-    stage_of,
     way_text,
 )
 from sgstore.lang._invariants import INVARIANT, is_lasting, join_lasting
@@ -55,6 +51,7 @@ from sgstore.lang.ir import (
     TraceAttribute,
     nodes_of,
 )
+from sgstore.pair_numbers import LANE_DIST, PAIR_FUNCTIONS, needed_for, parts_of, stage_of
 from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
@@ -65,7 +62,6 @@ if TYPE_CHECKING:
     from sgstore.lang._plan import Gathered
 
 
-_DEAR: Final = {"gap", "ttc", "closing_time"}
 _LESS: Final = {"<", "<=", "="}
 _MORE: Final = {">", ">=", "="}
 
@@ -75,7 +71,7 @@ Part = tuple[str, str, str]
 
 def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
     """The numbers of pairs among values that are computed in layers."""
-    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function != WAY]
+    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function != LANE_DIST]
 
 
 @dataclass(slots=True)
@@ -208,7 +204,7 @@ class Layers:
                 if stage_of(name) == 0:
                     key = pair.a if name[0] == "a" else pair.b
                     columns[pair_column(name, pair.a, pair.b)] = _raw_text(
-                        name[1:], self.join.at[key]
+                        name[2:], self.join.at[key]
                     )
         return columns
 
@@ -277,17 +273,21 @@ def bounds(conditions: list[Bound]) -> list[Bound]:
 
 
 def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
-    if pair.function not in _DEAR or any(_dear(leaf) for leaf in leaves(limit)):
+    if not _dear(pair) or any(_dear(leaf) for leaf in leaves(limit)):
         return []
     least = PairNumber("at_least", pair.a, pair.b)
-    if pair.function != "gap":
+    if PAIR_FUNCTIONS[pair.function].unit == "s":
         approach = PairNumber("approach", pair.a, pair.b)
         limit = Operation("*", (limit, approach), Type.number)
     return [Operation("<=", (least, limit), Type.boolean)]
 
 
 def _dear(leaf: Leaf) -> bool:
-    return isinstance(leaf, PairNumber) and leaf.function in _DEAR
+    return (
+        isinstance(leaf, PairNumber)
+        and leaf.function in PAIR_FUNCTIONS
+        and PAIR_FUNCTIONS[leaf.function].dear
+    )
 
 
 # Bound patterns → SQL, second phase: conditions and results that need values of single frames ----
@@ -612,7 +612,7 @@ class Frames(Masks):
             case BlockValue():
                 join.texts[leaf] = self._of_block(join, given, leaf)
             case PairNumber(function=function, a=a, b=b):
-                if function == WAY:  # the others are computed in layers
+                if function == LANE_DIST:  # the others are computed in layers
                     join.texts[leaf] = self._of_ways(join, scope, a, b)
 
     def _of_node(self, join: Join, scope: Scope, node: str, attribute: Attribute) -> str:
@@ -704,7 +704,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
         case PairNumber(function=function, a=a, b=b):
-            return frozenset() if function == WAY else frozenset({a, b})
+            return frozenset() if function == LANE_DIST else frozenset({a, b})
         case _:
             return frozenset()
 

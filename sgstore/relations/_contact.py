@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.geometry import gap
+from sgstore.pair_numbers import gap
 from sgstore.relations._scene import IS_SIGNAL, Relation, edges_between, meeting, relates_pairs
 from sgstore.roads import STOREY
 

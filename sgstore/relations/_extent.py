@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.geometry import gap, gap_to_points
+from sgstore.geometry import gap_to_points
+from sgstore.pair_numbers import gap
 from sgstore.relations._scene import IS_SIGNAL, joined, spread
 from sgstore.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 

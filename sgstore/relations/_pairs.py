@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.geometry import bearings, gap
+from sgstore.geometry import bearings
 from sgstore.mcap import Loss
+from sgstore.pair_numbers import gap
 from sgstore.relations._scene import IS_SIGNAL, IS_VEHICLE, Bodies, BodyPairs, parts, spread
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled, normalize_name
 from sgstore.world import Entities, MessageRefs

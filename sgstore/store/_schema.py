@@ -22,6 +22,7 @@ import duckdb
 import numpy as np
 
 from sgstore.errors import StoreError
+from sgstore.pair_numbers import pairs_view
 from sgstore.quoting import quoted
 from sgstore.vocabulary import RELATION_CODE, RELATIONS, add_relation
 
@@ -58,7 +59,9 @@ _SYSTEM: Final = frozenset({"information_schema", "pg_catalog", "system", "temp"
 @cache
 def schema_sql() -> str:
     """The text of ``schema.sql``: types, tables and views."""
-    return resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
+    text = resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
+    pairs, numbers = pairs_view()
+    return text.replace("{{pairs}}", pairs).replace("{{numbers}}", numbers.replace("'", "''"))
 
 
 def tables_sql() -> str:

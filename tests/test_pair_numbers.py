@@ -1,0 +1,350 @@
+"""Numbers of pairs as arrays: against shapely, against plain definitions, and against SQL that was measured."""
+
+from __future__ import annotations
+
+import cmath
+import math
+import os
+from typing import TYPE_CHECKING
+
+import duckdb
+import numpy as np
+import pytest
+import shapely
+from contacts import COLUMNS, disagreements, random_movers
+from test_geometry import random_boxes
+
+from sgstore.geometry import corners
+from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers, gap, pairs_view
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from sgstore.world import Floats
+
+PI = math.pi
+
+
+def random_pairs(count: int) -> tuple[Floats, Floats]:
+    """Pairs of boxes, from apart to overlapping; a third parallel or perpendicular, exactly or almost."""
+    rng = np.random.default_rng(7)
+    a, b = random_boxes(rng, count, 15), random_boxes(rng, count, 15)
+    third = count // 3
+    b[:third, 2] = a[:third, 2] + rng.integers(-4, 5, third) * (PI / 2)
+    b[: third // 2, 2] += rng.choice([0, 1e-15, -1e-12, 1e-9], third // 2)
+    b[third : third + third // 4, :2] = a[third : third + third // 4, :2]
+    return a, b
+
+
+def test_the_gap_is_shapelys_distance() -> None:
+    a, b = random_pairs(150_000)
+
+    expected = shapely.distance(shapely.polygons(corners(a)), shapely.polygons(corners(b)))
+
+    assert np.abs(gap(a, b) - expected).max() <= 1e-9
+    assert 0.1 < (expected == 0).mean() < 0.5
+    assert np.array_equal(gap(a, b) > 1e-9, expected > 1e-9)
+
+
+def test_the_gap_is_the_same_from_both_sides() -> None:
+    a, b = random_pairs(20_000)
+
+    assert np.abs(gap(a, b) - gap(b, a)).max() <= 1e-12
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "heading", "expected"),
+    [
+        pytest.param(10, 0, 0, 6, id="in line: bumper to bumper"),
+        pytest.param(-10, 0, PI, 6, id="behind, facing away: bumper to bumper"),
+        pytest.param(10, 0, PI / 2, 7, id="crossing: bumper to door"),
+        pytest.param(0, 5, 0, 3, id="side by side: door to door"),
+        pytest.param(7, 6, 0, 5, id="corner to corner, 3 ahead and 4 aside"),
+        pytest.param(4, 0, 0, 0, id="touching"),
+        pytest.param(1, 1, 0.3, 0, id="overlapping"),
+        pytest.param(0, 0, 0, 0, id="one in the other"),
+    ],
+)
+def test_the_gap_is_between_footprints(x: float, y: float, heading: float, expected: float) -> None:
+    car, other = np.array([[0, 0, 0, 4, 2.0]]), np.array([[x, y, heading, 4, 2.0]])
+
+    assert gap(car, other)[0] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("column", range(5))
+def test_a_missing_number_makes_the_gap_missing(column: int) -> None:
+    a = np.array([[0, 0, 0, 4, 2.0]] * 2)
+    b = a + np.array([[20, 3, 1, 0, 0], [0.5, 0, 0, 0, 0]])
+    b[:, column] = np.nan
+
+    assert np.isnan(gap(a, b)).all()
+    assert np.isnan(gap(b, a)).all()
+
+
+def moving(x: float, y: float, heading: float = 0, *, z: float = 0, vx: float = 0, vy: float = 0):
+    return np.array([[x, y, z, heading, 4, 2, vx, vy]], float)
+
+
+def test_pair_numbers_of_a_car_closing_in_on_another() -> None:
+    numbers = PairNumbers(moving(0, 0, vx=10), moving(24, 0, z=7, vx=5))
+
+    assert numbers["dist"][0] == 25
+    assert numbers["gap"][0] == pytest.approx(20)
+    assert numbers["closing_speed"][0] == pytest.approx(5)
+    assert numbers["closing_time"][0] == pytest.approx(4)
+    assert numbers["ttc"][0] == pytest.approx(4)
+    assert numbers["headway"][0] == pytest.approx(2)
+    assert numbers["rel_speed"][0] == pytest.approx(5)
+    assert numbers["bearing"][0] == 0
+
+
+def test_pair_numbers_that_do_not_exist_are_missing() -> None:
+    apart = PairNumbers(moving(0, 0, vx=5), moving(20, 0, vx=10))
+    standing = PairNumbers(moving(0, 0, vx=0.1), moving(20, 0))
+    behind = PairNumbers(moving(0, 0, vx=10), moving(-20, 0, vx=20))
+    same_place = PairNumbers(moving(0, 0, vx=10), moving(0, 0, vx=20))
+
+    assert np.isnan(apart["closing_time"][0])
+    assert np.isnan(apart["ttc"][0])
+    assert apart["closing_speed"][0] == pytest.approx(-5)
+    assert np.isnan(standing["headway"][0])
+    assert np.isnan(behind["headway"][0])
+    assert behind["closing_time"][0] == pytest.approx(1.6)
+    assert behind["ttc"][0] == pytest.approx(1.6)
+    assert np.isnan(same_place["closing_speed"][0])
+    assert np.isnan(same_place["closing_time"][0])
+    assert same_place["ttc"][0] == 0
+    assert same_place["gap"][0] == 0
+
+
+@pytest.mark.parametrize("seed", range(100 if os.environ.get("SGSTORE_LONG") else 1))
+def test_the_time_to_collision_is_when_sampled_boxes_first_touch(seed: int) -> None:
+    a, b = random_movers(10_000, seed)
+
+    numbers = PairNumbers(a, b)
+
+    assert disagreements(a, b, numbers["ttc"], horizon=20) == []
+    assert np.array_equal(numbers["ttc"] == 0, numbers["gap"] == 0)
+    assert min((numbers["ttc"] == 0).mean(), (numbers["ttc"] > 0).mean()) > 0.09
+    assert np.array_equal(numbers["ttc"], PairNumbers(b, a)["ttc"], equal_nan=True) or (
+        np.nanmax(np.abs(numbers["ttc"] - PairNumbers(b, a)["ttc"])) < 1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("other", "closing_time", "ttc"),
+    [
+        pytest.param(moving(24, 0), 2, 2, id="stands ahead"),
+        pytest.param(moving(24, 3), 2.02, None, id="stands beside the path"),
+        pytest.param(moving(20, 16, -PI / 2, vy=-10), 1.522, 1.7, id="comes from the side"),
+        pytest.param(moving(20, 30, -PI / 2, vy=-10), 2.30, None, id="comes from the side, late"),
+        pytest.param(moving(3, 1.5, vx=-5), 0, 0, id="overlaps"),
+        pytest.param(moving(1, 1, vx=12), None, 0, id="overlaps and leaves"),
+        pytest.param(moving(4, 0, vx=10), None, 0, id="touches, and keeps its place"),
+        pytest.param(moving(9, 0, vx=10), None, None, id="keeps its place"),
+        pytest.param(moving(9, 0, vx=10 - 9e-7), 5.56e6, None, id="comes nearer in months"),
+        pytest.param(moving(-2, 2.1, vx=10, vy=-1), 0.138, 0.1, id="drives into the flank"),
+        pytest.param(moving(-1, 3.1, PI / 2, vx=60, vy=-1), 0.00613, None, id="is past in time"),
+        pytest.param(moving(3, 2.2, vx=11, vy=-1), None, 0.2, id="meets though the centres part"),
+        pytest.param(moving(0, 0, math.nan), None, None, id="turned who knows how"),
+        pytest.param(moving(24, 0, vx=math.nan), None, None, id="of a speed that is not known"),
+    ],
+)
+def test_times_until_two_meet(other: Floats, closing_time: float | None, ttc: float | None) -> None:
+    numbers = PairNumbers(moving(0, 0, vx=10), other)
+
+    expected = [math.nan if time is None else time for time in (closing_time, ttc)]
+    found = [numbers["closing_time"][0], numbers["ttc"][0]]
+    assert found == pytest.approx(expected, nan_ok=True, rel=0.01)
+
+
+@pytest.mark.parametrize("column", [0, 1, 3, 4, 5, 6, 7])
+def test_a_missing_number_makes_the_time_to_collision_missing(column: int) -> None:
+    a = np.concatenate([moving(0, 0, vx=10), moving(0, 0, vx=10)])
+    b = np.concatenate([moving(9, 0, 0.2), moving(1, 0, 0.2)])
+    assert not np.isnan(PairNumbers(a, b)["ttc"]).any()
+    b[:, column] = np.nan
+
+    assert np.isnan(PairNumbers(a, b)["ttc"]).all()
+    assert np.isnan(PairNumbers(b, a)["ttc"]).all()
+
+
+def test_gaps_along_and_across_are_those_of_the_shadows_on_the_axes() -> None:
+    rng = np.random.default_rng(8)
+    a, b = rng.uniform(-12, 12, (2, 500, 8))
+    a[:, 4:6], b[:, 4:6] = rng.uniform(0.5, 6, (2, 500, 2))
+
+    numbers = PairNumbers(a, b)
+
+    for i in range(500):
+        shadows = []
+        for x, y, _, heading, length, width, _, _ in (a[i], b[i]):
+            box = [
+                complex(x, y) + np.exp(1j * heading) * complex(u * length / 2, v * width / 2)
+                for u in (1, -1)
+                for v in (1, -1)
+            ]
+            shadows.append([corner * np.exp(-1j * a[i, 3]) for corner in box])
+        for axis, found in (("real", numbers["lon_gap"][i]), ("imag", numbers["lat_gap"][i])):
+            one, other = ([getattr(corner, axis) for corner in box] for box in shadows)
+            assert found == pytest.approx(max(min(other) - max(one), min(one) - max(other), 0))
+        assert max(numbers["lon_gap"][i], numbers["lat_gap"][i]) <= numbers["gap"][i] + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("heading", "expected"),
+    [
+        pytest.param(PI / 2, 0, id="its tail"),
+        pytest.param(-PI / 2, 180, id="its front"),
+        pytest.param(PI, 90, id="its right side"),
+    ],
+)
+def test_apparent_heading_is_what_is_seen_of_a_car(heading: float, expected: float) -> None:
+    numbers = PairNumbers(moving(0, 0, 0.3), moving(0, 20, heading))
+
+    assert abs(numbers["apparent_heading"][0]) == pytest.approx(expected)
+    assert np.isnan(PairNumbers(moving(0, 0), moving(0, 0))["apparent_heading"][0])
+
+
+def test_closing_speed_is_how_fast_the_distance_shrinks() -> None:
+    rng = np.random.default_rng(5)
+    a, b = rng.uniform(-20, 20, (2, 2000, 8))
+    a[:, 2] = b[:, 2] = 0
+    step = 1e-6
+    later_a, later_b = a.copy(), b.copy()
+    later_a[:, :2] += a[:, 6:] * step
+    later_b[:, :2] += b[:, 6:] * step
+
+    now, later = PairNumbers(a, b), PairNumbers(later_a, later_b)
+
+    apart = (
+        now["dist"] > 1
+    )  # the difference over a step means little between centres that almost meet
+    slope = (now["dist"] - later["dist"]) / step
+    assert now["closing_speed"][apart] == pytest.approx(slope[apart], abs=1e-3)
+
+
+@pytest.mark.data
+def test_pair_numbers_equal_the_measured_view_in_sql(data: Path) -> None:
+    rng = np.random.default_rng(11)
+    state = rng.uniform((-30, -30, 0, -3, 1, 1, -9, -9), (30, 30, 0, 3, 9, 3, 9, 9), (120, 8))
+    names = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
+    columns = {name: state[:, i] for i, name in enumerate(names)}
+    columns |= {"frame_id": np.arange(120) // 12, "node_id": np.arange(120)}
+    columns |= {"speed": np.hypot(state[:, 6], state[:, 7])}
+    view = (data / "views_measured.sql").read_text(encoding="utf-8")
+    view = view[view.index("CREATE TEMP VIEW pairs") :]
+    with duckdb.connect() as db:
+        db.execute("CREATE TABLE state_f AS SELECT *, 'car' AS kind FROM columns")
+        db.execute(view)
+        rows = db.execute("SELECT * EXCLUDE (frame_id, src_kind, dst_kind) FROM pairs").fetchnumpy()
+
+    numbers = PairNumbers(state[rows["src"]], state[rows["dst"]])
+
+    assert len(rows["src"]) == 120 * 11
+    rows["closing_time"] = rows.pop("ttc")  # as it was called then
+    rows["dist"] = rows.pop("distance")
+    measured = [name for name in PAIR_FUNCTIONS if name in rows]
+    assert len(measured) == 10
+    for name in measured:
+        missing = np.ma.getmaskarray(rows[name])
+        ours = numbers[name]
+        assert np.array_equal(np.isnan(ours), missing), name
+        ours = np.radians(ours) if PAIR_FUNCTIONS[name].unit == "degrees" else ours
+        expected = np.ma.getdata(rows[name])[~missing]
+        assert ours[~missing] == pytest.approx(expected, rel=1e-12, abs=1e-12), name
+
+
+class Box:
+    """A box of one pair in complex numbers, for definitions that share nothing with the expressions."""
+
+    def __init__(self, row: Floats) -> None:
+        x, y, self.z, self.heading, self.length, self.width, vx, vy = map(float, row)
+        self.place, self.velocity = complex(x, y), complex(vx, vy)
+
+    def seen(self, other: Box) -> complex:
+        return (other.place - self.place) * cmath.exp(-1j * self.heading)
+
+
+def apart(a: Box, b: Box) -> float:
+    """Between the footprints, by shapely."""
+    boxes = [[o.place.real, o.place.imag, o.heading, o.length, o.width] for o in (a, b)]
+    one, other = shapely.polygons(corners(np.array(boxes)))  # pyright: ignore[reportGeneralTypeIssues]
+    return shapely.distance(one, other)
+
+
+def closing(a: Box, b: Box) -> float:
+    """The part of b's velocity, as a sees it, that leads to a."""
+    there = (b.place - a.place) / abs(b.place - a.place)
+    return -((b.velocity - a.velocity) * there.conjugate()).real
+
+
+def bumpers(a: Box, b: Box) -> float:
+    return max(a.seen(b).real - a.length / 2 - b.length / 2, 0)
+
+
+def angle(turn: float) -> float:
+    return math.degrees(cmath.phase(cmath.exp(1j * turn)))
+
+
+DEFINITIONS: dict[str, Callable[[Box, Box], float | None]] = {
+    "dist": lambda a, b: math.hypot(abs(b.place - a.place), b.z - a.z),
+    "gap": apart,
+    "bearing": lambda a, b: angle(cmath.phase(b.place - a.place) - a.heading),
+    "rel_heading": lambda a, b: angle(b.heading - a.heading),
+    "lon": lambda a, b: a.seen(b).real,
+    "lat": lambda a, b: a.seen(b).imag,
+    "closing_speed": closing,
+    "headway": lambda a, b: (
+        bumpers(a, b) / abs(a.velocity) if a.seen(b).real > 0 and abs(a.velocity) > 0.1 else None
+    ),
+    "rel_speed": lambda a, b: abs(b.velocity - a.velocity),
+    "apparent_heading": lambda a, b: angle(b.heading - cmath.phase(b.place - a.place)),
+    "closing_time": lambda a, b: apart(a, b) / closing(a, b) if closing(a, b) > 0 else None,
+}
+"""Of all but those with a test of their own: ``ttc``, ``lon_gap`` and ``lat_gap``."""
+
+
+@pytest.mark.parametrize("name", DEFINITIONS)
+def test_a_number_is_what_its_definition_says(name: str) -> None:
+    a, b = random_movers(400, seed=3)
+    known = ~np.isnan(a + b).any(axis=1) & (np.hypot(*(b - a)[:, :2].T) > 1e-9)
+    a, b = a[known], b[known]
+
+    found = PairNumbers(a, b)[name]
+
+    expected = [DEFINITIONS[name](Box(one), Box(other)) for one, other in zip(a, b, strict=True)]
+    wanted = np.array([np.nan if value is None else value for value in expected])
+    assert np.array_equal(np.isnan(found), np.isnan(wanted))
+    off = found - wanted
+    off = (off + 180) % 360 - 180 if PAIR_FUNCTIONS[name].unit == "degrees" else off
+    assert np.nanmax(np.abs(off) / (1 + np.abs(wanted))) < 1e-9
+    assert len(a) > 200
+
+
+@pytest.mark.parametrize("name", [name for name, one in PAIR_FUNCTIONS.items() if one.sql])
+def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
+    a, b = random_movers(2000, seed=4)
+    rng = np.random.default_rng(4)
+    for side in (a, b):  # NULL where NaN, each column now and then
+        side[rng.random(side.shape) < 0.03] = np.nan
+    state = {c: np.concatenate([a[:, i], b[:, i]]) for i, c in enumerate(COLUMNS)}
+    state |= {"frame_id": np.tile(np.arange(len(a)), 2), "node_id": np.repeat([0, 1], len(a))}
+    read = ", ".join(f"CASE WHEN isnan({c}) THEN NULL ELSE {c} END AS {c}" for c in COLUMNS)
+
+    with duckdb.connect() as db:
+        db.execute(
+            f"CREATE TABLE state AS SELECT frame_id, node_id, 'car' AS kind, FALSE AS is_ego, {read} FROM state"
+        )
+        view, _ = pairs_view()
+        column = PAIR_FUNCTIONS[name].column or name
+        rows = db.execute(
+            f"SELECT {column} FROM ({view}) WHERE src = 0 ORDER BY frame_id"
+        ).fetchall()
+
+    wanted = np.array([np.nan if value is None else value for (value,) in rows])
+    found = PairNumbers(a, b)[name]
+    assert np.array_equal(np.isnan(found), np.isnan(wanted))
+    assert np.allclose(found, wanted, rtol=1e-12, atol=1e-12, equal_nan=True)
+    assert 0 < np.isnan(found).mean() < 1
