@@ -23,7 +23,7 @@ from carla_recordings import (
 )
 
 from sgstore.errors import TraceError
-from sgstore.readers.carla._actors import meaning_of
+from sgstore.readers.carla._survey import meaning_of
 
 if TYPE_CHECKING:
     from pathlib import Path

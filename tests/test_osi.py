@@ -19,12 +19,11 @@ from mcap.reader import make_reader
 from mcap.records import Schema
 from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
 
-import sgstore.readers._base as frames
+import sgstore.readers._blocks as frames
 from sgstore.errors import TraceError
 from sgstore.readers import message_class, open_trace
-from sgstore.readers._base import derive
-from sgstore.readers.osi._lights import lit, shown
-from sgstore.readers.osi._objects import MovingObjects, light_bits
+from sgstore.readers._blocks import derive
+from sgstore.readers.osi._objects import MovingObjects, light_bits, lit, shown
 from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.world import POSE, FrameBlock, States, TraceInfo, TraceReport
 

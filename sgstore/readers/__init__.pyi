@@ -1,5 +1,12 @@
 # The face of this package: what others may import from it.
 
+from ._base import MessageDecoder as MessageDecoder
+from ._base import MessageTrace as MessageTrace
+from ._base import channels_of as channels_of
+from ._blocks import NAN as NAN
+from ._blocks import POSE as POSE
+from ._blocks import EntityTable as EntityTable
+from ._blocks import FrameRows as FrameRows
 from ._frames import FramesTrace as FramesTrace
 from ._frames import TraceMessage as TraceMessage
 from ._media import Media as Media
@@ -31,26 +38,18 @@ from .osi._schema import DECODE_ERRORS as DECODE_ERRORS
 from .osi._schema import SENSOR_VIEW as SENSOR_VIEW
 from .osi._schema import descriptors as descriptors
 from .osi._schema import message_class as message_class
-from ._base import NAN as NAN
-from ._base import POSE as POSE
-from ._base import EntityTable as EntityTable
-from ._base import FrameRefs as FrameRefs
-from ._base import FrameRows as FrameRows
-from ._base import assemble as assemble
-from ._base import channels_of as channels_of
-from ._base import counted as counted
-from ._base import refs_of as refs_of
 
 __all__ = [
     "DECODE_ERRORS",
     "DERIVED",
     "ENDINGS",
     "EntityTable",
-    "FrameRefs",
     "FrameRows",
     "FramesTrace",
     "LiveWorld",
     "Media",
+    "MessageDecoder",
+    "MessageTrace",
     "NAN",
     "OpenTrace",
     "OsiFile",
@@ -64,11 +63,9 @@ __all__ = [
     "SensorReading",
     "Sensors",
     "TraceMessage",
-    "assemble",
     "camera_of",
     "channels_of",
     "connect",
-    "counted",
     "decode",
     "descriptors",
     "load_sensors",
@@ -81,5 +78,4 @@ __all__ = [
     "read_message",
     "read_messages",
     "readers",
-    "refs_of",
 ]

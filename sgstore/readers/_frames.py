@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.mcap import digest_of
-from sgstore.readers._base import (
-    EntityTable,
-    FrameRows,
-    LossTally,
-    Opened,
-    channels_of,
-    ref_of,
-    refs_of,
-)
+from sgstore.readers._base import LossTally, MessageDecoder, MessageTrace, channels_of, ref_of
+from sgstore.readers._blocks import FrameRows
 from sgstore.step import Frame
 from sgstore.vocabulary import KINDS, TypeMeaning
-from sgstore.world import POSE, Channel, TraceInfo, TraceReport
+from sgstore.world import POSE, Channel, TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Mapping
 
     from sgstore.mcap import Messages, Recording
     from sgstore.readers._base import Ref
     from sgstore.step import Entity
-    from sgstore.world import FrameBlock
 
 _LATEST: Final = 1 << 62
 """Simulation times lie between this and its negative; ns."""
@@ -54,7 +46,7 @@ class TraceMessage(NamedTuple):
     data: bytes
 
 
-class FramesTrace(Opened):
+class FramesTrace(MessageTrace):
     """Base class of a flavour whose messages tell plain frames.
 
     A subclass has a ``name``, and says with :meth:`role` which channels it reads and with :meth:`frame` what
@@ -86,28 +78,22 @@ class FramesTrace(Opened):
     static entity that is told only after the first frame is kept as one that does not move from then on.
     """
 
-    name: ClassVar[str] = ""
-
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        self._recording = recording
+        self.recording = recording
         channels = _channels(self, recording)
         self._channels = {channel.id: channel for channel in channels}
         self._map_losses = LossTally()
         self._ego = ""
         first, refs, map_text = self._beginning()
         self._ego = ego if ego != first else ""  # frames that name others may still do so
-        self.report = TraceReport()
-        self.info = TraceInfo(
-            path=recording.path,
-            size=recording.size,
-            mtime_ns=recording.mtime_ns,
-            digest=digest or digest_of(recording.path),
-            flavour=self.name,
-            channels=channels,
+        super().__init__(
+            recording,
+            digest or digest_of(recording.path),
+            channels,
             ego=ego or first,
+            context=refs,
             map_text=map_text,
             map_name="map" if map_text else "",
-            context=refs_of(refs, channels),
         )
 
     @staticmethod
@@ -161,35 +147,23 @@ class FramesTrace(Opened):
         """True if a channel of a recording tells frames of this flavour."""
         return any(channel.role == "ground_truth" for channel in _channels(cls, recording))
 
-    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
-
-        Raises
-        ------
-        TraceError
-            The file cannot be read any more, has no frame, or no frame has the ego that was asked for.
-        """
-        report = self.report = TraceReport()
-        report.losses += self._map_losses.losses()
-        decoder = self._decoder(report)
-        topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")
-        yield from self._told(decoder, size, report, topic)
-
-    def _decoder(self, report: TraceReport) -> _FramesDecoder:
+    def decoder(self, report: TraceReport) -> _FramesDecoder:
+        """A decoder that has read nothing yet."""
         self.start()
-        return _FramesDecoder(self, self._channels, self._ego, self._recording.window, report)
+        report.losses += self._map_losses.losses()
+        return _FramesDecoder(self, self._channels, self._ego, self.recording.window, report)
 
     def _beginning(self) -> tuple[str, list[Ref], str]:
         """The ego of the first frame, the messages that later ones depend on, and the road map.
 
         Reads the recording as far as it takes to find them.
         """
-        decoder = self._decoder(TraceReport())
+        decoder = self.decoder(TraceReport())
         maps = {c.id for c in self._channels.values() if c.role == "map" and c.messages}
         refs: list[Ref] = []
         text = ""
         wanted = [*maps, *decoder.channels]
-        for run in self._recording.walk(TraceReport()):
+        for run in self.recording.walk(TraceReport()):
             for row in np.flatnonzero(np.isin(run.channel, wanted)).tolist():
                 channel = int(run.channel[row])
                 if channel in maps and not text:
@@ -210,8 +184,8 @@ class FramesTrace(Opened):
             return ""
 
 
-class _FramesDecoder:
-    """Messages → frames; see :class:`sgstore.readers._base.Decoder`.
+class _FramesDecoder(MessageDecoder[FrameRows]):
+    """Messages → frames, which are whole as they come.
 
     Attributes
     ----------
@@ -229,14 +203,11 @@ class _FramesDecoder:
         window: tuple[int, int],
         report: TraceReport,
     ) -> None:
-        self.roster = EntityTable(report)
-        self.channels: Collection[int] = {
-            c.id for c in channels.values() if c.role == "ground_truth"
-        }
+        leading = {c.id for c in channels.values() if c.role == "ground_truth"}
+        super().__init__(leading, window, report)
         self.first: str | None = None
         self.has_static = False
-        self._trace, self._named, self._ego, self._window = trace, channels, ego, window
-        self._report, self._lost = report, LossTally()
+        self._trace, self._named, self._ego = trace, channels, ego
         self._known: dict[str, tuple[int, Entity]] = {}
         self._late: dict[int, Entity] = {}  # static, but told when frames had been handed out
         self._begun = self._has_ego = False
@@ -249,14 +220,14 @@ class _FramesDecoder:
                 return None
             self._check(frame)
         except Exception as error:  # noqa: BLE001  whatever a flavour of another package does
-            _lose(self._lost, self._named, run, row, error)
+            _lose(self._unreadable, self._named, run, row, error)
             return None
         self.first = frame.ego if self.first is None else self.first
         for entity in frame.entities:
             if entity.static and entity.ident not in self._known:
                 self._stand(entity)
-        log_time, (start, end) = int(run.log_time_ns[row]), self._window
-        if not start <= log_time <= end:  # a clip brings it for what stands
+        log_time = int(run.log_time_ns[row])
+        if not self.is_inside(log_time):  # a clip brings it for what stands
             return None
         self._begun = True
         return self._rows(frame, log_time)
@@ -267,13 +238,12 @@ class _FramesDecoder:
 
     def settle(self) -> None:
         """Report what could not be read, and the lack of an ego."""
-        self._report.losses += self._lost.losses()
+        super().settle()
         if self._has_ego or not self._report.frames:
             return
         if self._ego:
             raise TraceError(f"no entity that moves has the id {self._ego!r}")
-        self._report.warnings.append(_NO_EGO)
-        self._report.about_ego.append(_NO_EGO)
+        self._warn_of_egos(_NO_EGO)
 
     def _check(self, frame: object) -> None:
         """Raise if a frame cannot follow those before it; nothing of it is remembered then."""

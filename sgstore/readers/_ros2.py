@@ -41,6 +41,9 @@ MAX_MEMBERS: Final = 4096
 MAX_ARRAY: Final = 1 << 20
 """Most elements of an array of fixed length."""
 
+MAX_IDENT: Final = 1 << 53
+"""Ids are below it, as far as a double is exact."""
+
 LENGTH: Final = 4
 """Bytes of a length in front of a string or a sequence."""
 
@@ -364,6 +367,12 @@ def records(record: dict[str, Any], path: str) -> list[dict[str, Any]]:
     """The records in the list at a path of a record; none if there is no such list."""
     value = _at(record, path)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def ident_of(record: dict[str, Any], path: str) -> int | None:
+    """The id at a path of a record; ``None`` if there is none."""
+    value = number(record, path)
+    return int(value) if abs(value) < MAX_IDENT else None
 
 
 def _at(record: Any, path: str) -> Any:

@@ -30,8 +30,8 @@ import numpy as np
 
 from sgstore.errors import MissingExtraError, TraceError
 from sgstore.opendrive import read_map
-from sgstore.readers.carla._actors import EGO_ROLES, meaning_of
 from sgstore.readers.carla._signals import AtOnce, Light, light_state, shared_signals, signals_of
+from sgstore.readers.carla._survey import EGO_ROLES, meaning_of
 from sgstore.step import Frame
 from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES
 

@@ -27,9 +27,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from sgstore.readers._base import FAR, NAN
-from sgstore.readers._ros2 import number, records
-from sgstore.readers.carla._actors import ident_of
+from sgstore.readers._blocks import FAR, NAN
+from sgstore.readers._ros2 import ident_of, number, records
 from sgstore.roads import lanes_ref
 from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
 from sgstore.world import POSE
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.readers._base import EntityTable
+    from sgstore.readers._blocks import EntityTable
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Floats, Ints
 

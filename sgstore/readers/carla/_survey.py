@@ -1,4 +1,4 @@
-"""The first reading of a CARLA recording: what must be known before its frames can be read.
+"""The first reading of a CARLA recording: actors, channels, egos, lights and map.
 
 What an object is stands in the list of actors, which may come once and late, as may the places of lights and
 the map. All of that is gathered when a recording is opened.
@@ -6,6 +6,7 @@ the map. All of that is gathered when a recording is opened.
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
@@ -14,43 +15,335 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.readers._base import LossTally, Ref, ref_of
-from sgstore.readers._ros2 import ColumnReader, decode, number, records, text
-from sgstore.readers.carla._actors import (
-    ACTORS,
-    FOR_FRAMES,
-    LASTING,
-    LIGHT_PLACES,
-    LIGHT_STATES,
+from sgstore.readers._base import Lead, LossTally, Survey, ref_of
+from sgstore.readers._ros2 import (
     MAX_IDENT,
-    OBJECTS,
-    ODOMETRY,
-    OF_ONE_VEHICLE,
-    TEXT,
-    VEHICLE,
-    WORLD,
-    Actor,
-    Egos,
-    content_of,
+    ColumnReader,
+    decode,
     ident_of,
-    role_in,
-    stamp_of,
-    structure,
+    number,
+    parse_definition,
+    records,
+    short_name,
+    text,
 )
 from sgstore.readers.carla._signals import read_places
-from sgstore.world import TraceReport
+from sgstore.vocabulary import TypeMeaning, type_meanings, vague_kind
+from sgstore.world import Event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping
+
+    from mcap.records import Channel, Schema
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.readers._base import Ref
     from sgstore.readers._ros2 import Struct
     from sgstore.readers.carla._signals import Light
     from sgstore.world import Floats
 
 
-BEGINNING: Final = 1_000_000_000
-"""How long after the first frame a message still comes with it; ns of log time."""
+EGO_ROLES: Final = ("hero", "ego_vehicle", *(f"hero{i}" for i in range(10)))
+"""Role names by which the bridge knows a vehicle under test, in the order in which they are asked."""
+
+LISTED: Final = 20
+"""Actors that an error lists by name."""
+
+_CLASSES: Final = {
+    4: "person",
+    5: "bicycle",
+    6: "car",
+    7: "truck",
+    8: "motorcycle",
+    9: "vehicle",
+    10: "barrier",
+    11: "sign",
+}
+"""``derived_object_msgs/Object.classification`` → kind."""
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """An actor as the list of actors has it.
+
+    Attributes
+    ----------
+    type_name : str
+        Id of its blueprint: ``vehicle.tesla.model3``.
+    role : str
+        ``hero``, ``autopilot``, …; empty: none.
+    """
+
+    type_name: str
+    role: str
+
+
+def meaning_of(type_name: str) -> TypeMeaning:
+    """Meaning of a blueprint: that of its id, else of the longest beginning of it that ends before a dot.
+
+    Of a vehicle that nothing maps it is only known that it is one.
+    """
+    meanings = type_meanings()
+    name = type_name.lower()
+    while name:
+        if name in meanings:
+            return meanings[name]
+        name = name.rpartition(".")[0]
+    return TypeMeaning(vague_kind(type_name))
+
+
+def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
+    """Meaning of an object: by its blueprint, else by the class that the bridge gives it.
+
+    The bridge says "car" whenever it does not know better, so of a blueprint that nothing maps this word is
+    not believed.
+    """
+    number = int(classification) if math.isfinite(classification) else 0
+    kind = _CLASSES.get(number, "unknown")
+    if actor is None:
+        return TypeMeaning(kind)
+    meaning = meaning_of(actor.type_name)
+    unmapped = meaning.kind == vague_kind(actor.type_name) and not meaning.subkind
+    return TypeMeaning(kind) if unmapped and kind not in {"car", "unknown"} else meaning
+
+
+@dataclass(slots=True)
+class Egos:
+    """Choice of the ego: a vehicle with one of the bridge's role names, or the one that the user names.
+
+    Attributes
+    ----------
+    wanted : str
+        Id or role name that the user gave; empty: as the recording says.
+    actors : dict
+        Actor id → :class:`Actor`.
+    by_role : dict
+        Role name → actor id, as other messages than the list of actors tell it.
+    seen : set of int
+        Ids of objects that were seen.
+    """
+
+    wanted: str
+    actors: dict[int, Actor] = field(default_factory=dict[int, Actor])
+    by_role: dict[str, int] = field(default_factory=dict[str, int])
+    seen: set[int] = field(default_factory=set[int])
+
+    def id_of(self, role: str) -> int | None:
+        """The vehicle with a role name, if there is one."""
+        ids = self._with(role)
+        return ids[0] if ids else self.by_role.get(role)
+
+    def settle(self, driven: Iterable[str]) -> tuple[int | None, list[str]]:
+        """The ego's id, and what is odd about the choice.
+
+        Parameters
+        ----------
+        driven : iterable of str
+            Role names of the vehicles that channels of their own tell of.
+
+        Raises
+        ------
+        TraceError
+            Nothing bears the name that the user gave, or several actors do.
+        """
+        if self.wanted:
+            return self._named(), []
+        candidates = {
+            role: ident
+            for role in (*EGO_ROLES, *sorted(driven))
+            if (ident := self.id_of(role)) is not None
+        }
+        found = list(dict.fromkeys(candidates.values()))
+        if not found:
+            return None, ["no vehicle has the role of an ego: there is none unless one is named"]
+        if len(found) == 1:
+            return found[0], []
+        names = ", ".join(f"{role!r} ({ident})" for role, ident in candidates.items())
+        return found[0], [f"several egos: {names}; the first is taken unless one is named"]
+
+    def _with(self, role: str) -> list[int]:
+        return [ident for ident, actor in self.actors.items() if role and actor.role == role]
+
+    def _named(self) -> int:
+        if self.wanted.isdecimal() and int(self.wanted) in self.actors.keys() | self.seen:
+            return int(self.wanted)
+        ids = self._with(self.wanted)
+        if len(ids) > 1:
+            listed = ", ".join(map(str, ids[:LISTED]))
+            raise TraceError(f"several actors have the role {self.wanted!r}: ids {listed}")
+        if ids:
+            return ids[0]
+        if self.wanted in self.by_role:
+            return self.by_role[self.wanted]
+        raise TraceError(f"no actor has the id or role {self.wanted!r}; {_listing(self)}")
+
+
+def _listing(egos: Egos) -> str:
+    """Actors that could have been meant."""
+    things = [
+        f"{ident} ({actor.role or actor.type_name})"
+        for ident, actor in _vehicles(egos.actors).items()
+    ] or [str(ident) for ident in sorted(egos.seen)]
+    more = f" and {len(things) - LISTED} more" if len(things) > LISTED else ""
+    return f"there are: {', '.join(things[:LISTED]) or 'none'}{more}"
+
+
+def _vehicles(actors: Mapping[int, Actor]) -> dict[int, Actor]:
+    """The actors that move, those with a role of their own first."""
+    moving = {
+        ident: actor
+        for ident, actor in actors.items()
+        if actor.type_name.startswith(("vehicle.", "walker."))
+    }
+    return dict(sorted(moving.items(), key=lambda item: (item[1].role == "autopilot", item[0])))
+
+
+# What the channels of a recording of CARLA's ROS bridge carry, by their schemas -----------------
+# Topics are free and tell nothing, with one exception: a message of a vehicle's own sensors does not say whose
+# it is, but the bridge puts them under the vehicle's role name, ``/carla/<role>/vehicle_status``.
+#
+# Source: carla-simulator/ros-bridge, ros-carla-msgs, astuff_sensor_msgs (message definitions).
+
+OBJECTS: Final = "objects"
+ACTORS: Final = "actors"
+LIGHT_PLACES: Final = "light places"
+LIGHT_STATES: Final = "light states"
+WORLD: Final = "world"
+TEXT: Final = "text"
+STATUS: Final = "status"
+COMMANDS: Final = "commands"
+VEHICLE: Final = "vehicle"
+ODOMETRY: Final = "odometry"
+COLLISION: Final = "collision"
+LANE_INVASION: Final = "lane invasion"
+VEHICLE_LIGHTS: Final = "vehicle lights"
+
+CONTENTS: Final = {
+    "derived_object_msgs/ObjectArray": OBJECTS,
+    "carla_msgs/CarlaActorList": ACTORS,
+    "carla_msgs/CarlaTrafficLightInfoList": LIGHT_PLACES,
+    "carla_msgs/CarlaTrafficLightStatusList": LIGHT_STATES,
+    "carla_msgs/CarlaWorldInfo": WORLD,
+    "std_msgs/String": TEXT,
+    "carla_msgs/CarlaEgoVehicleStatus": STATUS,
+    "carla_msgs/CarlaEgoVehicleControl": COMMANDS,
+    "carla_msgs/CarlaEgoVehicleInfo": VEHICLE,
+    "nav_msgs/Odometry": ODOMETRY,
+    "carla_msgs/CarlaCollisionEvent": COLLISION,
+    "carla_msgs/CarlaLaneInvasionEvent": LANE_INVASION,
+}
+"""Schema → what its messages are."""
+
+LASTING: Final = frozenset({ACTORS, LIGHT_PLACES, LIGHT_STATES, WORLD, VEHICLE})
+"""What holds until it is told anew, so that no single frame owns the message."""
+
+FOR_FRAMES: Final = frozenset(
+    {
+        OBJECTS,
+        LIGHT_STATES,
+        STATUS,
+        COMMANDS,
+        ODOMETRY,
+        COLLISION,
+        LANE_INVASION,
+        VEHICLE_LIGHTS,
+    }
+)
+"""What is read with the frames, after what lasts is known."""
+
+OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISION, LANE_INVASION})
+"""What the bridge publishes under the role name of a vehicle."""
+
+NEVER: Final = -(1 << 62)
+"""Time of what bears none; ns."""
+_MAX_SECONDS: Final = 1 << 32
+
+
+def content_of(recording: Recording, channel: int) -> str:
+    """Kind of content that the messages of a channel have; empty where the reader does not know them.
+
+    Lights of vehicles are no part of the bridge: they are read from JSON messages ``{"t": s, "lights": {id:
+    carla.VehicleLightState}}`` of a schema whose name ends in ``VehicleLights``.
+    """
+    record = recording.channels[channel]
+    schema = recording.schemas.get(record.schema_id)
+    if schema is None:
+        return ""
+    if record.message_encoding == "json" and schema.name.endswith("VehicleLights"):
+        return VEHICLE_LIGHTS
+    return CONTENTS.get(short_name(schema.name), "") if _is_ros(record, schema) else ""
+
+
+def structure(recording: Recording, channel: int) -> Struct | None:
+    """The structure of a channel's messages, as the recording itself defines it; ``None``: no ROS messages.
+
+    Raises
+    ------
+    TraceError
+        The definition is missing or malformed.
+    """
+    record = recording.channels[channel]
+    schema = recording.schemas.get(record.schema_id)
+    if schema is None or not _is_ros(record, schema):
+        return None
+    return parse_definition(schema.name, schema.data)
+
+
+def _is_ros(channel: Channel, schema: Schema) -> bool:
+    return channel.message_encoding == "cdr" and schema.encoding == "ros2msg"
+
+
+def role_in(topic: str) -> str:
+    """The role name of the vehicle that a topic is of: ``hero`` in ``/carla/hero/vehicle_status``."""
+    parts = topic.split("/")
+    return parts[-2] if len(parts) > 2 else ""
+
+
+def stamp_of(message: dict[str, Any]) -> int:
+    """Time in a message's header; ns. :data:`NEVER` if it has none, or one beyond all clocks."""
+    return stamp_from([number(message, f"header.stamp.{part}") for part in ("sec", "nanosec")])
+
+
+def stamp_from(told: Floats | list[float]) -> int:
+    """Time of seconds and nanoseconds, likewise."""
+    seconds, nanos = told
+    there = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
+    return int(seconds) * 1_000_000_000 + int(nanos) if there else NEVER
+
+
+# Collisions and crossed lane markings, as the sensors of CARLA's bridge tell them ---------------
+# Source: ros-carla-msgs, CarlaCollisionEvent and CarlaLaneInvasionEvent.
+
+EVENTS: Final = frozenset({COLLISION, LANE_INVASION})
+"""Contents of the channels that tell events."""
+_MARKINGS: Final = {0: "other", 1: "broken", 2: "solid"}
+
+
+def event_of(
+    content: str, message: dict[str, Any], place: tuple[int, int, int], ident: str
+) -> Event:
+    """The event that a message tells.
+
+    ``place``: simulation time, log time, number of the frame before it; ``ident``: id of the vehicle.
+    """
+    if content == COLLISION:
+        other = ident_of(message, "other_actor_id")
+        impulse = math.hypot(*(number(message, f"normal_impulse.{axis}") for axis in "xyz"))
+        return Event(
+            "collision",
+            *place,
+            ident,
+            "" if other is None else str(other),
+            impulse if math.isfinite(impulse) else None,
+        )
+    told = message.get("crossed_lane_markings")
+    crossed = told.tolist() if isinstance(told, np.ndarray) else []
+    names = dict.fromkeys(_MARKINGS.get(marking, "other") for marking in crossed)
+    return Event("lane_invasion", *place, ident, detail=", ".join(names))
+
+
+# The survey ---------------------------------------------------------------------------------------
+
 SAME_TICK: Final = 1_000_000
 """Greatest difference of the stamps of one instant, which the bridge cuts off unevenly; ns."""
 SAME_PLACE: Final = 0.01
@@ -61,15 +354,6 @@ _ODOMETRY: Final = tuple(f"pose.{path}" for path in _PLACES[1:])
 _MAP_BEGINS: Final = 4096
 _MOST_TRIES: Final = 200
 _MOST_NOTES: Final = 100
-
-
-@dataclass(slots=True)
-class CarlaLead:
-    """A channel that may lead: how many frames it has, their bytes, and their least log time."""
-
-    frames: int = 0
-    bytes: int = 0
-    first_ns: int = (1 << 63) - 1
 
 
 @dataclass(slots=True)
@@ -95,7 +379,7 @@ class _Whereabouts:
         return ids
 
 
-class CarlaSurvey:
+class CarlaSurvey(Survey[Lead]):
     """Findings of the first reading of a recording.
 
     Parameters
@@ -107,53 +391,35 @@ class CarlaSurvey:
     Attributes
     ----------
     contents : dict
-        Channel id → what its messages are (:mod:`sgstore.readers.carla._actors`).
+        Channel id → kind of content of its messages, such as :data:`OBJECTS`.
     structures : dict
         Channel id → structure of its messages.
-    leads : dict
-        Channel id → :class:`CarlaLead`, of the channels with objects.
     egos : Egos
         With the actors of the recording.
     lights : dict
         Id → :class:`~sgstore.readers.carla._signals.Light`.
     map_text, map_name : str
-    notes : list of str
-        What is odd but lost nothing.
     lost : LossTally
         What could not be used.
-
-    Raises
-    ------
-    TraceError
-        The file cannot be read.
     """
 
     def __init__(self, recording: Recording, ego: str) -> None:
+        super().__init__(recording)
         self.contents: dict[int, str] = {}
         self.structures: dict[int, Struct] = {}
-        self.leads: dict[int, CarlaLead] = {}
         self.egos = Egos(ego)
         self.lights: dict[int, Light] = {}
         self.map_text = ""
         self.map_name = ""
-        self.notes: list[str] = []
         self.lost = LossTally()
-        self._recording = recording
         self._tables: dict[int, ColumnReader] = {}
         self._whereabouts = _Whereabouts()
         self._last: dict[int, bytes] = {}
         self._lasting: list[Ref] = []
-        self._others: dict[int, tuple[int, Ref]] = {}
-        walk = recording.walk(TraceReport(), keep=lambda channel: self._meet(channel) in FOR_FRAMES)
-        for run in walk:  # what it loses is reported when frames are read
-            self._look_at(run)
 
-    @property
-    def leading(self) -> int | None:
-        """The channel with most frames, then with most in them; ``None`` if none has any."""
-        ranked = [(lead.frames, lead.bytes, -channel) for channel, lead in self.leads.items()]
-        best = max(ranked, default=(0, 0, 0))
-        return -best[2] if best[0] else None
+    def rank(self, lead: Lead) -> tuple[int, ...]:
+        """Order by frames, then by bytes in them."""
+        return lead.frames, lead.weight
 
     @property
     def driven(self) -> dict[int, str]:
@@ -164,43 +430,31 @@ class CarlaSurvey:
             if content in OF_ONE_VEHICLE
         }
 
-    def topic(self, channel: int) -> str:
-        """The topic of a channel."""
-        return self._recording.channels[channel].topic
-
     def context(self, leading: int) -> list[Ref]:
-        """Messages that later ones depend on.
+        """Messages that later ones depend on: those that last, where they tell something new; calibrations."""
+        return [*self._lasting, *self.once(self.leads[leading].first_ns)]
 
-        Those that tell what lasts, where it was not told just so before; and the only message of a channel if
-        it comes with the first frame, such as the calibration of a camera.
-        """
-        latest = self.leads[leading].first_ns + BEGINNING
-        once = [ref for count, ref in self._others.values() if count == 1 and ref[1] <= latest]
-        return [*self._lasting, *once]
+    # Channels ----------------------------------------------------------------------------------------
 
-    # One run of messages -----------------------------------------------------------------------------
+    def meet(self, channel: int) -> bool:
+        """Return whether the messages of a channel are frames, or last."""
+        return self._content(channel) in LASTING | {OBJECTS}
 
-    def _look_at(self, run: Messages) -> None:
-        counts = np.bincount(run.channel)
-        watched = np.zeros(len(counts), np.bool_)
-        for channel in np.flatnonzero(counts).tolist():
-            content = self._meet(channel)
-            if content == OBJECTS:
-                self._count(channel, run)
-            if content not in LASTING | {OBJECTS}:
-                before, ref = self._others.get(channel) or (0, _first(run, channel))
-                self._others[channel] = (before + int(counts[channel]), ref)
-            watched[channel] = self._is_watched(channel, content)
-        for row in np.flatnonzero(watched[run.channel]).tolist():
-            try:
-                self._look(run, row)
-            except TraceError as error:
-                self._lose(run, row, error)
+    def watches(self, channel: int, *, met: bool) -> bool:
+        """Look also at texts, one of which may be the map, and at places of vehicles that nobody knows."""
+        content = self.contents[channel]
+        if content == TEXT:
+            return channel not in self._last  # a text that is no map is not looked at again
+        return met or (content == ODOMETRY and self._is_lost(channel))
 
-    def _meet(self, channel: int) -> str:
+    def keeps(self, channel: int) -> bool:
+        """Return whether the frames need the messages of a channel."""
+        return self._content(channel) in FOR_FRAMES
+
+    def _content(self, channel: int) -> str:
         """Kind of content that the messages of a channel have; empty if they are of no concern."""
         if channel not in self.contents:
-            self.contents[channel] = content = content_of(self._recording, channel)
+            self.contents[channel] = content = content_of(self.recording, channel)
             try:
                 self._learn(channel, content)
             except TraceError as error:
@@ -214,43 +468,32 @@ class CarlaSurvey:
 
     def _learn(self, channel: int, content: str) -> None:
         """Learn the structure of a channel's messages, if these are ROS messages."""
-        found = structure(self._recording, channel)
+        found = structure(self.recording, channel)
         if found is None:
             return
         self.structures[channel] = found
         if content == OBJECTS:
             self._tables[channel] = ColumnReader(found, "objects", _PLACES)
-            self.leads[channel] = CarlaLead()
-
-    def _is_watched(self, channel: int, content: str) -> bool:
-        if content == TEXT:
-            return channel not in self._last  # a text that is no map is not looked at again
-        return content in LASTING | {OBJECTS} or (content == ODOMETRY and self._is_lost(channel))
-
-    def _count(self, channel: int, run: Messages) -> None:
-        start, end = self._recording.window
-        inside = (run.channel == channel) & (run.log_time_ns >= start) & (run.log_time_ns <= end)
-        if inside.any():
-            lead = self.leads[channel]
-            lead.frames += int(inside.sum())
-            lead.bytes += int(run.length[inside].sum())
-            lead.first_ns = min(lead.first_ns, int(run.log_time_ns[inside].min()))
-
-    def _lose(self, run: Messages, row: int, error: TraceError) -> None:
-        topic = self._recording.channels[int(run.channel[row])].topic
-        reason = f"a message of {topic!r} cannot be read: {error.reason}"
-        self.lost.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
+            self.leads[channel] = Lead()
 
     # One message -----------------------------------------------------------------------------------
 
-    def _look(self, run: Messages, row: int) -> None:
+    def look(self, run: Messages, row: int) -> None:
+        """Look at one message; what cannot be read is counted."""
         channel = int(run.channel[row])
-        content = self.contents[channel]
-        if content == OBJECTS:
+        if self.contents[channel] == OBJECTS:
+            self.count(run, row, int(run.length[row]))
             with suppress(TraceError):  # reported when frames are read
                 self._look_for_egos(run.data(row), channel)
             return
-        data = bytes(run.data(row))
+        try:
+            self._look(run, row, channel, bytes(run.data(row)))
+        except TraceError as error:
+            reason = f"a message of {self.topic(channel)!r} cannot be read: {error.reason}"
+            self.lost.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
+
+    def _look(self, run: Messages, row: int, channel: int, data: bytes) -> None:
+        content = self.contents[channel]
         if content == ODOMETRY:
             self._take_odometry(channel, decode(self.structures[channel], data))
         elif self._last.get(channel) != data:  # the bridge says many things again and again
@@ -321,13 +564,13 @@ class CarlaSurvey:
 
     def _is_lost(self, channel: int) -> bool:
         """Return whether nobody knows which object the vehicle of an odometry is."""
-        role = role_in(self._recording.channels[channel].topic)
+        role = role_in(self.topic(channel))
         tried = self._whereabouts.tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
 
     def _take_odometry(self, channel: int, message: dict[str, Any]) -> None:
         place = np.array([number(message, path) for path in _ODOMETRY])
-        role = role_in(self._recording.channels[channel].topic)
+        role = role_in(self.topic(channel))
         self._whereabouts.odometry[role] = (stamp_of(message), place)
         self._find_egos()
 
@@ -345,8 +588,3 @@ class CarlaSurvey:
     def _find_egos(self) -> None:
         for role, ident in self._whereabouts.found().items():
             self.egos.by_role.setdefault(role, ident)
-
-
-def _first(run: Messages, channel: int) -> Ref:
-    """Reference to the first message of a channel."""
-    return ref_of(run, int(np.argmax(run.channel == channel)))

@@ -1,36 +1,515 @@
 """Recordings of CARLA's ROS bridge: ``ros2 bag record -s mcap`` of ``derived_object_msgs`` and ``carla_msgs``.
 
 They are recognised by the schema of a channel and by nothing else. A frame is one list of objects, in file
-order; its time is the simulation's. How messages become frames stands in :mod:`sgstore.readers.carla._frames`.
-The road map is the OpenDRIVE text of ``CarlaWorldInfo``, or of a string message that holds one.
+order; its time is the simulation's. The road map is the OpenDRIVE text of ``CarlaWorldInfo``, or of a string
+message that holds one. The bridge tells where vehicles and walkers are, and nothing else that has a body: signs
+and props stand in the list of actors without a place, and are left out; signs come from the road map.
 
-The bridge tells where vehicles and walkers are, and nothing else that has a body: signs and props stand in the
-list of actors without a place, and are left out; signs come from the road map.
+* Axes and units of ROS are ours: x ahead, y to the left, z up, metres, radians; the bridge has mirrored
+  CARLA's y and yaw already. Velocities and accelerations of objects are in the axes of the map.
+* A vehicle's origin lies on the ground below its middle, a walker's in the middle of its body. Our position
+  is the centre of the box, so a vehicle is lifted by half its height, along its own upright axis. (The bridge
+  drops the small offset that some blueprints have between their origin and their box.)
+* What an object is, is told by the list of actors (:mod:`sgstore.readers.carla._survey`).
+* Controls, lights of vehicles and odometry come in messages of their own, before or behind the objects of
+  the same instant. They belong together if their stamps agree within 1 ms; controls that come less often
+  hold for half a second.
+* CARLA's steer is positive to the right; ours to the left.
+
+Source: carla-simulator/ros-bridge (carla_common/transforms.py, carla_ros_bridge/traffic_participant.py,
+ego_vehicle.py); carla.VehicleLightState.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+import json
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import numpy as np
 
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import read_and_digest
 from sgstore.opendrive import read_map
-from sgstore.readers._base import Opened, channels_of, refs_of
-from sgstore.readers.carla._actors import LASTING, OBJECTS, content_of
-from sgstore.readers.carla._frames import CarlaDecoder
-from sgstore.readers.carla._signals import signals_of
-from sgstore.readers.carla._survey import CarlaSurvey
-from sgstore.world import TraceInfo, TraceReport
+from sgstore.readers._base import MessageDecoder, MessageTrace, channels_of
+from sgstore.readers._blocks import FAR, NAN, FrameRows
+from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, Fields, decode
+from sgstore.readers.carla._signals import Lights, signals_of
+from sgstore.readers.carla._survey import (
+    COMMANDS,
+    EVENTS,
+    LASTING,
+    LIGHT_STATES,
+    NEVER,
+    OBJECTS,
+    ODOMETRY,
+    SAME_TICK,
+    STATUS,
+    VEHICLE_LIGHTS,
+    CarlaSurvey,
+    content_of,
+    event_of,
+    meaning_of_object,
+    stamp_from,
+    stamp_of,
+)
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Mapping
 
-    from sgstore.mcap import Recording
+    from sgstore.mcap import Messages, Recording
     from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock
+    from sgstore.world import Bools, Floats, Ints, TraceReport
 
 
-class CarlaTrace(Opened):
+COLUMNS: Final = (
+    "id",
+    "classification",
+    "shape.type",
+    *(f"pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.orientation.{part}" for part in "xyzw"),
+    *(f"twist.linear.{axis}" for axis in "xyz"),
+    *(f"accel.linear.{axis}" for axis in "xyz"),
+    "twist.angular.z",
+    *(f"shape.dimensions[{i}]" for i in range(3)),
+)
+"""Numbers that are read of every ``derived_object_msgs/Object``."""
+STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
+CONTROLS: Final = ("steer", "throttle", "brake")
+ODOMETRY_COLUMNS: Final = (
+    *(f"pose.pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.pose.orientation.{part}" for part in "xyzw"),
+    *(f"twist.twist.linear.{axis}" for axis in "xyz"),
+    "twist.twist.angular.z",
+)
+"""Numbers that are read of a ``nav_msgs/Odometry``; its velocity is in the axes of the vehicle."""
+
+HOLDS: Final = 500_000_000
+"""How long controls hold after the last message that told them; ns."""
+MAX_JSON: Final = 1 << 20
+"""Greatest JSON message that is read; bytes."""
+
+_ID, _CLASS, _SHAPE, _POSITION, _TURN, _MOTION, _SIZE = 0, 1, 2, 3, 6, 10, 17
+_SPHERE, _CYLINDER, _CONE = 2, 3, 4
+_CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
+"""Bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS` → bit of ``carla.VehicleLightState``. These are: position 0,
+low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
+_NO_CONTROLS: Final = (NAN, NAN, NAN)
+
+Controls = tuple[float, float, float]
+"""Steer, throttle, brake, as :class:`sgstore.world.States` has them; NaN: not told."""
+
+
+@dataclass(slots=True)
+class CarlaRawFrame:
+    """A frame whose numbers are still as CARLA has them.
+
+    Attributes
+    ----------
+    time_ns, log_time_ns : int
+    objects : (n, 20) float64
+        Columns :data:`COLUMNS`.
+    nodes : (n,) int64
+        Node id of each object.
+    light_states : (m,) int64
+        Of the traffic lights.
+    controls : dict
+        Actor id → steer, throttle, brake.
+    vehicle_lights : mapping
+        Actor id → mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`.
+    odometry : (11,) float64 or None
+        Columns :data:`ODOMETRY_COLUMNS` of the ego, where it is not among the objects.
+    """
+
+    time_ns: int
+    log_time_ns: int
+    objects: Floats
+    nodes: Ints
+    light_states: Ints
+    controls: dict[int, Controls] = field(default_factory=dict[int, "Controls"])
+    vehicle_lights: Mapping[int, int] = field(default_factory=dict[int, int])
+    odometry: Floats | None = None
+
+
+class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
+    """Messages → frames, with what must be remembered from one to the next.
+
+    Parameters
+    ----------
+    found : CarlaSurvey
+    leading : int
+        Channel whose messages are frames.
+    ego : int or None
+        Id of the ego.
+    signals : mapping
+        Traffic light → id of the signal of the road map that it is.
+    road_map : RoadMap or None
+        That map.
+    report : TraceReport
+        Takes up what cannot be used.
+    """
+
+    def __init__(
+        self,
+        found: CarlaSurvey,
+        leading: int,
+        *,
+        ego: int | None,
+        signals: Mapping[int, str],
+        road_map: RoadMap | None,
+        report: TraceReport,
+    ) -> None:
+        self._survey = found
+        self._leading = leading
+        self._ego = ego
+        self._table = ColumnReader(found.structures[leading], "objects", COLUMNS)
+        self._nodes: dict[int, int] = {}
+        self._idents: dict[int, int] = {}
+        self._people: set[int] = set()
+        self._seq = -1
+        self._frame: CarlaRawFrame | None = None
+        self._controls: dict[int, tuple[int, Controls]] = {}
+        self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
+        self._odometry: tuple[int, Floats | None] = NEVER, None
+        self._fields: dict[int, Fields] = {}
+        self._driven = found.driven
+        self._drivers: dict[int, int] = {}
+        self._take = self._takers()
+        super().__init__({leading, *self._take}, found.recording.window, report)
+        self._lights = Lights(found.lights, signals, road_map, self.roster)
+
+    def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
+        """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
+        channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
+        try:
+            take = self._take.get(channel)
+            if take is not None:
+                take(channel, log_time, run.data(row))
+            elif self.is_inside(log_time):
+                return self._raw(log_time, run.data(row))
+        except TraceError as error:
+            what = "frame" if channel == self._leading else "message"
+            topic = self._survey.topic(channel)
+            self.lose(f"a {what} of {topic!r} cannot be read: {error.reason}", run, row)
+        return None
+
+    def settle(self) -> None:
+        """Report what could not be used, once all frames are read."""
+        warn = self._report.warnings.append
+        if self._lights.unplaced:
+            warn(
+                f"of {self._lights.unplaced} traffic lights the recording does not say where they stand:"
+                " they are listed as entities, but are in no graph"
+            )
+        if self._lights.aimless:
+            warn(
+                f"{self._lights.aimless} traffic lights are no signal of the road map, and their boxes are on"
+                " none of its lanes: for which lanes they are is not known"
+            )
+        self._report.warnings += self._lights.warnings
+        super().settle()
+        if not self._survey.egos.actors:
+            warn(
+                "no list of actors: what a vehicle is, is what the bridge guesses, and mostly a car"
+            )
+
+    # Frames ------------------------------------------------------------------------------------------
+
+    def _raw(self, log_time: int, data: memoryview) -> CarlaRawFrame:
+        head, objects = self._table.read(data)
+        known = np.abs(objects[:, _ID]) < MAX_IDENT
+        if not known.all():
+            self._unusable.add("an object has no id", log_time)
+            objects = objects[known]
+        time_ns = stamp_of(head)
+        if time_ns == NEVER:
+            self._untimed += 1
+            time_ns = log_time
+        idents = objects[:, _ID].astype(np.int64).tolist()
+        nodes = self._nodes
+        for row, ident in enumerate(idents):
+            if ident not in nodes:
+                self._enter(ident, float(objects[row, _CLASS]))
+        frame = CarlaRawFrame(
+            time_ns,
+            log_time,
+            objects,
+            np.array([nodes[ident] for ident in idents], np.int64),
+            self._lights.of_frame(),
+        )
+        for ident, (stamp, controls) in self._controls.items():
+            if -SAME_TICK <= time_ns - stamp <= HOLDS:
+                frame.controls[ident] = controls
+        stamp, lights = self._vehicle_lights
+        if abs(time_ns - stamp) <= SAME_TICK:
+            frame.vehicle_lights = lights
+        self._frame = frame
+        self._seq += 1
+        self._see_odometry()
+        return frame
+
+    def _enter(self, ident: int, classification: float) -> None:
+        """Enter an object that is seen for the first time."""
+        actor = self._survey.egos.actors.get(ident)
+        meaning = meaning_of_object(actor, classification)
+        type_name = actor.type_name if actor else f"class {classification:.0f}"
+        if meaning.kind == "vehicle":
+            self.roster.count_unknown(type_name)
+        node = self.roster.enter(str(ident), meaning, type_name)
+        self._nodes[ident] = node
+        self._idents[node] = ident
+        if meaning.kind == "person":
+            self._people.add(node)
+
+    def complete(self, frames: list[CarlaRawFrame]) -> list[FrameRows]:
+        """Frames with their numbers, for all of them at once."""
+        if not frames:
+            return []
+        nodes = np.concatenate([frame.nodes for frame in frames])
+        people = np.isin(nodes, list(self._people))
+        values, usable = _numbers(np.concatenate([frame.objects for frame in frames]), ~people)
+        done: list[FrameRows] = []
+        start = 0
+        for frame in frames:
+            stop = start + len(frame.nodes)
+            done.append(self._rows(frame, values[start:stop], usable[start:stop]))
+            start = stop
+        return done
+
+    def _rows(self, frame: CarlaRawFrame, values: Floats, usable: Bools) -> FrameRows:
+        """A frame with its numbers, without the rows that cannot be used."""
+        node = frame.nodes
+        if not usable.all():
+            for row in np.flatnonzero(~usable).tolist():
+                self._unuse("object {} has no usable pose", int(node[row]), frame)
+            node, values = node[usable], values[usable]
+        if len(set(node.tolist())) < len(node):
+            first = np.unique(node, return_index=True)[1]
+            for row in np.setdiff1d(np.arange(len(node)), first).tolist():
+                self._unuse("object {} comes more than once in a frame", int(node[row]), frame)
+            first.sort()
+            node, values = node[first], values[first]
+        if frame.odometry is not None:
+            own = self._nodes[self._ego if self._ego is not None else -1]
+            node = np.append(node, own)
+            values = np.vstack([values, _pose_of(frame.odometry)])
+        ego = self._nodes.get(-1 if self._ego is None else self._ego, -1)
+        driven = {self._nodes.get(one, -1): told for one, told in frame.controls.items()}
+        rows = FrameRows(
+            time_ns=frame.time_ns,
+            log_time_ns=frame.log_time_ns,
+            ego=ego if (node == ego).any() else -1,
+            node=node,
+            values=values,
+            lights=self._lights_of(frame, node),
+            light_state=np.full(len(node), -1, np.int64),
+            controls=driven.pop(ego, _NO_CONTROLS),
+            driven=driven,
+        )
+        return rows.with_heads((self._lights.nodes, self._lights.values, frame.light_states))
+
+    def _lights_of(self, frame: CarlaRawFrame, node: Ints) -> Ints:
+        lights = frame.vehicle_lights
+        if not lights:
+            return np.full(len(node), -1)
+        return np.array([lights.get(self._idents[one], -1) for one in node.tolist()], np.int64)
+
+    def _unuse(self, reason: str, node: int, frame: CarlaRawFrame) -> None:
+        self._unusable.add(reason.format(self._idents[node]), frame.log_time_ns)
+
+    # What else is told ---------------------------------------------------------------------------------
+
+    def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
+        """Channel → what takes up its messages."""
+        found = self._survey
+        takers: dict[int, Callable[[int, int, memoryview], None]] = {}
+        own = {
+            channel: (found.contents[channel], ident)
+            for channel, role in self._driven.items()
+            if (ident := found.egos.id_of(role)) is not None
+        }
+        for channel, (content, ident) in own.items():
+            # A status tells what was applied, a command only what was asked for.
+            applied = (STATUS, ident) in own.values()
+            if content == (STATUS if applied else COMMANDS):
+                columns = tuple(("control." if applied else "") + name for name in CONTROLS)
+                self._fields[channel] = Fields(found.structures[channel], (*STAMP, *columns))
+                self._drivers[channel] = ident
+                takers[channel] = self._take_controls
+            elif (content, ident) == (ODOMETRY, self._ego):
+                columns = (*STAMP, *ODOMETRY_COLUMNS)
+                self._fields[channel] = Fields(found.structures[channel], columns)
+                takers[channel] = self._take_odometry
+        for channel, content in found.contents.items():
+            if content == LIGHT_STATES:
+                takers[channel] = self._take_light_states
+            elif content == VEHICLE_LIGHTS:
+                takers[channel] = self._take_vehicle_lights
+            elif content in EVENTS:
+                takers[channel] = self._take_event
+        return takers
+
+    def _take_light_states(self, channel: int, _log_time: int, data: memoryview) -> None:
+        self._lights.update(decode(self._survey.structures[channel], data))
+
+    def _take_controls(self, channel: int, _log_time: int, data: memoryview) -> None:
+        told = self._fields[channel].read(data)
+        stamp, ident = stamp_from(told[:2]), self._drivers[channel]
+        steer, throttle, brake = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
+        self._controls[ident] = stamp, (0.0 - steer, throttle, brake)
+        if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
+            self._frame.controls[ident] = self._controls[ident][1]
+
+    def _take_event(self, channel: int, log_time: int, data: memoryview) -> None:
+        if not self.is_inside(log_time):
+            return
+        found = self._survey
+        message = decode(found.structures[channel], data)
+        ident = found.egos.id_of(self._driven[channel])
+        stamp = stamp_of(message)
+        place = log_time if stamp == NEVER else stamp, log_time, self._seq
+        named = "" if ident is None else str(ident)
+        self.roster.happen(event_of(found.contents[channel], message, place, named))
+
+    def _take_vehicle_lights(self, _channel: int, _log_time: int, data: memoryview) -> None:
+        stamp, lights = _vehicle_lights(data)
+        self._vehicle_lights = stamp, lights
+        if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
+            self._frame.vehicle_lights = lights
+
+    def _take_odometry(self, channel: int, _log_time: int, data: memoryview) -> None:
+        if self._frame is not None and self._ego in self._nodes and self._odometry[1] is None:
+            return  # it is among the objects
+        told = self._fields[channel].read(data)
+        self._odometry = stamp_from(told[:2]), told[2:]
+        self._see_odometry()
+
+    def _see_odometry(self) -> None:
+        """Give the ego its place in the frame by its odometry where it is not among the objects."""
+        frame, (stamp, numbers), ego = self._frame, self._odometry, self._ego
+        if frame is None or numbers is None or ego is None:
+            return
+        if abs(frame.time_ns - stamp) > SAME_TICK or not np.abs(numbers).max() < FAR:
+            return
+        if ego not in self._nodes:
+            self._enter(ego, NAN)
+        if not (frame.nodes == self._nodes[ego]).any():
+            frame.odometry = numbers
+
+
+def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
+    """Poses of objects.
+
+    Parameters
+    ----------
+    objects : (n, 20) float64
+        Columns :data:`COLUMNS`.
+    lifted : (n,) bool
+        Whose origin lies at the foot of the box.
+
+    Returns
+    -------
+    values : (n, 16) float64
+        Columns :data:`sgstore.world.POSE`.
+    usable : (n,) bool
+        Whether there is a position on earth, and a quaternion that is one.
+    """
+    values = np.full((len(objects), len(POSE)), np.nan)
+    angles, up = _turned(objects[:, _TURN : _TURN + 4])
+    values[:, :3] = objects[:, _POSITION : _POSITION + 3]
+    values[:, 3:6] = angles
+    values[:, 6:13] = objects[:, _MOTION : _MOTION + 7]
+    values[:, 13:16] = _boxes(objects[:, _SHAPE], objects[:, _SIZE : _SIZE + 3])
+    half = np.where(lifted, np.nan_to_num(values[:, 15]) / 2, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        values[:, :3] += half[:, None] * up
+        near = np.abs(values[:, :4]) < FAR
+    return values, np.all(near, axis=1, keepdims=True)[:, 0]
+
+
+def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
+    """Heading, pitch, roll of quaternions (x, y, z, w), and where their upright axis points; NaN for none.
+
+    A quaternion may be a little longer or shorter than 1.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        norm = np.sqrt((quaternions * quaternions).sum(axis=1))
+        norm[~((norm > 0.5) & (norm < 2))] = np.nan
+        x, y, z, w = (quaternions / norm[:, None]).T
+        up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+        roll = np.arctan2(2 * (w * x + y * z), up[:, 2])
+    return np.stack([heading, pitch, roll], axis=1), up
+
+
+def _boxes(shape: Floats, size: Floats) -> Floats:
+    """Length, width and height of shapes; a box has its edges, round ones a radius."""
+    boxes = size.copy()
+    sphere = shape == _SPHERE
+    boxes[sphere] = 2 * size[sphere, :1]
+    upright = (shape == _CYLINDER) | (shape == _CONE)  # height, radius
+    boxes[upright] = np.column_stack([2 * size[upright, 1], 2 * size[upright, 1], size[upright, 0]])
+    with np.errstate(invalid="ignore"):
+        boxes[~((boxes >= 0) & (boxes < FAR))] = np.nan
+    return boxes
+
+
+def _pose_of(odometry: Floats) -> Floats:
+    """Columns :data:`sgstore.world.POSE` of an odometry: without a box, so at the vehicle's origin."""
+    values = np.full(len(POSE), np.nan)
+    angles, _ = _turned(odometry[None, 3:7])
+    values[:3], values[3:6] = odometry[:3], angles[0]
+    values[6:9] = _rotated(odometry[3:7], odometry[7:10])
+    values[12] = odometry[10]
+    return values
+
+
+def _rotated(quaternion: Floats, vector: Floats) -> Floats:
+    """A vector in the axes that a quaternion turns, in those that it is turned from."""
+    axis, w = quaternion[:3], quaternion[3]
+    across = 2 * np.cross(axis, vector)
+    return vector + w * across + np.cross(axis, across)
+
+
+def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
+    """Stamp of a JSON message, and lights by the id of their vehicle.
+
+    Raises
+    ------
+    TraceError
+        It is too large, or not of the form that is read.
+    """
+    if len(data) > MAX_JSON:
+        raise TraceError(f"{len(data)} bytes of JSON; at most {MAX_JSON} are read")
+    try:
+        message = json.loads(bytes(data))
+        lights = {int(ident): _our_lights(int(bits)) for ident, bits in message["lights"].items()}
+        return round(float(message["t"]) * 1e9), lights
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
+        reason = f"expected {{'t': s, 'lights': {{id: bits}}}}: {type(error).__name__}: {error}"
+        raise TraceError(reason) from error
+
+
+@lru_cache(maxsize=4096)  # vehicles show the same lights for long
+def _our_lights(bits: int) -> int:
+    """Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS` for a ``carla.VehicleLightState``."""
+    return sum((bits >> theirs & 1) << ours for ours, theirs in enumerate(_CARLA_LIGHTS))
+
+
+# The recording ------------------------------------------------------------------------------------
+
+
+class CarlaTrace(MessageTrace):
     """A recording of CARLA's ROS bridge.
 
     Parameters
@@ -58,32 +537,26 @@ class CarlaTrace(Opened):
     name: ClassVar[str] = "carla"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        self._recording = recording
-        found, digest = read_and_digest(recording.path, digest, lambda: CarlaSurvey(recording, ego))
-        leading = found.leading
+        survey = CarlaSurvey(recording, ego)
+        _, digest = read_and_digest(recording.path, digest, survey.read)
+        leading = survey.leading()
         if leading is None:
-            lost = found.lost.losses()
+            lost = survey.lost.losses()
             reason = lost[0].reason if lost else "no list of objects can be read"
             raise TraceError(reason, path=recording.path)
-        self._survey = found
-        self._leading = leading
-        self._ego, self._notes = found.egos.settle(found.driven.values())
+        self._survey, self._leading = survey, leading
+        self._ego, self._notes = survey.egos.settle(survey.driven.values())
         self._signals: dict[int, str] = {}
         self._road_map: RoadMap | None = None
         self.on_map(self._own_map())
-        self.report = TraceReport()
-        channels = channels_of(recording, self._role)
-        self.info = TraceInfo(
-            path=recording.path,
-            size=recording.size,
-            mtime_ns=recording.mtime_ns,
-            digest=digest,
-            flavour=self.name,
-            channels=channels,
+        super().__init__(
+            recording,
+            digest,
+            channels_of(recording, self._role),
             ego="" if self._ego is None else str(self._ego),
-            map_text=found.map_text,
-            map_name=found.map_name,
-            context=refs_of(found.context(leading), channels),
+            context=survey.context(leading),
+            map_text=survey.map_text,
+            map_name=survey.map_name,
         )
 
     @classmethod
@@ -91,30 +564,19 @@ class CarlaTrace(Opened):
         """Return whether one of the channels carries lists of objects."""
         return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
 
-    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
-
-        Raises
-        ------
-        TraceError
-            The file cannot be read any more.
-        """
-        report = self.report = TraceReport()
+    def decoder(self, report: TraceReport) -> CarlaDecoder:
+        """A decoder that has read nothing yet."""
         report.warnings += [*self._survey.notes, *self._notes]
         report.about_ego += self._notes
         report.losses += self._survey.lost.losses()
-        window = self._recording.window
-        decoder = CarlaDecoder(
+        return CarlaDecoder(
             self._survey,
             self._leading,
             ego=self._ego,
             signals=self._signals,
             road_map=self._road_map,
-            window=window,
             report=report,
         )
-        topic = self._survey.topic(self._leading)
-        yield from self._told(decoder, size, report, topic)
 
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the lanes of traffic lights in the road map that the recording is read with."""

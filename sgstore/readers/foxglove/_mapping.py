@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from collections.abc import Mapping as Map
 
+    from sgstore.readers.foxglove._messages import Box
+
 
 MAX_MAPPING_BYTES: Final = 1 << 20
 PREFIX: Final = "foxglove_"
@@ -156,6 +158,7 @@ _ALIASES: Final = {
 """Words that producers use for kinds; what is called nothing but the ego is a car."""
 _GENERAL: Final = Mapping(entity=EntityMapping(type="metadata.type"))
 _TYPE_KEYS: Final = ("type", "class", "category", "label", "kind", "classification")
+"""Keys of metadata that tell a type where no mapping says which one does."""
 _SECTIONS: Final[dict[str, type[Any]]] = {
     "recognise": Recognise,
     "scene": SceneMapping,
@@ -164,9 +167,38 @@ _SECTIONS: Final[dict[str, type[Any]]] = {
 }
 
 
-def type_keys() -> tuple[str, ...]:
-    """Keys of metadata that tell a type where no mapping says which one does."""
-    return _TYPE_KEYS
+@dataclass(frozen=True, slots=True)
+class EntityNames:
+    """Ids and types of entities, as a mapping says where they stand."""
+
+    entity: EntityMapping
+
+    def ident(self, box: Box) -> str:
+        """The id of an entity; its own where the mapping's place for it is empty."""
+        return self.text(self.entity.id, box) or box.id
+
+    def type_name(self, box: Box) -> str:
+        """The type of an entity, or the empty string."""
+        if self.entity.type:
+            told = self.text(self.entity.type, box)
+            if told or self.entity.type != "metadata.type":
+                return told
+        lowered = {key.lower(): value for key, value in box.metadata.items()}
+        return next((lowered[key] for key in _TYPE_KEYS if lowered.get(key)), "")
+
+    @staticmethod
+    def text(place: str, box: Box) -> str:
+        """Text at a place of an entity."""
+        if place.startswith(METADATA):
+            return box.metadata.get(place.removeprefix(METADATA), "")
+        return box.id if place == "id" else ""
+
+    def number(self, place: str, box: Box) -> float:
+        """The number at a place of an entity; NaN if there is none."""
+        try:
+            return float(self.text(place, box) or math.nan)
+        except ValueError:
+            return math.nan
 
 
 @cache

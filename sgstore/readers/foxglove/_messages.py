@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.readers._base import FAR
+from sgstore.readers._blocks import FAR
 from sgstore.readers.osi._schema import DECODE_ERRORS, check_size, message_class
 
 if TYPE_CHECKING:

@@ -4,13 +4,21 @@ They are recognised by the schemas of their channels. A scene is made to be draw
 fast they move and which is the ego, a mapping says (:mod:`sgstore.readers.foxglove._mapping`). A frame is one
 message of the leading scene, the one with most messages that hold boxes, in file order.
 
+* What other scenes tell stays until they tell something else.
+* An entity stays until it is replaced, deleted, or its lifetime ends; or, if messages tell all that there is
+  (``snapshot``), until the next message.
+* Poses are carried to the axes that stand still by the transforms of the recording, at the time of the frame
+  for what is locked to its axes, else at the time of the entity.
+* Foxglove knows no velocity: what no metadata tells is derived.
+
 Source: foxglove-sdk, schemas.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -18,9 +26,19 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.mcap import read_and_digest
-from sgstore.readers._base import Opened, Ref, channels_of, ref_of, refs_of
-from sgstore.readers.foxglove._frames import EntityNames, FoxgloveDecoder
-from sgstore.readers.foxglove._mapping import Mapping, mapping_for
+from sgstore.readers._base import (
+    Lead,
+    LossTally,
+    MessageDecoder,
+    MessageTrace,
+    Ref,
+    Survey,
+    channels_of,
+    count_ref,
+    ref_of,
+)
+from sgstore.readers._blocks import FAR, NAN, FrameRows
+from sgstore.readers.foxglove._mapping import EntityNames, Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
     ERRORS,
     ORIGIN,
@@ -28,20 +46,29 @@ from sgstore.readers.foxglove._messages import (
     STILL,
     Axes,
     ChannelReader,
+    angles,
     encoding_of,
+    product,
+    rotated,
 )
-from sgstore.world import TraceInfo, TraceReport
+from sgstore.vocabulary import LIGHT_STATE_CODE, normalize_name
+from sgstore.world import POSE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.mcap import Messages, Recording
-    from sgstore.world import FrameBlock
+    from sgstore.readers.foxglove._mapping import Ego
+    from sgstore.readers.foxglove._messages import Box, Pose, SceneUpdate, Transform
+    from sgstore.world import TraceReport
 
 
-BEGINNING: Final = 1_000_000_000
-"""How long after the first frame a message still comes with it; ns of log time."""
+MAX_STANDING: Final = 100_000
+"""Entities that stay from one message to the next."""
+REMEMBERED: Final = 10_000_000_000
+"""How long transforms are remembered; ns."""
+NO_EGO: Final = "no entity is the ego: none is named, and the mapping names none that is there"
+
 LISTED: Final = 20
 """Entities that an error lists by name."""
 EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "ego-vehicle", "vehicle.ego"})
@@ -49,8 +76,390 @@ EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "ego-vehicle
 EGO_AXES: Final = ("base_link", "ego_vehicle", "ego", "hero")
 """Axes that move with the ego where no mapping says which do."""
 
+_HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
+_STATES: Final = {normalize_name(name): code for name, code in LIGHT_STATE_CODE.items()}
 
-class FoxgloveTrace(Opened):
+
+class FoxgloveSurvey(Survey[Lead]):
+    """The first reading of a recording: what must be known before its frames can be read.
+
+    The weight of a frame is 1 if it has boxes.
+
+    Attributes
+    ----------
+    readers : dict
+        Channel id → reader, of the scenes that the mapping names and of the transforms.
+    """
+
+    def __init__(self, recording: Recording, mapping: Mapping) -> None:
+        super().__init__(recording)
+        self.readers: dict[int, ChannelReader] = {}
+        self._mapping = mapping
+        self._names = EntityNames(mapping.entity)
+        self._entities: dict[str, tuple[int, Ref]] = {}
+        self._types: dict[str, str] = {}
+        self._entity_axes: Counter[str] = Counter()
+        self._transforms: dict[str, tuple[int, Ref]] = {}
+        self._axes = Axes()
+
+    def root(self) -> str:
+        """The axes that stand still."""
+        if self._mapping.scene.axes:
+            return self._mapping.scene.axes
+        most = [axes for axes, _ in self._entity_axes.most_common(1)]
+        return self._axes.root() or (most or [""])[0]
+
+    def ego(self, wanted: str, notes: list[str]) -> tuple[str, str]:
+        """Id of the entity, and name of the axes, that are the ego; empty where they are not.
+
+        Raises
+        ------
+        TraceError
+            Nothing bears the name that the user gave.
+        """
+        told = self._mapping.ego
+        if wanted:
+            if wanted in self._entities:
+                return wanted, ""
+            if wanted in self._transforms:
+                return "", wanted
+            entities = ", ".join([*self._entities][:LISTED]) or "none"
+            axes = ", ".join([*self._transforms][:LISTED]) or "none"
+            raise TraceError(
+                f"no entity and no axes are called {wanted!r}; entities: {entities}; axes: {axes}",
+                path=self.recording.path,
+            )
+        names = {told.entity.lower()} if told.entity else EGO_NAMES
+        named = [
+            ident
+            for ident, type_name in self._types.items()
+            if ident.lower() in names or type_name.lower() in names
+        ]
+        if len(named) == 1 and not told.axes:
+            return named[0], ""
+        if told.axes:
+            return "", told.axes if told.axes in self._transforms else ""
+        axes = next((axes for axes in EGO_AXES if axes in self._transforms), "")
+        if axes:
+            notes.append(
+                f"the ego is the axes {axes!r}, a box without a size: a mapping can tell one"
+            )
+        return "", axes
+
+    def context(self) -> list[Ref]:
+        """Messages that later ones depend on: what comes once, with the first frame or to stay."""
+        lasting = self._transforms
+        if not self._mapping.scene.snapshot:
+            lasting = self._entities | self._transforms
+        first = min(lead.first_ns for lead in self.leads.values())
+        return [*self.once(first), *(ref for count, ref in lasting.values() if count == 1)]
+
+    def keeps(self, channel: int) -> bool:
+        """Return whether the frames need the messages of a channel."""
+        return channel in self.readers
+
+    def meet(self, channel: int) -> bool:
+        """Return whether the messages of a channel are read; make ready for one that is met first."""
+        if channel in self.readers:
+            return True
+        encoding = encoding_of(self.recording, channel)
+        record = self.recording.channels[channel]
+        topics = self._mapping.scene.topics
+        schema = self.recording.schemas.get(record.schema_id)
+        if not encoding or schema is None:
+            return False
+        if schema.name == SCENE and topics and record.topic not in topics:
+            return False
+        self.readers[channel] = ChannelReader(schema, encoding)
+        if schema.name == SCENE:
+            self.leads[channel] = Lead()
+        return True
+
+    def look(self, run: Messages, row: int) -> None:
+        """Look at a scene, or at transforms."""
+        reader = self.readers[int(run.channel[row])]
+        try:
+            data = bytes(run.data(row))
+            if reader.name == SCENE:
+                self._look_at_scene(reader.scene(data), run, row)
+            else:
+                self._look_at_transforms(reader.transforms(data), run, row)
+        except ERRORS:  # counted as a loss when the frames are read
+            return
+
+    def _look_at_scene(self, scene: SceneUpdate, run: Messages, row: int) -> None:
+        self.count(run, row, bool(scene.boxes))
+        for box in scene.boxes:
+            ident = self._names.ident(box)
+            if not count_ref(self._entities, ident, ref_of(run, row)):
+                self._types[ident] = self._names.type_name(box)
+                self._entity_axes[box.axes] += 1
+
+    def _look_at_transforms(self, told: list[Transform], run: Messages, row: int) -> None:
+        for one in told:
+            if self._axes.tell(one.child, one.parent, 0, (ORIGIN, STILL)):
+                count_ref(self._transforms, one.child, ref_of(run, row))
+
+
+# Frames -------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class FoxgloveRawFrame:
+    """A frame whose poses are still in the axes that they were told in.
+
+    ``boxes``: each with its node id and log time of the frame that it was told with.
+    """
+
+    time_ns: int
+    log_time_ns: int
+    boxes: list[tuple[int, Box]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+
+
+class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
+    """Messages → frames, with what must be remembered from one to the next.
+
+    Parameters
+    ----------
+    readers : dict
+        Channel id → reader, of the scenes and transforms.
+    leading : int
+        Id of the channel whose messages are frames.
+    mapping : Mapping
+    root : str
+        The axes that stand still.
+    ego : tuple of str
+        Id of the entity, and name of the axes, that are the ego; empty where they are not.
+    window : tuple of int
+        Log times, both included, between which messages are frames.
+    report : TraceReport
+    """
+
+    def __init__(
+        self,
+        readers: dict[int, ChannelReader],
+        leading: int,
+        mapping: Mapping,
+        root: str,
+        ego: tuple[str, str],
+        window: tuple[int, int],
+        report: TraceReport,
+    ) -> None:
+        super().__init__(readers, window, report)
+        self._readers = readers
+        self._leading = leading
+        self._mapping = mapping
+        self._names = EntityNames(mapping.entity)
+        self._root = root
+        self._ego_entity, self._ego_axes = ego
+        self._axes = Axes()
+        self._nodes: dict[tuple[int, str], int] = {}
+        self._idents: list[str] = []
+        self._ego = -1
+        self._standing: dict[int, dict[str, tuple[int, Box]]] = {}
+        self._left_out = LossTally()
+        self._bodiless = self._odd_axes = 0
+        self._last = (0, 0)
+
+    def decode(self, run: Messages, row: int) -> FoxgloveRawFrame | None:
+        """The frame that a message of the leading scene is; of others ``None``."""
+        channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
+        reader = self._readers[channel]
+        try:
+            data = bytes(run.data(row))
+            if reader.name != SCENE:
+                self._take_transforms(reader.transforms(data), log_time)
+                return None
+            scene = reader.scene(data)
+        except ERRORS as error:
+            what = f"a message of schema {reader.name} cannot be read"
+            self.lose(f"{what}: {type(error).__name__}: {error}", run, row)
+            return None
+        time_ns = self._time_of(scene, log_time)
+        self._take_scene(channel, scene, time_ns, log_time)
+        if channel != self._leading or not self.is_inside(log_time):
+            return None
+        frame = FoxgloveRawFrame(time_ns, log_time)
+        for source, standing in self._standing.items():
+            ended = [
+                ident
+                for ident, (told, box) in standing.items()
+                if box.lifetime_ns and told + box.lifetime_ns < time_ns
+            ]
+            for ident in ended:
+                del standing[ident]
+            frame.boxes += [
+                (self._nodes[source, ident], box) for ident, (_, box) in standing.items()
+            ]
+        if self._ego < 0 and self._ego_axes and self._pose_of_ego(time_ns) is not None:
+            self._ego = self._enter_ego()
+        return frame
+
+    def complete(self, frames: list[FoxgloveRawFrame]) -> list[FrameRows]:
+        """Frames with the poses of their boxes in the axes that stand still."""
+        done = [self._rows(frame) for frame in frames]
+        if frames:
+            self._axes.forget(frames[-1].time_ns - REMEMBERED)
+        return done
+
+    def settle(self) -> None:
+        """Report what could not be used, once all frames are read."""
+        super().settle()
+        self._report.losses += self._left_out.losses()
+        warn = self._report.warnings.append
+        if self._bodiless:
+            warn(f"{self._bodiless} entities are lines, texts or arrows only: they are no objects")
+        if self._odd_axes:
+            warn(
+                f"{self._odd_axes} transforms contradict others or have no usable pose: they were left out"
+            )
+        if self._ego < 0:
+            self._warn_of_egos(NO_EGO)
+
+    # Messages ------------------------------------------------------------------------------------------
+
+    def _take_transforms(self, told: list[Transform], log_time: int) -> None:
+        for one in told:
+            time_ns = one.time_ns or log_time
+            if one.pose is None or not self._axes.tell(one.child, one.parent, time_ns, one.pose):
+                self._odd_axes += 1
+
+    def _time_of(self, scene: SceneUpdate, log_time: int) -> int:
+        """The time of a message: that of its latest entity, else as far behind the last as it was logged."""
+        times = [box.time_ns for box in scene.boxes if box.time_ns]
+        last, last_log = self._last
+        if times:
+            time_ns = max(times)
+        elif last:
+            time_ns = last + log_time - last_log
+        else:
+            time_ns = log_time
+            self._untimed += bool(scene.boxes)
+            return time_ns
+        self._last = (time_ns, log_time)
+        return time_ns
+
+    def _take_scene(self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int) -> None:
+        standing = self._standing.setdefault(channel, {})
+        if scene.cleared or self._mapping.scene.snapshot:
+            standing.clear()
+        for ident in scene.deleted:
+            standing.pop(ident, None)
+        self._bodiless += scene.bodiless
+        seen: set[str] = set()
+        for box in scene.boxes:
+            ident = self._names.ident(box)
+            if ident in seen:
+                self._left_out.add(f"entity {ident} comes more than once in a message", log_time)
+                continue
+            seen.add(ident)
+            if len(standing) >= MAX_STANDING and ident not in standing:
+                self._left_out.add(f"more than {MAX_STANDING} entities at once", log_time)
+                continue
+            if (channel, ident) not in self._nodes:
+                self._nodes[channel, ident] = self._enter(ident, box)
+            standing[ident] = (box.time_ns or time_ns, box)
+
+    def _enter(self, ident: str, box: Box) -> int:
+        type_name = self._names.type_name(box)
+        meaning = self._mapping.meaning(type_name)
+        if meaning.kind == "vehicle" and type_name.lower() not in self._mapping.types:
+            self.roster.count_unknown(type_name)
+        node = self.roster.enter(ident, meaning, type_name)
+        self._idents.append(ident)
+        if self._ego < 0 and self._ego_entity and ident == self._ego_entity:
+            self._ego = node
+        return node
+
+    def _enter_ego(self) -> int:
+        ego = self._mapping.ego
+        self._idents.append(self._ego_axes)
+        return self.roster.enter(self._ego_axes, self._mapping.meaning(ego.type), ego.type)
+
+    # Rows ----------------------------------------------------------------------------------------------
+
+    def _rows(self, frame: FoxgloveRawFrame) -> FrameRows:
+        nodes: list[int] = []
+        rows: list[list[float]] = []
+        states: list[int] = []
+        for node, box in frame.boxes:
+            values = self._values(box, frame.time_ns)
+            if values is None:
+                where = (
+                    ""
+                    if box.pose is None
+                    else f" (axes {box.axes!r} are not tied to {self._root!r})"
+                )
+                words = f"entity {self._idents[node]} has no usable pose{where}"
+                self._left_out.add(words, frame.log_time_ns)
+                continue
+            nodes.append(node)
+            rows.append(values)
+            state = normalize_name(self._names.text(self._mapping.entity.light_state, box))
+            states.append(
+                _STATES.get(state, 0) if self._mapping.entity.light_state and state else -1
+            )
+        if self._ego >= 0 and self._ego_axes:
+            pose = self._pose_of_ego(frame.time_ns)
+            if pose is not None:
+                nodes.append(self._ego)
+                rows.append(_row(pose, _size(self._mapping.ego)))
+                states.append(-1)
+        count = len(nodes)
+        return FrameRows(
+            time_ns=frame.time_ns,
+            log_time_ns=frame.log_time_ns,
+            ego=self._ego if self._ego in nodes else -1,
+            node=np.array(nodes, np.int64),
+            values=np.array(rows, np.float64).reshape(count, len(POSE)),
+            lights=np.full(count, -1, np.int64),
+            light_state=np.array(states, np.int64),
+        )
+
+    def _values(self, box: Box, time_ns: int) -> list[float] | None:
+        """The columns of :data:`POSE` of a box; ``None`` if it has no pose in the axes that stand still."""
+        at = time_ns if box.locked or not box.time_ns else box.time_ns
+        outer = self._axes.pose(box.axes or self._root, self._root, at)
+        if box.pose is None or outer is None:
+            return None
+        place = outer[0] + rotated(outer[1], box.pose[0])
+        if not (np.abs(place) < FAR).all():
+            return None
+        row = _row((place, product(outer[1], box.pose[1])), box.size)
+        entity, number = self._mapping.entity, self._names.number
+        for column, places in ((_VELOCITY, entity.velocity), (_ACCELERATION, entity.acceleration)):
+            if places:
+                told = np.array([number(place, box) for place in places])
+                row[column : column + 3] = rotated(outer[1], told).tolist()
+        speed = number(entity.speed, box) if entity.speed else NAN
+        if math.isfinite(speed) and math.isnan(row[_VELOCITY]):
+            heading = row[_HEADING]
+            row[_VELOCITY : _VELOCITY + 3] = [
+                speed * math.cos(heading), speed * math.sin(heading), 0.0
+            ]  # fmt: skip
+        return row
+
+    def _pose_of_ego(self, time_ns: int) -> Pose | None:
+        pose = self._axes.pose(self._ego_axes, self._root, time_ns)
+        if pose is None:
+            return None
+        place, turn = pose
+        return place + rotated(turn, np.array(self._mapping.ego.offset)), turn
+
+
+def _row(pose: Pose, size: tuple[float, float, float]) -> list[float]:
+    place, turn = pose
+    return [*place.tolist(), *angles(turn), *(NAN,) * 7, *size]
+
+
+def _size(ego: Ego) -> tuple[float, float, float]:
+    return ego.length, ego.width, ego.height
+
+
+# The recording ------------------------------------------------------------------------------------
+
+
+class FoxgloveTrace(MessageTrace):
     """A recording of Foxglove scenes.
 
     Parameters
@@ -86,29 +495,24 @@ class FoxgloveTrace(Opened):
         digest: str = "",
         mapping: str | Path = "",
     ) -> None:
-        self._recording = recording
         topics = [record.topic for record in recording.channels.values()]
         self._mapping = mapping_for(mapping, topics)
-        self._survey, digest = read_and_digest(
-            recording.path, digest, lambda: _Survey(recording, self._mapping)
-        )
-        self._leading = self._survey.leading()
-        self._root = self._survey.root()
+        survey = FoxgloveSurvey(recording, self._mapping)
+        _, digest = read_and_digest(recording.path, digest, survey.read)
+        leading = survey.leading()
+        if leading is None:
+            named = ", ".join(self._mapping.scene.topics)
+            where = f" on the topics of the mapping: {named}" if named else ""
+            raise TraceError(f"no {SCENE} can be read{where}", path=recording.path)
+        self._survey, self._leading = survey, leading
         self._notes: list[str] = []
-        self._ego = self._survey.ego(ego, self._notes)
-        self.report = TraceReport()
-        channels = channels_of(recording, self._role)
-        self.info = TraceInfo(
-            path=recording.path,
-            size=recording.size,
-            mtime_ns=recording.mtime_ns,
-            digest=digest,
-            flavour=self.name,
-            channels=channels,
+        self._ego = survey.ego(ego, self._notes)
+        super().__init__(
+            recording,
+            digest,
+            channels_of(recording, self._role),
             ego=self._ego[0] or self._ego[1],
-            map_text="",
-            map_name="",
-            context=refs_of(self._survey.context(), channels),
+            context=survey.context(),
             mapping=sha256(repr(self._mapping).encode("utf-8", "replace")).hexdigest(),
         )
 
@@ -121,205 +525,19 @@ class FoxgloveTrace(Opened):
                 return True
         return False
 
-    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
-
-        Raises
-        ------
-        TraceError
-            The file cannot be read any more, or has no frame.
-        """
-        report = self.report = TraceReport()
+    def decoder(self, report: TraceReport) -> FoxgloveDecoder:
+        """A decoder that has read nothing yet."""
         report.warnings += self._notes
         report.about_ego += self._notes
-        decoder = FoxgloveDecoder(
+        return FoxgloveDecoder(
             self._survey.readers,
             self._leading,
             self._mapping,
-            self._root,
+            self._survey.root(),
             self._ego,
-            self._recording.window,
+            self.recording.window,
             report,
         )
-        topic = self._recording.channels[self._leading].topic
-        yield from self._told(decoder, size, report, topic)
 
     def _role(self, channel: int) -> str:
         return "ground_truth" if channel == self._leading else "payload"
-
-
-@dataclass(slots=True)
-class _LossNote:
-    """Number of times that a loss was told, and the first message that it concerns."""
-
-    first: Ref
-    count: int = 0
-
-
-@dataclass(slots=True)
-class _SceneChannel:
-    """A channel of scenes: its messages with boxes, all its messages, log time of its first."""
-
-    boxed: int = 0
-    messages: int = 0
-    first_ns: int = (1 << 63) - 1
-
-
-class _Survey:
-    """The first reading of a recording: what must be known before its frames can be read.
-
-    Attributes
-    ----------
-    readers : dict
-        Channel id → reader, of the scenes that the mapping names and of the transforms.
-    """
-
-    def __init__(self, recording: Recording, mapping: Mapping) -> None:
-        self.readers: dict[int, ChannelReader] = {}
-        self._recording = recording
-        self._mapping = mapping
-        self._names = EntityNames(mapping.entity)
-        self._others: dict[int, _LossNote] = {}
-        self._scenes: dict[int, _SceneChannel] = {}
-        self._entities: dict[str, _LossNote] = {}
-        self._types: dict[str, str] = {}
-        self._entity_axes: Counter[str] = Counter()
-        self._transforms: dict[str, _LossNote] = {}
-        self._axes = Axes()
-        for run in recording.walk(TraceReport(), keep=self.readers.__contains__):
-            self._look(run)
-
-    def leading(self) -> int:
-        """The scene with most messages that hold boxes.
-
-        Raises
-        ------
-        TraceError
-            No message of a scene can be read.
-        """
-        ranked = [
-            (scene.boxed, scene.messages, -channel)
-            for channel, scene in self._scenes.items()
-            if scene.messages
-        ]
-        if not ranked:
-            named = ", ".join(self._mapping.scene.topics)
-            where = f" on the topics of the mapping: {named}" if named else ""
-            raise TraceError(f"no {SCENE} can be read{where}", path=self._recording.path)
-        return -max(ranked)[2]
-
-    def root(self) -> str:
-        """The axes that stand still."""
-        if self._mapping.scene.axes:
-            return self._mapping.scene.axes
-        most = [axes for axes, _ in self._entity_axes.most_common(1)]
-        return self._axes.root() or (most or [""])[0]
-
-    def ego(self, wanted: str, notes: list[str]) -> tuple[str, str]:
-        """Id of the entity, and name of the axes, that are the ego; empty where they are not.
-
-        Raises
-        ------
-        TraceError
-            Nothing bears the name that the user gave.
-        """
-        told = self._mapping.ego
-        if wanted:
-            if wanted in self._entities:
-                return wanted, ""
-            if wanted in self._transforms:
-                return "", wanted
-            entities = ", ".join([*self._entities][:LISTED]) or "none"
-            axes = ", ".join([*self._transforms][:LISTED]) or "none"
-            raise TraceError(
-                f"no entity and no axes are called {wanted!r}; entities: {entities}; axes: {axes}",
-                path=self._recording.path,
-            )
-        names = {told.entity.lower()} if told.entity else EGO_NAMES
-        named = [
-            ident
-            for ident, type_name in self._types.items()
-            if ident.lower() in names or type_name.lower() in names
-        ]
-        if len(named) == 1 and not told.axes:
-            return named[0], ""
-        if told.axes:
-            return "", told.axes if told.axes in self._transforms else ""
-        axes = next((axes for axes in EGO_AXES if axes in self._transforms), "")
-        if axes:
-            notes.append(
-                f"the ego is the axes {axes!r}, a box without a size: a mapping can tell one"
-            )
-        return "", axes
-
-    def context(self) -> list[Ref]:
-        """Messages that later ones depend on: what comes once, with the first frame or to stay."""
-        first = min((scene.first_ns for scene in self._scenes.values()), default=0)
-        once = [
-            told.first
-            for told in self._others.values()
-            if told.count == 1 and told.first[1] <= first + BEGINNING
-        ]
-        lasting = (
-            self._transforms if self._mapping.scene.snapshot else self._entities | self._transforms
-        )
-        return once + [told.first for told in lasting.values() if told.count == 1]
-
-    def _look(self, run: Messages) -> None:
-        rows = np.unique(run.channel, return_index=True, return_counts=True)
-        for channel, row, count in zip(*(column.tolist() for column in rows), strict=True):
-            if not self._meet(channel):
-                told = self._others.setdefault(channel, _LossNote(ref_of(run, row)))
-                told.count += count
-        for row in np.flatnonzero(np.isin(run.channel, [*self.readers])).tolist():
-            reader = self.readers[int(run.channel[row])]
-            try:
-                data = bytes(run.data(row))
-                if reader.name == SCENE:
-                    self._look_at_scene(reader, run, row, data)
-                else:
-                    self._look_at_transforms(reader, run, row, data)
-            except ERRORS:  # counted as a loss when the frames are read
-                continue
-
-    def _meet(self, channel: int) -> bool:
-        """Return whether the messages of a channel are read; make ready for one that is met first."""
-        if channel in self.readers:
-            return True
-        encoding = encoding_of(self._recording, channel)
-        record = self._recording.channels[channel]
-        topics = self._mapping.scene.topics
-        schema = self._recording.schemas.get(record.schema_id)
-        if not encoding or schema is None:
-            return False
-        if schema.name == SCENE and topics and record.topic not in topics:
-            return False
-        self.readers[channel] = ChannelReader(schema, encoding)
-        if schema.name == SCENE:
-            self._scenes[channel] = _SceneChannel()
-        return True
-
-    def _look_at_scene(self, reader: ChannelReader, run: Messages, row: int, data: bytes) -> None:
-        scene = reader.scene(data)
-        start, end = self._recording.window
-        log_time = int(run.log_time_ns[row])
-        found = self._scenes[int(run.channel[row])]
-        if start <= log_time <= end:
-            found.messages += 1
-            found.boxed += bool(scene.boxes)
-            found.first_ns = min(found.first_ns, log_time)
-        for box in scene.boxes:
-            ident = self._names.ident(box)
-            told = self._entities.setdefault(ident, _LossNote(ref_of(run, row)))
-            told.count += 1
-            if told.count == 1:
-                self._types[ident] = self._names.type_name(box)
-                self._entity_axes[box.axes] += 1
-
-    def _look_at_transforms(
-        self, reader: ChannelReader, run: Messages, row: int, data: bytes
-    ) -> None:
-        for one in reader.transforms(data):
-            if self._axes.tell(one.child, one.parent, 0, (ORIGIN, STILL)):
-                told = self._transforms.setdefault(one.child, _LossNote(ref_of(run, row)))
-                told.count += 1

@@ -20,7 +20,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, un
 from google.protobuf.message import DecodeError
 
 from sgstore.errors import TraceError
-from sgstore.readers._base import FAR, NAN
+from sgstore.readers._blocks import FAR, NAN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

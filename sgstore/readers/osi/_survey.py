@@ -14,16 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.errors import MapError, TraceError
-from sgstore.readers._base import EntityTable, Ref, ref_of
+from sgstore.readers._base import Lead, Ref, Survey, ref_of
+from sgstore.readers._blocks import EntityTable
 from sgstore.readers.osi._lanes import FIELDS as LANE_FIELDS
 from sgstore.readers.osi._lanes import LaneSignal, OsiLanes
-from sgstore.readers.osi._lights import TrafficLights
-from sgstore.readers.osi._objects import Statics
+from sgstore.readers.osi._objects import Statics, TrafficLights
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
@@ -44,6 +42,8 @@ from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from mcap.records import Schema
 
     from sgstore.mcap import Messages, Recording
 
@@ -224,9 +224,6 @@ STATIC_FIELDS: Final = (
 )
 """Fields of a ground truth whose objects do not change, so that a producer may write them only once."""
 
-BEGINNING: Final = 1_000_000_000
-"""How long after the first frame a message still comes with it; ns of log time."""
-
 
 @dataclass(slots=True)
 class _Latch:
@@ -275,13 +272,12 @@ class _Latch:
             return None
 
 
-@dataclass(slots=True)
-class OsiLead:
-    """A channel that may lead: its message class, its messages that could be read, what they depend on.
+@dataclass(slots=True, kw_only=True)
+class OsiLead(Lead):
+    """A channel that may lead: its message class, and what its messages depend on.
 
-    ``objects``: class of its moving objects. ``driven``: how many of its frames have some. ``first_ns``: least
-    log time of its frames. ``lanes``: what they tell of roads; ``None`` if that cannot
-    be read.
+    ``objects``: class of its moving objects. ``latch``: its messages on which others depend. ``lanes``: what
+    they tell of roads; ``None`` if that cannot be read. The weight of a frame is 1 if it has moving objects.
     """
 
     schema: str
@@ -289,142 +285,6 @@ class OsiLead:
     objects: type[Any]
     latch: _Latch
     lanes: OsiLanes | None
-    frames: int = 0
-    driven: int = 0
-    first_ns: int = (1 << 63) - 1
-
-
-@dataclass(slots=True)
-class OsiSurvey:
-    """Findings of the first reading of a recording.
-
-    Attributes
-    ----------
-    leads : dict
-        Channel id → :class:`OsiLead`, of the channels with ground truth.
-    hosts : dict
-        Channel id → class of the messages, of the channels with data of the host vehicle.
-    cast : Cast
-        The moving objects.
-    statics : Statics
-        What stands still.
-    map_text, map_name : str
-        OpenDRIVE; in a recording that carries none, the lanes of its ground truth.
-    map_refs : list of Ref
-    others : dict
-        Channel id → number of messages and the first of them, of all other channels.
-    notes : list of str
-        What is odd but lost nothing.
-    lost_lanes : list of str
-        Lanes that make no part of the map of its lanes, and why.
-    window : tuple of int
-        Log times, both included, between which messages are frames.
-    signals : dict
-        First bulb of each traffic light that is assigned to lanes → the signal of the map of its lanes.
-    lights : dict
-        Channel id → all traffic lights, as messages of that channel are to be read.
-    """
-
-    leads: dict[int, OsiLead] = field(default_factory=dict[int, OsiLead])
-    hosts: dict[int, type[Any]] = field(default_factory=dict[int, type[Any]])
-    cast: Cast = field(default_factory=Cast)
-    statics: Statics = field(default_factory=Statics)
-    map_text: str = ""
-    map_name: str = ""
-    map_refs: list[Ref] = field(default_factory=list[Ref])
-    others: dict[int, tuple[int, Ref]] = field(default_factory=dict[int, tuple[int, Ref]])
-    notes: list[str] = field(default_factory=list[str])
-    lost_lanes: list[str] = field(default_factory=list[str])
-    window: tuple[int, int] = (0, 0)
-    signals: dict[int, LaneSignal] = field(default_factory=dict[int, LaneSignal])
-    lights: dict[int, TrafficLights] = field(default_factory=dict[int, TrafficLights])
-
-    def leading(self) -> int | None:
-        """The channel with most frames, a ground truth before a sensor view; ``None`` if none has any.
-
-        Frames with moving objects count first: of split channels the one that moves leads.
-        """
-        ranked = [
-            (lead.driven, lead.frames, lead.schema == GROUND_TRUTH, -channel)
-            for channel, lead in self.leads.items()
-            if lead.frames
-        ]
-        return -max(ranked)[3] if ranked else None
-
-    def context(self, leading: int) -> set[Ref]:
-        """Messages that later ones depend on.
-
-        The only message of a channel is one of them if it comes with the first frame: what is told once
-        and at the beginning, such as the calibration of a camera, is told for all that follows. Of a channel
-        beside the leading one it is whatever tells of static things for the first time.
-        """
-        lead = self.leads[leading]
-        once = [
-            ref
-            for count, ref in self.others.values()
-            if count == 1 and ref[1] <= lead.first_ns + BEGINNING
-        ]
-        refs = {*self.map_refs, *once}
-        for channel, other in self.leads.items():
-            refs.update(other.latch.refs)
-            if channel != leading:
-                refs.update(other.latch.told_by.values())
-        return refs
-
-
-def survey(recording: Recording) -> OsiSurvey:
-    """Read a recording once, from end to end.
-
-    Raises
-    ------
-    TraceError
-        Descriptors are malformed, or the file cannot be read.
-    """
-    result = OsiSurvey()
-    maps: dict[int, type[Any]] = {}
-    for run in recording.walk(
-        TraceReport(), keep=lambda channel: channel in result.leads or channel in result.hosts
-    ):
-        for channel, row, count in zip(
-            *np.unique(run.channel, return_index=True, return_counts=True), strict=True
-        ):
-            if not _meet(recording, int(channel), result, maps):
-                before, ref = result.others.get(int(channel), (0, ref_of(run, int(row))))
-                result.others[int(channel)] = (before + int(count), ref)
-        result.window = recording.window
-        known = np.isin(run.channel, [*result.leads, *maps])
-        for row in np.flatnonzero(known):
-            channel = int(run.channel[row])
-            if channel in maps:
-                _look_at_map(result, maps[channel], run, int(row))
-            else:
-                _look_at_frame(result, channel, run, int(row))
-    if not result.map_text:
-        leading = result.leading()
-        lights = result.lights.get(leading) if leading is not None else None
-        result.signals = {} if lights is None else lights.signals()
-        _make_map_of_lanes(result, recording.path.stem)
-    return result
-
-
-def _make_map_of_lanes(result: OsiSurvey, name: str) -> None:
-    """The map that the lanes make, those of the leading channel before those of others."""
-    leading = result.leading()
-    for _, lead in sorted(result.leads.items(), key=lambda item: item[0] != leading):
-        if lead.lanes is None:
-            continue
-        try:
-            result.map_text, told = lead.lanes.text(
-                [*result.signals.values(), *result.statics.signals()]
-            )
-        except MapError as error:
-            lead.lanes.warnings.append(str(error))
-        else:
-            result.lost_lanes += lead.lanes.lost
-            if result.map_text:
-                result.map_name = told or f"{name}{OF_LANES}"
-                return
-        result.notes += [f"its lanes make no road map: {what}" for what in lead.lanes.warnings]
 
 
 def schema_name(recording: Recording, channel: int) -> str:
@@ -435,70 +295,157 @@ def schema_name(recording: Recording, channel: int) -> str:
     return schema.name if schema is not None and protobuf else ""
 
 
-def _meet(
-    recording: Recording, channel: int, result: OsiSurvey, maps: dict[int, type[Any]]
-) -> bool:
-    """Return whether a channel may lead or carries maps; make ready for one that is met for the first time."""
-    if channel in result.leads or channel in maps:
-        return True
-    name = schema_name(recording, channel)
-    if name not in {GROUND_TRUTH, SENSOR_VIEW, ROAD_MAP, HOST_DATA} or channel in result.hosts:
-        return False
-    message = message_class(recording.schemas[recording.channels[channel].schema_id])
-    if name == HOST_DATA:
-        result.hosts[channel] = message  # a message of its own, too, that belongs to a frame
-        return False
-    if name == ROAD_MAP:
-        maps[channel] = message
-        return True
-    prefix = "global_ground_truth." if name == SENSOR_VIEW else ""
-    present = tuple(field for field in STATIC_FIELDS if has_field(message, prefix + field))
-    try:
-        lanes = OsiLanes(recording.schemas[recording.channels[channel].schema_id])
-    except TraceError as error:
-        lanes = None
-        result.notes.append(f"its lanes cannot be read: {error.reason}")
-    result.lights[channel] = TrafficLights(EntityTable(TraceReport()), light_class(message))
-    result.leads[channel] = OsiLead(
-        name, message, object_class(message), _Latch(present, light_class(message)), lanes
-    )
-    return True
+class OsiSurvey(Survey[OsiLead]):
+    """Findings of the first reading of a recording.
 
+    Attributes
+    ----------
+    hosts : dict
+        Channel id → class of the messages, of the channels with data of the host vehicle.
+    cast : Cast
+        The moving objects.
+    statics : Statics
+        What stands still.
+    map_text, map_name : str
+        OpenDRIVE; in a recording that carries none, the lanes of its ground truth.
+    lost_lanes : list of str
+        Lanes that make no part of the map of its lanes, and why.
+    signals : dict
+        First bulb of each traffic light that is assigned to lanes → the signal of the map of its lanes.
+    """
 
-def _look_at_map(result: OsiSurvey, message: type[Any], run: Messages, row: int) -> None:
-    result.map_refs.append(ref_of(run, row))
-    try:
-        told = message.FromString(bytes(run.data(row)))
-        text, name = str(told.open_drive_xml_content), str(told.map_reference)
-    except DECODE_ERRORS as error:
-        result.notes.append(f"a message of schema {ROAD_MAP} cannot be read: {error}")
-        return
-    if not text:
-        return
-    if result.map_text and text != result.map_text:
-        result.notes.append("the recording carries more than one road map; the first one counts")
-    elif not result.map_text:
-        result.map_text = text
-        # Producers write the path of the file on their own machine: its last part is the map's name.
-        result.map_name = PurePosixPath(name.replace("\\", "/")).name
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording)
+        self.hosts: dict[int, type[Any]] = {}
+        self.cast = Cast()
+        self.statics = Statics()
+        self.map_text = ""
+        self.map_name = ""
+        self.lost_lanes: list[str] = []
+        self.signals: dict[int, LaneSignal] = {}
+        self._maps: dict[int, type[Any]] = {}
+        self._map_refs: list[Ref] = []
+        self._lights: dict[int, TrafficLights] = {}  # as messages of each channel are to be read
 
+    def rank(self, lead: OsiLead) -> tuple[int, ...]:
+        """Order by frames with moving objects: of split channels the one that moves leads."""
+        return lead.weight, lead.frames, lead.schema == GROUND_TRUTH
 
-def _look_at_frame(result: OsiSurvey, channel: int, run: Messages, row: int) -> None:
-    lead = result.leads[channel]
-    log_time = int(run.log_time_ns[row])
-    try:
-        data = bytes(run.data(row))
-        message = parse(lead.message, data)
-        ground = ground_truth_of(message)
-        if lead.latch.look(ground, ref_of(run, row)) and lead.lanes is not None:
-            lead.lanes.take(data)
-        for lights in result.lights.values():
-            lights.update(ground)
-        result.statics.look(ground, lead.latch.fields, log_time)
-        result.cast.look(message, lead.objects)
-    except DECODE_ERRORS:  # counted as a loss when the frames are read
-        return
-    if result.window[0] <= log_time <= result.window[1]:
-        lead.frames += 1
-        lead.driven += len(ground.moving_object) > 0
-        lead.first_ns = min(lead.first_ns, log_time)
+    def read(self) -> Self:
+        """Read the recording from end to end, and make a map of its lanes if it has no other."""
+        super().read()
+        if not self.map_text:
+            leading = self.leading()
+            self.signals = {} if leading is None else self._lights[leading].signals()
+            self._make_map_of_lanes(leading)
+        return self
+
+    def context(self, leading: int) -> set[Ref]:
+        """Messages that later ones depend on.
+
+        Of a channel beside the leading one it is whatever tells of static things for the first time.
+        """
+        refs = {*self._map_refs, *self.once(self.leads[leading].first_ns)}
+        for channel, other in self.leads.items():
+            refs.update(other.latch.refs)
+            if channel != leading:
+                refs.update(other.latch.told_by.values())
+        return refs
+
+    # Channels ----------------------------------------------------------------------------------------
+
+    def keeps(self, channel: int) -> bool:
+        """Return whether the frames need the messages of a channel."""
+        return channel in self.leads or channel in self.hosts
+
+    def meet(self, channel: int) -> bool:
+        """Return whether a channel may lead or carries maps; make ready for one that is met first."""
+        if channel in self.leads or channel in self._maps:
+            return True
+        name = schema_name(self.recording, channel)
+        if name not in {GROUND_TRUTH, SENSOR_VIEW, ROAD_MAP, HOST_DATA} or channel in self.hosts:
+            return False
+        schema = self.recording.schemas[self.recording.channels[channel].schema_id]
+        message = message_class(schema)
+        if name == HOST_DATA:
+            self.hosts[channel] = message  # a message of its own, too, that belongs to a frame
+        elif name == ROAD_MAP:
+            self._maps[channel] = message
+        else:
+            self._meet_lead(channel, schema, message)
+        return name != HOST_DATA
+
+    def _meet_lead(self, channel: int, schema: Schema, message: type[Any]) -> None:
+        prefix = "global_ground_truth." if schema.name == SENSOR_VIEW else ""
+        present = tuple(field for field in STATIC_FIELDS if has_field(message, prefix + field))
+        try:
+            lanes = OsiLanes(schema)
+        except TraceError as error:
+            lanes = None
+            self.notes.append(f"its lanes cannot be read: {error.reason}")
+        bulbs = light_class(message)
+        self._lights[channel] = TrafficLights(EntityTable(TraceReport()), bulbs)
+        self.leads[channel] = OsiLead(
+            schema=schema.name,
+            message=message,
+            objects=object_class(message),
+            latch=_Latch(present, bulbs),
+            lanes=lanes,
+        )
+
+    # One message -------------------------------------------------------------------------------------
+
+    def look(self, run: Messages, row: int) -> None:
+        """Look at a message of a map, or at a frame."""
+        channel = int(run.channel[row])
+        if channel in self._maps:
+            self._look_at_map(self._maps[channel], run, row)
+        else:
+            self._look_at_frame(self.leads[channel], run, row)
+
+    def _look_at_map(self, message: type[Any], run: Messages, row: int) -> None:
+        self._map_refs.append(ref_of(run, row))
+        try:
+            told = message.FromString(bytes(run.data(row)))
+            text, name = str(told.open_drive_xml_content), str(told.map_reference)
+        except DECODE_ERRORS as error:
+            self.notes.append(f"a message of schema {ROAD_MAP} cannot be read: {error}")
+            return
+        if self.map_text and text and text != self.map_text:
+            self.notes.append("the recording carries more than one road map; the first one counts")
+        elif text and not self.map_text:
+            self.map_text = text
+            # Producers write the path of the file on their own machine: its last part is the map's name.
+            self.map_name = PurePosixPath(name.replace("\\", "/")).name
+
+    def _look_at_frame(self, lead: OsiLead, run: Messages, row: int) -> None:
+        try:
+            data = bytes(run.data(row))
+            message = parse(lead.message, data)
+            ground = ground_truth_of(message)
+            if lead.latch.look(ground, ref_of(run, row)) and lead.lanes is not None:
+                lead.lanes.take(data)
+            for lights in self._lights.values():
+                lights.update(ground)
+            self.statics.look(ground, lead.latch.fields, int(run.log_time_ns[row]))
+            self.cast.look(message, lead.objects)
+        except DECODE_ERRORS:  # counted as a loss when the frames are read
+            return
+        self.count(run, row, len(ground.moving_object) > 0)
+
+    def _make_map_of_lanes(self, leading: int | None) -> None:
+        """Make the map of the lanes, those of the leading channel before those of others."""
+        for _, lead in sorted(self.leads.items(), key=lambda item: item[0] != leading):
+            if lead.lanes is None:
+                continue
+            try:
+                signals = [*self.signals.values(), *self.statics.signals()]
+                self.map_text, told = lead.lanes.text(signals)
+            except MapError as error:
+                lead.lanes.warnings.append(str(error))
+            else:
+                self.lost_lanes += lead.lanes.lost
+                if self.map_text:
+                    self.map_name = told or f"{self.recording.path.stem}{OF_LANES}"
+                    return
+            self.notes += [f"its lanes make no road map: {what}" for what in lead.lanes.warnings]

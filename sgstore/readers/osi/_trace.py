@@ -1,33 +1,490 @@
 """Recordings of ASAM OSI: ``osi3.GroundTruth`` and ``osi3.SensorView`` messages in MCAP.
 
 They are recognised by the schema of a channel and by nothing else: topics are free, and most files lack
-the metadata that the standard asks for. A frame is one message of the leading channel, in file order.
-How a message becomes a frame stands in :mod:`sgstore.readers.osi._frames`; the road map is that of an
-``osi3.MapAsamOpenDrive`` message, as omega-prime records it.
+the metadata that the standard asks for. A frame is one message of the leading channel, in file order. The
+road map is that of an ``osi3.MapAsamOpenDrive`` message, as omega-prime records it, or one of the lanes.
 
-Source: open-simulation-interface 3.8.0; omega-prime specification.
+Weather and light of OSI ground truth: events of the report, at the beginning and whenever they change.
+
+Source: open-simulation-interface 3.8.0 (osi_environment.proto); omega-prime specification.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+import math
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+import numpy as np
+from google.protobuf import message_factory
 
 from sgstore.errors import TraceError
-from sgstore.mcap import read_and_digest
-from sgstore.readers._base import Opened, channels_of, refs_of
-from sgstore.readers.osi._frames import OsiDecoder
-from sgstore.readers.osi._schema import GROUND_TRUTH, ROAD_MAP, SENSOR_VIEW
-from sgstore.readers.osi._survey import OsiSurvey, schema_name, survey
-from sgstore.world import TraceInfo, TraceReport
+from sgstore.mcap import Loss, read_and_digest
+from sgstore.readers._base import LossTally, MessageDecoder, MessageTrace, channels_of
+from sgstore.readers._blocks import NAN, FrameRows
+from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights
+from sgstore.readers.osi._schema import (
+    DECODE_ERRORS,
+    GROUND_TRUTH,
+    LATEST_NS,
+    NO_VECTOR,
+    ROAD_MAP,
+    SENSOR_VIEW,
+    enum_name,
+    ground_truth_of,
+    has_field,
+    light_class,
+    parse,
+)
+from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
+from sgstore.vocabulary import TypeMeaning, type_meanings
+from sgstore.world import POSE, Event
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from sgstore.mcap import Messages, Recording
+    from sgstore.readers._blocks import EntityTable
+    from sgstore.world import Bools, Floats, Ints, TraceReport
 
-    from sgstore.mcap import Recording
-    from sgstore.world import FrameBlock
+
+TYPE: Final = "osi3.EnvironmentalConditions"
+_CLASSES: Final = (
+    ("precipitation", "precipitation"),
+    ("fog", "fog"),
+    ("illumination", "ambient_illumination"),
+)
+"""Word of an event → field whose value is a class."""
 
 
-class OsiTrace(Opened):
+class Environment:
+    """The conditions of a trace.
+
+    Parameters
+    ----------
+    message : type
+        Class of the messages of the leading channel, which have the conditions as bytes.
+    roster : EntityTable
+        Takes up an event of kind ``environment`` whenever a class of conditions changes; its ``detail`` is
+        such as ``precipitation=light, fog=mist, illumination=level5, clouds=six_oktas, time_of_day=13:05:00``.
+    """
+
+    def __init__(self, message: type[Any], roster: EntityTable) -> None:
+        self._roster = roster
+        self._told = b""
+        self._state = ""
+        self._unread = 0
+        try:
+            found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(TYPE)
+            self._class = message_factory.GetMessageClass(found)
+        except DECODE_ERRORS:
+            self._class = None
+
+    def look(self, ground: Any, time_ns: int, log_time_ns: int, seq: int) -> None:
+        """Take note of what a ground truth says; what it does not say goes on."""
+        told = getattr(ground, "environmental_conditions", b"")
+        if not told or told == self._told or self._class is None:
+            return
+        self._told = told
+        try:
+            conditions: Any = self._class.FromString(told)
+            state, more = classes_of(conditions), numbers_of(conditions)
+        except DECODE_ERRORS:  # whatever else is in the message is read all the same
+            self._unread += 1
+            return
+        if state == self._state or not state:
+            return
+        self._state = state
+        detail = ", ".join([state, *more])
+        self._roster.happen(Event("environment", time_ns, log_time_ns, seq, detail=detail))
+
+    def settle(self) -> None:
+        """Say what could not be read."""
+        if self._unread:
+            words = f"weather and light cannot be read where they changed {self._unread} times"
+            self._roster.report.warnings.append(words)
+
+
+def classes_of(conditions: Any) -> str:
+    """The classes that are told: ``precipitation=light, fog=mist``."""
+    told = [(word, _class(conditions, field)) for word, field in _CLASSES]
+    if "clouds" in conditions.DESCRIPTOR.fields_by_name and conditions.HasField("clouds"):
+        told.append(("clouds", _class(conditions.clouds, "fractional_cloud_cover")))
+    return ", ".join(f"{word}={value}" for word, value in told if value)
+
+
+def numbers_of(conditions: Any) -> list[str]:
+    """Time of day and temperature, where they are told."""
+    told: list[str] = []
+    if conditions.HasField("time_of_day"):
+        minutes, seconds = divmod(conditions.time_of_day.seconds_since_midnight % 86_400, 60)
+        told.append(f"time_of_day={minutes // 60:02}:{minutes % 60:02}:{seconds:02}")
+    if conditions.HasField("temperature"):
+        told.append(f"temperature={conditions.temperature:.1f} K")
+    return told
+
+
+def _class(message: Any, field: str) -> str:
+    """A value of an enumeration in lower case, without what all values begin with; empty if it is unknown."""
+    told = message.DESCRIPTOR.fields_by_name.get(field)
+    if told is None or told.enum_type is None or not message.HasField(field):
+        return ""
+    names = told.enum_type.values_by_number
+    number = getattr(message, field)
+    if 0 not in names or number not in names or number == 0:
+        return ""
+    prefix = names[0].name.removesuffix("UNKNOWN")
+    return str(names[number].name).removeprefix(prefix).lower()
+
+
+# OSI messages → frames: moving objects as rows, static things as entities, lights carried forward ----
+# * A moving object becomes a row. OSI's position is the centre of the box, its axes and units are ours. A
+#   sub-message that is missing (velocity, acceleration, …) is missing; a number that is missing in a
+#   sub-message is 0, because producers leave zeros out.
+# * What stands still is entered with the first frame, wherever it is told.
+# * Traffic lights become one entity for each head, with a row in every frame.
+# * A ground truth may be split: over messages of one time on one channel, or over channels. What other channels
+#   tell at the time of a frame of the leading channel belongs to that frame.
+#
+# Source: open-simulation-interface 3.8.0 (osi_object.proto, osi_hostvehicledata.proto).
+
+NO_EGO: Final = "no host vehicle is among the moving objects: there is no ego unless one is named"
+"""What a report says of it."""
+
+_VEHICLE: Final = 2
+"""``MovingObject.TYPE_VEHICLE``: what it is stands in ``vehicle_classification.type``."""
+_UNSET: Final = "TYPE_UNKNOWN"
+_HEADING: Final = POSE.index("heading")
+_UNKNOWN: Final = -2
+_MOST_AHEAD: Final = 16
+"""Times ahead of the leading channel whose messages on other channels are kept until it gets there."""
+
+
+@dataclass(slots=True)
+class OsiRawFrame:
+    """A frame whose objects are still bytes.
+
+    Attributes
+    ----------
+    time_ns, log_time_ns : int
+    heads : tuple of arrays
+        Rows of the traffic lights: node ids, columns, states.
+    controls : tuple of float
+        As :class:`~sgstore.readers._blocks.FrameRows` has them.
+    nodes : list of int
+        Node id of each moving object; none comes twice.
+    objects : list of bytes
+        The moving objects.
+    """
+
+    time_ns: int
+    log_time_ns: int
+    heads: tuple[Ints, Floats, Ints]
+    controls: tuple[float, float, float] = NO_VECTOR
+    nodes: list[int] = field(default_factory=list[int])
+    objects: list[bytes] = field(default_factory=list[bytes])
+
+
+class OsiDecoder(MessageDecoder[OsiRawFrame]):
+    """Messages of ground truth → frames, with what must be remembered from one to the next.
+
+    Parameters
+    ----------
+    survey : OsiSurvey
+        What the first reading found.
+    leading : int
+        Id of the channel whose messages are frames.
+    ego : int or None
+        Id of the ego.
+    report : TraceReport
+        Takes up what cannot be used.
+    """
+
+    def __init__(
+        self, survey: OsiSurvey, leading: int, ego: int | None, report: TraceReport
+    ) -> None:
+        super().__init__({*survey.leads, *survey.hosts}, survey.recording.window, report)
+        self._survey = survey
+        self._leading = leading
+        self._ego = ego
+        self._idents = survey.cast.idents()
+        self._nodes: dict[int, int] = {}
+        self._keys: dict[bytes, int] = {}
+        self._last_keys: list[bytes] = []
+        self._last_nodes: list[int] = []
+        self._open: OsiRawFrame | None = None
+        self._ahead: dict[int, list[bytes]] = {}
+        self._aside: dict[int, int] = {}
+        self._controls = NO_VECTOR
+        lead = survey.leads[leading]
+        self._class = lead.objects  # the numbers of fields are those of every version
+        self._objects = MovingObjects(self._class)
+        names = {bulb: one.name for bulb, one in survey.signals.items()}
+        self._lights = TrafficLights(self.roster, light_class(lead.message), names)
+        self._environment = Environment(lead.message, self.roster)
+        self._frames = 0
+
+    def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
+        """The frame that a message begins, if it begins one; what else it says is taken up."""
+        channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
+        try:
+            data = bytes(run.data(row))
+            if channel in self._survey.hosts:
+                self._controls = controls_of(self._survey.hosts[channel].FromString(data))
+                return None
+            message = parse(self._survey.leads[channel].message, data)
+            ground = ground_truth_of(message)
+            if not self.is_inside(log_time):
+                self._lights.update(ground)
+                return None
+            time_ns = time_of(message, ground)
+            if channel == self._leading:
+                return self._frame(message, ground, time_ns, log_time)
+            self._take_aside(message, ground, log_time if time_ns is None else time_ns)
+        except DECODE_ERRORS as error:
+            what = "a ground truth message cannot be read"
+            self.lose(f"{what}: {type(error).__name__}: {error}", run, row)
+        return None
+
+    def settle(self) -> None:
+        """Report what could not be used, once all frames are read."""
+        self._environment.settle()
+        warn = self._report.warnings.append
+        if self._lights.unplaced:
+            warn(
+                f"{self._lights.unplaced} traffic lights have neither a position nor a reference to the"
+                " map: they are listed as entities, but are in no graph"
+            )
+        if self._lights.unreadable:
+            warn(
+                f"traffic lights cannot be read where they changed {self._lights.unreadable} times"
+            )
+        super().settle()
+        never = {ident: count for ident, count in self._aside.items() if ident not in self._nodes}
+        for ident, count in list(never.items())[: LossTally.MOST]:
+            reason = f"moving object {ident} is told only between the frames of the leading channel"
+            self._report.losses.append(Loss(f"{reason}: {count} states were left out", 0, 0))
+        if self._ego is None:
+            self._warn_of_egos(NO_EGO)
+
+    def complete(self, frames: list[OsiRawFrame]) -> list[FrameRows]:
+        """Frames with their numbers, read for all of them at once."""
+        objects = [content for frame in frames for content in frame.objects]
+        values, usable, lights = self._objects.read(objects)
+        turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
+        values[turned, _HEADING] = np.remainder(values[turned, _HEADING] + np.pi, 2 * np.pi) - np.pi
+        done: list[FrameRows] = []
+        start = 0
+        for frame in frames:
+            rows = slice(start, start + len(frame.objects))
+            done.append(self._rows(frame, values[rows], usable[rows], lights[rows]))
+            start = rows.stop
+        return done
+
+    # One message ---------------------------------------------------------------------------------------
+
+    def _frame(
+        self, message: Any, ground: Any, time_ns: int | None, log_time: int
+    ) -> OsiRawFrame | None:
+        """A frame, unless the message goes on with the last one."""
+        nodes, objects = self._met(ground.moving_object, log_time)
+        last = self._open
+        if last is not None and time_ns == last.time_ns and not set(nodes) & set(last.nodes):
+            self._lights.update(ground)
+            self._join(last, message, nodes, objects)
+            return None
+        self._untimed += time_ns is None
+        if last is None:
+            self._enter_statics()
+        self._lights.update(ground)
+        frame = OsiRawFrame(log_time if time_ns is None else time_ns, log_time, self._lights.rows())
+        self._open = frame
+        self._environment.look(ground, frame.time_ns, log_time, self._frames)
+        self._frames += 1
+        self._join(frame, message, nodes, objects)
+        for ahead in [time for time in self._ahead if time <= frame.time_ns]:
+            contents = self._ahead.pop(ahead)
+            if ahead == frame.time_ns:
+                self._join(frame, None, *self._met(contents, log_time))
+            else:
+                self._leave_aside(contents)
+        return frame
+
+    def _join(
+        self, frame: OsiRawFrame, message: Any, nodes: list[int], objects: list[bytes]
+    ) -> None:
+        """Add to a frame what it does not have yet."""
+        if not frame.nodes:
+            frame.nodes, frame.objects = nodes, objects
+        else:
+            there = set(frame.nodes)
+            for node, content in zip(nodes, objects, strict=True):
+                if node not in there:
+                    frame.nodes.append(node)
+                    frame.objects.append(content)
+        frame.heads = self._lights.rows()
+        data = getattr(message, "host_vehicle_data", None)
+        if data is None and self._controls is NO_VECTOR:
+            return
+        known = zip(frame.controls, controls_of(data), self._controls, strict=True)
+        steer, throttle, brake = (
+            next((value for value in three if not math.isnan(value)), NAN) for three in known
+        )
+        frame.controls = (steer, throttle, brake)
+
+    def _take_aside(self, message: Any, ground: Any, time_ns: int) -> None:
+        """Take a message of another channel: it tells of the last frame, of one to come, or of none."""
+        last = self._open
+        self._lights.update(ground)
+        contents: list[bytes] = list(ground.moving_object)
+        told = controls_of(getattr(message, "host_vehicle_data", None))
+        if not all(math.isnan(value) for value in told):
+            self._controls = told
+        if last is not None and time_ns == last.time_ns:
+            self._join(last, message, *self._met(contents, last.log_time_ns))
+        elif last is None or time_ns > last.time_ns:
+            self._ahead.setdefault(time_ns, []).extend(contents)
+            if len(self._ahead) > _MOST_AHEAD:
+                self._leave_aside(self._ahead.pop(next(iter(self._ahead))))
+        else:
+            self._leave_aside(contents)
+
+    def _leave_aside(self, contents: list[bytes]) -> None:
+        """Count objects at a time for which there is no frame."""
+        for content in contents:
+            with suppress(*DECODE_ERRORS):
+                ident = int(self._class.FromString(content).id.value)
+                self._aside[ident] = self._aside.get(ident, 0) + 1
+
+    # Entities ------------------------------------------------------------------------------------------
+
+    def _met(self, contents: Any, log_time: int) -> tuple[list[int], list[bytes]]:
+        """Node ids of serialised objects, and the objects; without those that cannot be read or come twice."""
+        objects = list(contents)
+        keys = keys_of(objects)
+        if keys == self._last_keys:  # the same objects as in the last frame, in the same order
+            return self._last_nodes.copy(), objects
+        nodes = [self._keys.get(key, _UNKNOWN) for key in keys]
+        known = _UNKNOWN not in nodes
+        if not known:
+            for row, node in enumerate(nodes):
+                if node == _UNKNOWN:
+                    nodes[row] = self._node_of(objects[row], keys[row], log_time)
+        if len(set(nodes)) == len(nodes) and -1 not in nodes:
+            if known or all(map(self._keys.__contains__, keys)):
+                self._last_keys, self._last_nodes = keys, nodes.copy()
+            return nodes, objects
+        rows: dict[int, int] = {}
+        for row, node in enumerate(nodes):
+            if node >= 0 and rows.setdefault(node, row) != row:
+                reason = "moving object {} comes more than once in a frame"
+                self._unusable.add(reason.format(self._number(node)), log_time)
+        return list(rows), [objects[row] for row in rows.values()]
+
+    def _node_of(self, content: bytes, key: bytes, log_time: int) -> int:
+        """The node of an object whose beginning is not known, entered if it is new; -1 if it is malformed."""
+        try:
+            thing = self._class.FromString(content)
+        except DECODE_ERRORS as error:
+            self._unusable.add(f"a moving object cannot be read ({error})", log_time)
+            return -1
+        ident = thing.id.value
+        node = self._nodes.get(ident)
+        if node is None:
+            node = self._nodes[ident] = self._enter(thing)
+        if is_key(key, thing):
+            self._keys[key] = node
+        return node
+
+    def _enter(self, thing: Any) -> int:
+        """Enter a moving object that is seen for the first time.
+
+        Its class counts if it is said to be a vehicle, or if nothing is said of what it is.
+        """
+        meanings = type_meanings()
+        type_name = enum_name(thing, "type")
+        vehicle = getattr(thing, "vehicle_classification", None)
+        told = _UNSET if vehicle is None else enum_name(vehicle, "type")
+        is_vehicle = thing.type == _VEHICLE or (type_name == _UNSET and told != _UNSET)
+        special = ""
+        if is_vehicle:
+            type_name = type_name if told in UNTOLD else told
+            role = enum_name(vehicle, "role") if has_field(type(vehicle), "role") else ""
+            special = meanings[role.lower()].special if role.lower() in meanings else ""
+        vague = TypeMeaning("vehicle" if is_vehicle else "unknown")
+        meaning = meanings.get(type_name.lower(), vague)
+        if meaning is vague and is_vehicle:
+            self.roster.count_unknown(type_name)
+        if special:
+            meaning = replace(meaning, special=special)
+        ident = self._idents.get(thing.id.value, str(thing.id.value))
+        return self.roster.enter(ident, meaning, type_name)
+
+    def _enter_statics(self) -> None:
+        statics = self._survey.statics
+        statics.enter(self.roster, self._survey.map_text)
+        for words, log_time in statics.unplaced.items():
+            self._unusable.add(words, log_time)
+
+    def _number(self, node: int) -> int:
+        """The recording's own id of a moving object."""
+        return next(ident for ident, known in self._nodes.items() if known == node)
+
+    # Rows ----------------------------------------------------------------------------------------------
+
+    def _rows(self, frame: OsiRawFrame, values: Floats, usable: Bools, lights: Ints) -> FrameRows:
+        """A frame with its numbers, without the rows that cannot be used."""
+        node = np.array(frame.nodes, np.int64)
+        if not usable.all():
+            for row in np.flatnonzero(~usable):
+                words = f"moving object {self._number(int(node[row]))} has no usable pose"
+                self._unusable.add(words, frame.log_time_ns)
+            node, values, lights = node[usable], values[usable], lights[usable]
+        ego = self._nodes.get(self._ego, -1) if self._ego is not None else -1
+        rows = FrameRows(
+            time_ns=frame.time_ns,
+            log_time_ns=frame.log_time_ns,
+            ego=ego if (node == ego).any() else -1,
+            node=node,
+            values=values,
+            lights=lights,
+            light_state=np.full(len(node), -1, np.int64),
+            controls=frame.controls,
+        )
+        return rows.with_heads(frame.heads)
+
+
+def time_of(message: Any, ground: Any) -> int | None:
+    """The time that a message says it is of, in ns; ``None`` if it says none that can be."""
+    for part in (ground, message):
+        if part.HasField("timestamp"):
+            time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
+            if abs(time_ns) < LATEST_NS:
+                return time_ns
+    return None
+
+
+def controls_of(data: Any) -> tuple[float, float, float]:
+    """Steer, throttle and brake in an ``osi3.HostVehicleData``; NaN what it does not tell.
+
+    The angle of a steering wheel is no normalised steer, and how far the wheel turns is not told: that is
+    always NaN.
+    """
+    return (
+        NAN,
+        _number(data, "vehicle_powertrain", "pedal_position_acceleration"),
+        _number(data, "vehicle_brake_system", "pedal_position_brake"),
+    )
+
+
+def _number(message: Any, part: str, name: str) -> float:
+    inner = getattr(message, part, None)
+    return float(getattr(inner, name)) if inner is not None and inner.HasField(name) else NAN
+
+
+# The recording ------------------------------------------------------------------------------------
+
+
+class OsiTrace(MessageTrace):
     """A recording of OSI ground truth.
 
     Parameters
@@ -54,20 +511,27 @@ class OsiTrace(Opened):
     name: ClassVar[str] = "osi"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        self._recording = recording
-        found, digest = read_and_digest(recording.path, digest, lambda: survey(recording))
-        leading = found.leading()
+        survey = OsiSurvey(recording)
+        _, digest = read_and_digest(recording.path, digest, survey.read)
+        leading = survey.leading()
         if leading is None:
-            topics = [repr(recording.channels[channel].topic) for channel in found.leads]
+            topics = [repr(survey.topic(channel)) for channel in survey.leads]
             where = ", ".join(topics) or "the channels of its schema"
             reason = f"no ground truth message can be read from {where}"
             raise TraceError(reason, path=recording.path)
-        self._survey = found
-        self._leading = leading
+        self._survey, self._leading = survey, leading
         self._notes: list[str] = []
-        self._ego = found.cast.ego(ego, self._notes)
-        self.report = TraceReport()
-        self.info = self._info(found, digest)
+        self._ego = survey.cast.ego(ego, self._notes)
+        super().__init__(
+            recording,
+            digest,
+            channels_of(recording, self._role),
+            ego="" if self._ego is None else survey.cast.idents()[self._ego],
+            context=survey.context(leading),
+            map_text=survey.map_text,
+            map_name=survey.map_name,
+            lost_lanes=tuple(dict.fromkeys(survey.lost_lanes)),
+        )
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
@@ -75,39 +539,13 @@ class OsiTrace(Opened):
         names = {schema_name(recording, channel) for channel in recording.channels}
         return bool(names & {GROUND_TRUTH, SENSOR_VIEW})
 
-    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
-
-        Raises
-        ------
-        TraceError
-            The file cannot be read any more.
-        """
-        report = self.report = TraceReport()
+    def decoder(self, report: TraceReport) -> OsiDecoder:
+        """A decoder that has read nothing yet."""
         report.warnings += [*self._survey.notes, *self._notes]
         report.about_ego += self._notes
-        decoder = OsiDecoder(self._survey, self._leading, self._ego, report)
-        topic = self._recording.channels[self._leading].topic
-        yield from self._told(decoder, size, report, topic)
-
-    def _info(self, found: OsiSurvey, digest: str) -> TraceInfo:
-        recording = self._recording
-        channels = channels_of(recording, self._role)
-        return TraceInfo(
-            path=recording.path,
-            size=recording.size,
-            mtime_ns=recording.mtime_ns,
-            digest=digest,
-            flavour=self.name,
-            channels=channels,
-            ego="" if self._ego is None else found.cast.idents()[self._ego],
-            map_text=found.map_text,
-            map_name=found.map_name,
-            context=refs_of(found.context(self._leading), channels),
-            lost_lanes=tuple(dict.fromkeys(found.lost_lanes)),
-        )
+        return OsiDecoder(self._survey, self._leading, self._ego, report)
 
     def _role(self, channel: int) -> str:
         if channel == self._leading:
             return "ground_truth"
-        return "map" if schema_name(self._recording, channel) == ROAD_MAP else "payload"
+        return "map" if schema_name(self._survey.recording, channel) == ROAD_MAP else "payload"
