@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     Attributes = dict[str, Any]
     Edge = tuple[int, str, int, Attributes]
 
-__all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper"]
+__all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities"]
 
 
 _NAN: Final = math.nan
@@ -595,26 +595,20 @@ class Stepper:
 
         Everything is checked before anything is remembered: a frame that is refused has not been.
         """
-        moving: dict[str, Entity] = {}
+        check_entities(frame, self._known)
+        moving = {entity.ident: entity for entity in frame.entities if not entity.static}
         new: dict[str, Entity] = {}
         for entity in frame.entities:
-            ident = entity.ident
-            stands = ident in self._standing or ident in new
-            known = self._moving.get(ident)
-            if ident in moving or (stands and not entity.static):
-                raise ValueError(f"two entities have the id {ident!r}")
-            if entity.static and known is not None:
-                raise ValueError(f"entity {ident!r} moved before and is static now")
-            if known is not None and known.kind != KINDS[entity.kind]:
-                now = KINDS[entity.kind]
-                raise ValueError(f"entity {ident!r} was of kind {known.kind!r} and is {now!r} now")
-            if not entity.static:
-                moving[ident] = entity
-            elif not stands:
-                new[ident] = entity
+            if entity.static and entity.ident not in self._standing:
+                new.setdefault(entity.ident, entity)
         for entity in frame.entities:
             self._remember(entity, new)
         return list(moving.values()), list(new.values())
+
+    def _known(self, ident: str) -> tuple[bool, str] | None:
+        if ident in self._standing:
+            return True, self._standing[ident][1].kind
+        return (False, self._moving[ident].kind) if ident in self._moving else None
 
     def _remember(self, entity: Entity, new: dict[str, Entity]) -> None:
         ident = entity.ident
@@ -673,6 +667,34 @@ class Stepper:
             derived=derived,
             **{name: numbers[:, i] for i, name in enumerate(NUMBERS)},
         )
+
+
+def check_entities(frame: Frame, known: Callable[[str], tuple[bool, str] | None]) -> None:
+    """Refuse a frame that contradicts itself or those before it; nothing of it need be remembered then.
+
+    Parameters
+    ----------
+    frame : Frame
+    known : callable
+        Of an id that was met before: whether it is static, and its kind.
+
+    Raises
+    ------
+    ValueError
+        Two entities have one id, one that moved is static or the other way round, or its kind has changed.
+    """
+    here: dict[str, Entity] = {}
+    for entity in frame.entities:
+        ident, kind = entity.ident, KINDS[entity.kind]
+        static, was = known(ident) or (entity.static, kind)
+        if ident in here and not (here[ident].static and entity.static):
+            raise ValueError(f"two entities have the id {ident!r}")
+        if entity.static != static:
+            now, before = ("is static", "moved") if entity.static else ("moves", "was static")
+            raise ValueError(f"entity {ident!r} {before} before and {now} now")
+        if kind != was and not entity.static:
+            raise ValueError(f"entity {ident!r} was of kind {was!r} and is {kind!r} now")
+        here[ident] = entity
 
 
 class GcPaused:

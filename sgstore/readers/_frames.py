@@ -11,7 +11,7 @@ from sgstore.errors import TraceError
 from sgstore.mcap import digest_of
 from sgstore.readers._base import LossTally, MessageDecoder, MessageTrace, channels_of, ref_of
 from sgstore.readers._blocks import FrameRows
-from sgstore.step import Frame
+from sgstore.step import Frame, check_entities
 from sgstore.vocabulary import KINDS, TypeMeaning
 from sgstore.world import POSE, Channel, TraceReport
 
@@ -251,19 +251,13 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             raise TypeError(f"{type(frame).__name__} is no Frame")
         if abs(frame.time_ns) >= _LATEST:
             raise ValueError(f"no time: {frame.time_ns} ns")
-        here: dict[str, Entity] = {}
-        for entity in frame.entities:
-            ident = entity.ident
-            known = self._known[ident][1] if ident in self._known else entity
-            if ident in here and not (here[ident].static and entity.static):
-                raise ValueError(f"two entities have the id {ident!r}")
-            if entity.static != known.static:
-                now, before = ("is static", "moved") if entity.static else ("moves", "was static")
-                raise ValueError(f"entity {ident!r} {before} before and {now} now")
-            if entity.kind != known.kind and not entity.static:
-                was, now = KINDS[known.kind], KINDS[entity.kind]
-                raise ValueError(f"entity {ident!r} was of kind {was!r} and is {now!r} now")
-            here[ident] = entity
+        check_entities(frame, self._told)
+
+    def _told(self, ident: str) -> tuple[bool, str] | None:
+        if ident not in self._known:
+            return None
+        entity = self._known[ident][1]
+        return entity.static, KINDS[entity.kind]
 
     def _stand(self, entity: Entity) -> None:
         """Enter what never moves.
