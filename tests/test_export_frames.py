@@ -22,8 +22,9 @@ import sgstore
 import sgstore.exporters._foxglove as foxglove
 from sgstore.errors import ExportError, TraceError
 from sgstore.exporters import Export, labelled, write_export
-from sgstore.exporters._sensors import ImageFile, PointCloud, Video, cloud_file, png, sensor_of
+from sgstore.exporters._sensors import ImageFile, PointCloud, Video, cloud_file, sensor_of
 from sgstore.ingest import ingest
+from sgstore.readers import png
 from sgstore.world import Clip
 
 if TYPE_CHECKING:

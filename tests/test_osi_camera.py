@@ -139,6 +139,22 @@ def test_a_jpeg_in_the_place_of_pixels_is_given_as_it_is(tmp_path: Path) -> None
     assert (found.form, found.data) == ("jpeg", stream.getvalue())
 
 
+def test_a_jpeg_in_the_place_of_pixels_is_exported_under_its_own_ending(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(pixels("RGB_U8")).save(stream, "jpeg")
+    with Everything(tmp_path / "a.mcap") as recorder:
+        channel = recorder.channel("view", "osi3.SensorView")
+        recorder.write(channel, 0.0, view(0.0, stream.getvalue(), 1))
+    ingest(tmp_path / "s.sgstore", [tmp_path / "a.mcap"])
+    store = sgstore.open(tmp_path / "s.sgstore")
+    clips = list(store.find("MATCH (e:Ego)").clips(0.0, 0.0))
+
+    write_stored(store, clips, tmp_path / "clips", form="frames", query="")
+
+    (file,) = (tmp_path / "clips").rglob("*.jpg")
+    assert file.read_bytes() == stream.getvalue()
+
+
 @pytest.mark.parametrize(
     "how",
     [{"kind": 10}, {"kind": 1}, {"width": 6}, {"width": 0, "height": 0}, {"height": 1 << 31}],

@@ -25,7 +25,7 @@ from sgstore.exporters import Recorder  # noqa: E402
 from sgstore.ingest import ingest  # noqa: E402
 from sgstore.query import Store  # noqa: E402
 from sgstore.readers import LiveWorld, Sensor, load_sensors  # noqa: E402
-from sgstore.readers.carla._sensors import LIDAR  # noqa: E402
+from sgstore.readers.carla._live import LIDAR  # noqa: E402
 from sgstore.record import record  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
 from sgstore.step import Frame  # noqa: E402

@@ -25,7 +25,7 @@ from google.protobuf import (
     timestamp_pb2,
 )
 
-from sgstore.exporters._sensors import png
+from sgstore.readers import png
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:

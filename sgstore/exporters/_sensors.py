@@ -1,78 +1,21 @@
-"""Decoded sensor messages: pictures and point clouds.
-
-Pixels → PNG: a few lines, no package, nothing lost.
-
-Source: PNG specification (third edition), chapters 9 to 11.
-"""
+"""Decoded sensor messages: pictures and point clouds."""
 
 from __future__ import annotations
 
-import base64
 import io
-import json
 import re
-import struct
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import ExportError, TraceError
-from sgstore.readers import (
-    DECODE_ERRORS,
-    SENSOR_VIEW,
-    camera_of,
-    decode,
-    message_class,
-    parse_definition,
-)
+from sgstore.errors import TraceError
+from sgstore.readers import picture_form, png, record_reader
 
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
-
-
-COLOURS: Final = {1: 0, 2: 4, 3: 2, 4: 6}
-"""Numbers of a pixel → the colour type: grey, grey and alpha, red green blue, these and alpha."""
-
-
-def png(pixels: NDArray[Any]) -> bytes:
-    """A picture as a PNG file.
-
-    Each row is written as its difference to the one above (filter 2), which costs little and makes most
-    pictures a third smaller.
-
-    Parameters
-    ----------
-    pixels : (height, width) or (height, width, 1 … 4), uint8 or uint16
-        Grey; grey and alpha; red, green, blue; these and alpha.
-
-    Raises
-    ------
-    ExportError
-        They are no picture of that kind, or it is empty.
-    """
-    channels = 1 if pixels.ndim == 2 else pixels.shape[-1]
-    if pixels.ndim not in {2, 3} or channels not in COLOURS or not pixels.size:
-        raise ExportError(f"no picture: an array of shape {pixels.shape}")
-    if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
-        raise ExportError(f"no picture: numbers of {pixels.dtype}; expected uint8 or uint16")
-    height, width = pixels.shape[:2]
-    bytes_of = pixels.dtype.itemsize
-    big = np.ascontiguousarray(pixels.astype(f">u{bytes_of}")).view(np.uint8)
-    rows = big.reshape(height, -1)
-    lines = np.empty((height, rows.shape[1] + 1), np.uint8)
-    lines[:, 0] = 2
-    lines[0, 1:] = rows[0]
-    lines[1:, 1:] = rows[1:] - rows[:-1]
-    head = struct.pack(">IIBBBBB", width, height, 8 * bytes_of, COLOURS[channels], 0, 0, 0)
-    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
-        for tag, data in parts
-    )
 
 
 # What a message of a sensor holds: a picture or a cloud of points, by the schema in the file ----
@@ -84,14 +27,6 @@ def png(pixels: NDArray[Any]) -> bytes:
 # Source: ROS 2, ``sensor_msgs`` (``Image``, ``PointCloud2``; ``image_encodings.hpp``); Foxglove's schemas
 # ``RawImage``, ``CompressedImage``, ``PointCloud``, ``PackedElementField``.
 
-FILES: Final = {
-    "jpeg": rb"\xff\xd8\xff",
-    "png": rb"\x89PNG\r\n\x1a\n",
-    "webp": rb"RIFF....WEBP",
-    "tiff": rb"II\*\x00|MM\x00\*",
-    "bmp": rb"BM",
-}
-"""How files of pictures begin."""
 VIDEO: Final = re.compile("26[45]|avc|hevc|av1|vp9", re.IGNORECASE)
 """What formats of video are called."""
 
@@ -155,64 +90,13 @@ def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sens
 
     It raises ``TraceError`` where a message looks like a picture or a cloud and is not what it says.
     """
-    if schema is not None and schema.name == SENSOR_VIEW and channel.message_encoding == "protobuf":
-        camera = camera_of(schema)
-
-        def seen(message: bytes) -> Sensed:
-            data, form = camera(message)
-            return ImageFile(form, data) if data else None
-
-        return seen
-    read = _reader(channel, schema)
+    read = record_reader(channel, schema)
 
     def sensed(message: bytes) -> Sensed:
         record = read(message)
         return None if record is None else _of_record(record)
 
     return sensed
-
-
-def _reader(channel: Channel, schema: Schema | None) -> Callable[[bytes], Record | None]:
-    encoding = channel.message_encoding
-    try:
-        if encoding == "cdr" and schema and schema.encoding == "ros2msg":
-            kind = parse_definition(schema.name, schema.data)
-            return lambda message: decode(kind, message)
-        if encoding == "protobuf" and schema:
-            made = message_class(schema)
-            return lambda message: _of_protobuf(made, message)
-    except TraceError:
-        return lambda _message: (
-            None
-        )  # a schema that cannot be read: nothing is known of its messages
-    return _of_json if encoding == "json" else lambda _message: None
-
-
-def _of_protobuf(made: type[Any], message: bytes) -> Record | None:
-    names = {field.name for field in made.DESCRIPTOR.fields}
-    if "data" not in names:
-        return None
-    try:
-        parsed = made.FromString(message)
-        found = {name: getattr(parsed, name) for name in names}
-    except DECODE_ERRORS as error:
-        raise TraceError(f"malformed message: {error}") from error
-    if "fields" in found:
-        found["fields"] = [
-            {name: getattr(one, name, None) for name in ("name", "offset", "type")}
-            for one in found["fields"]
-        ]
-    return found
-
-
-def _of_json(message: bytes) -> Record | None:
-    try:
-        found = json.loads(message)
-        if not isinstance(found, dict) or not isinstance(found.get("data"), str):
-            return None
-        return found | {"data": base64.b64decode(found["data"], validate=True)}
-    except (ValueError, RecursionError):
-        return None
 
 
 def _of_record(record: Record) -> Sensed:
@@ -234,9 +118,9 @@ def _of_record(record: Record) -> Sensed:
 
 
 def _of_file(data: bytes, form: str) -> Sensed:
-    for name, start in FILES.items():
-        if re.match(start, data, re.DOTALL):
-            return ImageFile(name, data)
+    picture = picture_form(data)
+    if picture:
+        return ImageFile(picture, data)
     return Video(form, data) if VIDEO.search(form) else None
 
 

@@ -10,7 +10,10 @@ from ._blocks import FrameRows as FrameRows
 from ._frames import FramesTrace as FramesTrace
 from ._frames import TraceMessage as TraceMessage
 from ._media import Media as Media
+from ._media import picture_form as picture_form
+from ._media import png as png
 from ._media import read_carried as read_carried
+from ._media import record_reader as record_reader
 from ._registry import ENDINGS as ENDINGS
 from ._registry import READERS as READERS
 from ._registry import OpenTrace as OpenTrace
@@ -25,14 +28,13 @@ from ._ros2 import decode as decode
 from ._ros2 import parse_definition as parse_definition
 from .carla._live import LiveWorld as LiveWorld
 from .carla._live import connect as connect
-from .carla._sensors import Sensor as Sensor
-from .carla._sensors import SensorCloud as SensorCloud
-from .carla._sensors import SensorPicture as SensorPicture
-from .carla._sensors import SensorReading as SensorReading
-from .carla._sensors import Sensors as Sensors
-from .carla._sensors import load_sensors as load_sensors
+from .carla._live import Sensor as Sensor
+from .carla._live import SensorCloud as SensorCloud
+from .carla._live import SensorPicture as SensorPicture
+from .carla._live import SensorReading as SensorReading
+from .carla._live import Sensors as Sensors
+from .carla._live import load_sensors as load_sensors
 from .foxglove._messages import DERIVED as DERIVED
-from .osi._camera import camera_of as camera_of
 from .osi._file import OsiFile as OsiFile
 from .osi._schema import DECODE_ERRORS as DECODE_ERRORS
 from .osi._schema import SENSOR_VIEW as SENSOR_VIEW
@@ -63,7 +65,6 @@ __all__ = [
     "SensorReading",
     "Sensors",
     "TraceMessage",
-    "camera_of",
     "channels_of",
     "connect",
     "decode",
@@ -74,8 +75,11 @@ __all__ = [
     "open_recording",
     "open_trace",
     "parse_definition",
+    "picture_form",
+    "png",
     "read_carried",
     "read_message",
     "read_messages",
     "readers",
+    "record_reader",
 ]

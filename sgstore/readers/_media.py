@@ -19,14 +19,18 @@ from __future__ import annotations
 import base64
 import json
 import re
+import struct
+import zlib
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import TraceError
+from sgstore.errors import ExportError, TraceError
 from sgstore.mcap import (
+    Findings,
     McapFile,
     bag_folder,
     message_at,
@@ -39,13 +43,14 @@ from sgstore.mcap import (
 )
 from sgstore.readers._registry import open_recording, read_message
 from sgstore.readers._ros2 import decode, parse_definition
-from sgstore.readers.osi._camera import camera_of
 from sgstore.readers.osi._schema import DECODE_ERRORS, SENSOR_VIEW, message_class
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
+
+    from mcap.records import Channel, Schema
+    from numpy.typing import NDArray
 
     from sgstore.mcap import Recording
 
@@ -137,9 +142,9 @@ def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, le
     with open_recording(path) as recording:
         unwrap = _unwrapping(recording, channel)
     data, form = unwrap(message)
-    for name, start in _PICTURES.items():
-        if re.match(start, data, re.DOTALL):
-            return Media(name, data)
+    picture = picture_form(data)
+    if picture:
+        return Media(picture, data)
     codec = next((codec for codec in _CODECS if codec.named.search(form.lower())), None)
     if codec is None or not data:
         return Media("message", message)
@@ -155,51 +160,193 @@ def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, le
 # What is in a message -------------------------------------------------------------------------------------
 
 
-def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
-    """A function that gives the data in messages of a channel, and what they call its format; empty: none."""
-    if channel not in recording.channels:
-        for _ in recording.walk(TraceReport()):  # no summary: channels come with their messages
-            if channel in recording.channels:
-                break
-    record = recording.channels.get(channel)
-    schema = recording.schemas.get(record.schema_id) if record else None
-    encoding = record.message_encoding if record else ""
+def picture_form(data: bytes) -> str:
+    """Format of a picture by how its file begins; empty if it is none that is known."""
+    return next((name for name, start in _PICTURES.items() if re.match(start, data, re.DOTALL)), "")
+
+
+def record_reader(
+    channel: Channel, schema: Schema | None
+) -> Callable[[bytes], Mapping[str, Any] | None]:
+    """A function that reads a message of a channel as a record of its fields.
+
+    Its field ``data`` has bytes, or an array of them; ``None`` where there is no such field. A sensor view of
+    OSI has the picture of its first camera as ``data``, the content of a file whose ``format`` is empty.
+
+    It raises ``TraceError`` where a message is malformed.
+    """
+    encoding = channel.message_encoding
     try:
         if encoding == "cdr" and schema and schema.encoding == "ros2msg":
             kind = parse_definition(schema.name, schema.data)
-            return lambda message: _of_record(decode(kind, message))
-        if encoding == "protobuf" and schema and schema.name == SENSOR_VIEW:
-            return camera_of(schema)
+            return lambda message: decode(kind, message)
         if encoding == "protobuf" and schema:
-            made = message_class(schema)
-            return lambda message: _of_protobuf(made, message)
-    except TraceError:
-        pass  # a schema that cannot be read: then its messages are given as they are
-    return _of_json if encoding == "json" else lambda _message: (b"", "")
+            view = schema.name == SENSOR_VIEW
+            made = message_class(schema, _CAMERA_FIELDS if view else None)
+            return partial(_of_sensor_view if view else _of_protobuf, made)
+    except TraceError:  # a schema that cannot be read: nothing is known of its messages
+        return lambda _message: None
+    return _of_json if encoding == "json" else lambda _message: None
 
 
-def _of_record(record: dict[str, Any]) -> tuple[bytes, str]:
-    data, form = record.get("data"), record.get("format", record.get("encoding"))
-    if not isinstance(data, np.ndarray) or data.dtype.itemsize != 1 or not isinstance(form, str):
-        return b"", ""
-    return data.tobytes(), form
-
-
-def _of_protobuf(made: type[Any], message: bytes) -> tuple[bytes, str]:
+def _of_protobuf(made: type[Any], message: bytes) -> Mapping[str, Any] | None:
+    names = {field.name for field in made.DESCRIPTOR.fields}
+    if "data" not in names:
+        return None
     try:
         parsed = made.FromString(message)
-        data, form = parsed.data, parsed.format
-    except DECODE_ERRORS:  # another kind of message: it has no such fields
-        return b"", ""
-    return (data, form) if isinstance(data, bytes) and isinstance(form, str) else (b"", "")
+        found = {name: getattr(parsed, name) for name in names}
+    except DECODE_ERRORS as error:
+        raise TraceError(f"malformed message: {error}") from error
+    if "fields" in found:
+        found["fields"] = [
+            {name: getattr(one, name, None) for name in ("name", "offset", "type")}
+            for one in found["fields"]
+        ]
+    return found
 
 
-def _of_json(message: bytes) -> tuple[bytes, str]:
+def _of_json(message: bytes) -> Mapping[str, Any] | None:
     try:
-        values = json.loads(message)
-        return base64.b64decode(values["data"], validate=True), str(values["format"])
-    except (ValueError, TypeError, LookupError, RecursionError):  # another kind of message
+        found = json.loads(message)
+        if not isinstance(found, dict) or not isinstance(found.get("data"), str):
+            return None
+        return found | {"data": base64.b64decode(found["data"], validate=True)}
+    except (ValueError, RecursionError):
+        return None
+
+
+def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
+    """A function that gives the data in messages of a channel, and what they call its format; empty: none."""
+    if channel not in recording.channels:
+        for _ in recording.walk(Findings()):  # no summary: channels come with their messages
+            if channel in recording.channels:
+                break
+    about = recording.channels.get(channel)
+    if about is None:
+        return lambda _message: (b"", "")
+    read = record_reader(about, recording.schemas.get(about.schema_id))
+
+    def unwrap(message: bytes) -> tuple[bytes, str]:
+        try:
+            record = read(message) or {}
+        except TraceError:
+            if about.message_encoding == "cdr":
+                raise
+            record = {}  # another kind of message
+        data, form = record.get("data"), record.get("format", record.get("encoding"))
+        if isinstance(data, np.ndarray) and data.dtype.itemsize == 1:
+            data = data.tobytes()
+        if isinstance(data, bytes) and isinstance(form, str):
+            return data, form
         return b"", ""
+
+    return unwrap
+
+
+# Pictures of OSI's sensor views are bare pixels; how many, of what and in which order a configuration says.
+# What a PNG can hold without loss (grey and red-green-blue, of 8 and 16 bits) becomes one; of any other the
+# message is all there is.
+#
+# Source: open-simulation-interface 3.8.0 (osi_sensorview.proto, osi_sensorviewconfiguration.proto).
+
+_CAMERA_FIELDS: Final[dict[str, Any]] = {
+    "camera_sensor_view": {
+        "view_configuration": dict.fromkeys(
+            (
+                "number_of_pixels_horizontal",
+                "number_of_pixels_vertical",
+                "channel_format",
+                "pixel_order",
+            )
+        ),
+        "image_data": None,
+    }
+}
+_PIXELS: Final = {
+    "CHANNEL_FORMAT_MONO_U8_LIN": (1, "u1"),
+    "CHANNEL_FORMAT_MONO_U16_LIN": (1, "<u2"),
+    "CHANNEL_FORMAT_RGB_U8_LIN": (3, "u1"),
+    "CHANNEL_FORMAT_RGB_U16_LIN": (3, "<u2"),
+}
+"""Formats of channels → how many there are, and the type of their numbers."""
+_RIGHT_TO_LEFT, _BOTTOM_TO_TOP = 2, 3
+MAX_SIDE: Final = 1 << 16
+"""Most pixels of a picture from side to side; more than any camera has."""
+
+
+def _of_sensor_view(made: type[Any], message: bytes) -> Mapping[str, Any] | None:
+    """The picture of the first camera that has one, as a file."""
+    try:
+        cameras = getattr(made.FromString(message), "camera_sensor_view", ())
+        seen = next((camera for camera in cameras if camera.image_data), None)
+        data = b"" if seen is None else _camera_picture(seen)
+    except DECODE_ERRORS:
+        return None
+    return {"data": data, "format": ""} if data else None
+
+
+def _camera_picture(camera: Any) -> bytes:
+    """The picture of a ``CameraSensorView``: a file in the place of pixels, or the one that they make."""
+    data, told = bytes(camera.image_data), camera.view_configuration
+    if picture_form(data) in {"jpeg", "png"}:
+        return data
+    names = told.DESCRIPTOR.fields_by_name["channel_format"].enum_type.values_by_number
+    formats = [names[number].name for number in told.channel_format if number in names]
+    width, height = told.number_of_pixels_horizontal, told.number_of_pixels_vertical
+    if len(formats) != 1 or formats[0] not in _PIXELS:
+        return b""
+    channels, kind = _PIXELS[formats[0]]
+    size = width * height * channels * np.dtype(kind).itemsize
+    if size != len(data) or not size or max(width, height) > MAX_SIDE:
+        return b""
+    pixels = np.frombuffer(data, kind).reshape(height, width, channels)
+    if told.pixel_order == _RIGHT_TO_LEFT:
+        pixels = pixels[:, ::-1]
+    elif told.pixel_order == _BOTTOM_TO_TOP:
+        pixels = pixels[::-1]
+    return png(pixels)
+
+
+_COLOURS: Final = {1: 0, 2: 4, 3: 2, 4: 6}
+"""Numbers of a pixel → the colour type: grey, grey and alpha, red green blue, these and alpha."""
+
+
+def png(pixels: NDArray[Any]) -> bytes:
+    """A picture as a PNG file.
+
+    Each row is written as its difference to the one above (filter 2), which costs little and makes most
+    pictures a third smaller.
+
+    Parameters
+    ----------
+    pixels : (height, width) or (height, width, 1 … 4), uint8 or uint16
+        Grey; grey and alpha; red, green, blue; these and alpha.
+
+    Raises
+    ------
+    ExportError
+        They are no picture of that kind, or it is empty.
+    """
+    channels = 1 if pixels.ndim == 2 else pixels.shape[-1]
+    if pixels.ndim not in {2, 3} or channels not in _COLOURS or not pixels.size:
+        raise ExportError(f"no picture: an array of shape {pixels.shape}")
+    if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
+        raise ExportError(f"no picture: numbers of {pixels.dtype}; expected uint8 or uint16")
+    height, width = pixels.shape[:2]
+    bytes_of = pixels.dtype.itemsize
+    big = np.ascontiguousarray(pixels.astype(f">u{bytes_of}")).view(np.uint8)
+    rows = big.reshape(height, -1)
+    lines = np.empty((height, rows.shape[1] + 1), np.uint8)
+    lines[:, 0] = 2
+    lines[0, 1:] = rows[0]
+    lines[1:, 1:] = rows[1:] - rows[:-1]
+    head = struct.pack(">IIBBBBB", width, height, 8 * bytes_of, _COLOURS[channels], 0, 0, 0)
+    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
+        for tag, data in parts
+    )
 
 
 # Video ----------------------------------------------------------------------------------------------------
@@ -308,7 +455,7 @@ def _chunks(place: _MessagePlace) -> list[int]:
 
         found = []
         with McapFile(place.path) as recording:
-            for _ in recording.walk(TraceReport(), note):
+            for _ in recording.walk(Findings(), note):
                 pass
     return [start for start in found if start <= place.chunk_offset]
 
@@ -316,7 +463,7 @@ def _chunks(place: _MessagePlace) -> list[int]:
 def _before_outside_chunks(place: _MessagePlace) -> Iterator[bytes]:
     offsets: list[tuple[int, int]] = []
     with McapFile(place.path) as recording:
-        for run in recording.walk(TraceReport(), lambda _: False):
+        for run in recording.walk(Findings(), lambda _: False):
             mine = (run.channel == place.channel) & (run.offset < place.offset)
             offsets += zip(run.offset[mine].tolist(), run.length[mine].tolist(), strict=True)
     for offset, length in reversed(offsets):
