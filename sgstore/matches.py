@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.graph import graph_of_records
@@ -35,11 +34,8 @@ from sgstore.store import (
     SEQ_BITS,
     FrameRef,
     GivenTable,
-    arrow_table,
-    pandas_frame,
-    polars_frame,
-    write_csv,
-    write_parquet,
+    Tabular,
+    as_told,
 )
 from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
@@ -105,7 +101,7 @@ class Interval:
     values: dict[str, Any]
 
 
-class Matches:
+class Matches(Tabular):
     """Matches of a query. Iterating gives rows; each way of asking searches anew.
 
     ``count``, ``frames`` and ``clips`` speak of the frames in which the pattern holds, whatever ``RETURN``
@@ -313,55 +309,24 @@ class Matches:
             statement = compiled.rows()
             return self._file.arrays(statement.sql, statement.values, given=self._given(statement))
 
-    def arrow(self) -> Any:
-        """All rows as a ``pyarrow.Table``.
+    def _described(self) -> tuple[tuple[str, ...], None]:
+        return self.columns, None
 
-        Raises
-        ------
-        MissingExtraError
-            pyarrow is not installed.
-        """
-        return arrow_table(self.columns, self)
-
-    def df(self) -> Any:
-        """All rows as a ``pandas.DataFrame``.
-
-        Raises
-        ------
-        MissingExtraError
-            pandas is not installed.
-        """
-        return pandas_frame(self.columns, self)
-
-    def polars(self) -> Any:
-        """All rows as a ``polars.DataFrame``.
-
-        Raises
-        ------
-        MissingExtraError
-            polars is not installed.
-        """
-        return polars_frame(self.columns, self)
-
-    def parquet(self, path: str | Path) -> int:
-        """Write all rows to a Parquet file, as they come; how many there are.
-
-        Raises
-        ------
-        ExportError
-            The file cannot be written.
-        """
-        return write_parquet(self.columns, self, Path(path))
-
-    def csv(self, path: str | Path) -> int:
-        """Write all rows to a CSV file, as they come; how many there are.
-
-        Raises
-        ------
-        ExportError
-            The file cannot be written.
-        """
-        return write_csv(self.columns, self, Path(path))
+    def _table(self) -> Any:
+        if self.graphs:
+            return None
+        with self._compiled() as compiled:
+            most, found = compiled.query.result.limit, list[Any]()
+            for ready, windows in self._statements(compiled, Compiled.rows):
+                given = self._given(ready)
+                table = self._file.table(ready.sql, ready.values, given=given)
+                if table is None:
+                    return None
+                windows.rows = len(table)
+                found.append(table)
+                if most is not None and sum(map(len, found)) >= most:
+                    break
+            return as_told(found, self.columns, most)
 
     def explain(self) -> str:
         """Explain the query, stage by stage: parse, bind, rewrite, emit."""
@@ -383,31 +348,34 @@ class Matches:
         for. Only for that do its order and its limit hold.
         """
         with self._compiled() as compiled:
+            rows = self._rows_of(self._statements(compiled, statement, form))
             asked = form in {None, compiled.query.result.form}
-            form = form or compiled.query.result.form
-            rows = self._windows(
-                lambda window: statement(compiled, window),
-                at_once=asked and not compiled.in_windows,
-                whole_traces=form in {"intervals", "clips"},
-            )
             yield from islice(rows, compiled.query.result.limit if asked else None)
 
-    def _windows(
-        self,
-        statement: Callable[[Window | None], SqlStatement],
-        *,
-        at_once: bool,
-        whole_traces: bool,
+    def _rows_of(
+        self, statements: Iterable[tuple[SqlStatement, Windows]]
     ) -> Iterator[tuple[Any, ...]]:
-        extents = [] if at_once else self._extents()
-        steps = Windows(extents, whole_traces=whole_traces)
-        for window in steps:
-            ready = statement(window)
+        for ready, windows in statements:
             given = self._given(ready)
             with self._file.batches(ready.sql, ready.values, given=given) as batches:
                 for batch in batches:
-                    steps.rows += len(batch)
+                    windows.rows += len(batch)
                     yield from batch.values
+
+    def _statements(
+        self,
+        compiled: Compiled,
+        statement: Callable[[Compiled, Window | None], SqlStatement],
+        form: str | None = None,
+    ) -> Iterator[tuple[SqlStatement, Windows]]:
+        """A statement for each window; whoever reads its rows counts them in ``Windows.rows``."""
+        asked = form in {None, compiled.query.result.form}
+        form = form or compiled.query.result.form
+        at_once = asked and not compiled.in_windows
+        whole = form in {"intervals", "clips"} or bool(compiled.query.steps)
+        windows = Windows([] if at_once else self._extents(), whole_traces=whole)
+        for window in windows:
+            yield statement(compiled, window), windows
 
     def _extents(self) -> list[tuple[int, int]]:
         """First bucket and number of buckets of each trace, in the order in which they are told."""

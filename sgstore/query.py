@@ -215,14 +215,25 @@ class Store:
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None
     ) -> Rows:
-        """All rows of a statement on the views of the store; it only reads, and sees no files.
+        """The rows of a statement on the views of the store, which only reads and sees no files.
+
+        Of more than 10,000 rows the store is asked again when they are wanted, in the form in which they are:
+        as values, as a table of Arrow, as a file.
+
+        Parameters
+        ----------
+        text : str
+        timeout_s : float, optional
+            When to stop it; s.
+        max_rows : int, optional
+            How many rows to give; ``Rows.truncated`` tells whether there are more.
 
         Raises
         ------
         SqlError
             It is not one statement that only reads, the database refuses it, or it runs for too long.
         """
-        return self.file.user_sql(text, timeout_s=timeout_s, max_rows=max_rows)
+        return self.file.user_rows(text, timeout_s=timeout_s, max_rows=max_rows)
 
     @overload
     def graph(self, frame: int | str | FrameRef) -> nx.MultiDiGraph[int]: ...

@@ -9,6 +9,7 @@ from textwrap import dedent
 from typing import Any
 
 import sgstore
+from sgstore.store import Tabular
 
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 
@@ -70,10 +71,11 @@ def page() -> str:
 
 
 def members(name: str) -> list[tuple[str, Any]]:
-    """Public methods and properties of a class, in the order of the source."""
+    """Public methods and properties of a class, and those of :class:`sgstore.store.Tabular`."""
     kind = getattr(sgstore, name)
     found: list[tuple[str, Any]] = []
-    for key, held in vars(kind).items():
+    shared = vars(Tabular) if issubclass(kind, Tabular) else {}
+    for key, held in (vars(kind) | shared).items():
         one = getattr(held, "__func__", held)
         method = inspect.isfunction(one) or isinstance(held, property)
         if method and not key.startswith("_") and key not in LEFT_OUT.get(name, ()):

@@ -107,8 +107,8 @@ _KEYS: Final = frozenset({"frame", "from", "trace"})
 """Columns by which a row is found again."""
 _LEAST: Final = 8
 """Letters that a column keeps."""
-_BINARY: Final = frozenset({Format.parquet, Format.arrow})
-_WITHOUT_NESTING: Final = frozenset({Format.csv, *_BINARY})
+BINARY: Final = frozenset({Format.parquet, Format.arrow})
+_WITHOUT_NESTING: Final = frozenset({Format.csv, *BINARY})
 
 LONG: Final = frozenset({"frame_id", "trace_id", "bucket"})
 SAFE_INTEGER: Final = 2**53
@@ -148,8 +148,10 @@ def write_rows(
     """
     if form in _WITHOUT_NESTING and not types:
         rows = ([_flat(value) for value in row] for row in rows)
-    if form in _BINARY:
-        return _write_binary(columns, rows, form, output, types)
+    if form in BINARY:
+        from sgstore.store import write_parquet
+
+        return write_binary(lambda to: write_parquet(columns, rows, to, types), form, output)
     if output is None:
         return _write_text(columns, rows, form, sys.stdout)
     with written_text(output) as stream:
@@ -269,18 +271,18 @@ def _json_value(value: Any, name: str = "") -> Any:
             return value.isoformat() if hasattr(value, "isoformat") else str(value)
 
 
-def _write_binary(
-    columns: Sequence[str],
-    rows: Iterable[Sequence[Any]],
-    form: Format,
-    output: Path | None,
-    types: Sequence[str] | None,
-) -> int:
-    """Write Parquet, or by way of it, so that memory stays bounded and types are those of the whole, Arrow."""
-    from sgstore.store import write_parquet
+def write_binary(write: Callable[[Path], int], form: Format, output: Path | None) -> int:
+    """Write Parquet, or by way of it, so that memory stays bounded and types are those of the whole, Arrow.
 
+    Parameters
+    ----------
+    write : callable
+        Writes a Parquet file, and tells how many rows it has.
+    form, output
+        As of :func:`write_rows`, which says what is raised, too.
+    """
     if form is Format.parquet and output is not None:
-        return write_parquet(columns, rows, output, types)
+        return write(output)
     if output is None and sys.stdout.isatty():
         raise ExportError(
             f"{form.capitalize()} is not for a terminal: name a file with -o FILE, or redirect stdout"
@@ -289,7 +291,7 @@ def _write_binary(
 
     with working_folder("rows") as folder:
         file = folder / "rows.parquet"
-        number = write_parquet(columns, rows, file, types)
+        number = write(file)
         if form is Format.arrow:
             ready = output or folder / "rows.arrow"
             arrow_file(file, ready)

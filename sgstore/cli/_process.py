@@ -9,7 +9,7 @@ An interruption that comes while Python runs a ``__del__`` or a callback of a we
 reports it and goes on. :func:`_lost` hears of that and raises it again a moment later.
 
 Python heeds a signal only between its own steps. One step of the database may take for ever, so the main thread
-does none itself, but waits for a thread that does: see ``interruptible`` of :mod:`sgstore.store._rows`.
+does none itself, but waits for a thread that does: see ``interruptible`` of :mod:`sgstore.store._steps`.
 """
 
 from __future__ import annotations

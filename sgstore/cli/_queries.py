@@ -32,7 +32,7 @@ from sgstore.cli._options import (
     tables_of,
     text_of,
 )
-from sgstore.cli._output import Format, say, write_document, write_text
+from sgstore.cli._output import BINARY, Format, say, write_binary, write_document, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -252,8 +252,11 @@ def sql(
         _say_all(answer)
         ask.write(answer.columns, answer.rows)
         return 0
-    opened = ask.opened(store, tables_of(tables)).file
-    with opened.user_batches(query_of(statement, file)) as batches:
+    opened, text = ask.opened(store, tables_of(tables)).file, query_of(statement, file)
+    if (form := ask.chosen()) in BINARY:
+        write_binary(lambda to: opened.user_parquet(text, to), form, ask.output)
+        return 0
+    with opened.user_batches(text) as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
         ask.write(batches.columns, rows, batches.types)
     return 0

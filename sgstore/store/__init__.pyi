@@ -29,11 +29,10 @@ from ._rows import Batches as Batches
 from ._rows import GivenTable as GivenTable
 from ._rows import ParquetTable as ParquetTable
 from ._rows import Rows as Rows
+from ._rows import Tabular as Tabular
+from ._rows import as_told as as_told
 from ._rows import arrow_file as arrow_file
-from ._rows import arrow_table as arrow_table
 from ._rows import count_parquet as count_parquet
-from ._rows import pandas_frame as pandas_frame
-from ._rows import polars_frame as polars_frame
 from ._rows import write_csv as write_csv
 from ._rows import write_parquet as write_parquet
 from ._similarity import SimilarFrames as SimilarFrames
@@ -73,7 +72,6 @@ __all__ = [
     "UserTables",
     "WINDOW",
     "arrow_file",
-    "arrow_table",
     "begins",
     "count_parquet",
     "frame_ids",
@@ -84,8 +82,6 @@ __all__ = [
     "messages_of",
     "named_as",
     "new_segment",
-    "pandas_frame",
-    "polars_frame",
     "remains_of",
     "seq_of",
     "take_place",

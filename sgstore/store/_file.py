@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -162,6 +164,13 @@ class StoreFile:
         with self._answered(lambda at, _: rows.arrays(at, sql, parameters), given) as found:
             return found
 
+    def table(
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+    ) -> Any:
+        """All rows of a statement of ours as Arrow; see :func:`sgstore.store._rows.table_of`."""
+        with self._answered(lambda at, _: rows.table_of(at, sql, parameters), given) as found:
+            return found
+
     @contextmanager
     def batches(
         self,
@@ -208,6 +217,58 @@ class StoreFile:
         more = max_rows is not None and len(values) > max_rows
         return Rows(batches.columns, batches.types, values[:max_rows], truncated=more)
 
+    def user_rows(
+        self, sql: str, *, timeout_s: float | None = None, max_rows: int | None = None
+    ) -> Rows:
+        """As :meth:`user_sql`; but of more rows than a batch, all are asked for when they are wanted.
+
+        Raises
+        ------
+        SqlError
+            As :meth:`user_sql`.
+        """
+        first = self.user_sql(
+            sql, timeout_s=timeout_s, max_rows=BATCH if max_rows is None else max_rows
+        )
+        if max_rows is not None or not first.truncated:
+            return first
+
+        return rows.LaterRows(
+            first,
+            partial(self.user_sql, sql, timeout_s=timeout_s),
+            lambda: self._user_step(sql, timeout_s, lambda at: rows.table_of(at, sql)),
+            partial(self.user_parquet, sql, timeout_s=timeout_s),
+        )
+
+    def user_parquet(self, sql: str, to: Path, *, timeout_s: float | None = None) -> int:
+        """Write the rows of a statement of a user's to a Parquet file, as they come; how many there are.
+
+        Raises
+        ------
+        SqlError
+            As :meth:`user_sql`.
+        ExportError
+            The file cannot be written.
+        """
+        number = self._user_step(sql, timeout_s, lambda at: rows.parquet_of(at, sql, to))
+        if number is not None:
+            return number
+        with self.user_batches(sql, timeout_s=timeout_s) as batches:
+            values = chain.from_iterable(batch.values for batch in batches)
+            return rows.write_parquet(batches.columns, values, to, batches.types)
+
+    def _user_step(
+        self, sql: str, timeout_s: float | None, step: Callable[[DuckDBPyConnection], T]
+    ) -> T:
+        """Answer of a statement of a user's that is read at once."""
+
+        def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
+            of = partial(step, connection)
+            return until.enter_context(rows.user_statement(connection, sql, timeout_s, of))
+
+        with self._answered(ask) as found:
+            return found
+
     @contextmanager
     def user_batches(
         self, sql: str, *, timeout_s: float | None = None, size: int = BATCH
@@ -215,8 +276,8 @@ class StoreFile:
         """The rows of a statement of a user's as a stream; see :meth:`user_sql`."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
-            statement = rows.user_statement(connection, sql, timeout_s=timeout_s, size=size)
-            return until.enter_context(statement)
+            begin = partial(Batches, connection, sql, size=size)
+            return until.enter_context(rows.user_statement(connection, sql, timeout_s, begin))
 
         with self._answered(ask) as found:
             yield found

@@ -1,25 +1,17 @@
-"""Statement results: rows, arrays, Arrow, pandas, polars, CSV and Parquet.
-
-How a step of the database is waited for, so that a signal ends it at once.
-
-Python runs the handler of a signal only between its own steps and in the main thread, and DuckDB lets it do so
-only between its tasks, one of which may take minutes. So the main thread does no such step itself: it waits for
-a thread that does, which Python can interrupt at any time, and then interrupts the database, which heeds that
-within a task, too.
-"""
+"""Statement results: rows, arrays, Arrow, pandas, polars, CSV and Parquet."""
 
 from __future__ import annotations
 
 import csv
 import json
+import re
 import threading
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
-from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import duckdb
 import numpy as np
@@ -28,6 +20,7 @@ from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.files import without_controls, working_folder, written_at, written_text
 from sgstore.quoting import literal, quoted
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
+from sgstore.store._steps import interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -39,133 +32,6 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-
-_LOOK_S: Final = 0.5
-"""How often is looked for a signal where waiting is not interrupted by one (on Windows); s."""
-_AGAIN_S: Final = 0.01
-"""How often the database is interrupted until it has ended: one may come before the statement begins; s."""
-
-
-def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
-    """Do a step of the database; whatever a handler of signals raises meanwhile ends it.
-
-    Parameters
-    ----------
-    connection : DuckDBPyConnection
-        The one that the step uses, and nobody else while it lasts.
-    step : callable
-        In another thread than the caller's, if that is the main thread: no other has handlers of signals.
-
-    Returns
-    -------
-    Whatever the step returns.
-
-    Raises
-    ------
-    BaseException
-        What the step raises; or, once the step has ended, what a handler raised: ``KeyboardInterrupt`` after
-        Ctrl-C.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return step()
-    task = _Task(step)
-    try:
-        began = _step_thread.begin(task)
-        while began and not task.ended.wait(_LOOK_S):
-            pass
-    except BaseException:
-        while not task.is_over():
-            with suppress(BaseException):  # whoever asks twice does not leave a statement behind
-                task.ended.wait(_AGAIN_S)
-                connection.interrupt()
-        task.forget()
-        raise
-    return task.result() if began else step()
-
-
-class _Task(Generic[T]):
-    """A step that another thread does."""
-
-    def __init__(self, step: Callable[[], T]) -> None:
-        self.ended = threading.Event()
-        self._step = step
-        # One turn, for whoever takes it first: the thread that does the step, or who wants it no more.
-        self._turns = [None]
-        self._found: list[T] = []
-        self._error: BaseException | None = None
-
-    def take(self) -> bool:
-        """Take the turn; ``False`` if it was taken."""
-        try:
-            self._turns.pop()
-        except IndexError:
-            return False
-        return True
-
-    def is_over(self) -> bool:
-        """Return whether the step has ended, or will never begin."""
-        if self.take():
-            self.ended.set()
-        return self.ended.is_set()
-
-    def result(self) -> T:
-        """Return what the step returned, or raise what it raised."""
-        try:
-            if self._error is not None:
-                raise self._error
-            return self._found.pop()
-        finally:
-            self.forget()
-
-    def forget(self) -> None:
-        """Let go of the result: an error refers to what refers to it, and so would hold the connection."""
-        self._error = None
-        self._found.clear()
-
-    def run(self) -> None:
-        """Do the step, unless it is not wanted any more."""
-        if not self.take():
-            return
-        try:
-            self._found.append(self._step())
-        except BaseException as error:  # noqa: BLE001  (raised again where it is waited for)
-            self._error = error
-        finally:
-            self.ended.set()
-
-
-class _StepThread:
-    """The thread that does the steps of the main thread, one after another.
-
-    It lasts, because to start one takes longer than a short question.
-    """
-
-    def __init__(self) -> None:
-        self._tasks: SimpleQueue[_Task[Any]] = SimpleQueue()
-        self._thread: threading.Thread | None = None
-
-    def begin(self, task: _Task[Any]) -> bool:
-        """Hand over a task; ``False``: there can be no thread for it."""
-        # A process that was forked off has no thread, and its queue may be locked for ever.
-        if self._thread is None or not self._thread.is_alive():
-            self._tasks = SimpleQueue()
-            thread = threading.Thread(target=_do_all, args=(self._tasks,), daemon=True)
-            try:
-                thread.start()
-            except RuntimeError:  # no more threads may be had
-                return not task.take()
-            self._thread = thread
-        self._tasks.put(task)
-        return True
-
-
-def _do_all(tasks: SimpleQueue[_Task[Any]]) -> None:
-    while True:
-        tasks.get().run()  # not by a name, which would hold the connection until the next task
-
-
-_step_thread: Final = _StepThread()
-
 
 # What a statement gives: rows in memory, arrays, or a stream of rows ----------------------------
 
@@ -179,8 +45,98 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 """Types of statements that only read: WITH, FROM, VALUES, TABLE, DESCRIBE, SHOW and SUMMARIZE are SELECT."""
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Rows:
+class Tabular:
+    """What gives rows, as tables of other packages and as files."""
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        raise NotImplementedError
+
+    def _described(self) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
+        """Names of the columns, and their types in the database; ``None``: the values tell them."""
+        raise NotImplementedError
+
+    def _table(self) -> Any:
+        """The rows as Arrow, made by the database; ``None`` where Arrow has them otherwise than Python."""
+        return None
+
+    def arrow(self) -> Any:
+        """All rows as a ``pyarrow.Table``.
+
+        Raises
+        ------
+        MissingExtraError
+            pyarrow is not installed.
+        """
+        arrow = _package("pyarrow")
+        table = self._table()
+        if table is not None:
+            return table
+        names, types = self._described()
+        kinds = [getattr(arrow, _ARROW[kind])() if kind in _ARROW else None for kind in types or ()]
+        columns = _columns(names, self)
+        arrays = map(arrow.array, columns, kinds) if kinds else map(arrow.array, columns)
+        return arrow.table(list(arrays), names=list(names))
+
+    def df(self) -> Any:
+        """All rows as a ``pandas.DataFrame``.
+
+        Raises
+        ------
+        MissingExtraError
+            pandas is not installed.
+        """
+        pandas = _package("pandas")
+        if (table := self._by_values()) is not None:
+            return table.to_pandas()
+        names, _ = self._described()
+        return pandas.DataFrame.from_records(list(self), columns=list(names))
+
+    def polars(self) -> Any:
+        """All rows as a ``polars.DataFrame``.
+
+        Raises
+        ------
+        MissingExtraError
+            polars is not installed.
+        """
+        polars = _package("polars")
+        if (table := self._by_values()) is not None:
+            return polars.from_arrow(table)
+        names, _ = self._described()
+        columns = zip(names, _columns(names, self), strict=True)
+        return polars.DataFrame([polars.Series(name, of, strict=False) for name, of in columns])
+
+    def _by_values(self) -> Any:
+        """The table with the types that values of Python tell; ``None`` without pyarrow, too."""
+        with suppress(MissingExtraError):
+            _package("pyarrow")
+            table = self._table()
+            return None if table is None else as_told([table])
+        return None
+
+    def parquet(self, path: str | Path) -> int:
+        """Write all rows to a Parquet file, as they come; how many there are.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written.
+        """
+        names, types = self._described()
+        return write_parquet(names, self, Path(path), types)
+
+    def csv(self, path: str | Path) -> int:
+        """Write all rows to a CSV file, as they come; how many there are.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written.
+        """
+        return write_csv(self._described()[0], self, Path(path))
+
+
+class Rows(Tabular):
     """The result of a statement.
 
     Attributes
@@ -189,16 +145,25 @@ class Rows:
         Their names.
     types : tuple of str
         Their types in the database: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``, …
-    values : list of tuple
-        The rows; enumerations as ``str``, NULL as ``None``.
     truncated : bool
         Whether there were more rows than asked for.
     """
 
-    columns: tuple[str, ...]
-    types: tuple[str, ...]
-    values: list[tuple[Any, ...]]
-    truncated: bool = False
+    def __init__(
+        self,
+        columns: tuple[str, ...],
+        types: tuple[str, ...],
+        values: list[tuple[Any, ...]],
+        *,
+        truncated: bool = False,
+    ) -> None:
+        self.columns, self.types, self.truncated = columns, types, truncated
+        self._values = values
+
+    @property
+    def values(self) -> list[tuple[Any, ...]]:
+        """The rows; enumerations as ``str``, NULL as ``None``."""
+        return self._values
 
     def __repr__(self) -> str:
         more = " and more" * self.truncated
@@ -210,59 +175,64 @@ class Rows:
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         return iter(self.values)
 
+    def _described(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return self.columns, self.types
+
     def dicts(self) -> list[dict[str, Any]]:
         """The rows, each as a dict from column to value."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.values]
 
-    def arrow(self) -> Any:
-        """The rows as a ``pyarrow.Table``.
 
-        Raises
-        ------
-        MissingExtraError
-            pyarrow is not installed.
-        """
-        return arrow_table(self.columns, self.values, self.types)
+class LaterRows(Rows):
+    """Many rows, of which the first are known; all are asked for when they are wanted.
 
-    def df(self) -> Any:
-        """The rows as a ``pandas.DataFrame``.
+    Parameters
+    ----------
+    first : Rows
+        The first ones.
+    ask : callable
+        Gives all rows, which are kept.
+    table : callable
+        Gives them as Arrow: see :meth:`Tabular._table`.
+    parquet : callable
+        Writes them to a Parquet file; how many there are.
+    """
 
-        Raises
-        ------
-        MissingExtraError
-            pandas is not installed.
-        """
-        return pandas_frame(self.columns, self.values)
+    def __init__(
+        self,
+        first: Rows,
+        ask: Callable[[], Rows],
+        table: Callable[[], Any],
+        parquet: Callable[[Path], int],
+    ) -> None:
+        super().__init__(first.columns, first.types, first.values)
+        self._ask, self._ask_table, self._ask_parquet = ask, table, parquet
+        self._whole = False
 
-    def polars(self) -> Any:
-        """The rows as a ``polars.DataFrame``.
+    def __repr__(self) -> str:
+        if self._whole:
+            return super().__repr__()
+        return f"<over {len(self._values):,} rows of {', '.join(self.columns)}>"
 
-        Raises
-        ------
-        MissingExtraError
-            polars is not installed.
-        """
-        return polars_frame(self.columns, self.values)
+    @property
+    def values(self) -> list[tuple[Any, ...]]:
+        """The rows; enumerations as ``str``, NULL as ``None``."""
+        if not self._whole:
+            self._values, self._whole = self._ask().values, True
+        return self._values
+
+    def _table(self) -> Any:
+        return None if self._whole else self._ask_table()
 
     def parquet(self, path: str | Path) -> int:
-        """Write the rows to a Parquet file, in the types of the database; how many there are.
+        """Write all rows to a Parquet file, as they come; how many there are.
 
         Raises
         ------
         ExportError
             The file cannot be written.
         """
-        return write_parquet(self.columns, self.values, Path(path), self.types)
-
-    def csv(self, path: str | Path) -> int:
-        """Write the rows to a CSV file; how many there are.
-
-        Raises
-        ------
-        ExportError
-            The file cannot be written.
-        """
-        return write_csv(self.columns, self.values, Path(path))
+        return super().parquet(path) if self._whole else self._ask_parquet(Path(path))
 
 
 class Batches:
@@ -294,6 +264,59 @@ class Batches:
         while values := self._next:
             yield Rows(self.columns, self.types, values)
             self._next = self._more()
+
+
+def table_of(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Any:
+    """All rows of a statement as a ``pyarrow.Table``, enumerations as texts.
+
+    ``None``, and nothing is searched, if a column holds anything but numbers, truth values and texts: of others
+    Arrow and Python have different notions.
+    """
+
+    def step() -> Any:
+        relation: Any = connection.sql(sql, params=parameters or None)
+        return relation.to_arrow_table() if _is_plain(relation) else None
+
+    table = interruptible(connection, step)
+    if table is None:
+        return None
+    arrow = _package("pyarrow")
+    columns = [
+        column.cast(arrow.string()) if arrow.types.is_dictionary(column.type) else column
+        for column in table.columns
+    ]
+    return arrow.table(columns, names=table.column_names)
+
+
+def _is_plain(relation: Any) -> bool:
+    kinds = (str(kind) for kind in relation.types)
+    return all(kind in _ARROW or _ENUM.fullmatch(kind) for kind in kinds)
+
+
+def as_told(
+    tables: Sequence[Any], columns: Sequence[str] | None = None, most: int | None = None
+) -> Any:
+    """Tables of Arrow as one, with the types that values of Python would tell.
+
+    Parameters
+    ----------
+    tables : sequence of pyarrow.Table
+        At least one; all have the same columns.
+    columns : sequence of str, optional
+        What these are to be called.
+    most : int, optional
+        Rows that are taken, from the first.
+    """
+    arrow = _package("pyarrow")
+    table = arrow.concat_tables(tables).slice(0, most)
+    wide = {arrow.int32(): arrow.int64(), arrow.float32(): arrow.float64()}
+    arrays = [
+        arrow.nulls(len(column))
+        if column.null_count == len(column)
+        else column.cast(wide.get(column.type, column.type))
+        for column in table.columns
+    ]
+    return arrow.table(arrays, names=list(columns or table.column_names))
 
 
 def run(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Rows:
@@ -329,9 +352,11 @@ def arrays(
 
 @contextmanager
 def user_statement(
-    connection: DuckDBPyConnection, sql: str, *, timeout_s: float | None, size: int
-) -> Generator[Batches]:
+    connection: DuckDBPyConnection, sql: str, timeout_s: float | None, ask: Callable[[], T]
+) -> Generator[T]:
     """Run a statement of a user's on a connection that can read the store and nothing else.
+
+    ``ask`` begins it; what is read of it is read before this is left.
 
     Raises
     ------
@@ -341,7 +366,7 @@ def user_statement(
     with _refused(sql, timeout_s):
         _check(connection, sql)
     with _interrupted_after(connection, timeout_s), _refused(sql, timeout_s):
-        yield Batches(connection, sql, size=size)
+        yield ask()
 
 
 def _check(connection: DuckDBPyConnection, sql: str) -> None:
@@ -403,7 +428,7 @@ def _interrupted_after(connection: DuckDBPyConnection, timeout_s: float | None) 
         watcher.join()
 
 
-# Rows → tables of Arrow, pandas and polars, and CSV; the packages are imported when they are asked for ----
+# Rows → packages for tables, which are imported when they are asked for, and CSV ----
 
 _ARROW: Final = {
     "BIGINT": "int64",
@@ -416,59 +441,21 @@ _ARROW: Final = {
 """Types of the database as functions of pyarrow; others are told by their values."""
 
 
-def arrow_table(
-    columns: Sequence[str], rows: Iterable[Sequence[Any]], types: Sequence[str] | None = None
-) -> Any:
-    """Rows as a ``pyarrow.Table``.
+_ENUM: Final = re.compile(r"ENUM\(('([^']|'')*'(, )?)*\)")
 
-    Parameters
-    ----------
-    columns : sequence of str
-    rows : iterable of sequences
-        Plain Python values; lists and dicts become lists and structs.
-    types : sequence of str, optional
-        Types of the columns in the database; else they are told by the values.
-
-    Raises
-    ------
-    MissingExtraError
-        pyarrow is not installed.
-    """
-    arrow = _package("pyarrow", "tables of Arrow", "arrow")
-    by_column = _columns(columns, rows)
-    declared = types or ["" for _ in columns]
-    arrays = [
-        arrow.array(values, getattr(arrow, _ARROW[kind])() if kind in _ARROW else None)
-        for values, kind in zip(by_column, declared, strict=True)
-    ]
-    return arrow.table(arrays, names=list(columns))
+_EXTRAS: Final = {
+    "pyarrow": ("tables of Arrow", "arrow"),
+    "pandas": ("data frames", "pandas"),
+    "polars": ("data frames of polars", "polars"),
+}
+"""Packages that only some have: what for, and the extra that brings them."""
 
 
-def pandas_frame(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Any:
-    """Rows as a ``pandas.DataFrame``.
-
-    Raises
-    ------
-    MissingExtraError
-        pandas is not installed.
-    """
-    pandas = _package("pandas", "data frames", "pandas")
-    return pandas.DataFrame.from_records(list(rows), columns=list(columns))
-
-
-def polars_frame(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Any:
-    """Rows as a ``polars.DataFrame``.
-
-    Raises
-    ------
-    MissingExtraError
-        polars is not installed.
-    """
-    polars = _package("polars", "data frames of polars", "polars")
-    by_column = zip(columns, _columns(columns, rows), strict=True)
-    return polars.DataFrame(
-        [polars.Series(name, values, strict=False) for name, values in by_column]
-    )
+def _package(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise MissingExtraError(*_EXTRAS[name]) from error
 
 
 def write_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]], to: Path) -> int:
@@ -504,7 +491,7 @@ def arrow_file(source: Path, to: Path) -> None:
     MissingExtraError
         pyarrow is not installed.
     """
-    arrow = _package("pyarrow", "files of Arrow", "arrow")
+    arrow = _package("pyarrow")
     parquet = import_module("pyarrow.parquet")
     with (
         written_at(to) as place,
@@ -531,13 +518,6 @@ def _cell(value: Any) -> Any:
     if isinstance(value, list | tuple | dict):
         value = json.dumps(value, ensure_ascii=False, default=str)
     return "" if value is None else without_controls(value) if isinstance(value, str) else value
-
-
-def _package(name: str, purpose: str, extra: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise MissingExtraError(purpose, extra) from error
 
 
 # Columns or rows → Parquet, block by block, by DuckDB, so that nobody needs another package for it ----
@@ -636,6 +616,10 @@ class ParquetTable:
         while batch := list(islice(rows, _TOGETHER)):
             self._add([[row[i] for row in batch] for i in range(len(self._columns))])
 
+    def add_arrow(self, block: Any) -> None:
+        """Add the rows of a ``pyarrow.Table``, whose columns have distinct names; see :meth:`add`."""
+        self._insert(block, len(block))
+
     def _add(self, columns: Sequence[NDArray[Any] | Sequence[Any]]) -> None:
         data: dict[str, NDArray[Any]] = {}
         for i, values in enumerate(columns):
@@ -644,11 +628,13 @@ class ParquetTable:
             else:
                 listed = data[f"c{i}"] = np.empty(len(values), object)
                 listed[:] = values
-        number = len(data["c0"])
+        self._insert(data, len(data["c0"]))
+
+    def _insert(self, block: object, number: int) -> None:
         if not number:
             return
         with self._translated():
-            self._connection.register("block", data)
+            self._connection.register("block", block)
             self._connection.execute("INSERT INTO output SELECT * FROM block")
             self._connection.unregister("block")
         self.rows += number
@@ -701,6 +687,58 @@ def write_parquet(
     ):
         table.add_rows(rows)
     return table.rows
+
+
+def parquet_of(connection: DuckDBPyConnection, sql: str, to: Path) -> int | None:
+    """Write the rows of a statement to a Parquet file, a batch of Arrow at a time.
+
+    Returns
+    -------
+    int or None
+        How many rows were written. ``None``, and nothing is written: pyarrow is not installed, or a column is
+        not plain (:func:`table_of`).
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    try:
+        arrow = _package("pyarrow")
+    except MissingExtraError:
+        return None
+
+    def begun() -> Any:
+        relation: Any = connection.sql(sql)
+        if not _is_plain(relation):
+            return None, ()
+        begin = getattr(relation, "to_arrow_reader", None) or relation.fetch_record_batch
+        return begin(_TOGETHER), list(zip(relation.columns, map(str, relation.types), strict=True))
+
+    def more() -> Any:
+        try:
+            return next(reader, None)
+        except (OSError, ValueError) as error:  # so Arrow tells an error of the database
+            stopped = "INTERRUPT" in str(error)
+            raise (duckdb.InterruptException if stopped else duckdb.Error)(str(error)) from error
+
+    reader, columns = interruptible(connection, begun)
+    if reader is None:
+        return None
+    with written_at(to) as place, ParquetTable(place, columns, enums=True, called=to) as table:
+        while (batch := interruptible(connection, more)) is not None:
+            columns = [_without_nan(column) for column in batch.columns]
+            names = [f"c{i}" for i in range(len(columns))]
+            table.add_arrow(arrow.Table.from_arrays(columns, names=names))
+    return table.rows
+
+
+def _without_nan(column: Any) -> Any:
+    """A column of Arrow in which numbers that are none are missing, as in what Python values become."""
+    compute = import_module("pyarrow.compute")
+    if not import_module("pyarrow").types.is_floating(column.type):
+        return column
+    return compute.if_else(compute.is_nan(column), None, column)
 
 
 def _type_of(values: list[Any]) -> str:

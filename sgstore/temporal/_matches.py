@@ -26,11 +26,11 @@ from sgstore.temporal._plan import Plan, formula_text, hold_text, link_text, nee
 from sgstore.temporal._sequences import BindingLine, JoinedBindings, Leg, joined, matches_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
+    from collections.abc import Generator, Iterator
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Column, Compiled, SqlStatement
+    from sgstore.lang import Catalog, Column, Compiled
     from sgstore.lang.ir import BoundStep, StepLink
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
@@ -431,17 +431,6 @@ class TemporalMatches(Matches):
     def _lacking(self, compiled: Compiled) -> dict[int, str]:
         """The traces that do not know what the query needs, and why."""
         return lacking(self._file, compiled.catalog, of_query(compiled.bound))
-
-    def _windows(
-        self,
-        statement: Callable[[Window | None], SqlStatement],
-        *,
-        at_once: bool,
-        whole_traces: bool,
-    ) -> Iterator[tuple[Any, ...]]:
-        over_time = bool(self._ready.query.steps)
-        whole = whole_traces or over_time
-        yield from super()._windows(statement, at_once=at_once, whole_traces=whole)
 
     def explain(self) -> str:
         """Explain the query stage by stage; of one over several frames also the questions about each frame."""

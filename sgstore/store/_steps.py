@@ -1,0 +1,148 @@
+"""Steps of the database that a signal ends at once.
+
+Python runs the handler of a signal only between its own steps and in the main thread, and DuckDB lets it do so
+only between its tasks, one of which may take minutes. So the main thread does no such step itself: it waits for
+a thread that does, which Python can interrupt at any time, and then interrupts the database, which heeds that
+within a task, too.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from duckdb import DuckDBPyConnection
+
+
+T = TypeVar("T")
+
+_LOOK_S: Final = 0.5
+"""How often is looked for a signal where waiting is not interrupted by one (on Windows); s."""
+_AGAIN_S: Final = 0.01
+"""How often the database is interrupted until it has ended: one may come before the statement begins; s."""
+
+
+def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
+    """Do a step of the database; whatever a handler of signals raises meanwhile ends it.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+        The one that the step uses, and nobody else while it lasts.
+    step : callable
+        In another thread than the caller's, if that is the main thread: no other has handlers of signals.
+
+    Returns
+    -------
+    Whatever the step returns.
+
+    Raises
+    ------
+    BaseException
+        What the step raises; or, once the step has ended, what a handler raised: ``KeyboardInterrupt`` after
+        Ctrl-C.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return step()
+    task = _Task(step)
+    try:
+        began = _step_thread.begin(task)
+        while began and not task.ended.wait(_LOOK_S):
+            pass
+    except BaseException:
+        while not task.is_over():
+            with suppress(BaseException):  # whoever asks twice does not leave a statement behind
+                task.ended.wait(_AGAIN_S)
+                connection.interrupt()
+        task.forget()
+        raise
+    return task.result() if began else step()
+
+
+class _Task(Generic[T]):
+    """A step that another thread does."""
+
+    def __init__(self, step: Callable[[], T]) -> None:
+        self.ended = threading.Event()
+        self._step = step
+        # One turn, for whoever takes it first: the thread that does the step, or who wants it no more.
+        self._turns = [None]
+        self._found: list[T] = []
+        self._error: BaseException | None = None
+
+    def take(self) -> bool:
+        """Take the turn; ``False`` if it was taken."""
+        try:
+            self._turns.pop()
+        except IndexError:
+            return False
+        return True
+
+    def is_over(self) -> bool:
+        """Return whether the step has ended, or will never begin."""
+        if self.take():
+            self.ended.set()
+        return self.ended.is_set()
+
+    def result(self) -> T:
+        """Return what the step returned, or raise what it raised."""
+        try:
+            if self._error is not None:
+                raise self._error
+            return self._found.pop()
+        finally:
+            self.forget()
+
+    def forget(self) -> None:
+        """Let go of the result: an error refers to what refers to it, and so would hold the connection."""
+        self._error = None
+        self._found.clear()
+
+    def run(self) -> None:
+        """Do the step, unless it is not wanted any more."""
+        if not self.take():
+            return
+        try:
+            self._found.append(self._step())
+        except BaseException as error:  # noqa: BLE001  (raised again where it is waited for)
+            self._error = error
+        finally:
+            self.ended.set()
+
+
+class _StepThread:
+    """The thread that does the steps of the main thread, one after another.
+
+    It lasts, because to start one takes longer than a short question.
+    """
+
+    def __init__(self) -> None:
+        self._tasks: SimpleQueue[_Task[Any]] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, task: _Task[Any]) -> bool:
+        """Hand over a task; ``False``: there can be no thread for it."""
+        # A process that was forked off has no thread, and its queue may be locked for ever.
+        if self._thread is None or not self._thread.is_alive():
+            self._tasks = SimpleQueue()
+            thread = threading.Thread(target=_do_all, args=(self._tasks,), daemon=True)
+            try:
+                thread.start()
+            except RuntimeError:  # no more threads may be had
+                return not task.take()
+            self._thread = thread
+        self._tasks.put(task)
+        return True
+
+
+def _do_all(tasks: SimpleQueue[_Task[Any]]) -> None:
+    while True:
+        tasks.get().run()  # not by a name, which would hold the connection until the next task
+
+
+_step_thread: Final = _StepThread()
