@@ -8,9 +8,10 @@ import shutil
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+import typer.main
 
 try:
     from hypothesis import HealthCheck, settings
@@ -34,6 +35,18 @@ for number, heed in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP
 # Tests start hundreds of processes: what these import is compiled once, not in each of them.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# Tests run thousands of command lines in one process, and to build the commands takes longer than many an
+# answer: they are built once for each set of verbs that is known.
+_build, _built = typer.main.get_command, {}
+
+
+def _command(app: typer.Typer) -> Any:
+    key = id(app), len(app.registered_commands), len(app.registered_groups)
+    return _built.get(key) or _built.setdefault(key, _build(app))
+
+
+typer.main.get_command = _command
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -7,12 +7,16 @@ code, length of stdout, and stderr. Each runs in a process of its own, forked fr
 from __future__ import annotations
 
 import atexit
+import importlib
 import io
 import json
 import os
+import pkgutil
 import sys
 import tempfile
 import traceback
+from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -122,18 +126,26 @@ def _child(arguments: list[str], condition: str, kept: Path) -> int:
     return code if isinstance(code, int) else 0
 
 
+def _warm() -> None:
+    """Do once what each process would do: imports, settings, the grammar, fonts; no database is opened."""
+    import sgstore.cli
+    from sgstore import readers
+
+    ours = [one.name for one in pkgutil.walk_packages(sgstore.__path__, "sgstore.")]
+    for name in ("matplotlib.pyplot", "networkx", *ours):
+        if not name.endswith("__main__"):
+            importlib.import_module(name)
+    with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
+        sgstore.cli.run(["config"])
+        sgstore.cli.run(["patterns", "show", "cut_in"])
+    sgstore.lang.parse(PATTERN)
+    # No simulator answers here, however long one waits.
+    readers.connect = partial(readers.connect, timeout_s=0.3)
+
+
 def main() -> None:
     """Run what stdin says."""
-    import duckdb  # noqa: F401
-    import matplotlib.figure  # noqa: F401
-
-    import sgstore.cli
-    import sgstore.draw._stored
-    import sgstore.exporters._labels
-    import sgstore.ingest
-    import sgstore.query
-
-    sgstore.cli.application()
+    _warm()
     kept = Path(tempfile.mkdtemp()) / "out"
     for arguments, condition in json.load(sys.stdin):
         child = os.fork()
