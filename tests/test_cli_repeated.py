@@ -117,7 +117,9 @@ def test_one_violated_check_of_two_is_enough_in_any_order(first: bool, town_stor
     assert run(["check", str(town_store), "-e", KEPT, "--require"]) == 0
 
 
-def test_several_unnamed_checks_are_numbered_across_options(town_store: Path, capsys) -> None:
+def test_several_unnamed_checks_are_numbered_across_options(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     texts = ["-e", "CHECK ALWAYS ego.speed < 3;", "-e", "CHECK ALWAYS ego.speed < 300"]
 
     assert run(["check", str(town_store), *texts, "--format", "ndjson"]) == 0
@@ -125,7 +127,9 @@ def test_several_unnamed_checks_are_numbered_across_options(town_store: Path, ca
     assert [(r["check"], r["verdict"]) for r in rows] == [("check 1", "false"), ("check 2", "true")]
 
 
-def test_a_parameter_that_nobody_has_is_refused(town_store: Path, capsys) -> None:
+def test_a_parameter_that_nobody_has_is_refused(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     store = str(town_store)
 
     assert run(["check", store, "-p", "phi1", "-p", "phi7", "--param", "none=1"]) == 2
@@ -133,20 +137,27 @@ def test_a_parameter_that_nobody_has_is_refused(town_store: Path, capsys) -> Non
     assert "none" in capsys.readouterr().err
 
 
-def test_monitor_watches_everything_and_calls_patterns_by_their_names(capsys) -> None:
+def test_monitor_watches_everything_and_calls_patterns_by_their_names(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     from sgstore.demo import RECORDING
 
-    asked = ["-p", "cut_in", "-p", "jaywalking", "-p", "phi1", "-e", BROKEN, "-e", KEPT]
+    asked = ["-p", "cut_in", "-p", "lead_hard_braking", "-p", "phi1", "-e", BROKEN, "-e", KEPT]
 
-    assert run(["monitor", str(RECORDING), *asked, "--json", "--require"]) == 4
+    assert run(["monitor", str(RECORDING), *asked, "--duration", "12s", "--json", "--require"]) == 4
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert {one["name"] for one in lines if one["event"] == "found"} == {"cut_in", "jaywalking"}
+    assert {one["name"] for one in lines if one["event"] == "found"} == {
+        "cut_in",
+        "lead_hard_braking",
+    }
     verdicts = {one["name"]: one["verdict"] for one in lines if one["event"] == "verdict"}
     assert set(verdicts) == {"phi1", "slow", "sane"}
     assert (verdicts["slow"], verdicts["sane"]) == ("false", "true")
 
 
-def test_info_tells_of_each_trace_that_is_named(town_store: Path, capsys) -> None:
+def test_info_tells_of_each_trace_that_is_named(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     twice = ["info", str(town_store), "--trace", "town", "--trace", "tow"]
 
     assert run([*twice, "--json"]) == 0
@@ -155,7 +166,7 @@ def test_info_tells_of_each_trace_that_is_named(town_store: Path, capsys) -> Non
     assert capsys.readouterr().out.count("sha256") == 2
 
 
-def test_the_library_lists_each_kind_that_is_asked_for(capsys) -> None:
+def test_the_library_lists_each_kind_that_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["patterns", "list", "--kind", "concept", "--kind", "property", "--json"]) == 0
     kinds = {one["kind"] for one in json.loads(capsys.readouterr().out)}
     assert kinds == {"concept", "property"}

@@ -15,6 +15,7 @@ import pytest
 import sgstore
 from sgstore.config import Config
 from sgstore.derive import derive
+from sgstore.lang import patterns
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
@@ -79,7 +80,11 @@ def store(town_store: Path) -> Iterator[sgstore.Store]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_queries_of_a_page_are_answered(page: Path, store: sgstore.Store) -> None:
+    # Those of the library are asked by their own tests: of scenes, and of this recording, too.
+    known = {one.text for one in patterns().values()}
     for text in queries_of(page.read_text(encoding="utf-8")):
+        if text in known:
+            continue
         if text.startswith(("SELECT", "WITH", "DESCRIBE", "FROM")):
             store.sql(text, max_rows=ROWS)
         elif re.search(r"^CHECK\b.*^MATCH\b", text, re.MULTILINE | re.DOTALL):

@@ -22,7 +22,7 @@ from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
 
-def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path) -> None:
+def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path: Path) -> None:
     # All of them take minutes: ``make kill``.
     verbs = ["derive", "export clips", "lock union"]
 
@@ -73,7 +73,7 @@ def again(temporary: Path, *line: object) -> None:
     subprocess.run(command, env=env, check=True, capture_output=True)
 
 
-def test_an_export_that_was_killed_while_its_files_were_moved_is_made_again(tmp_path) -> None:
+def test_an_export_that_was_killed_while_its_files_were_moved_is_made_again(tmp_path: Path) -> None:
     store, to = tmp_path / "s.db", tmp_path / "clips"
     ingest(store, [drive(tmp_path / "d.mcap", frames=30)])
     line = ("export", store, "MATCH (e:Ego) WHERE e.x < 1 OR e.x > 20 RETURN CLIPS(0s, 0s)")
@@ -92,7 +92,7 @@ def test_an_export_that_was_killed_while_its_files_were_moved_is_made_again(tmp_
     assert len(found) == 3
 
 
-def test_folders_that_a_killed_export_had_moved_are_taken_back_too(tmp_path) -> None:
+def test_folders_that_a_killed_export_had_moved_are_taken_back_too(tmp_path: Path) -> None:
     store, to = tmp_path / "s.db", tmp_path / "frames"
     ingest(store, [drive(tmp_path / "d.mcap", frames=12)])
     line = ("export", store, "MATCH (e:Ego) WHERE e.x < 5", "--format", "frames", "--to", to)
@@ -105,7 +105,7 @@ def test_folders_that_a_killed_export_had_moved_are_taken_back_too(tmp_path) -> 
     assert not list(to.glob(".export-*"))
 
 
-def test_the_map_of_a_rebuild_that_was_killed_is_not_left(tmp_path) -> None:
+def test_the_map_of_a_rebuild_that_was_killed_is_not_left(tmp_path: Path) -> None:
     store, road = tmp_path / "s.db", tmp_path / "street.xodr"
     road.write_text(a_map(a_road("1", straight(200.0, x=-20.0, y=2.0))))
     bare = drive(tmp_path / "d.mcap", frames=9)
@@ -130,7 +130,7 @@ LOGGED = (
 """A writer that is killed before its log is worked into the store."""
 
 
-def test_a_log_is_never_left_beside_a_store_that_was_written_anew(tmp_path) -> None:
+def test_a_log_is_never_left_beside_a_store_that_was_written_anew(tmp_path: Path) -> None:
     store = tmp_path / "s.db"
     ingest(store, [drive(tmp_path / "d.mcap", frames=20)])
     subprocess.run([sys.executable, "-c", LOGGED, str(store)], check=False)
@@ -144,7 +144,9 @@ def test_a_log_is_never_left_beside_a_store_that_was_written_anew(tmp_path) -> N
 
 
 @pytest.mark.parametrize("verb", ["derive", "import"])
-def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(tmp_path, verb) -> None:
+def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(
+    tmp_path: Path, verb: str
+) -> None:
     store = tmp_path / "s.db"
     ingest(store, [drive(tmp_path / "d.mcap", frames=20)])
     (tmp_path / "g.csv").write_text("graph,src,relation,dst\ng,ego,near,car_1\n")
@@ -163,8 +165,8 @@ def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(tmp_path, v
     assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values
 
 
-def test_readers_and_a_writer_meet_no_lock_and_no_half_trace(tmp_path) -> None:
-    soaked = soak(tmp_path, seconds=4)
+def test_readers_and_a_writer_meet_no_lock_and_no_half_trace(tmp_path: Path) -> None:
+    soaked = soak(tmp_path, seconds=2)
 
     assert soaked.written > 0
 
@@ -175,7 +177,7 @@ def children(pid: int) -> set[int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are told by Linux")
-def test_workers_end_with_the_run_that_is_killed(tmp_path) -> None:
+def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
     paths = [drive(tmp_path / f"d{i}.mcap", frames=400 + i) for i in range(4)]
     run = begun(tmp_path / "s.db", paths, jobs=2)
     end = time.monotonic() + 30
@@ -192,7 +194,7 @@ def test_workers_end_with_the_run_that_is_killed(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_leaves_a_whole_store_and_nothing_beside_it(tmp_path, jobs) -> None:
+def test_ctrl_c_leaves_a_whole_store_and_nothing_beside_it(tmp_path: Path, jobs: int) -> None:
     paths = [drive(tmp_path / f"d{i}.mcap", frames=30 if i == 0 else 1200) for i in range(3)]
     store = tmp_path / "out" / "s.db"
     store.parent.mkdir()
@@ -225,7 +227,7 @@ for outcome in ingest(sys.argv[1], sys.argv[2:]):
 
 
 @pytest.mark.parametrize("room", [2_000, 30_000])
-def test_a_disk_that_is_full_leaves_the_old_store(tmp_path, room) -> None:
+def test_a_disk_that_is_full_leaves_the_old_store(tmp_path: Path, room: int) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     paths = made(folder)
@@ -256,7 +258,9 @@ def test_a_disk_that_is_full_leaves_the_old_store(tmp_path, room) -> None:
 @pytest.mark.parametrize(
     "place", ["none/s.db", "file/s.db", pytest.param("/proc/s.db", id="where nobody can write")]
 )
-def test_a_place_that_cannot_be_written_is_told_before_anything_is_read(tmp_path, place) -> None:
+def test_a_place_that_cannot_be_written_is_told_before_anything_is_read(
+    tmp_path: Path, place: str
+) -> None:
     (tmp_path / "file").write_text("a file")
     path = drive(tmp_path / "d.mcap", frames=3)
 

@@ -1,10 +1,13 @@
 """Patterns on a real recording, against networkx over the graph of every frame."""
 
+# pyright: basic
+
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import networkx as nx
+import numpy as np
 import pytest
 
 import sgstore
@@ -34,7 +37,8 @@ def store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stor
 
 @pytest.fixture(scope="module")
 def graphs(store: Store) -> list[Graph]:
-    return [store.graph(frame) for frame in store.find("MATCH (n)").frames()]
+    frames = np.array([frame.frame_id for frame in store.find("MATCH (n)").frames()])
+    return [graph.to_networkx() for graph in store.file.graphs(frames)]
 
 
 def subgraphs(pattern: nx.DiGraph, graph: Graph) -> bool:
