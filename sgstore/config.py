@@ -26,6 +26,7 @@ from sgstore.vocabulary import (
     RELATIONS,
     SIGNALS,
     TypeMeaning,
+    add_kind,
     add_relation,
     kinds_labelled,
     labels,
@@ -35,7 +36,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 __all__ = [
     "ALL_EGOS",
@@ -349,6 +350,7 @@ class Config:
         "of the road's line where it is '+', to the right where it is '-'. Where the place of signals "
         "contradicts, that is said",
     )
+    new_kinds: tuple[str, ...] = setting((), "kinds of your own, for types to name: ['scooter']")
     types: Mapping[str, TypeMeaning] = setting(
         {},
         "type names of the simulator, and type codes of the map's signals ('206'), without regard to case -> "
@@ -362,6 +364,8 @@ class Config:
         check(all(self.egos), "egos", self.egos, "ids, roles or names")
         alone = ALL_EGOS not in self.egos or len(self.egos) == 1
         check(alone, "egos", self.egos, f"'{ALL_EGOS}' alone, or a list of egos")
+        for kind in self.new_kinds:
+            _make_known("new_kinds", add_kind, kind)
         check(0 <= self.rate <= 1e6, "rate", self.rate, "0 or more frames per second")
         check_labels("kinds", self.kinds, ego=False)
         both = set(self.proximity.names) & set(self.direction.names)
@@ -370,8 +374,8 @@ class Config:
             relation_named(name)  # those of other packages are looked for
             known = [r for r in RELATIONS if r not in MAP_ONLY]
             check(name in known, "without", name, _expected(name, known))
-        right = self.orientation in ORIENTATIONS
-        check(right, "orientation", self.orientation, one_of(ORIENTATIONS))
+        right = one_of(ORIENTATIONS)
+        check(self.orientation in ORIENTATIONS, "orientation", self.orientation, right)
         object.__setattr__(self, "types", _checked_types(self.types))
 
     def __hash__(self) -> int:
@@ -428,6 +432,13 @@ def one_of(words: Iterable[str]) -> str:
     return f"{', '.join(most)} or {last}"
 
 
+def _make_known(name: str, add: Callable[[str], int], new: str) -> None:
+    try:
+        add(new)
+    except ValueError as error:
+        raise ConfigError(f"setting '{name}': {error}") from None
+
+
 def check_steps(
     name: str, names: tuple[str, ...], upper: tuple[float, ...], known: tuple[str, ...], bounds: int
 ) -> None:
@@ -438,10 +449,7 @@ def check_steps(
     for relation in names:
         free = relation in known or relation not in OWN_RELATIONS
         check(free, f"{name}.names", relation, f"one of {', '.join(known)}, or a new name")
-        try:
-            add_relation(relation)
-        except ValueError as error:
-            raise ConfigError(f"setting '{name}.names': {error}") from None
+        _make_known(f"{name}.names", add_relation, relation)
     check(len(set(names)) == len(names), f"{name}.names", names, "each name once")
     check(len(upper) == bounds, f"{name}.upper", upper, f"{bounds} bounds for {len(names)} names")
     rising = all(a < b < math.inf for a, b in zip((0.0, *upper), upper, strict=False))
@@ -517,8 +525,8 @@ def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
     for name, meaning in sorted(types.items(), key=lambda item: item[0].lower()):
         where = f'types."{name}"'
         check(bool(name.strip()), where, name, "the type name of a simulator")
-        known = meaning.kind in ENTITY_KINDS
-        check(known, f"{where}.kind", meaning.kind, _expected(meaning.kind, ENTITY_KINDS))
+        right = f"{_expected(meaning.kind, ENTITY_KINDS)}; new_kinds names those of your own"
+        check(meaning.kind in ENTITY_KINDS, f"{where}.kind", meaning.kind, right)
         for part in ("special", "subkind"):
             word = getattr(meaning, part)
             plain = _WORD.fullmatch(word) is not None
@@ -549,6 +557,7 @@ class Preset:
     config: Config
 
 
+_MET_BY_CARLASGG: Final = ("Person", "Bicycle", "Car", "Motorcycle", "Bus", "Train", "Truck")
 _CARLASGG: Final = Config(
     range=RangeSettings(
         shape="rectangle",
@@ -565,10 +574,7 @@ _CARLASGG: Final = Config(
     pairs=PairSettings(
         within=0.0,
         ego_within=25.0,
-        kinds=tuple(
-            ("Ego", label)
-            for label in ("Person", "Bicycle", "Car", "Motorcycle", "Bus", "Train", "Truck")
-        ),
+        kinds=tuple(("Ego", kind) for kind in _MET_BY_CARLASGG),
     ),
     lanes=LaneSettings(ahead=50.0, types=("driving",), sections=False),
     sees=False,
@@ -589,14 +595,7 @@ _ROADSCENE2VEC: Final = Config(
     pairs=PairSettings(
         within=0.0,
         ego_within=25.0,
-        kinds=tuple(
-            ("Ego", label)
-            for label in (
-                "Vehicle",
-                "Person",
-                "Signal",
-            )
-        ),
+        kinds=(("Ego", "Vehicle"), ("Ego", "Person"), ("Ego", "Signal")),
     ),
     sees=False,
     without=("leads", "follows", "overlaps", "sees"),

@@ -31,7 +31,6 @@ MOST_RECORDS: Final = 1 << 16
 """Edges of a graph of which records are made at once; where there are more, they stay columns."""
 
 _IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
-_TELLS: Final = np.isin(np.arange(MOST_RELATIONS), (_IS_IN, _LEADS, _FOLLOWS))
 """Of each relation whether its edges may have attributes."""
 
 
@@ -431,7 +430,9 @@ class SceneGraph:
                     far = self.reach.distance(places[src], places[dst])
                     known[src, dst] = {} if far is None else {"lane_dist": far}
                 more = known[src, dst]
-            graph.add_edge(src, dst, key=relation, relation=relation, **attributes, **more)
+            about = {"relation": relation, **attributes, **more}
+            graph.add_edge(src, dst, key=relation)
+            graph.edges[src, dst, relation].update(about)  # whose names may be anything
         return graph
 
 
@@ -525,6 +526,7 @@ class SceneColumns:
         standing = _divided(present.frame[by_place], len(self.frame_id))
         edges = self.edges.distinct()
         related = _divided(edges.frame, len(self.frame_id))
+        tells = np.isin(np.arange(MOST_RELATIONS), [relation for _, relation, *_ in self.about])
         for row in range(len(self.frame_id)):
             rows = order[moving[row]].tolist()
             nodes = dict(zip(node[rows].tolist(), (about[i] for i in rows), strict=True))
@@ -542,14 +544,16 @@ class SceneColumns:
                 time_ns=int(self.time_ns[row]),
                 ego=self.ego[row],
                 nodes=nodes,
-                edges=self._edges(row, edges, related[row], mapped),
+                edges=self._edges(row, edges, related[row], mapped, tells),
                 reach=self.map.reach if self.map is not None and len(mapped) else None,
             )
 
-    def _edges(self, row: int, edges: Edges, own: slice, mapped: Ints) -> Sequence[EdgeRecord]:
+    def _edges(
+        self, row: int, edges: Edges, own: slice, mapped: Ints, telling: NDArray[np.bool_]
+    ) -> Sequence[EdgeRecord]:
         src, relation, dst = edges.src[own], edges.relation[own], edges.dst[own]
         about: dict[int, Attributes] = {}
-        tells = np.flatnonzero(_TELLS[relation])
+        tells = np.flatnonzero(telling[relation])
         ends = (column[tells].tolist() for column in (relation, src, dst))
         for place, *key in zip(tells.tolist(), *ends, strict=True):
             if (found := self.about.get((row, *key))) is not None:

@@ -10,11 +10,11 @@
 -- A node_id names a node within its trace: 0 and above are entities of the trace, below zero parts of its map
 -- (-1 is off_road). A mask holds 60 frames of a bucket: bit i is the frame with seq % 60 = i.
 --
--- Enumerations are those of vocabulary.py, in its order (a test holds the two together). When a trace comes that can answer
--- a relation which the type does not have, it is added behind the others, in place.
+-- Enumerations are those of vocabulary.py, in its order (a test holds the two together). When a trace comes with a kind or a
+-- state of lights, or can answer a relation, that the type does not have, it is added behind the others, in place.
 --
 -- Changes
---   * Version 4: the kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
+--   * Version 4: kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     Columns that are always known are NOT NULL; store_info holds a digest of these statements.
 --   * Version 3: bucket.joined; the states of the ego lie together (state, lane_state).
 --   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; lane_dists, by lane_state.is_own and map_reach. roles, by lane_role.
@@ -149,6 +149,10 @@ CREATE TABLE event (                                           -- what the simul
 
 CREATE TABLE imported (                                        -- frames that came as graphs: what their file calls them
   bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, graph VARCHAR, place BIGINT NOT NULL, images BIGINT NOT NULL); -- place: row or line
+
+CREATE TABLE attribute (                                       -- of a client's own: what no column takes, of nodes and edges of imported graphs
+  frame_id BIGINT NOT NULL, node_id INTEGER NOT NULL, relation relation, dst INTEGER, -- of an edge from node_id; NULL: of the node itself
+  attribute VARCHAR NOT NULL, value JSON NOT NULL);
 
 -- Maps: once each, whatever the number of traces on them ----------------------------------------------------------
 
@@ -313,6 +317,18 @@ FROM event v JOIN trace t ON t.trace_id = v.trace_id
      LEFT JOIN entity o ON o.trace_id = v.trace_id AND o.ident = v.other;
 
 COMMENT ON VIEW events IS 'What the simulator says has happened. frame_id: of the frame that is nearest in time; kind: collision, lane_invasion, environment; t: seconds since the trace began; node_id, ident: the vehicle, as an entity and as the simulator calls it; other, other_ident: what it collided with, NULL where that is no entity of the trace or nothing; value: length of the impulse of a collision, N·s; detail: markings that were crossed (broken, solid, other), or weather and light from then on. What is not known is NULL.';
+
+CREATE VIEW attributes AS
+SELECT frame_id, node_id, attribute AS name, json_extract_string(value, '$') AS text, value
+FROM attribute WHERE relation IS NULL;
+
+COMMENT ON VIEW attributes IS 'Attributes of a client''s own: one row for each of a node in a frame that was imported as a graph and for which nodes has no column. name: as in the file; text: its value as text; value: as JSON.';
+
+CREATE VIEW edge_attributes AS
+SELECT frame_id, node_id AS src, relation, dst, attribute AS name, json_extract_string(value, '$') AS text, value
+FROM attribute WHERE relation IS NOT NULL;
+
+COMMENT ON VIEW edge_attributes IS 'The same of edges (src relation dst): one row for each attribute for which no view has a column.';
 
 CREATE VIEW imports AS
 SELECT f.frame_id, i.graph, i.place, i.images

@@ -1,9 +1,10 @@
 """Kinds, relations and the states of lights: the catalogue of names.
 
-A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Kinds are
-closed; relations are those of :mod:`sgstore.plugins`, and what stores and settings add (:func:`add_relation`).
-The *code* of a name is its index. ``vocabulary.toml`` maps the type names of simulators to kinds; a
-type that nothing maps becomes ``unknown``, never nothing.
+A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Readers, settings,
+imports and stores add kinds of entities, relations and states of lights of their own (:func:`add_kind`,
+:func:`add_relation`, :func:`add_light_state`). The *code* of a name is its index, and stays. The file
+``vocabulary.toml`` maps the type names of simulators to kinds; a type that nothing maps becomes ``unknown``,
+never nothing.
 
 Names are compared without regard to case and underscores (``TrafficLight`` is ``traffic_light``);
 the canonical spelling is stored and printed.
@@ -24,9 +25,12 @@ from typing import TYPE_CHECKING, Final
 from sgstore import plugins
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-ENTITY_KINDS: Final = (
+    import numpy as np
+    from numpy.typing import NDArray
+
+OWN_ENTITY_KINDS: Final = (
     "car",
     "truck",
     "van",
@@ -55,7 +59,16 @@ ENTITY_KINDS: Final = (
 MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint")
 """Kinds of the parts of a road map. ``off_road`` is a single node: whatever is not a driving lane."""
 
-KINDS: Final = ENTITY_KINDS + MAP_KINDS
+OWN_KINDS: Final = OWN_ENTITY_KINDS + MAP_KINDS
+"""Kinds of this package, the parts of the map behind the entities."""
+
+_entity_kinds: Final[list[str]] = list(OWN_ENTITY_KINDS)
+ENTITY_KINDS: Final[Sequence[str]] = _entity_kinds
+"""All kinds of entities known so far; see :func:`add_kind`."""
+
+_kinds: Final[list[str]] = list(OWN_KINDS)
+KINDS: Final[Sequence[str]] = _kinds
+"""All kinds known so far. It grows behind the kinds of this package, and what is in it keeps its place."""
 
 VEHICLES: Final = (
     "car",
@@ -70,7 +83,7 @@ VEHICLES: Final = (
 )
 SIGNALS: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
 
-SUPER_KINDS: Final[Mapping[str, tuple[str, ...]]] = {
+SUPER_KINDS: Final[Mapping[str, Sequence[str]]] = {
     "vehicle": VEHICLES,
     "two_wheeler": ("motorcycle", "bicycle"),
     "vru": ("person", "bicycle", "motorcycle"),
@@ -162,8 +175,12 @@ DRIVING: Final = frozenset(
 TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
 """Types of lanes that have a direction of travel which matters to their neighbours."""
 
-LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
-"""What a traffic light shows. ``flashing``: a bulb that flashes, whatever its colour."""
+OWN_LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
+"""States of traffic lights of this package. ``flashing``: a bulb that flashes, whatever its colour."""
+
+_light_states: Final[list[str]] = list(OWN_LIGHT_STATES)
+LIGHT_STATES: Final[Sequence[str]] = _light_states
+"""All that a traffic light can show, as far as it is known so far; see :func:`add_light_state`."""
 
 SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service")
 """Special kinds, beside the kind: CARLASGG's ``special_type`` and OSI's vehicle roles."""
@@ -183,10 +200,12 @@ VEHICLE_LIGHTS: Final = (
 )
 """Lights of a vehicle; the index is the bit of a light in a mask (hazard lights are left and right)."""
 
-KIND_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(KINDS)}
+_kind_code: Final = {name: code for code, name in enumerate(KINDS)}
+KIND_CODE: Final[Mapping[str, int]] = _kind_code
 _relation_code: Final = {name: code for code, name in enumerate(RELATIONS)}
 RELATION_CODE: Final[Mapping[str, int]] = _relation_code
-LIGHT_STATE_CODE: Final[Mapping[str, int]] = {name: code for code, name in enumerate(LIGHT_STATES)}
+_light_state_code: Final = {name: code for code, name in enumerate(LIGHT_STATES)}
+LIGHT_STATE_CODE: Final[Mapping[str, int]] = _light_state_code
 
 
 def normalize_name(name: str) -> str:
@@ -203,12 +222,15 @@ _growing: Final = Lock()
 MOST_RELATIONS: Final = 63
 """Relations that one process can know: a set of them is a 64-bit number."""
 
+MOST_KINDS: Final = 127
+"""Kinds, and states of lights, that one process can know: a code is an 8-bit number."""
+
 _KINDS_FOLDED: Final = {normalize_name(name): name for name in KINDS}
-_LABELS_FOLDED: Final[Mapping[str, tuple[str, ...]]] = (
-    {normalize_name(name): (name,) for name in KINDS}
-    | {normalize_name(name): kinds for name, kinds in SUPER_KINDS.items()}
-    | {normalize_name(alias): (name,) for alias, name in LABEL_ALIASES.items()}
-)
+_LABELS_FOLDED: Final[dict[str, Sequence[str]]] = {
+    **{normalize_name(name): (name,) for name in KINDS},
+    **{normalize_name(name): kinds for name, kinds in SUPER_KINDS.items()},
+    **{normalize_name(alias): (name,) for alias, name in LABEL_ALIASES.items()},
+}
 
 
 def add_relation(name: str) -> int:
@@ -223,19 +245,104 @@ def add_relation(name: str) -> int:
     with _growing:
         if name in _relation_code:
             return _relation_code[name]
-        if not _NAME.fullmatch(name):
-            raise ValueError(
-                f"{name!r} is no name: letters, digits and _, a letter first, 40 at most"
-            )
-        like = _RELATIONS_FOLDED.get(normalize_name(name)) or (name if kinds_labelled(name) else "")
-        if like:
-            what = "the label" if like == name else "the relation"
-            raise ValueError(f"{name!r} would be taken for {what} {like!r}")
-        if len(_relations) >= MOST_RELATIONS:
-            raise ValueError(f"there are {MOST_RELATIONS} relations, and no room for {name!r}")
+        _check_new("relation", name, MOST_RELATIONS, _relations)
         _RELATIONS_FOLDED[normalize_name(name)] = name
         _relations.append(name)
         return _relation_code.setdefault(name, len(_relations) - 1)
+
+
+def add_kind(name: str) -> int:
+    """Make a kind of entities known in this process, and return its code.
+
+    Parameters
+    ----------
+    name : str
+        Small letters, digits and ``_``: a pattern writes ``wheel_chair`` as ``WheelChair``.
+
+    Raises
+    ------
+    ValueError
+        It is no name, it is that of a relation or, but for case and underscores, of another label; or there are
+        too many.
+    """
+    with _growing:
+        if name in _kind_code:
+            return _kind_code[name]
+        _check_new("kind", name, MOST_KINDS, _kinds)
+        _KINDS_FOLDED[normalize_name(name)] = name
+        _LABELS_FOLDED[normalize_name(name)] = (name,)
+        _entity_kinds.append(name)
+        _kinds.append(name)
+        return _kind_code.setdefault(name, len(_kinds) - 1)
+
+
+def add_light_state(name: str) -> int:
+    """Make a state of traffic lights known in this process, and return its code.
+
+    Raises
+    ------
+    ValueError
+        It is no name or, but for case and underscores, that of another state; or there are too many.
+    """
+    with _growing:
+        if name in _light_state_code:
+            return _light_state_code[name]
+        _check_name(name)
+        like = {normalize_name(known): known for known in _light_states}.get(normalize_name(name))
+        if like:
+            raise ValueError(f"{name!r} would be taken for the state {like!r}")
+        _check_room("states of lights", name, MOST_KINDS, _light_states)
+        _light_states.append(name)
+        return _light_state_code.setdefault(name, len(_light_states) - 1)
+
+
+def _check_new(what: str, name: str, most: int, known: Sequence[str]) -> None:
+    """Refuse what cannot be the name of a new relation or kind."""
+    _check_name(name)
+    relation = _RELATIONS_FOLDED.get(normalize_name(name))
+    label = normalize_name(name) == "ego" or kinds_labelled(name) is not None
+    if relation or label:
+        like = f"the relation {relation!r}" if relation else f"the label {name!r}"
+        raise ValueError(f"{name!r} would be taken for {like}")
+    _check_room(f"{what}s", name, most, known)
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{name!r} is no name: letters, digits and _, a letter first, 40 at most")
+
+
+def _check_room(what: str, name: str, most: int, known: Sequence[str]) -> None:
+    if len(known) >= most:
+        raise ValueError(f"there are {most} {what}, and no room for {name!r}")
+
+
+ADD: Final[Mapping[str, Callable[[str], int]]] = {
+    "kind": add_kind,
+    "relation": add_relation,
+    "light_state": add_light_state,
+}
+"""Enumerations of a store, by the name of their type, and what makes one more of its values known."""
+
+NAMES: Final[Mapping[str, Sequence[str]]] = {
+    "kind": KINDS,
+    "relation": RELATIONS,
+    "light_state": LIGHT_STATES,
+}
+"""Their values, by their codes."""
+
+
+def entity_kinds() -> frozenset[str]:
+    """Return all kinds of entities that are known now."""
+    return frozenset(_entity_kinds)
+
+
+_MAPPED: Final = range(len(OWN_ENTITY_KINDS), len(OWN_KINDS))
+
+
+def are_entities(codes: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Tell which codes of kinds are those of entities; the others are of parts of the map."""
+    return (codes < _MAPPED.start) | (codes >= _MAPPED.stop)
 
 
 @cache
@@ -254,7 +361,8 @@ def relation_named(name: str) -> str | None:
 
 def kinds_labelled(label: str) -> tuple[str, ...] | None:
     """The kinds that a label stands for, or ``None``. ``Ego`` is a mark, not a label of kinds."""
-    return _LABELS_FOLDED.get(normalize_name(label))
+    kinds = _LABELS_FOLDED.get(normalize_name(label))
+    return None if kinds is None else tuple(kinds)
 
 
 def kind_named(word: str) -> str | None:

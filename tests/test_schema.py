@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import duckdb
 import pytest
@@ -10,8 +11,11 @@ import pytest
 import sgstore.store._schema as shape
 from sgstore.store import StoreFile
 from sgstore.store._schema import schema_sql, schema_version, tables_sql
-from sgstore.vocabulary import KINDS, LIGHT_STATES, OWN_RELATIONS, VEHICLE_LIGHTS
+from sgstore.vocabulary import OWN_KINDS, OWN_LIGHT_STATES, OWN_RELATIONS, VEHICLE_LIGHTS
 from sgstore.world import BUCKET_FRAMES
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 VIEWS = {
     "frames": "frame_id trace_id seq time_ns ego trace t log_time_ns map",
@@ -29,6 +33,8 @@ VIEWS = {
     "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",
     "events": "frame_id trace_id trace kind time_ns t log_time_ns node_id other value detail ident other_ident",
     "imports": "frame_id graph place images",
+    "attributes": "frame_id node_id name text value",
+    "edge_attributes": "frame_id src relation dst name text value",
     "payloads": "frame_id channel log_time_ns offset_s schema file chunk_offset message_offset length",
 }
 
@@ -42,28 +48,32 @@ def empty() -> duckdb.DuckDBPyConnection:
 
 @pytest.mark.parametrize(
     ("enum", "names"),
-    [("kind", KINDS), ("relation", OWN_RELATIONS[:23]), ("light_state", LIGHT_STATES)],
+    [("kind", OWN_KINDS), ("relation", OWN_RELATIONS[:23]), ("light_state", OWN_LIGHT_STATES)],
 )
-def test_enumerations_are_the_vocabulary_in_its_order(empty, enum, names) -> None:
-    (values,) = empty.execute(f"SELECT enum_range(NULL::{enum})").fetchone()
+def test_enumerations_are_the_vocabulary_in_its_order(
+    empty: duckdb.DuckDBPyConnection, enum: str, names: tuple[str, ...]
+) -> None:
+    ((values,),) = empty.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
 
     assert tuple(values) == names
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_public_views_keep_their_columns(empty, view) -> None:
+def test_public_views_keep_their_columns(empty: duckdb.DuckDBPyConnection, view: str) -> None:
     columns = [c[0] for c in empty.execute(f"SELECT * FROM {view}").description]
 
     assert columns[: len(VIEWS[view].split())] == VIEWS[view].split()
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_a_column_of_a_public_view_needs_no_quotes(empty, view) -> None:
+def test_a_column_of_a_public_view_needs_no_quotes(
+    empty: duckdb.DuckDBPyConnection, view: str
+) -> None:
     for column in empty.execute(f"SELECT * FROM {view}").description:
         empty.execute(f"SELECT {column[0]} FROM {view}")
 
 
-def test_every_view_is_public_and_commented(empty) -> None:
+def test_every_view_is_public_and_commented(empty: duckdb.DuckDBPyConnection) -> None:
     found = empty.execute(
         "SELECT view_name, comment FROM duckdb_views() WHERE NOT internal"
     ).fetchall()
@@ -72,7 +82,7 @@ def test_every_view_is_public_and_commented(empty) -> None:
     assert all(comment for _, comment in found)
 
 
-def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty) -> None:
+def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty: duckdb.DuckDBPyConnection) -> None:
     columns = [c[0] for c in empty.execute("SELECT * FROM nodes").description]
     loose = duckdb.connect()  # where nothing has to be known
     loose.execute(tables_sql())
@@ -88,19 +98,19 @@ def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty) -> None:
     assert all(row.count(True) == 1 for row in rows)
 
 
-def test_bits_are_those_of_the_frames_of_a_bucket(empty) -> None:
+def test_bits_are_those_of_the_frames_of_a_bucket(empty: duckdb.DuckDBPyConnection) -> None:
     assert empty.execute("SELECT bit, m FROM bits ORDER BY bit").fetchall() == [
         (bit, 1 << bit) for bit in range(BUCKET_FRAMES)
     ]
 
 
-def test_no_table_has_keys_that_loading_would_pay_for(empty) -> None:
+def test_no_table_has_keys_that_loading_would_pay_for(empty: duckdb.DuckDBPyConnection) -> None:
     found = empty.execute("SELECT DISTINCT constraint_type FROM duckdb_constraints()").fetchall()
 
     assert found == [("NOT NULL",)]
 
 
-def test_the_head_says_the_version_that_a_store_is_made_with(tmp_path) -> None:
+def test_the_head_says_the_version_that_a_store_is_made_with(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     (version,) = re.findall(
         r"^-- sgstore: what is in a store, version (\d+)\.$", schema_sql(), re.MULTILINE

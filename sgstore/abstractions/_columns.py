@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from sgstore.vocabulary import (
     DIRECTIONS,
     DRIVING,
-    ENTITY_KINDS,
     KIND_CODE,
-    KINDS,
+    MOST_KINDS,
     MOST_RELATIONS,
     PROXIMITY,
     RELATION_CODE,
     RELATIONS,
+    are_entities,
 )
 
 if TYPE_CHECKING:
@@ -54,10 +54,10 @@ SCENERY: Final = ("building", "pole", "barrier", "vegetation")
 BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
 """Relations among entities that the literature has."""
 
-_SMALL: Final = np.array([kind in SCENERY for kind in KINDS])
+_SMALL: Final = np.zeros(MOST_KINDS, np.bool_)
+_SMALL[[KIND_CODE[kind] for kind in SCENERY]] = True
 _BETWEEN: Final = np.zeros(MOST_RELATIONS, np.bool_)
 _BETWEEN[[RELATION_CODE[name] for name in BETWEEN_ENTITIES]] = True
-_ENTITY_KINDS: Final = len(ENTITY_KINDS)
 _LANE: Final = KIND_CODE["lane"]
 
 
@@ -213,7 +213,7 @@ class GraphColumns:
     @cached_property
     def is_entity(self) -> Bools:
         """(N,): whether a node is an entity; else it is a part of the map."""
-        return self.kind < _ENTITY_KINDS
+        return are_entities(self.kind)
 
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
         """Edges among parts of the map, in each frame in which both their ends are present.

@@ -41,12 +41,13 @@ from sgstore.abstractions._columns import (
 )
 from sgstore.abstractions._lanes import NAMELESS, OFF_ROAD, ego_lanes
 from sgstore.vocabulary import (
-    ENTITY_KINDS,
     KIND_CODE,
     KINDS,
+    MOST_KINDS,
     MOST_RELATIONS,
     RELATION_CODE,
     RELATIONS,
+    entity_kinds,
 )
 
 if TYPE_CHECKING:
@@ -73,30 +74,34 @@ class Subset:
 
     Attributes
     ----------
-    kinds : frozenset of str or None
-        Kinds of its nodes; ``None``: all, and all relations.
+    parts : frozenset of str or None
+        Kinds of parts of the map among its nodes, beside those of traffic; ``None``: all kinds and relations.
     moving : frozenset of str
         Relations of entities, to one another and to parts of the map.
     lasting : frozenset of str
         Relations among parts of the map.
     """
 
-    kinds: frozenset[str] | None
+    parts: frozenset[str] | None
     moving: frozenset[str] = frozenset()
     lasting: frozenset[str] = frozenset()
 
+    @property
+    def kinds(self) -> frozenset[str] | None:
+        """Kinds of its nodes, as far as they are known now; ``None``: all."""
+        return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
 
-_TRAFFIC: Final = frozenset(ENTITY_KINDS) - frozenset(SCENERY)
+
 _LANES: Final = frozenset({"lane", "off_road"})
 _RELATED: Final = frozenset(BETWEEN_ENTITIES)
 _PARTS: Final = frozenset({*_LANES, "road", "junction"})
 
 SUBSETS: Final[Mapping[str, Subset]] = {
-    "E": Subset(_TRAFFIC),
-    "EL": Subset(_TRAFFIC | _LANES, frozenset({"isIn"})),
-    "ER": Subset(_TRAFFIC, _RELATED),
-    "RSV": Subset(_TRAFFIC | _LANES, _RELATED | {"isIn"}),
-    "junction": Subset(_TRAFFIC | _PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
+    "E": Subset(frozenset()),
+    "EL": Subset(_LANES, frozenset({"isIn"})),
+    "ER": Subset(frozenset(), _RELATED),
+    "RSV": Subset(_LANES, _RELATED | {"isIn"}),
+    "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
     "SG": Subset(None),
 }
 """In queries lanes keep the names and the sections that they have in the map."""
@@ -104,21 +109,24 @@ SUBSETS: Final[Mapping[str, Subset]] = {
 _MAPS: Final = 4
 """Maps of which what follows from them is remembered."""
 
-_EGO_LABEL: Final = len(KINDS)
-_KIND_LABELS: Final = (*KINDS, EGO)
 _IS_IN: Final = RELATION_CODE["isIn"]
 _ON_ROADS: Final = np.zeros(MOST_RELATIONS, np.bool_)
 _ON_ROADS[[RELATION_CODE[r] for r in OF_JUNCTION if r not in BETWEEN_ENTITIES]] = True
 
 
+def _kind_labels() -> tuple[str, ...]:
+    """Labels of nodes: the kinds by their codes, and the ego behind them."""
+    return (*KINDS, EGO)
+
+
 def entities(seen: GraphColumns) -> Labelled:
     """``E``: the entities."""
-    return Labelled.assembled(seen.frames, [_entities(seen)], [], _KIND_LABELS)
+    return Labelled.assembled(seen.frames, [_entities(seen)], [], _kind_labels())
 
 
 def related(seen: GraphColumns) -> Labelled:
     """``ER``: the entities and their relations."""
-    labels = (*_KIND_LABELS, *RELATIONS)
+    labels = (*_kind_labels(), *RELATIONS)
     edges, bundles = _relations(seen)
     return Labelled.assembled(seen.frames, [_entities(seen)], [edges], labels, bundles=bundles)
 
@@ -135,14 +143,14 @@ def road_scene(seen: GraphColumns) -> Labelled:
 
 def whole(seen: GraphColumns) -> Labelled:
     """``SG``: the scene graph as it is."""
-    label = np.where(seen.is_ego, _EGO_LABEL, seen.kind)
-    first = len(_KIND_LABELS)
+    label = np.where(seen.is_ego, len(KINDS), seen.kind)
+    first = len(_kind_labels())
     frame, relation, src, dst = seen.lasting(range(len(RELATIONS)))
     edges = [
         (seen.frame, seen.src, first + seen.relation.astype(np.int64), seen.dst),
         (frame, src, first + relation.astype(np.int64), dst),
     ]
-    labels = [*_KIND_LABELS, *RELATIONS]
+    labels = [*_kind_labels(), *RELATIONS]
     if seen.grounds is not None:
         label, more = _with_roles(seen, seen.grounds, label, len(labels))
         labels += more
@@ -168,10 +176,10 @@ def _with_roles(
 def junction(seen: GraphColumns) -> Labelled:
     """``junction``: the entities with their relations; lanes, roads and junctions of the map."""
     grounds = seen.grounds
-    first = len(_KIND_LABELS)
+    first = len(_kind_labels())
     wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
     nodes, kept = [_entities(seen)], seen.is_traffic
-    labels = [*_KIND_LABELS, *RELATIONS]
+    labels = [*_kind_labels(), *RELATIONS]
     edges: list[Part] = []
     if grounds is not None:
         whose = _merged(grounds)
@@ -280,7 +288,7 @@ def _names(grounds: MapColumns | None) -> dict[int, str]:
 
 def _entities(seen: GraphColumns) -> Part:
     rows = np.flatnonzero(seen.is_traffic)
-    label = np.where(seen.is_ego[rows], _EGO_LABEL, seen.kind[rows])
+    label = np.where(seen.is_ego[rows], len(KINDS), seen.kind[rows])
     return seen.node_frame[rows], seen.node[rows], label
 
 
@@ -288,7 +296,7 @@ def _relations(seen: GraphColumns) -> tuple[Part, list[list[int]]]:
     """Edges between entities, and the bundles of labels, which follow those of the kinds, that they bear."""
     frame, src, dst, bits = seen.pairs
     distinct, number = np.unique(bits, return_inverse=True)
-    first = len(_KIND_LABELS)
+    first = len(_kind_labels())
     bundles = [
         [first + code for code in range(len(RELATIONS)) if one >> code & 1]
         for one in distinct.tolist()
@@ -297,7 +305,7 @@ def _relations(seen: GraphColumns) -> tuple[Part, list[list[int]]]:
 
 
 def _with_lanes(seen: GraphColumns, *, related: bool) -> Labelled:
-    labels = [*_KIND_LABELS, *RELATIONS]
+    labels = [*_kind_labels(), *RELATIONS]
     between, bundles = _relations(seen) if related else (None, [])
     nodes, edges = [_entities(seen)], [between] if between else []
     if seen.grounds is not None:
@@ -310,7 +318,7 @@ def _with_lanes(seen: GraphColumns, *, related: bool) -> Labelled:
 
 def _lanes(seen: GraphColumns, first: int) -> tuple[list[Part], list[Part], list[str]]:
     """Nodes, ``isIn`` edges and labels of the lanes as the ego has them; labels count from ``first``."""
-    is_in = len(_KIND_LABELS) + _IS_IN
+    is_in = len(_kind_labels()) + _IS_IN
     lanes = ego_lanes(seen)
     roots = np.unique(lanes.frame)
     frame, src = lanes.off_road
@@ -388,7 +396,8 @@ _EDGES: Final = (
 )
 _LABELS: Final = (*_NODES, *_EDGES)
 _LABEL: Final = {text: i for i, text in enumerate(_LABELS)}
-_ACTOR: Final = np.array([_LABEL[ACTORS[k]] if k in ACTORS else -1 for k in KINDS])
+_ACTOR: Final = np.full(MOST_KINDS, -1)
+_ACTOR[[KIND_CODE[kind] for kind in ACTORS]] = [_LABEL[actor] for actor in ACTORS.values()]
 _LANE_NODES: Final = ROOT_ROAD - 1 - np.arange(len(LANES))
 
 

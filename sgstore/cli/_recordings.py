@@ -327,9 +327,14 @@ class ImportOptions:
         typer.Option(
             "--unknown-as",
             metavar="KIND",
-            help="Take labels that nobody knows for this kind ('other': unknown), leave out relations.",
+            help="Take labels that nobody knows for this kind ('other': unknown), leave out relations; "
+            "'own': labels become kinds, names relations.",
         ),
     ] = ""
+    new_kind: Annotated[
+        list[str] | None,
+        typer.Option("--new-kind", metavar="KIND", help="A kind that --kind may name; repeatable."),
+    ] = None
     answers: Annotated[
         list[str] | None,
         typer.Option(
@@ -372,9 +377,8 @@ def import_(
     from sgstore.importing import Words, import_graphs
     from sgstore.vocabulary import relation_named
 
-    words = Words(
-        _pairs(meaning.kind, "--kind"), _pairs(meaning.relation, "--relation"), meaning.unknown_as
-    )
+    pairs = _pairs(meaning.kind, "--kind"), _pairs(meaning.relation, "--relation")
+    words = Words(*pairs, meaning.unknown_as, meaning.new_kind or ())
     answers = {name: relation_named(name) for name in meaning.answers or ()}
     for name, known in answers.items():
         if known is None:

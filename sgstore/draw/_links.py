@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from sgstore.draw._view import SCENERY, clean
-from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, PROXIMITY, RELATIONS, SIDES
+from sgstore.vocabulary import DIRECTIONS, ENTITY_KINDS, MAP_KINDS, PROXIMITY, RELATIONS, SIDES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,7 +23,8 @@ Family = Literal["ego", "matched", "entity", "road", "mixed", "light"]
 
 _RANK: Final[Mapping[str, int]] = {name: rank for rank, name in enumerate(PROXIMITY)}
 _ALONG: Final = ("leads", "follows", "overlaps")
-_MET: Final = frozenset(ENTITY_KINDS) - SCENERY
+_UNMET: Final = frozenset(MAP_KINDS) | SCENERY
+"""What the ego does not meet: parts of the map, and what stands beside the road."""
 _ORDER: Final = (*PROXIMITY, *_ALONG, *DIRECTIONS, *SIDES)
 
 
@@ -80,7 +81,7 @@ def links_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -
             family = "matched"
         elif "controlsTrafficOf" in there + back and lane is not None and lane in (a, b):
             family = "light"
-        elif a == graph.ego and kinds[1] in _MET and asked & set(there + back):
+        elif a == graph.ego and kinds[1] not in _UNMET and asked & set(there + back):
             family = "ego"
         if family is not None:
             links[family].append(DrawnLink(a, b, _sorted(there), _sorted(back, there), family))

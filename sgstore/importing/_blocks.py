@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
-from sgstore.importing._resolve import columns_of, gap_of, lane_state_of, others_lost, state_of
+from sgstore.importing._resolve import LONGEST, columns_of, gap_of, lane_state_of, part_of, state_of
 from sgstore.roads import MapEdges, MapNodes, Ribbons, RoadMap
 from sgstore.vocabulary import KIND_CODE, MAP_KINDS, RELATION_CODE
 from sgstore.world import Entities, FrameBlock, MessageRefs, States
@@ -26,6 +27,10 @@ _IS_IN: Final = RELATION_CODE["isIn"]
 _FOLLOWS: Final = RELATION_CODE["follows"]
 _LEADS: Final = RELATION_CODE["leads"]
 _LANE_COLUMNS: Final = ("overlap", "offset", "heading_error", "along")
+_OF_EDGES: Final = frozenset({"lane_dist"})
+"""Attributes that the graphs of this house give edges, and that follow from others."""
+_LONGEST_VALUE: Final = 10_000
+"""Longest value of an attribute of a client's own, as JSON; characters."""
 
 
 def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
@@ -82,11 +87,23 @@ class Blocks:
         Of :func:`parts_map`.
     period_ns : int
         Time from one graph to the next where the file does not tell it; ns.
+    any_state : bool
+        Whether traffic lights may show what no vocabulary has.
+
+    Attributes
+    ----------
+    own : list
+        Attributes of a client's own in the last block: frame, node, relation (-1: of the node) and other end,
+        name, value as JSON.
     """
 
-    def __init__(self, path: Path, road_map: RoadMap, period_ns: int) -> None:
+    def __init__(
+        self, path: Path, road_map: RoadMap, period_ns: int, *, any_state: bool = False
+    ) -> None:
         self._path = path
         self._period = period_ns
+        self._any_state = any_state
+        self.own: list[tuple[int, int, int, int, str, str]] = []
         names = zip(road_map.nodes.kind.tolist(), road_map.nodes.name, strict=True)
         codes = {code: kind for kind, code in KIND_CODE.items()}
         self._parts = {(codes[kind], name): -1 - row for row, (kind, name) in enumerate(names)}
@@ -96,6 +113,7 @@ class Blocks:
     def block(self, graphs: Sequence[Meant]) -> GraphBlock:
         """The next graphs as a block of frames; what cannot be kept is counted in each graph's ``lost``."""
         new: list[tuple[GivenNode, LabelMeaning]] = []
+        self.own = []
         first = len(self._entities)
         ids = [self._ids(meant, new) for meant in graphs]
         seq = self._seq + np.arange(len(graphs))
@@ -123,8 +141,30 @@ class Blocks:
             for frame, meant in enumerate(graphs)
             for part in meant.parts.values()
         ]
+        for frame, meant in enumerate(graphs):
+            for name, part in meant.parts.items():
+                node = meant.graph.nodes[name]
+                _, own = part_of(self._path, node.where, node.attributes)
+                self._keep(meant.graph.lost, (frame, self._parts[part], -1, 0), own)
         edges, lanes, gaps = self._edges(graphs, ids)
         return GraphBlock(frames, StaticPresence(*_whole(presence, 2)), edges, lanes, gaps)
+
+    def _keep(
+        self, lost: dict[str, int], at: tuple[int, int, int, int], own: Mapping[str, Any]
+    ) -> None:
+        """Take note of attributes of a client's own; what JSON cannot hold, or is very long, is lost."""
+        for name, value in own.items():
+            if value is None or name in _OF_EDGES:
+                continue
+            try:
+                text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+            except ValueError:
+                text = ""
+            if 0 < len(text) <= _LONGEST_VALUE and 0 < len(name) <= LONGEST:
+                self.own.append((*at, name, text))
+            else:
+                what = f"attribute {name[:80]}" + (" of edges" if at[2] >= 0 else "")
+                lost[what] = lost.get(what, 0) + 1
 
     def _ids(self, meant: Meant, new: list[tuple[GivenNode, LabelMeaning]]) -> dict[str, int]:
         """Node ids of a graph by name."""
@@ -140,15 +180,16 @@ class Blocks:
     def _states(self, graphs: Sequence[Meant], ids: Sequence[Mapping[str, int]]) -> States:
         nodes: list[int] = []
         rows: list[dict[str, float]] = []
-        for meant, of in zip(graphs, ids, strict=True):
+        for frame, (meant, of) in enumerate(zip(graphs, ids, strict=True)):
+            lost = meant.graph.lost
             for name in sorted(meant.entities, key=of.__getitem__):
                 node = meant.entities[name][0]
-                nodes.append(of[name])
-                rows.append(
-                    state_of(self._path, node.where, node.attributes, meant.graph.lost)
-                    if node.attributes
-                    else {}
+                state, own = state_of(
+                    self._path, node.where, node.attributes, lost, any_state=self._any_state
                 )
+                nodes.append(of[name])
+                rows.append(state)
+                self._keep(lost, (frame, of[name], -1, 0), own)
         return States.of(node=np.array(nodes, np.int64), **columns_of(rows))
 
     def _edges(
@@ -158,20 +199,20 @@ class Blocks:
         inside: dict[tuple[int, int, int], dict[str, float]] = {}
         gaps: dict[tuple[int, int, int], float] = {}
         for frame, (meant, of) in enumerate(zip(graphs, ids, strict=True)):
-            lost = meant.graph.lost
             for edge, relation in meant.edges:
+                own = edge.attributes
                 src, dst = of[edge.src], of[edge.dst]
                 rows.append((frame, relation, src, dst))
                 part = meant.parts.get(edge.dst, ("",))[0]
                 if relation == _IS_IN and src >= 0 and part == "lane":
-                    state = lane_state_of(self._path, edge.where, edge.attributes, lost)
+                    state, own = lane_state_of(self._path, edge.where, edge.attributes)
                     inside[frame, src, dst] = state
                 elif relation in {_FOLLOWS, _LEADS}:
                     ends = (src, dst) if relation == _FOLLOWS else (dst, src)
-                    gap = gap_of(self._path, edge.where, edge.attributes, lost)
+                    gap, own = gap_of(self._path, edge.where, edge.attributes)
                     gaps[frame, *ends] = gaps.get((frame, *ends), gap) if math.isnan(gap) else gap
-                elif edge.attributes:
-                    others_lost(edge.attributes, lost)
+                if own:
+                    self._keep(meant.graph.lost, (frame, src, relation, dst), own)
         frame, relation, src, dst = _whole(rows, 4)
         edges = Edges(frame, relation.astype(np.int8), src, dst)
         frame, src, dst = _whole(list(gaps), 3)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
+from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from types import MappingProxyType
@@ -25,6 +26,9 @@ from sgstore.vocabulary import (
     RELATION_CODE,
     RELATIONS,
     VEHICLE_LIGHTS,
+    add_kind,
+    add_light_state,
+    add_relation,
     kind_named,
     kinds_labelled,
     labels,
@@ -36,7 +40,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -190,6 +194,9 @@ _NUMBERED: Final = re.compile(r"(.+?)[_ ](\d+)")
 OTHER: Final = "other"
 """What ``unknown_as`` calls the kind ``unknown``."""
 
+OWN: Final = "own"
+"""The ``unknown_as`` by which labels and relations that nobody knows become kinds and relations themselves."""
+
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
@@ -228,7 +235,10 @@ class Words:
         The same of relations.
     unknown_as : str
         The kind of what no word is known for: any kind of an entity, or ``other``, which is ``unknown``.
-        Relations that are unknown are then left out, and counted. Empty: they are errors.
+        Relations that are unknown are then left out, and counted. ``own``: labels become kinds, and names
+        relations, of their own, as many as a process can know; the rest is as of ``other``. Empty: errors.
+    new_kinds : sequence of str
+        Kinds of entities beside those of the vocabulary, which ``kinds`` may name.
 
     Raises
     ------
@@ -239,8 +249,14 @@ class Words:
     kinds: Mapping[str, str] = field(default_factory=dict[str, str])
     relations: Mapping[str, str] = field(default_factory=dict[str, str])
     unknown_as: str = ""
+    new_kinds: Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        for kind in self.new_kinds:
+            try:
+                add_kind(kind)
+            except ValueError as error:
+                raise ConfigError(f"--new-kind {kind}: {error}") from None
         for label, kind in self.kinds.items():
             if not _kind(kind):
                 raise ConfigError(_no_kind(f"--kind {label}={kind}", kind))
@@ -254,7 +270,7 @@ class Words:
 
     @property
     def _fallback(self) -> str:
-        known = "unknown" if self.unknown_as == OTHER else _kind(self.unknown_as)
+        known = "unknown" if self.unknown_as in {OTHER, OWN} else _kind(self.unknown_as)
         return known or ""
 
     def meaning(self, name: str, label: str) -> LabelMeaning | None:
@@ -266,6 +282,8 @@ class Words:
         if not self.unknown_as:
             return None
         own = label or _plain(name)
+        if self.unknown_as == OWN and (kind := _own_kind(own)):
+            return LabelMeaning(kind, type_name=own)
         return LabelMeaning(self._fallback, type_name=own, subkind=own)
 
     def _meant(self, text: str) -> LabelMeaning | None:
@@ -284,7 +302,8 @@ class Words:
     def relation(self, name: str) -> str | None:
         """The relation of the vocabulary that a name means; ``None``: nobody knows."""
         given = {normalize_name(own): relation for own, relation in self.relations.items()}
-        return relation_named(given.get(normalize_name(name), name))
+        known = relation_named(given.get(normalize_name(name), name))
+        return _own_relation(name) if known is None and self.unknown_as == OWN else known
 
     def why_not_kind(self, name: str, label: str) -> str:
         """Explain why a node is not understood, and what can be done."""
@@ -297,7 +316,7 @@ class Words:
             hint = f" (it can be any of {', '.join(several)})"
         return (
             f"{text!r} is of no kind that is known{hint}; say what it is with --kind {text!r}=KIND,"
-            " or --unknown-as other for all such"
+            " --unknown-as own if its name is a kind of its own, or --unknown-as other for all such"
         )
 
     def why_not_relation(self, name: str) -> str:
@@ -306,7 +325,7 @@ class Words:
         hint = f" (did you mean {like!r}?)" if like else ""
         return (
             f"{name!r} is no relation that is known{hint}; say what it is with --relation {name!r}=RELATION,"
-            " or --unknown-as other to leave such edges out"
+            " --unknown-as own to take it as it is, or --unknown-as other to leave such edges out"
         )
 
     def as_dict(self) -> dict[str, object]:
@@ -315,6 +334,7 @@ class Words:
             "kinds": dict(sorted(self.kinds.items())),
             "relations": dict(sorted(self.relations.items())),
             "unknown_as": self.unknown_as,
+            **({"new_kinds": sorted(self.new_kinds)} if self.new_kinds else {}),
         }
 
 
@@ -322,6 +342,27 @@ def _plain(name: str) -> str:
     """A name without the number at its end."""
     numbered = _NUMBERED.fullmatch(name)
     return numbered[1] if numbered else name
+
+
+_NO_NAME: Final = re.compile(r"[^A-Za-z0-9]+")
+
+
+def _own_kind(text: str) -> str:
+    """A label of a file as a kind that is known from now on; empty if it can be none."""
+    name = _NO_NAME.sub("_", text).strip("_").lower()
+    known = kind_named(name)
+    with suppress(ValueError):
+        return known or KINDS[add_kind(name)]
+    return ""
+
+
+def _own_relation(text: str) -> str | None:
+    """The same of a relation; ``None`` if it can be none."""
+    name = _NO_NAME.sub("_", text).strip("_")
+    known = relation_named(name)
+    with suppress(ValueError):
+        return known or RELATIONS[add_relation(name)]
+    return None
 
 
 def _kind(text: str) -> str:
@@ -347,7 +388,7 @@ def _simulators(text: str) -> LabelMeaning | None:
 def _no_kind(what: str, kind: str) -> str:
     like = suggestion(kind, KINDS)
     hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(KINDS)}"
-    return f"{what}: no such kind; {hint}"
+    return f"{what}: no such kind; {hint}; --new-kind {kind} makes it one"
 
 
 # What files say of nodes and edges, in the units that people read, as the columns of the house ----
@@ -376,6 +417,9 @@ _SAID: Final = frozenset(
 )
 """Attributes that are read elsewhere, or say again what a graph says."""
 
+_FIXED: Final = frozenset({"speed", "vx", "vy", "vz"})
+"""Attributes that the graphs of this house give signs and lights of a map: these stand."""
+
 _FOLLOWING: Final = frozenset({"accel", "node_id"})
 """Attributes that follow from others."""
 
@@ -383,10 +427,16 @@ _DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate
 _TEXTS: Final = frozenset({"special", "subkind", "type_name", "type"})
 
 
+Own = dict[str, Any]
+"""Attributes of a client's own, by name: what no column takes."""
+
+
 def state_of(
-    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
-) -> dict[str, float]:
-    """State of an entity in a frame: columns of :class:`sgstore.world.States`; all else is lost.
+    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int], *, any_state: bool
+) -> tuple[dict[str, float], Own]:
+    """State of an entity in a frame: columns of :class:`sgstore.world.States`; and its other attributes.
+
+    ``any_state``: traffic lights may show what no vocabulary has.
 
     Raises
     ------
@@ -394,6 +444,7 @@ def state_of(
         A value is not what its attribute takes.
     """
     found: dict[str, float] = {}
+    own: Own = {}
     lights = 0
     for name, value in attributes.items():
         if value is None or name in _SAID or name in _FOLLOWING or name in _TEXTS:
@@ -401,7 +452,7 @@ def state_of(
         if name in STATE_NUMBERS:
             found[name] = _number(path, where, name, value)
         elif name == "light_state":
-            found[name] = _light_state(path, where, value)
+            found[name] = _light_state(path, where, value, any_state=any_state)
         elif name in VEHICLE_LIGHTS or name in _DERIVED:
             lights |= int(bool(value)) << (
                 VEHICLE_LIGHTS.index(name) if name in VEHICLE_LIGHTS else 0
@@ -415,9 +466,9 @@ def state_of(
         elif name == "speed":
             _number(path, where, name, value)
         else:
-            lost[f"attribute {name}"] = lost.get(f"attribute {name}", 0) + 1
+            own[name] = value
     _speed(attributes, found, lost)
-    return found
+    return found, own
 
 
 def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[str, int]) -> None:
@@ -432,10 +483,8 @@ def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[st
     found["vy"] = float(speed) * math.sin(found["heading"])
 
 
-def part_of(
-    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
-) -> dict[str, Any]:
-    """Attributes of a part of the road: columns of :class:`sgstore.roads.MapNodes`; all else is lost.
+def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict[str, Any], Own]:
+    """Attributes of a part of the road: columns of :class:`sgstore.roads.MapNodes`; and its others.
 
     Raises
     ------
@@ -443,8 +492,9 @@ def part_of(
         A value is not what its attribute takes.
     """
     found: dict[str, Any] = {}
+    own: Own = {}
     for name, value in attributes.items():
-        if value is None or name in _SAID or name in _FOLLOWING:
+        if value is None or name in _SAID or name in _FOLLOWING or name in _FIXED:
             continue
         if name in PART_NUMBERS:
             found[name] = _number(path, where, name, value)
@@ -453,20 +503,21 @@ def part_of(
         elif name in PART_TEXTS:
             found[name] = str(value)[:200]
         else:
-            lost[f"attribute {name}"] = lost.get(f"attribute {name}", 0) + 1
+            own[name] = value
     kinds = {normalize_name(kind): kind for kind in LANE_TYPES}
     if "lane_type" in found:
         if normalize_name(found["lane_type"]) not in kinds:
             raise wrong(path, where, f"no type of lanes: {found['lane_type']!r}")
         found["lane_type"] = kinds[normalize_name(found["lane_type"])]
-    return found
+    return found, own
 
 
 def lane_state_of(
-    path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]
-) -> dict[str, float]:
-    """Position of an entity in a lane; ``primary`` is 1 or 0 where the file says it."""
+    path: Path, where: str, attributes: Mapping[str, Any]
+) -> tuple[dict[str, float], Own]:
+    """Position of an entity in a lane, ``primary`` 1 or 0 where the file says it; and what else is said."""
     found: dict[str, float] = {}
+    own: Own = {}
     for name, value in attributes.items():
         if value is None:
             continue
@@ -475,24 +526,15 @@ def lane_state_of(
         elif name in {"is_primary", "primary"}:
             found["primary"] = float(bool(value))
         else:
-            lost[f"attribute {name} of edges"] = lost.get(f"attribute {name} of edges", 0) + 1
-    return found
+            own[name] = value
+    return found, own
 
 
-def gap_of(path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int]) -> float:
-    """The gap of an edge ``leads`` or ``follows``; NaN where it is not known."""
-    others_lost(attributes, lost, ("gap",))
+def gap_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[float, Own]:
+    """The gap of an edge ``leads`` or ``follows``, NaN where it is not known; and its other attributes."""
     value = attributes.get("gap")
-    return float("nan") if value is None else _number(path, where, "gap", value)
-
-
-def others_lost(
-    attributes: Mapping[str, Any], lost: dict[str, int], kept: tuple[str, ...] = ()
-) -> None:
-    """Count the attributes of an edge that cannot be kept."""
-    for name, value in attributes.items():
-        if value is not None and name not in kept:
-            lost[f"attribute {name} of edges"] = lost.get(f"attribute {name} of edges", 0) + 1
+    gap = float("nan") if value is None else _number(path, where, "gap", value)
+    return gap, {name: value for name, value in attributes.items() if name != "gap"}
 
 
 def columns_of(rows: list[dict[str, float]]) -> dict[str, NDArray[Any]]:
@@ -516,8 +558,11 @@ def _number(path: Path, where: str, name: str, value: Any) -> float:
     return math.radians(value) if name in _RADIANS else float(value)
 
 
-def _light_state(path: Path, where: str, value: Any) -> int:
+def _light_state(path: Path, where: str, value: Any, *, any_state: bool) -> int:
     code = LIGHT_STATE_CODE.get(str(value).lower())
+    if code is None and any_state:
+        with suppress(ValueError):
+            return add_light_state(_NO_NAME.sub("_", str(value)).strip("_").lower())
     if code is None:
         known = ", ".join(LIGHT_STATE_CODE)
         raise wrong(path, where, f"no state of a light: {str(value)[:80]!r}; there are: {known}")
@@ -654,8 +699,6 @@ class FileMeaning:
         Name of the ego, if it is the same wherever there is one.
     timed : int
         Graphs that tell their time.
-    lost : dict
-        What is known of parts of the road and cannot be kept → how often.
     """
 
     graphs: int = 0
@@ -663,7 +706,6 @@ class FileMeaning:
     relations: set[int] = field(default_factory=set[int])
     ego: str = ""
     timed: int = 0
-    lost: dict[str, int] = field(default_factory=dict[str, int])
 
 
 def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeaning:
@@ -691,7 +733,7 @@ def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeanin
         for name, part in meant.parts.items():
             if part not in found.parts:
                 node = graph.nodes[name]
-                found.parts[part] = part_of(path, node.where, node.attributes, found.lost)
+                found.parts[part], _ = part_of(path, node.where, node.attributes)
         if len(found.parts) > MAX_PARTS:
             raise wrong(path, f"row {graph.place}", f"more than {MAX_PARTS:,} parts of the road")
         entities.update(hash((name, meaning.kind)) for name, (_, meaning) in meant.entities.items())

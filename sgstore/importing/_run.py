@@ -14,7 +14,7 @@ from sgstore.config import Config
 from sgstore.errors import SgstoreError, TraceError
 from sgstore.importing._blocks import Blocks, parts_map
 from sgstore.importing._formats import read_csv, read_nodelink, read_s3c, stem_of
-from sgstore.importing._resolve import Understanding, Words, survey
+from sgstore.importing._resolve import OWN, Understanding, Words, survey
 from sgstore.mcap import Loss, check_name, digest_of, mark_of
 from sgstore.store import Folder, Place, StoreFile, new_segment
 from sgstore.vocabulary import DIRECTIONS, KINDS, PROXIMITY, RELATIONS
@@ -184,9 +184,9 @@ class _ImportRun:
     ) -> Sealed:
         occur = {RELATIONS[code] for code in found.relations} | set(self._answers)
         answers = tuple(name for name in RELATIONS if name in occur)
-        done.lost |= found.lost
         understanding = Understanding(info.path, self._words)
-        blocks = Blocks(info.path, road_map, self.period_ns)
+        any_state = self._words.unknown_as == OWN
+        blocks = Blocks(info.path, road_map, self.period_ns, any_state=any_state)
         graphs = map(understanding.of, FORMATS[self._form](info.path))
         with new_segment(
             self._path, info, Config(), road_map=road_map, answers=answers, place=Place(folder)
@@ -194,7 +194,7 @@ class _ImportRun:
             kinds: Counter[str] = Counter()
             for some in _blocks(graphs):
                 graph = self._append(segment, blocks, some, done)
-                kinds.update(KINDS[code] for code in graph.frames.entities.kind.tolist())
+                kinds.update([KINDS[int(code)] for code in graph.frames.entities.kind])
                 if self.on_frames is not None:
                     self.on_frames(info.path, done.frames)
             report = TraceReport(frames=done.frames, losses=_losses(done.lost))
@@ -217,6 +217,7 @@ class _ImportRun:
             places=np.array([one.graph.place for one in graphs], np.int64),
             images=np.array([one.graph.images for one in graphs], np.int64),
         )
+        segment.keep_attributes(graph.frames.seq, blocks.own)
         done.frames += len(graphs)
         done.entities += len(graph.frames.entities)
         done.edges += len(graph.edges)

@@ -29,9 +29,9 @@ from sgstore.lang._symbols import (
 from sgstore.lang.syntax import CheckClause as WrittenCheck
 from sgstore.lang.syntax import Define, MatchClause
 from sgstore.vocabulary import (
-    ENTITY_KINDS,
     RELATION_ALIASES,
     RELATIONS,
+    entity_kinds,
     kinds_labelled,
     labels,
     normalize_name,
@@ -315,7 +315,7 @@ _BINDERS: Final[Binders] = {
 
 
 def _node(node: s.NodePattern, names: SymbolTable) -> str:
-    kinds = kinds_of(node.label, names.session) if node.label else b.ANY
+    kinds = kinds_of(node.label, names.session) if node.label else b.any_kinds()
     if not kinds:
         names.session.refuse("no node can have this label", node.span)
     key = _known_node(node, names)
@@ -364,7 +364,7 @@ def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
     if node.name != THE_EGO:
         return None
     if names.scope.parent is None:
-        key = names.scope.add(THE_EGO, b.EGO, node.span, named=True)
+        key = names.scope.add(THE_EGO, b.ego_kinds(), node.span, named=True)
         names.session.the_ego = key
         names.meanings[THE_EGO] = Symbol(node=key)
         return key
@@ -450,9 +450,9 @@ def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
 
 def _labelled(label: s.Label, session: Session) -> b.Kinds:
     if label.name == "%":
-        return b.ANY
+        return b.any_kinds()
     if normalize_name(label.name) == "ego":
-        return b.EGO
+        return b.ego_kinds()
     kinds = kinds_labelled(label.name)
     if kinds is None:
         if relation_named(label.name):
@@ -463,7 +463,7 @@ def _labelled(label: s.Label, session: Session) -> b.Kinds:
             )
         session.unknown("label", label.name, label.span, labels())
     every = frozenset(kinds)
-    return b.Kinds(every & frozenset(ENTITY_KINDS), every)
+    return b.Kinds(every & entity_kinds(), every)
 
 
 def _relations(label: s.LabelExpression, session: Session) -> frozenset[str]:

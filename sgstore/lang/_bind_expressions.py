@@ -34,9 +34,9 @@ from sgstore.lang._symbols import (
     text_test,
 )
 from sgstore.vocabulary import (
-    ENTITY_KINDS,
     KINDS,
     LANE_TYPES,
+    entity_kinds,
     kind_named,
     kinds_labelled,
     labels,
@@ -45,7 +45,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
 
 MAX_NUMBER: Final = 1e300
@@ -206,7 +206,7 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
         what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"
         owners = [kind for kind in KINDS if kind in found.kinds]
         hint = hint_at(name, possible)
-        if "lane" in owners and kinds <= frozenset(ENTITY_KINDS):
+        if "lane" in owners and kinds <= entity_kinds():
             hint = f"the lanes that it is in are nodes: (x)-[:isIn]->(l:Lane), l.{found.name}"
         elif hint is None or not hint.startswith("did"):
             hint = f"it belongs to: {', '.join(owners)}"
@@ -376,7 +376,7 @@ def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTabl
     return b.Value(word, Type.text, closed=True)
 
 
-def _vocabulary(expression: b.Bound) -> tuple[str, ...]:
+def _vocabulary(expression: b.Bound) -> Sequence[str]:
     match expression:
         case b.NodeAttribute(attribute=attribute) | b.FrameAttribute(attribute=attribute):
             return attribute.values

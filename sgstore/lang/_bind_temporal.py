@@ -318,7 +318,7 @@ class StepScope(ScopeBuilder):
             if not node.kinds.other:
                 self.mention(node.key)
                 return node.key
-        return self.add("ego", b.EGO, span, named=False)
+        return self.add("ego", b.ego_kinds(), span, named=False)
 
 
 @dataclass(slots=True)

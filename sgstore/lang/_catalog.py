@@ -17,19 +17,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import (
-    ENTITY_KINDS,
     KINDS,
     LIGHT_STATES,
     MAP_KINDS,
+    OWN_ENTITY_KINDS,
+    OWN_KINDS,
     SIGNALS,
     SPECIALS,
     VEHICLE_LIGHTS,
     VEHICLES,
+    entity_kinds,
     normalize_name,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from typing import Self
 
 
@@ -112,9 +114,9 @@ class Type(StrEnum):
 DERIVED: Final = ("velocity", "acceleration", "yaw_rate")
 """What may have been computed by differences; the index is the bit in ``state.derived``."""
 
-_ENTITIES: Final = frozenset(ENTITY_KINDS)
+_ENTITIES: Final = frozenset(OWN_ENTITY_KINDS)
 _LANES: Final = frozenset({"lane"})
-_EVERY: Final = frozenset(KINDS)
+_EVERY: Final = frozenset(OWN_KINDS)
 _ON_ROADS: Final = frozenset({"lane", "junction", "road", "crosswalk", *SIGNALS})
 
 
@@ -131,9 +133,9 @@ class Attribute:
         Column in each home that has it.
     unit : DisplayUnit
         How the column becomes the value.
-    kinds : frozenset of str
-        Kinds of nodes that may have it.
-    values : tuple of str
+    own_kinds : frozenset of str
+        Kinds of the vocabulary whose nodes may have it; :attr:`kinds` are all of them.
+    values : sequence of str
         All values that it can have, if they are a closed list.
     meaning : str
         For the documentation; with unit.
@@ -148,10 +150,16 @@ class Attribute:
     columns: Mapping[Home, str]
     meaning: str
     unit: DisplayUnit = DisplayUnit.plain
-    kinds: frozenset[str] = _EVERY
-    values: tuple[str, ...] = ()
+    own_kinds: frozenset[str] = _EVERY
+    values: Sequence[str] = ()
     table: str = ""
     traces: tuple[int, ...] = ()
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """All kinds that have it: what all entities have, those that were added have, too."""
+        every = self.own_kinds >= _ENTITIES
+        return self.own_kinds | entity_kinds() if every else self.own_kinds
 
     @property
     def of_store(self) -> bool:
@@ -170,21 +178,21 @@ def _everywhere(name: str, meaning: str, unit: DisplayUnit) -> Attribute:
     return Attribute(name, Type.number, homes, meaning, unit)
 
 
-def _constant(name: str, column: str, meaning: str, values: tuple[str, ...] = ()) -> Attribute:
+def _constant(name: str, column: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
     return Attribute(
-        name, Type.text, {Home.entity: column}, meaning, kinds=_ENTITIES, values=values
+        name, Type.text, {Home.entity: column}, meaning, own_kinds=_ENTITIES, values=values
     )
 
 
-def _repeated(name: str, meaning: str, values: tuple[str, ...] = ()) -> Attribute:
+def _repeated(name: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
     """A constant of entities that their states repeat."""
     homes = {Home.state: name, Home.entity: name}
-    return Attribute(name, Type.text, homes, meaning, kinds=_ENTITIES, values=values)
+    return Attribute(name, Type.text, homes, meaning, own_kinds=_ENTITIES, values=values)
 
 
 def _control(name: str, meaning: str) -> Attribute:
     kinds = frozenset(VEHICLES)
-    return Attribute(name, Type.number, {Home.state: name}, meaning, kinds=kinds)
+    return Attribute(name, Type.number, {Home.state: name}, meaning, own_kinds=kinds)
 
 
 def _of_map(
@@ -220,7 +228,7 @@ NODE_ATTRIBUTES: Final = _named(
             Type.text,
             {Home.entity: "type_name", Home.map: "lane_type"},
             "the simulator's type name; of a lane, its type in OpenDRIVE",
-            kinds=_ENTITIES | _LANES,
+            own_kinds=_ENTITIES | _LANES,
         ),
         _constant("ident", "ident", "the simulator's own id"),
         _constant("type_name", "type_name", "the simulator's type name"),
@@ -229,7 +237,7 @@ NODE_ATTRIBUTES: Final = _named(
             Type.boolean,
             {Home.entity: "parked"},
             "whether a vehicle does not move in the whole trace, off the driving lanes",
-            kinds=frozenset(VEHICLES),
+            own_kinds=frozenset(VEHICLES),
         ),
         _repeated("special", "special kind", SPECIALS),
         _repeated("subkind", "what a prop or an unknown is"),
@@ -269,7 +277,7 @@ NODE_ATTRIBUTES: Final = _named(
             Type.number,
             {Home.state: "height", Home.scenery: "height"},
             "of the box; m",
-            kinds=_ENTITIES,
+            own_kinds=_ENTITIES,
         ),
         *(
             Attribute(
@@ -298,7 +306,7 @@ NODE_ATTRIBUTES: Final = _named(
             Type.text,
             {Home.state: "light_state"},
             "what a traffic light shows",
-            kinds=frozenset({"traffic_light"}),
+            own_kinds=frozenset({"traffic_light"}),
             values=LIGHT_STATES,
         ),
         _control("steer", "steering input, -1 … 1, positive to the left"),
@@ -328,7 +336,7 @@ NODE_ATTRIBUTES: Final = _named(
             Type.text,
             {Home.map: "turn"},
             "where a lane in a junction leads",
-            kinds=_LANES,
+            own_kinds=_LANES,
             values=("left", "right", "straight"),
         ),
         Attribute(
@@ -469,7 +477,7 @@ _OKTAS: Final = ("zero", "one", "two", "three", "four", "five", "six", "seven", 
 _CLOUDS: Final = (*(f"{number}_oktas" for number in _OKTAS), "sky_obscured", "other")
 
 
-def _weather(name: str, meaning: str, values: tuple[str, ...] = ()) -> Attribute:
+def _weather(name: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
     kind = Type.text if values else Type.number
     unit = DisplayUnit.clock if name == "time_of_day" else DisplayUnit.weather
     return Attribute(f"env.{name}", kind, {Home.state: name}, meaning, unit, values=values)
@@ -643,7 +651,7 @@ class Catalog:
 
     edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
     map_edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
-    moving: frozenset[str] = _ENTITIES
+    moving: frozenset[str] = field(default_factory=entity_kinds)
     fixed: frozenset[str] = frozenset()
     mapped: frozenset[str] = frozenset(MAP_KINDS)
     traces: tuple[TraceFacts, ...] = ()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang._formulas import Select, nested
-from sgstore.vocabulary import ENTITY_KINDS
+from sgstore.vocabulary import entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -94,7 +94,7 @@ def _type_of(kinds: b.Kinds) -> str:
     """Return the attribute that ``type`` means for nodes of some kinds."""
     if "lane" not in kinds.every:
         return "type_name"
-    return "type" if kinds.every & frozenset(ENTITY_KINDS) else "lane_type"
+    return "type" if kinds.every & entity_kinds() else "lane_type"
 
 
 def notes_on(

@@ -31,7 +31,6 @@ from sgstore.lang._parse import parse
 from sgstore.lang._rewrite import rewritten, unfold_paths
 from sgstore.lang._symbols import traces_in
 from sgstore.lang.ir import (
-    ANY,
     FRAME_COLUMNS,
     Aggregate,
     BlockValue,
@@ -57,10 +56,11 @@ from sgstore.lang.ir import (
     Tense,
     TraceAttribute,
     Value,
+    any_kinds,
     any_relation,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
-from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS, normalize_name
+from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds, normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -312,9 +312,9 @@ def edge_text(edge: Edge) -> str:
 
 def kinds_text(kinds: Kinds) -> str:
     """Return the kinds of a node as text."""
-    if kinds == ANY:
+    if kinds == any_kinds():
         return "anything"
-    entities = frozenset(ENTITY_KINDS)
+    entities = entity_kinds()
     if not kinds.other:
         which = "" if kinds.ego == entities else f", a {_kinds(kinds.ego)}"
         return "the ego" + which

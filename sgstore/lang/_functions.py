@@ -15,7 +15,7 @@ from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
 from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.vocabulary import ENTITY_KINDS, normalize_name, relation_named
+from sgstore.vocabulary import entity_kinds, normalize_name, relation_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -128,7 +128,7 @@ def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
             f"{function}() takes two entities", argument.span, f"write {function}(a, b)"
         )
     kinds = names.scope.kinds(found.node).every
-    if not kinds & frozenset(ENTITY_KINDS):
+    if not kinds & entity_kinds():
         names.session.refuse(
             f"{function}() takes two entities, and this is a {' or '.join(sorted(kinds))}",
             argument.span,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.lang._catalog import DisplayUnit, Home
 from sgstore.lang.ir import Bound, Operation, PairNumber, Scope, any_relation
 from sgstore.quoting import literal
-from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
+from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,7 +31,7 @@ class Profile:
         moving = kinds.every & catalog.moving
         fixed, mapped = kinds.other & catalog.fixed, kinds.other & catalog.mapped
         if not moving | fixed | mapped:
-            entities = frozenset(ENTITY_KINDS)
+            entities = entity_kinds()
             return cls(kinds.every & entities, frozenset(), kinds.every - entities)
         return cls(moving, fixed, mapped)
 
@@ -76,10 +76,10 @@ def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[st
     if ego is None:
         return _among(kinds.other, kind, held)
     if not kinds.other:
-        return [ego, *_among(kinds.ego, kind, held & frozenset(ENTITY_KINDS))]
-    if not kinds.ego and held & frozenset(ENTITY_KINDS):
+        return [ego, *_among(kinds.ego, kind, held & entity_kinds())]
+    if not kinds.ego and held & entity_kinds():
         return [f"NOT {ego}", *_among(kinds.other, kind, held)]
-    if kinds.ego == kinds.other & frozenset(ENTITY_KINDS) or not kinds.ego:
+    if kinds.ego == kinds.other & entity_kinds() or not kinds.ego:
         return _among(kinds.other, kind, held)
     one = " AND ".join([ego, *_among(kinds.ego, kind, held)])
     other = " AND ".join([f"NOT {ego}", *_among(kinds.other, kind, held)])
@@ -131,7 +131,6 @@ def alias_of(edge: Edge) -> str:
 
 # What conditions say of kinds of nodes: numbers of pairs are of entities, and what is compared is known ----
 
-_ENTITIES: Final = frozenset(ENTITY_KINDS)
 _COMPARED: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
 _STRICT: Final = frozenset(
     {"+", "-", "*", "/", "%", "negative", "abs", "sqrt", "floor", "ceil", "round", "min", "max"}
@@ -149,7 +148,7 @@ def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
         if isinstance(condition, Operation) and condition.word in _COMPARED:
             for pair in (p for operand in condition.operands for p in _needed(operand)):
                 for key in {pair.a, pair.b} & set(nodes):
-                    nodes[key] = replace(nodes[key], kinds=nodes[key].kinds.only(_ENTITIES))
+                    nodes[key] = replace(nodes[key], kinds=nodes[key].kinds.only(entity_kinds()))
     return replace(scope, nodes=nodes)
 
 

@@ -22,8 +22,6 @@ from sgstore.lang._catalog import (
     Type,
 )
 from sgstore.lang.ir import (
-    ANY,
-    EGO,
     Bound,
     Choices,
     Kinds,
@@ -33,13 +31,15 @@ from sgstore.lang.ir import (
     PairNumber,
     TraceAttribute,
     Value,
+    any_kinds,
+    ego_kinds,
 )
 from sgstore.pair_numbers import columns_needed
 from sgstore.vocabulary import (
-    ENTITY_KINDS,
     SIGNALS,
     VEHICLE_LIGHTS,
     VEHICLES,
+    entity_kinds,
     kinds_labelled,
     normalize_name,
 )
@@ -51,9 +51,8 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import BoundCheck
 
 
-_ENTITY: Final = ANY.only(frozenset(ENTITY_KINDS))
-_SIGNAL: Final = ANY.only(frozenset(SIGNALS))
-_VEHICLE: Final = ANY.only(frozenset(VEHICLES))
+_SIGNAL: Final = any_kinds().only(frozenset(SIGNALS))
+_VEHICLE: Final = any_kinds().only(frozenset(VEHICLES))
 
 
 def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
@@ -91,7 +90,7 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
 def _related(a: str, b: str, reach: RelationScope | None) -> Bound:
     if reach is None:
         return Value(None, Type.boolean)
-    ego = _or(LabelTest(node, EGO) for node in (a, b))
+    ego = _or(LabelTest(node, ego_kinds()) for node in (a, b))
     ways: list[Bound] = []
     if reach.ego:
         close = [_up_to(a, b, reach.ego_within, reach)] if reach.ego_within > 0 else []
@@ -108,13 +107,15 @@ def _related(a: str, b: str, reach: RelationScope | None) -> Bound:
         for pair in reach.kinds
         for one, other in (pair, pair[::-1])
     ]
-    entities = [LabelTest(node, _ENTITY) for node in (a, b)]
+    entities = [LabelTest(node, any_kinds().only(entity_kinds())) for node in (a, b)]
     return _and(*entities, *([_or(listed)] if listed else []), _or(ways))
 
 
 def _labelled(label: str) -> Kinds:
     return (
-        EGO if normalize_name(label) == "ego" else ANY.only(frozenset(kinds_labelled(label) or ()))
+        ego_kinds()
+        if normalize_name(label) == "ego"
+        else any_kinds().only(frozenset(kinds_labelled(label) or ()))
     )
 
 

@@ -16,8 +16,6 @@ from sgstore.lang._formulas import leaves
 from sgstore.lang._invariants import INVARIANT, is_lasting
 from sgstore.lang._kinds import entities_of_pairs
 from sgstore.lang.ir import (
-    ANY,
-    EGO,
     Aggregate,
     BlockValue,
     Bound,
@@ -31,7 +29,9 @@ from sgstore.lang.ir import (
     Query,
     Scope,
     Value,
+    any_kinds,
     conjuncts,
+    ego_kinds,
     walk,
     with_operands,
 )
@@ -197,7 +197,7 @@ def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
     """A scope in which a path has become ``length`` edges with hidden nodes between them."""
     between = [f"#{edge.key}.{number}" for number in range(1, length)]
     stops = [edge.src, *between, edge.dst]
-    hidden = {key: Node(key, ANY, "hidden", edge.span) for key in between}
+    hidden = {key: Node(key, any_kinds(), "hidden", edge.span) for key in between}
     links = tuple(
         replace(edge, key=f"{edge.key}.{i + 1}", src=src, dst=dst, low=1, high=1)
         for i, (src, dst) in enumerate(pairwise(stops))
@@ -228,17 +228,17 @@ def _label(condition: Bound) -> tuple[str, Kinds]:
         case LabelTest(node, kinds):
             return node, kinds
         case NodeAttribute(node=node, attribute=attribute) if attribute.name == "is_ego":
-            return node, EGO
+            return node, ego_kinds()
         case Operation("NOT", (NodeAttribute(node=node, attribute=attribute),)) if (
             attribute.name == "is_ego"
         ):
-            return node, ~EGO
+            return node, ~ego_kinds()
         case Operation(
             "=", (NodeAttribute(node=node, attribute=attribute), Value(value=str(kind)))
         ) if attribute.name == "kind":
-            return node, ANY.only(frozenset({kind}))
+            return node, any_kinds().only(frozenset({kind}))
         case _:
-            return "", ANY
+            return "", any_kinds()
 
 
 def open_exists(scope: Scope, _: Catalog) -> Scope:

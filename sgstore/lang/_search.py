@@ -66,7 +66,7 @@ class ScopeSearch:
         self._scope = scope
         self._injective = injective
         self._outer = tuple(scope.outer.items())
-        self._first = _SearchStep("", b.ANY, None)
+        self._first = _SearchStep("", b.any_kinds(), None)
         self._steps = [self._first]
         order = self._order()
         bound = set(scope.outer)

@@ -61,7 +61,7 @@ from sgstore.lang.ir import (
     blocks_of,
 )
 from sgstore.quoting import quoted
-from sgstore.vocabulary import ENTITY_KINDS
+from sgstore.vocabulary import entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -71,7 +71,6 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import Kinds, Query
 
 
-_ENTITIES: Final = frozenset(ENTITY_KINDS)
 _BIT: Final = '"bit"'
 
 
@@ -113,7 +112,7 @@ class PresenceSql:
             profile.moving
             and not conditions
             and not kinds.other
-            and profile.moving >= (self.catalog.moving & _ENTITIES)
+            and profile.moving >= (self.catalog.moving & entity_kinds())
         ):
             branches.append(self._ego())
         elif profile.moving:

@@ -19,7 +19,7 @@ from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._catalog import PAIR_NAMES, Attribute, DisplayUnit, Home, Type
 from sgstore.lang._hints import condition_hint, hint_at, variable_hint
-from sgstore.lang.ir import EGO, Bound, Edge, Kinds, Node, Scope
+from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
 from sgstore.lang.library import predicates
 from sgstore.vocabulary import normalize_name
 
@@ -177,7 +177,7 @@ class ScopeBuilder:
         for node in self.nodes.values():
             if not node.kinds.other:
                 return node.key
-        return self.add(THE_EGO, EGO, span, named=False)
+        return self.add(THE_EGO, ego_kinds(), span, named=False)
 
     def finished(self) -> Scope:
         """The scope, with what must differ."""

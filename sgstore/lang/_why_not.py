@@ -19,13 +19,12 @@ from sgstore.lang._evaluate import Binding, FrameView
 from sgstore.lang._formulas import leaves
 from sgstore.lang._operators import INFIX
 from sgstore.lang._search import ScopeSearch, expression
-from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS, SUPER_KINDS
+from sgstore.vocabulary import KINDS, RELATIONS, SUPER_KINDS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
 
-_ENTITIES: Final = frozenset(ENTITY_KINDS)
 _ESCAPES: Final = {"\\": "\\\\", "'": "\\'", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
@@ -36,17 +35,17 @@ def text_written(text: str) -> str:
 
 def label_written(kinds: b.Kinds) -> str:
     """The label that leaves these kinds; empty where it would leave any."""
-    if kinds == b.ANY:
+    if kinds == b.any_kinds():
         return ""
     if not kinds.other:
-        return "Ego" if kinds.ego == _ENTITIES else f"Ego&({_label(kinds.ego)})"
+        return "Ego" if kinds.ego == entity_kinds() else f"Ego&({_label(kinds.ego)})"
     label = _label(kinds.other)
-    if kinds.ego == kinds.other & _ENTITIES:
+    if kinds.ego == kinds.other & entity_kinds():
         return label
     if not kinds.ego:
         return f"({label})&!Ego" if "|" in label else f"{label}&!Ego"
-    of_ego = "Ego" if kinds.ego == _ENTITIES else f"(Ego&({_label(kinds.ego)}))"
-    if kinds.ego >= kinds.other & _ENTITIES:
+    of_ego = "Ego" if kinds.ego == entity_kinds() else f"(Ego&({_label(kinds.ego)}))"
+    if kinds.ego >= kinds.other & entity_kinds():
         return f"{label}|{of_ego}"
     return f"(({label})&!Ego)|{of_ego}"
 

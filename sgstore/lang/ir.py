@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sgstore.lang._catalog import Attribute, Type
-from sgstore.vocabulary import ENTITY_KINDS, KINDS, RELATIONS
+from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -35,7 +35,8 @@ class Kinds:
         return Kinds(self.ego | more.ego, self.other | more.other)
 
     def __invert__(self) -> Kinds:
-        return Kinds(ANY.ego - self.ego, ANY.other - self.other)
+        every = any_kinds()
+        return Kinds(every.ego - self.ego, every.other - self.other)
 
     def __bool__(self) -> bool:
         return bool(self.ego or self.other)
@@ -55,8 +56,14 @@ class Kinds:
         return not self.other
 
 
-ANY: Final = Kinds(frozenset(ENTITY_KINDS), frozenset(KINDS))
-EGO: Final = Kinds(frozenset(ENTITY_KINDS), frozenset())
+def any_kinds() -> Kinds:
+    """Return all kinds that are known now: readers, settings and stores may add some."""
+    return Kinds(entity_kinds(), frozenset(KINDS))
+
+
+def ego_kinds() -> Kinds:
+    """Return all kinds that are known now, of the ego alone."""
+    return Kinds(entity_kinds(), frozenset())
 
 
 def any_relation() -> frozenset[str]:

@@ -44,9 +44,13 @@ class Keeping:
     def __init__(self, config: Config, road_map: RoadMap | None) -> None:
         kept = {kind for label in config.kinds for kind in kinds_labelled(label) or ()}
         kept = kept if config.kinds else set(KINDS)
-        if config.lanes.granularity == "none":
+        without_map = config.lanes.granularity == "none"
+        if without_map:
             kept -= set(MAP_KINDS)
-        self._kinds = kinds_mask(tuple(sorted(kept)))
+        # Without a list kinds are kept that become known later, too.
+        self._kinds = ~kinds_mask(MAP_KINDS if without_map else ())
+        if config.kinds:
+            self._kinds = kinds_mask(tuple(sorted(kept)))
         self._without = frozenset(config.without)
         self._no_lanes = "lane" not in kept
         self._no_map = not set(MAP_KINDS) & kept

@@ -15,7 +15,7 @@ from sgstore.relations._following import next_ahead, own_hits
 from sgstore.relations._lane_net import Centrelines, LaneNet, SignalReach
 from sgstore.relations._scene import IS_SIGNAL, Bodies, MapContext, Standing, joined, kinds_mask
 from sgstore.roads import OFF_ROAD, LaneHits
-from sgstore.vocabulary import DRIVING, ENTITY_KINDS, RELATION_CODE, VEHICLES
+from sgstore.vocabulary import DRIVING, RELATION_CODE, VEHICLES, are_entities
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,7 +71,7 @@ class LaneContact:
         self.driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
         self._parent = _parents(road_map)
         self._columns: dict[tuple[bool, str], list[int]] = {}
-        for column in np.flatnonzero(nodes.kind < len(ENTITY_KINDS)).tolist():
+        for column in np.flatnonzero(are_entities(nodes.kind)).tolist():
             ref = nodes.name[column].partition("#")[0]  # of a repeated object: ref#1, ref#2, …
             key = bool(IS_SIGNAL[nodes.kind[column]]), ref
             self._columns.setdefault(key, []).append(column)

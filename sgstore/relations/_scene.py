@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.graph import Edges
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE, SIGNALS, VEHICLES
+from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -325,7 +325,7 @@ def _relation_codes(relation: str | Codes, count: int) -> Codes:
 
 def kinds_mask(names: tuple[str, ...]) -> Bools:
     """Table by kind code: whether the kind is one of those named."""
-    table = np.zeros(len(KIND_CODE), np.bool_)
+    table = np.zeros(MOST_KINDS, np.bool_)
     table[[KIND_CODE[name] for name in names]] = True
     return table
 

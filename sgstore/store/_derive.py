@@ -347,7 +347,7 @@ class Building:
             if there is None:
                 raise StoreError("the trace was removed from the store meanwhile")
             _delete(connection, self._name, self._trace_id)
-            shape.widen(connection, "store", answers)
+            shape.widen(connection, "store", self._staging.words(answers))
             add_files(connection, self._staging, files)
             connection.execute(
                 "INSERT INTO store.derived BY NAME SELECT $name AS name, $trace AS trace_id,"
@@ -392,6 +392,8 @@ class _StateReader:
         self._low = trace_id << packing.BUCKET_BITS
         self._high = self._low + -(-row[3] // BUCKET_FRAMES)
         self._entities = connection.execute(_ENTITIES, {"trace": trace_id}).fetchnumpy()
+        self._entities["kind"] = shape.codes_of(connection, "kind")[self._entities["kind"]]
+        self._lights = shape.codes_of(connection, "light_state")
         first = np.ma.getdata(self._entities["bucket"]).astype(np.int64)
         self._due: Ints = np.minimum.accumulate(first[::-1])[::-1]
         self._next = 0
@@ -418,7 +420,7 @@ class _StateReader:
             states=States.of(
                 node=states["node_id"].astype(np.int64),
                 lights=states["lights"].astype(np.int64),
-                light_state=states["light_state"].astype(np.int8),
+                light_state=np.append(self._lights, np.int8(-1))[states["light_state"]],
                 derived=states["derived"].astype(np.int64),
                 **self._placed(states, _NUMBERS),
             ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -20,8 +21,8 @@ from sgstore.graph import (
 from sgstore.quoting import literal
 from sgstore.store._packing import FRAME_BITS, SEQ_BITS, frames_of, trace_of
 from sgstore.store._rows import run
-from sgstore.store._schema import relation_codes
-from sgstore.vocabulary import MAP_KINDS
+from sgstore.store._schema import codes_of
+from sgstore.vocabulary import MAP_KINDS, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -103,6 +104,10 @@ FROM lane_states l JOIN {_WANTED} ON l.frame_id = w.frame_id WHERE l.frame_id BE
 _GAPS: Final = f"""
 SELECT g.frame_id, g.src, g.dst, g.gap
 FROM lane_gaps g JOIN {_WANTED} ON g.frame_id = w.frame_id WHERE g.frame_id BETWEEN $first AND $last
+"""
+_OWN: Final = f"""
+SELECT a.frame_id, a.node_id, a.relation::VARCHAR, a.dst, a.attribute, a.value::VARCHAR
+FROM attribute a JOIN {_WANTED} ON a.frame_id = w.frame_id WHERE a.frame_id BETWEEN $first AND $last
 """
 _STILL: Final = f"CASE WHEN kind NOT IN ({', '.join(map(literal, sorted(MAP_KINDS)))}) THEN 0e0 END"
 _MAP_NODES: Final = f"""
@@ -187,7 +192,9 @@ class Graphs:
             _each_frame(connection.execute(sql, by_mask).fetchnumpy())
             for sql in (_STANDING, _EDGES)
         )
-        edges["relation"] = relation_codes(connection)[edges["relation"]]
+        edges["relation"] = codes_of(connection, "relation")[edges["relation"]]
+        for of in (moving, standing):
+            of["kind"] = codes_of(connection, "kind")[of["kind"]]
         for of in (moving, standing, edges, own):
             of["frame"] = np.searchsorted(ids, of.pop("frame_id").astype(np.int64))
         traces = _Traces.of(connection, {name: by_frame[name] for name in ("first", "last")})
@@ -243,6 +250,8 @@ class Graphs:
             )
             for sql in (_LANES, _GAPS)
         )
+        about = edge_attributes(lanes, gaps)
+        own = _own_attributes(connection, by_frame, frame_id, about)
         columns = SceneColumns(
             trace=names[0],
             frame_id=frame_id,
@@ -258,14 +267,17 @@ class Graphs:
             standing=_standing(connection, by_frame["first"] >> SEQ_BITS, here),
             edges=Edges(
                 np.searchsorted(frame_id, edges["frame_id"]),
-                relation_codes(connection)[edges["relation"]],
+                codes_of(connection, "relation")[edges["relation"]],
                 edges["src"].astype(np.int64),
                 edges["dst"].astype(np.int64),
             ),
-            about=edge_attributes(lanes, gaps),
+            about=about,
             map=ground,
         )
-        yield from columns.graphs()
+        for graph in columns.graphs():
+            for node, name, value in own.get(graph.frame_id, ()):
+                graph.nodes[node] = {name: value, **graph.nodes[node]}
+            yield graph
 
 
 def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -> T:
@@ -310,6 +322,25 @@ def _records(
         yield row[:ids], {name: value for name, value in known if value is not None}
 
 
+def _own_attributes(
+    connection: DuckDBPyConnection,
+    by_frame: dict[str, Any],
+    frame_id: NDArray[np.int64],
+    of_edges: dict[tuple[int, int, int, int], dict[str, Any]],
+) -> dict[int, list[tuple[int, str, Any]]]:
+    """Attributes of a client's own: those of nodes, by frame; those of edges are added to ``of_edges``."""
+    of_nodes: dict[int, list[tuple[int, str, Any]]] = {}
+    for frame, node, relation, dst, name, text in run(connection, _OWN, by_frame).values:
+        value = json.loads(text)
+        if relation is None:
+            of_nodes.setdefault(frame, []).append((node, name, value))
+            continue
+        row = int(np.searchsorted(frame_id, frame))
+        about = of_edges.setdefault((row, RELATION_CODE[relation], node, dst), {})
+        about.setdefault(name, value)
+    return of_nodes
+
+
 def _standing(
     connection: DuckDBPyConnection, trace_id: int, here: NDArray[np.int64]
 ) -> dict[int, dict[str, Any]]:
@@ -327,7 +358,7 @@ def _map_records(connection: DuckDBPyConnection, map_id: int) -> MapRecords:
     src, dst, along, other = (
         of[name].astype(np.int64) for of in (edges, reach) for name in ("src", "dst")
     )
-    relation = relation_codes(connection)[edges["relation"]]
+    relation = codes_of(connection, "relation")[edges["relation"]]
     starts = LaneDistances(along, other, reach["start"].astype(np.float64))
     return MapRecords(nodes.__getitem__, src, relation, dst, starts)
 
@@ -343,7 +374,7 @@ def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
         road=nodes["road"],
         junction=nodes["junction"],
         lane=nodes["lane"].astype(np.int64),
-        relation=relation_codes(connection)[edges["relation"]],
+        relation=codes_of(connection, "relation")[edges["relation"]],
         src=edges["src"].astype(np.int64),
         dst=edges["dst"].astype(np.int64),
     )

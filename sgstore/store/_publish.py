@@ -19,6 +19,7 @@ from sgstore.store._locking import spill_folder
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP, plain
 from sgstore.store._staging import Checksum, Staging, columns_of, expressions, scratch
 from sgstore.store._traces import already_stored, free_name, stored_name
+from sgstore.vocabulary import NAMES
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -
         name = free_name(plain(sealed.path.stem), {name for (name,) in taken})
     else:
         _delete(connection, identity.trace_id)
-    shape.widen(connection, "store", _answered(connection, sealed))
+    shape.widen(connection, "store", sealed.words)
     given: dict[str, Any] = {"name": name, "ingested_at": datetime.now(UTC).replace(tzinfo=None)}
     given["map_id"] = _map_id(connection, sealed)
     given["config_id"] = _config_id(connection, identity)
@@ -111,16 +112,6 @@ def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -
     _note(connection, sealed.checksums, trace_id=identity.trace_id)
     connection.execute(_ORPHANS)  # of a trace that was replaced
     return name
-
-
-def _answered(connection: DuckDBPyConnection, sealed: Sealed) -> set[str]:
-    """The relations that the trace can have."""
-    found: set[str] = set()
-    for name in sealed.files["trace"]:
-        file = literal(escape(str(sealed.folder / name)))
-        rows = connection.execute(f"SELECT unnest(answers) FROM read_parquet({file})").fetchall()
-        found |= {relation for (relation,) in rows}
-    return found
 
 
 def _insert(
@@ -255,7 +246,8 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
     tables = connection.execute(
         "SELECT table_name FROM duckdb_tables() WHERE database_name = 'fresh'"
     ).fetchall()
-    shape.widen(connection, "fresh", shape.relation_labels(connection, "store"))
+    words = {enum: shape.labels_of(connection, "store", enum) for enum in NAMES}
+    shape.widen(connection, "fresh", words)
     for (table,) in tables:
         select = _SORTED.get(table, f"SELECT * FROM store.{table}")
         connection.execute(f"DELETE FROM fresh.{table}")

@@ -24,10 +24,10 @@ import numpy as np
 from sgstore.errors import StoreError
 from sgstore.pair_numbers import pairs_view
 from sgstore.quoting import quoted
-from sgstore.vocabulary import RELATION_CODE, RELATIONS, add_relation
+from sgstore.vocabulary import ADD, NAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -39,10 +39,7 @@ if TYPE_CHECKING:
 _VIEWS: Final = "-- The public views "
 """Where the views begin in ``schema.sql``."""
 
-_RELATION: Final = re.compile(r"CREATE TYPE relation AS ENUM \([^)]*\);")
-
-_RELATED: Final = ("edge", "map_edge", "derived_edge")
-"""Tables with a column of the type ``relation``."""
+_ENUM: Final = re.compile(r"CREATE TYPE (\w+) AS ENUM \([^)]*\);")
 
 _HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
 
@@ -65,12 +62,12 @@ def schema_sql() -> str:
 
 
 def tables_sql() -> str:
-    """Return the part of it that makes types and tables, for a segment, which holds any relation known now.
+    """Return the part of it that makes types and tables, for a segment.
 
-    A row is completed in several steps there.
+    It holds any kind and relation that is known now, and its rows are completed in several steps.
     """
     made = schema_sql().partition(_VIEWS)[0].replace(" NOT NULL", "")
-    return _RELATION.sub(f"CREATE TYPE relation AS {_enum(RELATIONS)};", made)
+    return _ENUM.sub(lambda found: f"CREATE TYPE {found[1]} AS {_enum(NAMES[found[1]])};", made)
 
 
 def schema_version() -> str:
@@ -106,8 +103,8 @@ class Shape:
 
 
 @cache
-def expected(relation: Tokens = ()) -> Shape:
-    """Return the shape that ``schema.sql`` makes, with other relations if they are given."""
+def expected(*wider: tuple[str, Tokens]) -> Shape:
+    """Return the shape that ``schema.sql`` makes, with other values of enumerations if they are given."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, str] = {}
@@ -118,7 +115,7 @@ def expected(relation: Tokens = ()) -> Shape:
             tables[words[2]] = words
         elif words[:2] == ("CREATE", "VIEW"):
             views[words[2]] = " ".join(words[4:])
-    types["relation"] = relation or types["relation"]
+    types |= dict(wider)
     written = {name: tuple(_with_types(words, types)) for name, words in tables.items()}
     return Shape(written, types, views)
 
@@ -230,12 +227,15 @@ def other_version(about: dict[str, str]) -> str:
 def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
     """List our tables, views and types that differ from ``schema.sql``, and others' that shadow them.
 
-    Relations may have come to those of ``schema.sql``; they are made known in this process.
+    Kinds, relations and states of lights may have come to those of ``schema.sql``; they are made known here.
     """
-    labels = relation_labels(connection, database)
-    ours = expected().types["relation"]
-    wider = labels[: len(own_relations())] == own_relations()
-    shape = expected(tuple(_words(_enum(labels))) if wider else ours)
+    labels = {enum: labels_of(connection, database, enum) for enum in NAMES}
+    wider = [
+        (enum, tuple(_words(_enum(some))))
+        for enum, some in labels.items()
+        if some[: len(own_labels(enum))] == own_labels(enum)
+    ]
+    shape = expected(*wider)
     tables, views, types = (
         _made(connection, what, database) for what in ("tables", "views", "types")
     )
@@ -244,63 +244,82 @@ def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
     found += _differing("type", shape.types, types, {})
     found += _shadowing(connection, database)
     found += _attached(connection, database, shape)
-    return found or [*_strange(labels[len(own_relations()) :])]
+    return found or [*_strange(labels)]
 
 
-# Relations: a store made before holds a new one ---------------------------------------------------------------
+# Kinds, relations, states of lights: a store made before holds a new one ------------------------------------
 
 
 @cache
-def own_relations() -> tuple[str, ...]:
-    """Return the relations of ``schema.sql``."""
-    return tuple(_label(word) for word in expected().types["relation"] if word.startswith("'"))
+def own_labels(enum: str) -> tuple[str, ...]:
+    """Return the values of an enumeration of ``schema.sql``."""
+    return tuple(_label(word) for word in expected().types[enum] if word.startswith("'"))
 
 
-def relation_labels(connection: DuckDBPyConnection, database: str) -> tuple[str, ...]:
-    """Return the relations that a store can hold, by their codes there; none if it has no such type."""
+def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple[str, ...]:
+    """Return the values of an enumeration of a store, by their codes there; none if there is no such type."""
     rows = connection.execute(
         "SELECT labels FROM system.main.duckdb_types() WHERE database_name = ?"
-        " AND schema_name = 'main' AND type_name = 'relation' AND internal = false",
-        [database],
+        " AND schema_name = 'main' AND type_name = ? AND internal = false",
+        [database, enum],
     ).fetchall()
     return tuple(rows[0][0] or ()) if rows else ()
 
 
-def relation_codes(connection: DuckDBPyConnection) -> NDArray[np.int8]:
-    """Return the codes in this process of the relations of a store, by their codes there."""
-    ((labels,),) = connection.execute("SELECT enum_range(NULL::relation)").fetchall()
-    return np.array([RELATION_CODE[label] for label in labels], np.int8)
+def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
+    """Return the codes in this process of the values of an enumeration of a store, by their codes there."""
+    ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
+    return np.array([ADD[enum](label) for label in labels], np.int8)
 
 
-def widen(connection: DuckDBPyConnection, database: str, names: Iterable[str]) -> None:
-    """Let a database that is attached hold these relations, too."""
-    labels = relation_labels(connection, database)
-    new = sorted(set(names) - {*labels})
-    if not new:
-        return
-    wider = _enum((*labels, *new))
+def widen(
+    connection: DuckDBPyConnection, database: str, names: Mapping[str, Iterable[str]]
+) -> None:
+    """Let the enumerations of a database that is attached hold these values, too."""
     main = f"{quoted(database)}.main"
-    for table in _RELATED:
-        connection.execute(f"ALTER TABLE {main}.{table} ALTER relation TYPE {wider}")
-    connection.execute(f"DROP TYPE {main}.relation")
-    connection.execute(f"CREATE TYPE {main}.relation AS {wider}")
+    for enum, wanted in names.items():
+        labels = labels_of(connection, database, enum)
+        new = [name for name in dict.fromkeys(wanted) if name not in labels]
+        if not new:
+            continue
+        wider = _enum((*labels, *new))
+        for table in expected().tables:
+            for column in (name for name, what in enums_of(table).items() if what == enum):
+                connection.execute(f"ALTER TABLE {main}.{table} ALTER {column} TYPE {wider}")
+        connection.execute(f"DROP TYPE {main}.{enum}")
+        connection.execute(f"CREATE TYPE {main}.{enum} AS {wider}")
+
+
+@cache
+def enums_of(table: str) -> Mapping[str, str]:
+    """Return the columns of a table of ``schema.sql`` that are of an enumeration, and which."""
+    words = next((words for words in _statements() if words[1:3] == ("TABLE", table)), ())
+    return {
+        column: what
+        for before, column, what in zip(words[3:], words[4:], words[5:], strict=False)
+        if what in NAMES and before in {"(", ","}
+    }
 
 
 def code_sql(column: str, enum: str) -> str:
     """Return SQL of a number for a value of an enumeration that is the same in every store."""
     code, words = f"enum_code({column}::{enum})", tuple(_words(enum))
-    if words in expected().types.values():
+    own = next(own for own in expected().types.values() if words[: len(own) - 1] == own[:-1])
+    if words == own:
         return code
     number = f"('0x' || md5({column}::VARCHAR)[:15])::BIGINT"
-    return f"CASE WHEN {code} < {len(own_relations())} THEN {code} ELSE {number} END"
+    many = sum(word.startswith("'") for word in own)
+    return f"CASE WHEN {code} < {many} THEN {code} ELSE {number} END"
 
 
-def _strange(labels: Iterable[str]) -> Iterator[str]:
-    for label in labels:
-        try:
-            add_relation(label)
-        except ValueError as error:
-            yield f"a relation: {error}"
+def _strange(labels: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """The values of enumerations that this process cannot take."""
+    for enum, some in labels.items():
+        for label in some[len(own_labels(enum)) :]:
+            try:
+                ADD[enum](label)
+            except ValueError as error:
+                yield f"a {enum.replace('_', ' ')}: {error}"
 
 
 def others(connection: DuckDBPyConnection, database: str) -> list[str]:

@@ -22,10 +22,20 @@ from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
 from sgstore.store._locking import Folder, memory_setting, translated
 from sgstore.store._packing import MISSING
-from sgstore.store._schema import code_sql, tables_sql
+from sgstore.store._schema import (
+    code_sql,
+    database_of,
+    enums_of,
+    own_labels,
+    tables_sql,
+    widen,
+)
 from sgstore.store._traces import Identity
+from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
@@ -148,19 +158,6 @@ MESSAGES: Final = (
     '"offset" BIGINT, length BIGINT)'
 )
 
-_ENUMS: Final[dict[str, dict[str, str]]] = {
-    "entity": {"kind": "kind"},
-    "state": {"kind": "kind", "light_state": "light_state"},
-    "node": {"kind": "kind"},
-    "edge": {"relation": "relation", "src_kind": "kind", "dst_kind": "kind"},
-    "lane_state": {"kind": "kind"},
-    "derived_node": {"kind": "kind"},
-    "derived_edge": {"relation": "relation", "src_kind": "kind", "dst_kind": "kind"},
-    "map_node": {"kind": "kind"},
-    "map_edge": {"relation": "relation", "src_kind": "kind", "dst_kind": "kind"},
-}
-"""Columns that come as codes, and the enumerations whose values they number."""
-
 _GROWING: Final = {
     "state": """
 SELECT s.* REPLACE (e.special AS special, e.subkind AS subkind)
@@ -242,12 +239,15 @@ class Staging:
         self._parts = 0
         self._files: dict[str, list[str]] = {}
         self._written: dict[str, int] = {}
+        self._known = dict.fromkeys(NAMES, 0)
+        self._new: dict[str, list[str]] = {}
         self.merge = False
         self._own = Folder(store) if place is None else None
         self.folder = self._own.path if self._own else place.folder if place else store
         try:
             with translated(store):
                 self.connection = scratch(self.folder / "spill", memory=self._memory)
+                self._known = {enum: len(names) for enum, names in NAMES.items()}
                 self.connection.execute(tables_sql())
                 self._tables = self._names() - _NOT_SEALED
                 self.connection.execute(MESSAGES)
@@ -271,10 +271,30 @@ class Staging:
             return
         with translated(self._store):
             self._make_room(columns)
+            for column, enum in enums_of(table).items():
+                if column in columns:
+                    self._learn(enum, columns[column])
             insert = f"INSERT INTO {table} BY NAME SELECT {_values(table, columns)} FROM columns"
             self._run(insert, columns)
         if table in _GROWING:
             self._rows += rows
+
+    def _learn(self, enum: str, codes: NDArray[Any]) -> None:
+        """Take note of values of an enumeration that ``schema.sql`` has not."""
+        if codes.max() < len(own_labels(enum)):
+            return
+        names = NAMES[enum]
+        if len(names) > self._known[enum]:
+            self._known[enum] = len(names)
+            widen(self.connection, database_of(self.connection), {enum: names})
+        noted = self._new.setdefault(enum, [])
+        found = [names[code] for code in np.unique(codes).tolist() if code >= len(own_labels(enum))]
+        noted += [name for name in found if name not in noted]
+
+    def words(self, answers: Iterable[str]) -> dict[str, list[str]]:
+        """Enumeration → values that a store must be able to hold: relations that are answered, what is new."""
+        relations = sorted({*answers, *self._new.get("relation", ())})
+        return {**self._new, "relation": relations}
 
     def _make_room(self, columns: Columns) -> None:
         """Let the database take what blocks need that are larger than usual."""
@@ -412,7 +432,7 @@ class Staging:
 
 def _values(table: str, columns: Columns) -> str:
     """SQL that selects columns: enumerations by their codes, and NULL for missing values."""
-    enums = _ENUMS.get(table, {})
+    enums = enums_of(table)
     return ", ".join(
         f'{_value(name, values, enums.get(name))} AS "{name}"' for name, values in columns.items()
     )
@@ -467,6 +487,8 @@ class Sealed:
         Table → checksum of its rows.
     map_checksums : dict
         The same of the tables of the map, which may be in the store already.
+    words : dict
+        Enumeration → values in it that are not those of ``schema.sql``, or may not be: a store takes them, too.
     """
 
     folder: Path
@@ -475,6 +497,7 @@ class Sealed:
     files: dict[str, list[str]]
     checksums: dict[str, Checksum]
     map_checksums: dict[str, Checksum]
+    words: dict[str, list[str]]
 
     def write(self) -> None:
         """Write into the folder what :meth:`read` needs.
@@ -510,6 +533,7 @@ class Sealed:
             files=values["files"],
             checksums=_checksums(values["checksums"]),
             map_checksums=_checksums(values["map_checksums"]),
+            words=values["words"],
         )
 
 

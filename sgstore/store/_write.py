@@ -24,7 +24,7 @@ from sgstore.store._traces import Identity
 from sgstore.world import BUCKET_FRAMES, Origin, origin_of, quantize
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from sgstore.config import Config
@@ -160,6 +160,30 @@ class Segment:
         }
         self._staging.insert("imported", self._owned(columns))
 
+    def keep_attributes(
+        self, seq: Ints, own: Sequence[tuple[int, int, int, int, str, str]]
+    ) -> None:
+        """Add attributes of a client's own: table ``attribute``.
+
+        Parameters
+        ----------
+        seq : (F,) int64
+        own : sequence of tuple
+            Row in ``seq``, node, relation (of an edge; -1: of the node) and the other end, name, value as JSON.
+        """
+        if own:
+            frame, src, relation, dst, name, value = zip(*own, strict=True)
+            of_node = np.array(relation) < 0
+            columns: Columns = {
+                "frame_id": packing.frame_ids(self._identity.trace_id, seq)[list(frame)],
+                "node_id": np.array(src, np.int64),
+                "relation": packing.unless(np.array(relation, np.int64), of_node),
+                "dst": packing.unless(np.array(dst, np.int64), of_node),
+                "attribute": texts(name),
+                "value": texts(value),
+            }
+            self._staging.insert("attribute", columns)
+
     def publish(self, report: TraceReport) -> str:
         """Bring the trace into the store, in one transaction.
 
@@ -220,7 +244,8 @@ class Segment:
             fill_trace(staging.connection, self._info, identity, self._trace_values(report, more))
             files, checksums = staging.seal()
         of_map = {name: checksums.pop(name) for name in MAP_TABLES if name in checksums}
-        sealed = Sealed(staging.folder, self._info.path, identity, files, checksums, of_map)
+        words = staging.words(self._answers)
+        sealed = Sealed(staging.folder, self._info.path, identity, files, checksums, of_map, words)
         sealed.write()
         return sealed
 

@@ -1,0 +1,224 @@
+"""Kinds, relations and states of lights that no vocabulary has, and attributes of a client's own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import networkx as nx
+import pytest
+
+import sgstore
+from sgstore import vocabulary
+from sgstore.config import Config, load
+from sgstore.errors import ConfigError, StoreError
+from sgstore.importing import Words, import_graphs
+from sgstore.ingest import ingest
+from sgstore.store import StoreFile, verify_file
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from sgstore.query import Store
+
+GROWING = (
+    *("_entity_kinds", "_kinds", "_kind_code", "_KINDS_FOLDED", "_LABELS_FOLDED"),
+    *("_light_states", "_light_state_code"),
+    *("_relations", "_relation_code", "_RELATIONS_FOLDED"),
+)
+
+
+@pytest.fixture(autouse=True)
+def names() -> Iterator[None]:
+    """Names that a test adds are forgotten behind it."""
+    held: list[Any] = [getattr(vocabulary, name) for name in GROWING]
+    before = [one.copy() for one in held]
+    yield
+    for one, was in zip(held, before, strict=True):
+        one.clear()
+        one.extend(was) if isinstance(one, list) else one.update(was)
+
+
+def scene(name: str) -> nx.MultiDiGraph[str]:
+    """An image as Visual Genome describes it: objects, relations, attributes."""
+    graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(name=name)
+    graph.add_node(
+        "o1", label="traffic cone", attributes=["orange", "small"], synset="cone.n.01", w=31
+    )
+    graph.add_node("o2", label="man", color="blue", score=0.5, seen=True)
+    graph.add_node("o3", label="Hydrant", color="red")
+    graph.add_node("o4", kind="traffic_light", light_state="Green Arrow")
+    graph.add_edge("o1", "o2", relation="next to", confidence=0.25)
+    graph.add_edge("o2", "o3", relation="sitting on")
+    return graph
+
+
+def brought_in(folder: Path, *graphs: nx.MultiDiGraph[Any], **options: Any) -> Store:
+    file = folder / "genome.json"
+    file.write_text("\n".join(json.dumps(nx.node_link_data(g, edges="edges")) for g in graphs))
+    (done,) = import_graphs(folder / "x.sgstore", [file], "nodelink", **options)
+    assert done.error is None
+    assert not done.lost
+    return sgstore.open(folder / "x.sgstore")
+
+
+def as_told(graph: nx.MultiDiGraph[Any]) -> tuple[set[str], set[tuple[str, str, str]]]:
+    kinds = {n: d["kind"] for n, d in graph.nodes(data=True)}
+    return set(kinds.values()), {
+        (kinds[a], d["relation"], kinds[b]) for a, b, d in graph.edges(data=True)
+    }
+
+
+def test_labels_relations_and_attributes_of_a_stranger_come_back(tmp_path: Path) -> None:
+    store = brought_in(tmp_path, scene("a.jpg"), scene("b.jpg"), words=Words(unknown_as="own"))
+    kinds, edges = as_told(store.graph("genome#1"))
+    nodes = {d["kind"]: d for _, d in store.graph("genome#1").nodes(data=True)}
+    ((_, _, near),) = [e for e in store.graph("genome#1").edges(data=True) if "confidence" in e[2]]
+
+    assert kinds == {"traffic_cone", "man", "hydrant", "traffic_light"}
+    assert edges == {("traffic_cone", "next_to", "man"), ("man", "sitting_on", "hydrant")}
+    assert nodes["traffic_cone"]["attributes"] == ["orange", "small"]
+    assert (nodes["traffic_cone"]["synset"], nodes["traffic_cone"]["w"]) == ("cone.n.01", 31)
+    assert (nodes["man"]["score"], nodes["man"]["seen"]) == (0.5, True)
+    assert nodes["traffic_light"]["light_state"] == "green_arrow"
+    assert near["confidence"] == 0.25
+    found = store.find("MATCH (c:TrafficCone)-[:next_to]->(m:man) RETURN c.type, m.kind")
+    assert list(found) == [("traffic cone", "man")] * 2
+    lit = store.find("MATCH (l:TrafficLight) WHERE l.light_state = 'green_arrow'")
+    assert lit.count() == 2
+    assert len(list(store.find("MATCH (x:Entity) RETURN x.kind"))) == 8
+    assert len(list(store.find("MATCH (x:Entity&!TrafficCone) RETURN x.kind"))) == 6
+    texts = "SELECT text, count(*) FROM attributes WHERE name = 'color' GROUP BY ALL ORDER BY 1"
+    assert store.sql(texts).values == [("blue", 2), ("red", 2)]
+    assert store.sql("SELECT DISTINCT relation, text FROM edge_attributes").values == [
+        ("next_to", "0.25")
+    ]
+    assert not store.file.verify().faults
+    assert len(set(store.classes("SG")["class"])) == 1
+    store.file.compact()
+    assert list(store.find("MATCH (c:TrafficCone)-[:next_to]->(m:man) RETURN c.type, m.kind"))
+    assert not verify_file(store.file.path).faults
+
+
+def test_what_is_exported_comes_in_again_as_it_was(tmp_path: Path) -> None:
+    first = brought_in(tmp_path, scene("a.jpg"), words=Words(unknown_as="own"))
+    (tmp_path / "again").mkdir()
+    graph = first.graph("genome#0")
+    second = brought_in(tmp_path / "again", graph, words=Words(unknown_as="own"))
+    back = second.graph("genome#0")
+
+    assert as_told(back) == as_told(graph)
+    for name in ("attributes", "synset", "w", "color", "score", "seen"):
+        values = [
+            sorted(map(repr, (d.get(name) for _, d in g.nodes(data=True)))) for g in (back, graph)
+        ]
+        assert values[0] == values[1]
+
+
+def test_a_store_with_new_names_is_asked_in_a_process_that_knows_none(tmp_path: Path) -> None:
+    store = brought_in(tmp_path, scene("a.jpg"), words=Words(unknown_as="own"))
+    script = """
+import sys, sgstore
+from sgstore import vocabulary
+vocabulary.add_kind("comes_first"); vocabulary.add_light_state("purple")  # other codes than in the store
+store = sgstore.open(sys.argv[1])
+print(store.find("MATCH (h:Hydrant)<-[:sitting_on]-(m:Man)").count(), len(store.file.verify().faults))
+print(sorted(d["base_class"] for _, d in store.graph("genome#0", abstraction="E").nodes(data=True)))
+print(*store.find("MATCH (l) WHERE l.light_state = 'green_arrow' RETURN l.kind"))
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script, str(store.file.path)],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+
+    assert told.splitlines()[0] == "1 0"
+    assert "hydrant" in told
+    assert "traffic_light" in told.splitlines()[2]
+
+
+def test_a_store_made_before_takes_new_kinds_beside_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.sgstore"
+    sample = sgstore.__path__[0] + "/sample/town.mcap"
+    ingest(path, [sample], until=3.0)
+    before = sgstore.open(path).sql("SELECT * FROM nodes ORDER BY ALL").values
+    store = brought_in(tmp_path, scene("a.jpg"), words=Words(unknown_as="own"))
+    of_town = (
+        "SELECT n.* FROM nodes n JOIN frames USING (frame_id) WHERE trace = 'town' ORDER BY ALL"
+    )
+
+    assert store.sql(of_town).values == before
+    assert store.find("MATCH (h:Hydrant)").count() == 1
+    assert not store.file.verify().faults
+    store.file.remove("genome")
+    assert not store.file.verify().faults
+
+
+def test_labels_for_which_there_is_no_room_are_unknown_and_keep_their_type(tmp_path: Path) -> None:
+    graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(name="many")
+    for number in range(150):
+        graph.add_node(f"o{number}", label=f"thing {'abcdefghij'[number // 15]}{number % 15}x")
+    store = brought_in(tmp_path, graph, words=Words(unknown_as="own"))
+    kinds = store.sql(
+        "SELECT kind = 'unknown', count(DISTINCT type_name) FROM entities GROUP BY 1 ORDER BY 1"
+    )
+
+    room = vocabulary.MOST_KINDS - len(vocabulary.OWN_KINDS)
+    assert kinds.values == [(False, room), (True, 150 - room)]
+
+
+def test_a_type_of_a_recording_is_of_a_kind_that_the_settings_name(tmp_path: Path) -> None:
+    sample = sgstore.__path__[0] + "/sample/town.mcap"
+    types = StoreFile.create(tmp_path / "types.db")
+    ingest(types.path, [sample], until=2.0)
+    ((name,),) = sgstore.open(types.path).sql(
+        "SELECT type_name FROM entities WHERE kind = 'car' AND type_name IS NOT NULL ORDER BY 1 LIMIT 1"
+    ).values or [("",)]
+    config = Config(new_kinds=("patrol_car",), types={name: vocabulary.TypeMeaning("patrol_car")})
+    for jobs in (1, 2):
+        path = tmp_path / f"{jobs}.db"
+        ingest(path, [sample], until=2.0, config=config, jobs=jobs)
+        store = sgstore.open(path)
+        assert set(store.find("MATCH (x:PatrolCar) RETURN x.kind")) == {("patrol_car",)}
+        assert store.find("MATCH (x:PatrolCar)-[:visible]-(y:Car)").count() > 0
+        assert not store.file.verify().faults
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            '[types]\nx = { kind = "trcuk" }',
+            "'truck', perhaps; new_kinds names those of your own",
+        ),
+        ('new_kinds = ["Vehicle"]', "would be taken for the label"),
+        ('new_kinds = ["near"]', "would be taken for the relation 'near'"),
+        ('new_kinds = ["a b"]', "is no name"),
+        ('new_kinds = ["ego"]', "would be taken for the label"),
+    ],
+)
+def test_a_kind_that_cannot_be_is_told(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises(ConfigError, match=told):
+        load(tmp_path / "c.toml")
+
+
+def test_a_store_whose_kinds_are_no_names_is_refused(tmp_path: Path) -> None:
+    import duckdb
+
+    path = tmp_path / "x.sgstore"
+    StoreFile.create(path)
+    from sgstore.store._schema import widen
+
+    with duckdb.connect() as connection:
+        connection.execute(f"ATTACH '{path}' AS other")
+        widen(connection, "other", {"kind": ["a b"]})
+
+    with pytest.raises(StoreError, match="a kind: 'a b' is no name"):
+        StoreFile(path)
