@@ -253,7 +253,7 @@ def sql(
         ask.write(answer.columns, answer.rows)
         return 0
     opened, text = ask.opened(store, tables_of(tables)).file, query_of(statement, file)
-    if (form := ask.chosen()) in BINARY:
+    if (form := ask.chosen) in BINARY:
         write_binary(lambda to: opened.user_parquet(text, to), form, ask.output)
         return 0
     with opened.user_batches(text) as batches:
