@@ -207,7 +207,9 @@ class MissingExtraError(SgstoreError):
 
     def __init__(self, purpose: str, extra: str) -> None:
         self.extra = extra
-        super().__init__(f"{purpose} needs an optional package: pip install 'sgstore[{extra}]'")
+        super().__init__(
+            f"an optional package is needed for {purpose}: pip install 'sgstore[{extra}]'"
+        )
 
 
 def position(text: str, offset: int) -> tuple[int, int]:

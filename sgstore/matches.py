@@ -70,6 +70,14 @@ ROWS: Final = 200_000
 """Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
 
 
+if TYPE_CHECKING:
+
+    class Row(tuple[Any, ...]):
+        """Row of matches, as a type checker sees it: a named tuple whose fields follow from the query."""
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Interval:
     """Consecutive frames of a trace in which something holds.
@@ -194,13 +202,13 @@ class Matches(Tabular):
             compared = compared_in_query(compiled.bound)
             return notes_in(self._file, compared, self._text, self._parameters)
 
-    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+    def __iter__(self) -> Iterator[Row]:
         with self._compiled() as compiled:
             layout, rows = compiled.layout, self._stream(Compiled.rows)
             row = _row_type(self.columns)
             yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
-    def rows(self) -> list[tuple[Any, ...]]:
+    def rows(self) -> list[Row]:
         """All rows at once."""
         return list(self)
 

@@ -89,6 +89,11 @@ def test_a_limit_is_that_of_the_language(store: sgstore.Store) -> None:
         matches.limit(-1)
 
 
+def test_a_limit_among_the_parameters_is_told_where_it_belongs(store: sgstore.Store) -> None:
+    with pytest.raises(sgstore.QueryError, match=r"call \.limit\(n\) on its matches"):
+        store.find(NEAR, limit=2)
+
+
 def test_a_limit_holds_after_the_store_has_changed(tmp_path: Path) -> None:
     with sgstore.open(tmp_path / "new.sgstore", create=True) as store:
         store.ingest(RECORDING, until=3)
@@ -128,6 +133,13 @@ def test_public_objects_say_what_they_are(store: sgstore.Store) -> None:
     )
     assert repr(store.sql("SELECT 1 AS one, 'x' AS two")) == "<1 rows of one, two>"
     assert repr(store.check("CHECK slow: ALWAYS ego.speed < 14")) == "<CheckRun of slow>"
+    assert repr(next(iter(store.check("CHECK still: ALWAYS ego.speed < 0")))) == (
+        "<Verdict 'still' of 'town': false, 1 violation>"
+    )
+    assert repr(next(iter(store.like("town#3")))) == (
+        "<SimilarFrames from 'town#2': 2 frames, similarity 1>"
+    )
+    assert repr(sgstore.Pattern().node("e", "Ego")) == "<Pattern 'MATCH (e:Ego)'>"
     assert repr(sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")) == (
         "<Monitor of slow after 0 frames>"
     )

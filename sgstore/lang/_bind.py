@@ -256,10 +256,10 @@ def refuse_unused(session: Session) -> None:
     """Refuse parameters that came with a query and are not in it."""
     unused = sorted(set(session.parameters) - session.used)
     if unused:
-        raise QueryError(
-            f"the query has no parameter '{unused[0]}'",
-            hint=f"it would be written ${unused[0]}",
-        )
+        name, hint = unused[0], f"it would be written ${unused[0]}"
+        if name == "limit":
+            hint = "for fewer rows write LIMIT into the query, or call .limit(n) on its matches"
+        raise QueryError(f"the query has no parameter '{name}'", hint=hint)
 
 
 def refuse_strange(session: Session, catalog: Catalog) -> None:

@@ -132,6 +132,9 @@ class Pattern:
         """Say what to return, as it would stand after ``RETURN``."""
         return Pattern(self.parts, self.conditions, what, self.parameters)
 
+    def __repr__(self) -> str:
+        return f"<Pattern {str(self) if self.parts else 'without nodes'!r}>"
+
     def __str__(self) -> str:
         """The text of the pattern."""
         if not self.parts:

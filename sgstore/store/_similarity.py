@@ -61,6 +61,10 @@ class SimilarFrames:
     missing: dict[str, int]
     extra: dict[str, int]
 
+    def __repr__(self) -> str:
+        first = f"{self.frame.trace}#{self.frame.seq}"
+        return f"<SimilarFrames from {first!r}: {self.frames} frames, similarity {self.similarity:.3g}>"
+
 
 @dataclass(slots=True)
 class _FrameRun:

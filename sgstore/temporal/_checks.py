@@ -251,6 +251,12 @@ class Verdict:
     status: Statuses | None = None
     reason: str = ""
 
+    def __repr__(self) -> str:
+        number = len(self.violations)
+        more = f", {number} violation{'s' * (number > 1)}" if number else ""
+        why = f", {self.reason}" if self.reason else ""
+        return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}>"
+
     @property
     def first_violation(self) -> Interval | None:
         """The first violation; ``None``: there is none."""
