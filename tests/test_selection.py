@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
@@ -20,6 +21,7 @@ from sgstore.ingest import ingest
 from sgstore.query import Store
 from sgstore.selection import (
     Budget,
+    Cover,
     Measure,
     Selection,
     SelectionSpec,
@@ -226,6 +228,23 @@ def test_the_minimal_set_keeps_every_class(
     assert found.result["exact"]
     assert found.result["bound"] <= found.result["cost"]
     assert len(found.picked) <= len(found.units)
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_bound_that_is_not_met_names_the_solver_where_there_is_none(
+    store: Store, monkeypatch: pytest.MonkeyPatch, installed: bool
+) -> None:
+    import sgstore.selection._choose as room
+
+    def loose(of: SetFamily) -> Cover:
+        return replace(minimal(of), bound=1.0)
+
+    monkeypatch.setattr(room, "minimal", loose)
+    monkeypatch.setattr(room, "has_solver", lambda: installed)
+    found = select(whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip))
+
+    advice = [text for text in found.said if "pip install 'sgstore[solver]'" in text]
+    assert len(advice) == (not installed)
 
 
 def test_of_frames_one_of_each_class_is_enough(store: Store) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from sgstore.coverage import ReportTable, names_of
 from sgstore.errors import ConfigError
 from sgstore.locks import CasePart, lock_of
-from sgstore.selection._cover import affordable, cheapest, minimal, within
+from sgstore.selection._cover import affordable, cheapest, has_solver, minimal, within
 from sgstore.selection._units import Budget, Measure, SelectionUnit, holdings, kept, units_of
 from sgstore.store import seq_of
 
@@ -303,6 +303,8 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         )
         + f" (greedy choice alone: {_number(cover.greedy)})",
     ]
+    if not (cover.exact or has_solver()):
+        said.append("a solver could prove the optimum: pip install 'sgstore[solver]'")
     budget = spec.budget
     if budget is None:
         return Selection(spec, units, cover.chosen, held, result | {"kept": met}, said)

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore.selection._sets import SetFamily, greedy, met, or_alone, ordered, spread, thinned
-from sgstore.selection._solver import NODES, ROUNDING, Solver
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from sgstore.selection._units import Holdings, Measure, Units
     from sgstore.world import Bools, Floats, Ints
 
+
+ROUNDING: Final = 1e-7
+"""Share of a cost that is due to rounding."""
 
 _COMPARISONS: Final = 100_000_000
 """Steps of comparing, all together: what is found superfluous by then is dropped, the rest stays."""
@@ -368,10 +371,108 @@ def _suggested(family: SetFamily, left: Floats) -> Ints:
     return thinned(family, chosen[np.argsort(place[chosen])])
 
 
+# Covers by HiGHS, a solver of integer programmes (the extra [solver]) ----------------------------
+# It finds covers that the greedy choice misses, and proves that there is none cheaper. Without it, the greedy
+# choice and the bound of prices stand as they are.
+
+NODES: Final = 2_000
+"""Nodes of branch and bound, in all parts together: counted, so that answers are the same everywhere."""
+
+LARGEST: Final = 100_000
+"""Most memberships of a part that is given to the solver: of larger ones the first relaxation takes minutes."""
+
+SECONDS: Final = 20.0
+"""Time for one part at most: a guard against relaxations that do not end; nodes are used up long before."""
+
+_LOOK_S: Final = 0.1
+"""How often to look for signals while it solves; s."""
+
+
+def has_solver() -> bool:
+    """Return true if HiGHS is installed."""
+    return find_spec("highspy") is not None
+
+
+def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, int]:
+    """Return a cover at most as dear as a given one, a bound from below, and the nodes that were looked at.
+
+    Parameters
+    ----------
+    family : SetFamily
+        Each element is in as many sets as it needs.
+    cover : int64
+    nodes : int
+        Most nodes of branch and bound. Where nothing is proven the bound is 0.
+    """
+    if nodes <= 0 or len(family.members) > LARGEST or not has_solver():
+        return cover, 0.0, 0
+    import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
+
+    solver = highspy.Highs()
+    options = {
+        "output_flag": False,
+        "threads": 1,
+        "mip_rel_gap": 0.0,
+        "mip_abs_gap": ROUNDING / 10,
+        "mip_max_nodes": nodes,
+        "time_limit": SECONDS,
+    }
+    for name, value in options.items():
+        solver.setOptionValue(name, value)
+    solver.passModel(_programme(family))
+    known = highspy.HighsSolution()
+    known.col_value = np.isin(np.arange(len(family)), cover).astype(float).tolist()
+    solver.setSolution(known)
+    _run(solver)
+    info = solver.getInfo()
+    used = max(int(info.mip_node_count), 1)
+    cost = float(family.cost[cover].sum())
+    found = np.flatnonzero(np.array(solver.getSolution().col_value) > 0.5)
+    covers = bool((family.covered(found) >= family.need).all())
+    if covers and family.cost[found].sum() < cost - ROUNDING * max(cost, 1):
+        cover, cost = found, float(family.cost[found].sum())
+    if solver.getModelStatus() == highspy.HighsModelStatus.kOptimal:
+        return cover, cost, used
+    low = float(info.mip_dual_bound)
+    low = low - ROUNDING * max(abs(low), 1) if math.isfinite(low) else 0.0
+    return cover, math.ceil(low) if family.whole else max(low, 0.0), used
+
+
+def _run(solver: Any) -> None:
+    """Solve in a thread, so that whatever a handler of signals raises meanwhile ends it."""
+    solver.HandleUserInterrupt = True
+    solver.startSolve()
+    try:
+        while not solver.wait(_LOOK_S)[0]:
+            pass
+    except BaseException:
+        solver.cancelSolve()
+        raise
+
+
+def _programme(family: SetFamily) -> Any:
+    """Return the integer programme of a cover: 0 or 1 for each set, a row for each element."""
+    import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
+
+    sets, elements = len(family), len(family.need)
+    made = highspy.HighsLp()
+    made.num_col_, made.num_row_ = sets, elements
+    made.col_cost_ = family.cost
+    made.col_lower_, made.col_upper_ = np.zeros(sets), np.ones(sets)
+    made.row_lower_ = family.need.astype(np.float64)
+    made.row_upper_ = np.full(elements, highspy.kHighsInf)
+    made.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    made.a_matrix_.start_ = family.starts.astype(np.int32)
+    made.a_matrix_.index_ = family.members.astype(np.int32)
+    made.a_matrix_.value_ = np.ones(len(family.members))
+    made.integrality_ = [highspy.HighsVarType.kInteger] * sets
+    return made
+
+
 # Set cover: few sets, or cheap ones, that together hold every element as often as is asked ------
 # What must be taken is taken, what is superfluous is dropped, what is left falls into parts that have nothing
 # to do with one another. Each part is covered greedily and bounded from below; a part whose bound is not met is
-# given to HiGHS, if that is installed (:mod:`sgstore.selection._solver`). So the answer is exact where that is
+# given to HiGHS, if that is installed. So the answer is exact where that is
 # cheap, and beside it stands how far from the best it can be at most.
 #
 # Source. Under a budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem", Information Processing
@@ -417,15 +518,14 @@ def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
     forced, rest = reduced(family)
     chosen, bound = [forced], float(family.cost[forced].sum())
     plain = bound
-    solver = Solver(nodes)
     for part, sets in rest:
         own = greedy(part)
         plain += float(part.cost[own].sum())
         low, own, _ = bounded(part, thinned(part, own))
         low = math.ceil(low - ROUNDING) if part.whole else low
         if part.cost[own].sum() > low + ROUNDING:
-            own, proven = solver.improved(part, own)
-            low = max(low, proven)
+            own, proven, used = improved(part, own, nodes)
+            low, nodes = max(low, proven), nodes - used
         chosen.append(sets[own])
         bound += min(low, float(part.cost[own].sum()))
     all_chosen = np.concatenate(chosen)
