@@ -14,11 +14,17 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from sgstore.errors import QueryError
-from sgstore.lang.ir import Query, Result
 from sgstore.matches import Interval
-from sgstore.temporal._checks import Level, Verdict, Witness, folded_values, innermost, levels_of
+from sgstore.temporal._checks import (
+    CheckPlan,
+    Level,
+    Verdict,
+    folded_values,
+    innermost,
+    levels_of,
+    verdict_of,
+)
 from sgstore.temporal._formula import TRUE, And, Formula, Since, looks_ahead, propositions
-from sgstore.temporal._plan import Plan
 from sgstore.temporal._progression import Past, Progression, ProgressionFrame, Term, Tick, least
 from sgstore.temporal._query_cache import BindingTable, Partial, Valuation
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
@@ -365,15 +371,8 @@ class CheckMonitor:
     ) -> None:
         self._check, self._pulse, self._compat = check, pulse, compat
         self._last: FrameTime | None = None
-        self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
-        whole = Query(check.scope, Result(), check.relations, check.injective, check.ego)
-        whole = replace(whole, unknown_is_false=check.unknown_is_false)
-        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
-        plan = Plan(whole, frozenset(self._variables), absent)
-        formula = plan.formula(check.formula)
-        reset = None
-        if check.reset is not None and not compat:
-            reset = plan.formula(check.reset)
+        planned = CheckPlan(check, reset=not compat)
+        self._variables, formula, reset = planned.variables, planned.formula, planned.reset
         if check.gaps == "unknown":
             raise QueryError(
                 f"USING GAPS unknown of {check.name} is a question about what was recorded",
@@ -384,10 +383,12 @@ class CheckMonitor:
                 f"RESET WHEN of {check.name} looks ahead",
                 hint="a monitor begins anew in the next frame, so what resets it must be known by then",
             )
-        guards = {q: plan.formula(q.where) for q in check.quantifiers if q.where is not None}
-        self._guards: dict[BoundQuantifier, int] = {q: 1 << n for n, q in enumerate(guards)}
+        guards = planned.guards
+        self._guards: dict[BoundQuantifier, int] = {
+            check.quantifiers[number]: 1 << place for place, number in enumerate(guards)
+        }
         self._letters = Valuation(
-            plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
+            planned.plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
         )
         bits = self._letters.bits
         self._automaton = Automaton(formula, reset, tuple(guards.values()), bits)
@@ -544,16 +545,8 @@ class CheckMonitor:
         return levels_of(self._check.quantifiers, domains, apart=apart, counts=counts)
 
     def _folded_codes(self, levels: list[Level], entries: list[_CheckEntry]) -> int:
-        rows = [_code(entry, compat=self._compat) for entry in entries]
-        for number in range(len(levels) - 1, -1, -1):
-            level = levels[number]
-            every = level.word == "FORALL"
-            outer = len(levels[number - 1].bindings) if number else 1
-            joined = [CERTAINLY_TRUE if every else FALSE] * outer
-            for parent, row in zip(level.parents.tolist(), rows, strict=True):
-                joined[parent] = (min if every else max)(joined[parent], row)
-            rows = joined
-        return rows[0]
+        codes = np.array([_code(entry, compat=self._compat) for entry in entries], np.int8)
+        return int(folded_values(levels, codes, CERTAINLY_TRUE)[0][0])
 
     def finish(self, trace: str, last: FrameTime) -> tuple[Verdict, list[MonitorEvent]]:
         """The trace has ended: the verdict, and what only the end makes known."""
@@ -568,17 +561,19 @@ class CheckMonitor:
         verdict = "true" if holds else "false"
         if self._check.end == "pending":
             verdict = STATUS[self._folded_codes(levels, entries)]
-        if not levels:
-            own = tuple(_interval(trace, span, {}) for span in spans[0])
-            found = Verdict(self.name, trace, verdict, own)
-        else:
-            witnesses = self._witnesses(trace, levels, truths, spans)
-            violations: tuple[Interval, ...] = ()
-            if not holds:
-                every = {(i.start_seq, i.end_seq): i for w in witnesses for i in w.violations}
-                violations = tuple(every[key] for key in sorted(every))
-                violations = violations or (_interval(trace, (last, last), {}),)
-            found = Verdict(self.name, trace, verdict, violations, witnesses)
+
+        def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
+            return tuple(_interval(trace, span, names) for span in spans[row])
+
+        found = verdict_of(
+            self._check,
+            Verdict(self.name, trace, verdict),
+            levels,
+            truths,
+            self._domains,
+            violations,
+            _interval(trace, (last, last), {}),
+        )
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
 
     def _at_end(
@@ -594,27 +589,6 @@ class CheckMonitor:
             begun, _ = self._told.get(tuple(key), (0, 0))
             for start, _ in found[begun:]:
                 yield self._event("violated", last, tuple(key), start, start, at_end=True)
-
-    def _witnesses(
-        self,
-        trace: str,
-        levels: list[Level],
-        truths: list[Bools],
-        spans: list[list[Span]],
-    ) -> tuple[Witness, ...]:
-        """Those of the outermost quantifiers that are of one word."""
-        word = levels[0].word
-        depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
-        level, values = levels[depth - 1], truths[depth]
-        names = [n for q in self._check.quantifiers[:depth] for n in q.nodes]
-        found: list[Witness] = []
-        for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
-            nodes = dict(zip(names, level.bindings[row].tolist(), strict=True))
-            called = {name: self._domains[name][node] for name, node in nodes.items()}
-            inner = spans[row] if depth == len(levels) else []
-            violations = tuple(_interval(trace, span, called) for span in inner)
-            found.append(Witness(nodes, called, bool(values[row]), violations))
-        return tuple(found)
 
 
 def _stepped(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from heapq import merge
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from sgstore.temporal._formula import tolerant
 from sgstore.temporal._offline import Ask, PlanValues, TraceReader, asks_of, traces
 from sgstore.temporal._plan import Plan
 from sgstore.temporal._verdicts import (
-    FALSE,
+    CERTAINLY_TRUE,
     PRESUMABLY_TRUE,
     STATUS,
     Settled,
@@ -42,12 +42,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Attribute, Catalog, CheckInCatalog, Need
-    from sgstore.lang.ir import BoundQuantifier
+    from sgstore.lang.ir import BoundCheck, BoundQuantifier
     from sgstore.store import StoreFile
     from sgstore.world import Bools, Ints
 
     Keys = NDArray[np.int64]
     Statuses = NDArray[np.int8]
+    Array = NDArray[Any]
 
 
 def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[int, str]:
@@ -158,24 +159,70 @@ def levels_of(
     return levels
 
 
-def folded_values(levels: Sequence[Level], values: Bools) -> list[Bools]:
-    """Return the truth of the bindings of each level, outermost first; the empty binding comes before.
+def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
+    """Return the values of the bindings of each level, outermost first; the empty binding comes before.
 
     Parameters
     ----------
     levels : sequence of Level
-    values : (B,) bool
-        Of the bindings of the last level; without quantifiers (1,).
+    values : (B, …) bool or int8
+        Of the bindings of the last level; without quantifiers (1, …).
+    most : int
+        The greatest value: that of ``FORALL`` over nothing. That of ``FORSOME`` is 0.
     """
     found = [values]
     for number in range(len(levels) - 1, -1, -1):
         level = levels[number]
         outer = len(levels[number - 1].bindings) if number else 1
         every = level.word == "FORALL"
-        joined = np.full(outer, every)
-        (np.logical_and if every else np.logical_or).at(joined, level.parents, found[0])
+        joined = np.full((outer, *values.shape[1:]), most if every else 0, values.dtype)
+        (np.minimum if every else np.maximum).at(joined, level.parents, found[0])
         found.insert(0, joined)
     return found
+
+
+class CheckPlan:
+    """A check with the formulas that it is made of.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    reset : bool
+        Whether what resets it matters.
+
+    Attributes
+    ----------
+    whole : Query
+        The nodes that it speaks of, and its settings.
+    variables : tuple of str
+        Those of its quantifiers.
+    plan : Plan
+    formula : Formula
+    reset : Formula or None
+    guards : dict of int to Formula
+        What restricts quantifiers, by their numbers.
+    """
+
+    def __init__(self, check: BoundCheck, *, reset: bool = True) -> None:
+        self.whole = Query(
+            check.scope,
+            Result(),
+            check.relations,
+            check.injective,
+            check.ego,
+            check.unknown_is_false,
+        )
+        self.variables = tuple(node for q in check.quantifiers for node in q.nodes)
+        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
+        self.plan = Plan(self.whole, frozenset(self.variables), absent)
+        self.formula = self.plan.formula(check.formula)
+        written = check.reset if reset else None
+        self.reset = None if written is None else self.plan.formula(written)
+        self.guards = {
+            number: self.plan.formula(quantifier.where)
+            for number, quantifier in enumerate(check.quantifiers)
+            if quantifier.where is not None
+        }
 
 
 # ``CHECK`` over a store: verdicts of its traces, where they are violated, and by whom -----------
@@ -273,6 +320,50 @@ class Verdict:
         return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
 
 
+def verdict_of(
+    check: BoundCheck,
+    verdict: Verdict,
+    levels: Sequence[Level],
+    truths: Sequence[Bools],
+    names: Mapping[str, Mapping[int, str]],
+    violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
+    last: Interval,
+) -> Verdict:
+    """A verdict with its violations and witnesses: those of the outermost quantifiers of one word.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    verdict : Verdict
+    levels : sequence of Level
+    truths : sequence of (B,) bool
+        As :func:`folded_values` gives them.
+    names : mapping of str to mapping of int to str
+        Names of the entities that each variable may be.
+    violations : function
+        Those of a binding of the last level, given its row and the names of its entities.
+    last : Interval
+        The last frame: what is violated where no binding tells it.
+    """
+    if not levels:
+        return replace(verdict, violations=violations(0, {}))
+    word = levels[0].word
+    depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
+    level, values = levels[depth - 1], truths[depth]
+    variables = [node for q in check.quantifiers[:depth] for node in q.nodes]
+    found: list[Witness] = []
+    for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
+        nodes = dict(zip(variables, level.bindings[row].tolist(), strict=True))
+        called = {name: names[name][node] for name, node in nodes.items()}
+        inner = violations(row, called) if depth == len(levels) else ()
+        found.append(Witness(nodes, called, bool(values[row]), inner))
+    told: tuple[Interval, ...] = ()
+    if not truths[0][0]:
+        every = {(i.start_seq, i.end_seq): i for w in found for i in w.violations}
+        told = tuple(every[key] for key in sorted(every)) or (last,)
+    return replace(verdict, violations=told, witnesses=tuple(found))
+
+
 class CheckRun:
     """The checks of a text, ready to be asked of a store. Iterating asks: verdicts trace by trace.
 
@@ -340,15 +431,8 @@ class CheckRun:
         return "\n\n".join(parts)
 
 
-@dataclass(frozen=True, slots=True)
-class _BindingVerdict:
-    """Verdict of one binding, or of a check without quantifiers."""
-
-    violations: tuple[Violation, ...] = ()
-    status: Statuses | None = None
-
-
-_NOTHING: Final = _BindingVerdict()
+_BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
+"""Violations of one binding, or of a check without quantifiers; and its status at each frame, if asked for."""
 
 
 class _Check:
@@ -358,24 +442,10 @@ class _Check:
         check = one.check
         self._file, self._check, self._catalog = file, check, one.catalog
         self._compat, self._want_status = compat, status
-        self._whole = Query(
-            check.scope,
-            Result(),
-            check.relations,
-            check.injective,
-            check.ego,
-            check.unknown_is_false,
-        )
-        self._variables = tuple(node for q in check.quantifiers for node in q.nodes)
-        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
-        self._plan = Plan(self._whole, frozenset(self._variables), absent)
-        self._formula = self._plan.formula(check.formula)
-        self._reset = self._plan.formula(check.reset) if check.reset is not None else None
-        self._guards = {
-            number: self._plan.formula(quantifier.where)
-            for number, quantifier in enumerate(check.quantifiers)
-            if quantifier.where is not None
-        }
+        planned = CheckPlan(check)
+        self._whole, self._variables, self._plan = planned.whole, planned.variables, planned.plan
+        self._formula, self._reset = planned.formula, planned.reset
+        self._guards = planned.guards
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     def text(self) -> str:
@@ -424,7 +494,7 @@ class _Check:
         bindings = innermost(levels)
         kinds, members = self._alike(trace, bindings)
         values = np.zeros(len(kinds), np.bool_)
-        told = [_NOTHING] * len(kinds)
+        told: list[_BindingVerdict] = [((), None)] * len(kinds)
         for low in range(0, len(kinds), trace.together):
             part = slice(low, low + trace.together)
             values[part], told[part] = self._evaluated(trace, kinds[part])
@@ -506,7 +576,7 @@ class _Check:
         for row in range(len(bindings)):
             needed = not truths[row] or self._compat or self._want_status
             if not (needed or self._check.end == "pending"):
-                told.append(_NOTHING)
+                told.append(((), None))
                 continue
             own = {name: column[min(row, len(column) - 1)] for name, column in columns.items()}
             settled = Settled(lenient, own, trace.clock.times)
@@ -521,12 +591,12 @@ class _Check:
         status = settled.statuses() if wanted else None
         if self._compat and status is not None:
             broken = status < PRESUMABLY_TRUE
-            return not broken.any(), _BindingVerdict(tuple(_runs(broken)), status)
+            return not broken.any(), (tuple(_runs(broken)), status)
         violations = tuple(settled.violations(reset, weak=weak))
         holds = bool(settled.value[0])
         if weak and not holds:
             holds = not violations
-        return holds, _BindingVerdict(violations, status)
+        return holds, (violations, status)
 
     def _reported(
         self,
@@ -535,50 +605,19 @@ class _Check:
         truths: list[Bools],
         told: list[_BindingVerdict],
     ) -> Verdict:
-        holds = bool(truths[0][0])
         status = self._joined(levels, told, len(trace))
-        verdict = "true" if holds else "false"
+        verdict = "true" if truths[0][0] else "false"
         if self._check.end == "pending" and status is not None:
             verdict = STATUS[int(status[-1])]
-        if not levels:
-            own = tuple(_interval(trace, one, {}) for one in told[0].violations)
-            return Verdict(self._check.name, trace.name, verdict, own, (), self._kept(status))
-        witnesses = self._witnesses(trace, levels, truths, told)
-        if holds:
-            violations: tuple[Interval, ...] = ()
-        else:
-            every = {(i.start_seq, i.end_seq): i for w in witnesses for i in w.violations}
-            violations = tuple(every[key] for key in sorted(every))
-            if not violations:
-                violations = (_interval(trace, Violation(len(trace) - 1, len(trace) - 1), {}),)
-        return Verdict(
-            self._check.name, trace.name, verdict, violations, witnesses, self._kept(status)
-        )
 
-    def _kept(self, status: Statuses | None) -> Statuses | None:
-        return status if self._want_status else None
+        def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
+            return tuple(_interval(trace, one, names) for one in told[row][0])
 
-    def _witnesses(
-        self,
-        trace: TraceReader,
-        levels: list[Level],
-        truths: list[Bools],
-        told: list[_BindingVerdict],
-    ) -> tuple[Witness, ...]:
-        """Those of the outermost quantifiers that are of one word."""
-        word = levels[0].word
-        depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
-        level, values = levels[depth - 1], truths[depth]
-        names = [n for q in self._check.quantifiers[:depth] for n in q.nodes]
-        people = self._people.get(trace.trace_id, {})
-        found: list[Witness] = []
-        for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
-            nodes = dict(zip(names, level.bindings[row].tolist(), strict=True))
-            called = {name: people[name][node] for name, node in nodes.items()}
-            inner = told[row].violations if depth == len(levels) else ()
-            violations = tuple(_interval(trace, one, called) for one in inner)
-            found.append(Witness(nodes, called, bool(values[row]), violations))
-        return tuple(found)
+        kept = status if self._want_status else None
+        names = self._people.get(trace.trace_id, {})
+        last = _interval(trace, Violation(len(trace) - 1, len(trace) - 1), {})
+        found = Verdict(self._check.name, trace.name, verdict, status=kept)
+        return verdict_of(self._check, found, levels, truths, names, violations, last)
 
     def _joined(
         self, levels: list[Level], told: list[_BindingVerdict], frames: int
@@ -586,18 +625,9 @@ class _Check:
         """The status of the whole check at each frame, of those of its bindings."""
         if not (self._want_status or self._check.end == "pending"):
             return None
-        rows = [one.status for one in told if one.status is not None]
-        for number in range(len(levels) - 1, -1, -1):
-            level = levels[number]
-            every = level.word == "FORALL"
-            outer = len(levels[number - 1].bindings) if number else 1
-            empty = len(STATUS) - 1 if every else FALSE
-            joined = [np.full(frames, empty, np.int8) for _ in range(outer)]
-            for parent, row in zip(level.parents.tolist(), rows, strict=True):
-                both = np.minimum if every else np.maximum
-                joined[parent] = both(joined[parent], row)
-            rows = joined
-        return rows[0]
+        rows = [status for _, status in told if status is not None]
+        codes = np.array(rows, np.int8).reshape(len(rows), frames)
+        return folded_values(levels, codes, CERTAINLY_TRUE)[0][0]
 
 
 def _runs(flags: Bools) -> Iterator[Violation]:
