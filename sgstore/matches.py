@@ -342,7 +342,7 @@ class Matches(Tabular):
             return compiled.stages()
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Columns and rows as a person wants to read them: see :func:`sgstore.lang._humanize.for_people`."""
+        """Columns and rows as a person wants to read them: see :func:`sgstore.lang.for_people`."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _stream(

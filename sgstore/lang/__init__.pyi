@@ -13,10 +13,10 @@ from ._catalog import TableFacts as TableFacts
 from ._catalog import TraceFacts as TraceFacts
 from ._catalog import Triple as Triple
 from ._catalog import Type as Type
-from ._compared import Compared as Compared
-from ._compared import compared_in_check as compared_in_check
-from ._compared import compared_in_query as compared_in_query
-from ._compared import notes_on as notes_on
+from ._why_not import Compared as Compared
+from ._why_not import compared_in_check as compared_in_check
+from ._why_not import compared_in_query as compared_in_query
+from ._why_not import notes_on as notes_on
 from ._compile import Compiled as Compiled
 from ._compile import Layout as Layout
 from ._compile import compile_checks as compile_checks
@@ -37,7 +37,7 @@ from ._external import entities as entities
 from ._external import relation as relation
 from ._external import traces_with as traces_with
 from ._external import with_places as with_places
-from ._humanize import for_people as for_people
+from ._compile import for_people as for_people
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
 from ._needs import of_check as of_check

@@ -32,6 +32,7 @@ from sgstore.lang._rewrite import rewritten, unfold_paths
 from sgstore.lang._symbols import traces_in
 from sgstore.lang.ir import (
     FRAME_COLUMNS,
+    INTERVAL_COLUMNS,
     Aggregate,
     BlockValue,
     Bound,
@@ -63,7 +64,7 @@ from sgstore.lang.syntax import CheckClause, MatchClause
 from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds, normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.lang._bind import CheckInCatalog
     from sgstore.lang._catalog import TraceFacts
@@ -231,7 +232,7 @@ def edge_attributes(edge: Edge) -> Iterator[Attribute]:
             yield attribute
 
 
-def shown(
+def _shown(
     nodes: Sequence[Mapping[str, Any]], edges: Sequence[Mapping[str, Any]]
 ) -> tuple[str, str]:
     """Nodes and edges of a graph as texts for people: ``e = car 0, v = car 3``, ``car 0 -near-> car 3``."""
@@ -243,6 +244,73 @@ def shown(
         for edge in edges
     )
     return ", ".join(named), ", ".join(lines)
+
+
+# Rows as a person wants to read them ---
+
+
+def for_people(
+    columns: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, graphs: bool
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Columns and rows of an answer, shorter.
+
+    Parameters
+    ----------
+    columns : tuple of str
+        As a query gives them.
+    rows : iterable of tuple
+    graphs : bool
+        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+
+    Returns
+    -------
+    columns, rows
+        A frame, and the first one of an interval, as ``trace#seq``, which every command takes; a variable as
+        the name of its node; a graph as two texts. What has neither frame nor interval comes as it is.
+    """
+    if columns[: len(INTERVAL_COLUMNS)] == INTERVAL_COLUMNS:
+        return _intervals(columns, rows)
+    if columns[: len(FRAME_COLUMNS)] != FRAME_COLUMNS:
+        return columns, rows
+    width = len(FRAME_COLUMNS)
+    rest = columns[width:]
+    named = {name.removesuffix(".name") for name in rest if name.endswith(".name")}
+    keep = [i for i, name in enumerate(rest) if name not in named]
+    called = (rest[i].removesuffix(".name") if _named(rest[i]) in rest else rest[i] for i in keep)
+
+    def lines() -> Iterator[tuple[Any, ...]]:
+        for row in rows:
+            _, trace, seq, _, t = row[:width]
+            values = [row[width + i] for i in keep]
+            values[-2:] = _shown(*values[-2:]) if graphs else values[-2:]
+            yield (f"{trace}#{seq}", round(t, 3), *values)
+
+    return ("frame", "t", *called), lines()
+
+
+def _named(name: str) -> str | None:
+    """The variable whose name a column holds."""
+    return name.removesuffix(".name") if name.endswith(".name") else None
+
+
+def _intervals(
+    columns: tuple[str, ...], rows: Iterable[tuple[Any, ...]]
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    width = len(INTERVAL_COLUMNS)
+    trace, first, start, end, frames = (
+        INTERVAL_COLUMNS.index(name) for name in ("trace", "start_seq", "start", "end", "frames")
+    )
+    lines = (
+        (
+            f"{row[trace]}#{row[first]}",
+            round(row[start], 3),
+            round(row[end], 3),
+            row[frames],
+            *row[width:],
+        )
+        for row in rows
+    )
+    return ("from", "start", "end", "frames", *columns[width:]), lines
 
 
 # The stages of the compiler as text, for ``--explain`` ------------------------------------------
@@ -467,7 +535,7 @@ class Compiled:
         """Names of what it returns."""
         if self.layout is not None:
             return self.layout.columns
-        return replace(self, finder=None).rows().columns
+        return results.names_of(self.query)
 
     @property
     def chosen(self) -> tuple[TraceFacts, ...]:

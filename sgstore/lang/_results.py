@@ -210,16 +210,20 @@ class SqlStatement:
     gathered: tuple[Gathered, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class ResultColumn:
-    """A column of a result: its name, and its text in terms of a relation's columns."""
-
-    name: str
-    text: str
-
-
 Span = tuple[Leaf, Leaf]
 """Of a match over several frames: the values that are its first and its last ``frame_id``."""
+
+
+def names_of(query: Query) -> tuple[str, ...]:
+    """Return the names of the columns of what a query returns."""
+    result, scope = query.result, query.scope
+    names = list(result.names)
+    if result.form == "rows" and result.whole:
+        for key, node in scope.nodes.items():
+            if node.role == "named":
+                names += [f"{key}.id" if key in result.names else key, f"{key}.name"]
+        names += [edge.key for edge in scope.edges if edge.named]
+    return (*names, *(column.name for column in result.columns))
 
 
 def rows(
@@ -341,7 +345,8 @@ class _RowStatement:
         wanted = [leaf for value in values for leaf in leaves(value)]
         relation = self.writer.frames(self.query.scope, None, self.nodes, self.edges, wanted)
         outputs = self._outputs()
-        select = Select([_named(o.text, o.name) for o in outputs])
+        names = [name for name, _ in outputs]
+        select = Select([_named(text, name) for name, text in outputs])
         if self.result.whole or self.result.framed:
             _from_frames(select, relation)
         else:
@@ -352,29 +357,22 @@ class _RowStatement:
             select.group = [str(place) for place, column in listed if not _aggregates(column)]
             select.group += [_column(owner) for owner in apart]
         elif apart:
-            select = _told_apart(select, [output.name for output in outputs], apart)
-        text = self._ordered(select, [quoted(output.name) for output in outputs])
-        return _finished(self.writer, text, tuple(output.name for output in outputs))
+            select = _told_apart(select, names, apart)
+        text = self._ordered(select, list(map(quoted, names)))
+        return _finished(self.writer, text, tuple(names))
 
-    def _outputs(self) -> list[ResultColumn]:
-        outputs: list[ResultColumn] = []
+    def _outputs(self) -> list[tuple[str, str]]:
+        """Names and texts of the columns."""
+        texts: list[str] = []
         if self.result.whole or self.result.framed:
-            outputs += [ResultColumn(name, text) for name, text in _frame_columns()]
-        if self.result.whole:
-            outputs += self._bindings({output.name for output in outputs})
-        outputs += [ResultColumn(c.name, self._text(c.value)) for c in self.result.columns]
-        return outputs
-
-    def _bindings(self, taken: set[str]) -> list[ResultColumn]:
-        """Ids and names of the nodes, and relations of the edges, that the query names, as it names them."""
-        outputs: list[ResultColumn] = []
+            texts += [text for _, text in _frame_columns()]
         for key, name in self._names():
-            outputs.append(
-                ResultColumn(f"{key}.id" if key in taken else key, f"{_ROWS}.{quoted(f'{key}.id')}")
-            )
-            outputs.append(ResultColumn(f"{key}.name", self._text(name)))
-        edges = [edge.key for edge in self.query.scope.edges if edge.key in self.edges]
-        return outputs + [ResultColumn(key, f"{_ROWS}.{quoted(f'{key}.type')}") for key in edges]
+            texts += [f"{_ROWS}.{quoted(f'{key}.id')}", self._text(name)]
+        if self.result.whole:
+            edges = (edge.key for edge in self.query.scope.edges if edge.key in self.edges)
+            texts += [f"{_ROWS}.{quoted(f'{key}.type')}" for key in edges]
+        texts += [self._text(column.value) for column in self.result.columns]
+        return list(zip(names_of(self.query), texts, strict=True))
 
     def _names(self) -> list[tuple[str, Bound]]:
         if not self.result.whole:

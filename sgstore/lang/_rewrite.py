@@ -11,23 +11,33 @@ from functools import partial
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Final
 
-from sgstore.lang._catalog import NODE_ATTRIBUTES, Catalog, Triple, Type
-from sgstore.lang._formulas import leaves
-from sgstore.lang._invariants import INVARIANT, is_lasting
-from sgstore.lang._kinds import entities_of_pairs
+from sgstore.lang._catalog import (
+    NODE_ATTRIBUTES,
+    Attribute,
+    Catalog,
+    DisplayUnit,
+    Triple,
+    Type,
+)
+from sgstore.lang._formulas import is_constant, leaves
+from sgstore.lang._kinds import Profile, entities_of_pairs
 from sgstore.lang.ir import (
     Aggregate,
     BlockValue,
     Bound,
     Choices,
     Edge,
+    EdgeRelation,
+    FrameAttribute,
     Kinds,
     LabelTest,
     Node,
     NodeAttribute,
+    NodeValue,
     Operation,
     Query,
     Scope,
+    TraceAttribute,
     Value,
     any_kinds,
     conjuncts,
@@ -39,6 +49,8 @@ from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+    from sgstore.lang._formulas import Leaf
 
 
 FALSE: Final = Value(value=False, type=Type.boolean)
@@ -371,6 +383,28 @@ def _words(kinds: frozenset[str]) -> Choices:
 
 
 # Results -------------------------------------------------------------------------------------------
+
+
+INVARIANT: Final = FrameAttribute(
+    Attribute("held", Type.number, {}, "how many frames a row stands for"), Type.number
+)
+"""What counts of matches add up where a row may stand for many frames."""
+
+
+def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
+    """Tell whether a value is the same in all frames of a bucket in which its binding holds."""
+    match leaf:
+        case NodeValue() | EdgeRelation() | TraceAttribute():
+            return True
+        case NodeAttribute(node=node, attribute=attribute):
+            if attribute.unit in {DisplayUnit.binding, DisplayUnit.owner} or is_constant(leaf):
+                return True
+            profile = Profile.of(scope.kinds(node), catalog)
+            if attribute.unit is DisplayUnit.role:
+                return False
+            return not profile.moving and not profile.fixed
+        case _:
+            return False
 
 
 def count_by_buckets(query: Query, catalog: Catalog) -> Query:

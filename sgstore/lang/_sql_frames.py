@@ -33,10 +33,10 @@ from sgstore.lang._formulas import (
     role_text,
     way_text,
 )
-from sgstore.lang._invariants import INVARIANT, is_lasting, join_lasting
 from sgstore.lang._kinds import Profile, homes_of, kind_conditions
 from sgstore.lang._plan import Phases, SharedRelation, apart
-from sgstore.lang._sql_masks import Masks, folded, merged
+from sgstore.lang._rewrite import INVARIANT, is_lasting
+from sgstore.lang._sql_masks import BUCKET, Masks, folded, merged
 from sgstore.lang.ir import (
     BlockValue,
     Bound,
@@ -57,7 +57,7 @@ from sgstore.quoting import quoted
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from sgstore.lang._catalog import Attribute
+    from sgstore.lang._catalog import Attribute, Catalog
     from sgstore.lang._formulas import BoundValues
     from sgstore.lang._plan import Gathered
 
@@ -385,7 +385,7 @@ class Frames(Masks):
         select.join(nested(self.masks(scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
         bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
         bucket = f'{PATTERN}."bucket"'
-        texts = join_lasting(select, bucket, bound, scope, self.catalog, wanted)
+        texts = _join_lasting(select, bucket, bound, scope, self.catalog, wanted)
         for leaf in wanted:
             if isinstance(leaf, EdgeRelation):
                 texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
@@ -734,3 +734,64 @@ def _of_frame(leaf: Leaf) -> bool:
 
 def _since_start(leaf: Leaf) -> bool:
     return isinstance(leaf, FrameAttribute) and leaf.attribute.unit is DisplayUnit.seconds
+
+
+# Values that a binding has for a whole bucket: constants of entities, of parts of the map, and of traces ----
+# Results that are made of nothing else need no single frames; how often they count is the number of frames that
+# a mask holds.
+
+
+def _join_lasting(
+    select: Select,
+    bucket: str,
+    nodes: Mapping[str, str],
+    scope: Scope,
+    catalog: Catalog,
+    needed: Iterable[Leaf],
+) -> dict[Leaf, str]:
+    """Join what lasting values come from to a relation of buckets; how each value is computed."""
+    needed = list(needed)
+    trace = f"{bucket} >> 18"
+    _join_trace_of(select, trace, [leaf for leaf in needed if isinstance(leaf, TraceAttribute)])
+    of_nodes = [leaf for leaf in needed if isinstance(leaf, NodeAttribute)]
+    of_nodes = [leaf for leaf in of_nodes if leaf.attribute.unit is not DisplayUnit.binding]
+    profiles = {leaf.node: Profile.of(scope.kinds(leaf.node), catalog) for leaf in of_nodes}
+    if any(profile.mapped for profile in profiles.values()):
+        select.join(f'"bucket" AS {BUCKET}', [f'{BUCKET}."bucket" = {bucket}'])
+    owned = [leaf for leaf in of_nodes if leaf.attribute.unit is DisplayUnit.owner]
+    texts: dict[Leaf, str] = {
+        leaf: owner_text(nodes[leaf.node], profiles[leaf.node], trace, f'{BUCKET}."map_id"')
+        for leaf in owned
+    }
+    of_nodes = [leaf for leaf in of_nodes if leaf not in texts]
+    profiles = {key: profiles[key] for key in {leaf.node for leaf in of_nodes}}
+    at: dict[str, Aliases] = {}
+    for key, profile in sorted(profiles.items()):
+        entity = part = None
+        if profile.moving or profile.fixed:
+            entity = quoted(f"{key}.entity")
+            on = [f'{entity}."trace_id" = {trace}', f'{entity}."node_id" = {nodes[key]}']
+            select.join(f'"entity" AS {entity}', on, "LEFT JOIN" if profile.mapped else "JOIN")
+        if profile.mapped:
+            part = quoted(f"{key}.map")
+            on = [f'{part}."map_id" = {BUCKET}."map_id"', f'{part}."node_id" = {nodes[key]}']
+            select.join(f'"map_node" AS {part}', on, "LEFT JOIN" if entity else "JOIN")
+        at[key] = Aliases(entity=entity, map=part)
+    texts |= {leaf: attribute_text(leaf.attribute, at[leaf.node]) for leaf in of_nodes}
+    for leaf in needed:
+        match leaf:
+            case TraceAttribute():
+                texts[leaf] = frame_text(leaf, "", TRACE, MAP)
+            case NodeValue(node=node) | NodeAttribute(node=node) if leaf not in texts:
+                texts[leaf] = nodes[node]
+            case _:
+                pass
+    return texts
+
+
+def _join_trace_of(select: Select, trace: str, needed: list[TraceAttribute]) -> None:
+    if needed:
+        select.join(f'"trace" AS {TRACE}', [f'{TRACE}."trace_id" = {trace}'])
+    if any(Home.map in leaf.attribute.columns for leaf in needed):
+        on = [f'{MAP}."map_id" = {TRACE}."map_id"']
+        select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
