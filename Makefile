@@ -65,9 +65,10 @@ check: $(VENV)/.dev
 test: $(VENV)/.dev
 	@$(MAKE) --no-print-directory -j2 lint tests
 
-# A file of tests at a time in each process: what its tests share is made once.
+# A file of tests at a time in each process: what its tests share is made once. The longest come first
+# (tests/conftest.py), so that no process is left alone with one of them.
 tests: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --durations 25 --durations-min 3
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
 
 test-wheel: $(VENV)/.dev
 	$(BIN)/python tests/packages.py wheel

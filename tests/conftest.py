@@ -50,6 +50,20 @@ typer.main.get_command = _command
 
 REPOSITORY = Path(__file__).parents[1]
 
+LONGEST = (
+    *("cli_streams", "rebuilding", "fuzz", "cli_ending", "ingest_hardship", "importing", "crowds"),
+    *("library", "monitor", "ingest_many", "exports", "ingest_data", "ingest", "over_time"),
+    *("export_graphs", "online", "mutants", "carla_cut", "outputs", "selection_docs", "frozen"),
+)
+"""Files of tests that take longest, in this order; where each runs in a process of its own they come first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files that take longest first; within a file nothing changes its place."""
+    place = {f"test_{name}.py": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 collect_ignore = ["learning.py"]  # a program that needs torch: make pyg
 
 

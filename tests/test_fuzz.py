@@ -15,6 +15,7 @@ import recordings
 from foxglove_scenes import SceneRecorder, cube
 from mcap.reader import make_reader
 from recordings import car
+from test_carla_cut import SMALL
 
 from sgstore.errors import TraceError
 from sgstore.readers import READERS, open_trace
@@ -84,7 +85,7 @@ def foxglove(path: Path, encoding: str) -> None:
 
 
 def carla(path: Path) -> None:
-    with carla_recordings.Bridge(path, use_chunking=False) as bridge:
+    with carla_recordings.Bridge(path, use_chunking=False, other=SMALL) as bridge:
         bridge.actors({1: ("vehicle.tesla.model3", "hero")})
         for i in range(2):
             bridge.objects(i / 10, [carla_recordings.vehicle(1, float(i))])
