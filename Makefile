@@ -26,7 +26,7 @@ help:
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
-	@echo "make api     write docs/api.md from the docstrings again"
+	@echo "make api     write docs/api.md and docs/relations.md from the code again"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.

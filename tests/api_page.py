@@ -1,4 +1,4 @@
-"""Write ``docs/api.md`` from the docstrings of the public names: ``make api``."""
+"""Write ``docs/api.md`` from the docstrings of the public names, and ``docs/relations.md``: ``make api``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from textwrap import dedent
 from typing import Any
 
 import sgstore
+from sgstore.relations import as_markdown
 from sgstore.store import Tabular
 
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
@@ -160,3 +161,4 @@ def entries(block: str) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(page(), encoding="utf-8")
+    PAGE.with_name("relations.md").write_text(as_markdown(), encoding="utf-8")
