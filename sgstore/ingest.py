@@ -196,7 +196,7 @@ class Workers:
         while len(self._workers) < count:
             separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
             process = subprocess.Popen(  # noqa: S603  a module of ours
-                command("sgstore.segment_worker"),
+                command("sgstore.segments"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 encoding="utf-8",

@@ -1,16 +1,25 @@
 """One recording to sealed segments, one for each ego, with outcome and counts.
 
 What is told of an ingest: how far it has come, and what became of each recording.
+
+``python -m sgstore.segments`` is a process that reads recordings for another. It is told what to do on stdin, a
+line of JSON each: the job first, then recordings. It answers on stdout, a line of JSON each: how far it has
+come, and what became of a recording. It ends when stdin does, whatever it is doing: nobody would publish it.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import sys
+import threading
 import time
 from array import array
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
@@ -535,3 +544,43 @@ def _reached(frames: FrameBlock, size: int) -> int:
     messages = frames.messages
     places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
     return min(int(places.max(initial=0)), size)
+
+
+# A process that reads recordings for another -----------------------------------------------------
+
+
+def main() -> None:
+    """Do what stdin says until it ends."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    sys.stdout = sys.stderr  # what anything prints is no answer
+    told: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    threading.Thread(target=_listen, args=(told,), daemon=True).start()
+
+    def answer(values: dict[str, Any]) -> None:
+        answers.write(f"{json.dumps(values)}\n")
+        answers.flush()
+
+    def on_block(frames: int, reached: int, size: int) -> None:
+        answer({"index": index, "frames": frames, "bytes": reached, "size": size})
+
+    index = -1
+    reading = SegmentReader(Job.from_dict(told.get()), on_block)
+    while True:
+        task = told.get()
+        index = task["index"]
+        views = reading.read(Path(task["path"]), Path(task["folder"]))
+        done = [
+            {"outcome": view.outcome.as_dict(), "sealed": view.sealed and str(view.sealed)}
+            for view in views
+        ]
+        answer({"index": index, "done": done})
+
+
+def _listen(told: SimpleQueue[dict[str, Any]]) -> None:
+    for line in sys.stdin:
+        told.put(json.loads(line))
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

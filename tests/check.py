@@ -41,8 +41,7 @@ TESTS = {
     "relations": "relations relations_*",
     "roads": "roads roads_lines roads_text",
     "schema": "schema views views_page",
-    "segments": "ingest",
-    "segment_worker": "ingest_many",
+    "segments": "ingest ingest_many",
     "step": "online",
     "store": "store store_*",
     "temporal": "temporal monitor over_time",
@@ -88,7 +87,7 @@ def tests_of(files: list[Path]) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--base", default="main", help="branch to compare with (main)")
     parser.add_argument("--list", action="store_true", help="say what would be run, and end")
     options = parser.parse_args()

@@ -27,7 +27,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"draw", "map_files", "readers", "sgg"}),
     frozenset({"store"}),
     frozenset({"derive", "importing", "matches", "segments"}),
-    frozenset({"doctor", "exporters", "ingest", "segment_worker", "temporal"}),
+    frozenset({"doctor", "exporters", "ingest", "temporal"}),
     frozenset({"query", "rebuild", "record"}),
     frozenset({"demo", "locks", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
