@@ -40,7 +40,7 @@ from sgstore.world import longest_step_ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from sgstore.readers import OpenTrace
+    from sgstore.readers import MessageTrace
     from sgstore.roads import RoadMap
     from sgstore.world import Codes, FrameBlock, Ints, TraceInfo
 
@@ -370,7 +370,7 @@ class SegmentReader:
 
     # Which views ----------------------------------------------------------------------------------------------
 
-    def _wanted(self, trace: OpenTrace, views: list[EgoView]) -> Iterator[_Wanted]:
+    def _wanted(self, trace: MessageTrace, views: list[EgoView]) -> Iterator[_Wanted]:
         """The views of a recording that are asked for; one whose ego is not in it has an error."""
         info, egos = trace.info, self._job.config.egos
         if not egos:
@@ -393,7 +393,7 @@ class SegmentReader:
             view.outcome.ego = found
             yield _Wanted(view, replace(info, ego=found))
 
-    def _vehicles(self, trace: OpenTrace) -> list[str]:
+    def _vehicles(self, trace: MessageTrace) -> list[str]:
         """The ids of all vehicles of a recording."""
         found: list[str] = []
         for block in trace.blocks(self._job.block_frames):
@@ -435,7 +435,7 @@ class SegmentReader:
     # Building -------------------------------------------------------------------------------------------------
 
     def _build(
-        self, trace: OpenTrace, group: list[_Wanted], road_map: RoadMap | None, folder: Path
+        self, trace: MessageTrace, group: list[_Wanted], road_map: RoadMap | None, folder: Path
     ) -> None:
         """Build the segments of some views in one pass over the recording."""
         job, size = self._job, self._job.block_frames
@@ -493,7 +493,7 @@ class SegmentReader:
 
     def _seal(
         self,
-        trace: OpenTrace,
+        trace: MessageTrace,
         group: list[_Wanted],
         segments: list[Segment],
         tally: TraceTally,

@@ -22,7 +22,6 @@ from sgstore.readers._ros2 import (
     MAX_VALUES,
     NUMBERS,
     ColumnReader,
-    Fields,
     Sequence,
     Struct,
     Text,
@@ -137,7 +136,7 @@ def test_fields_are_those_of_the_whole_message(case: tuple[str, dict[str, Any]])
     kind = parse_definition("pkg/msg/Top", content.encode())
     data = encoded(content, message)
     paths = [*(f"f{i}" for i in range(6)), "f0.f0", "f1[0]", "f2[1].f0", "f3.f1.f2"]
-    reader = Fields(kind, tuple(paths))
+    reader = ColumnReader(kind, tuple(paths))
 
     def told(path: str) -> float:
         value: Any = decode(kind, data)
@@ -152,7 +151,7 @@ def test_fields_are_those_of_the_whole_message(case: tuple[str, dict[str, Any]])
         return float(value) if isinstance(value, int | float | np.number) else math.nan
 
     for _ in range(2):  # learned, then remembered
-        np.testing.assert_array_equal(reader.read(data), [told(path) for path in paths])
+        np.testing.assert_array_equal(reader.read(data)[1][0], [told(path) for path in paths])
     for length in range(0, len(data), 3):
         with pytest.raises(TraceError):
             reader.read(data[:length])
@@ -234,7 +233,7 @@ def objects_of(things: list[dict[str, Any]], frame: str = "map") -> bytes:
 
 def table() -> ColumnReader:
     content = definition("derived_object_msgs/ObjectArray")
-    return ColumnReader(parse_definition(OBJECTS, content.encode()), "objects", COLUMNS)
+    return ColumnReader(parse_definition(OBJECTS, content.encode()), COLUMNS, "objects")
 
 
 sizes = st.sampled_from([[], [1.0], [1.0, 2.0], [1.0, 2.0, 3.0]])
@@ -288,9 +287,9 @@ def test_a_table_of_too_many_rows_is_refused() -> None:
     data = b"\0\1\0\0" + struct.pack("<I", MAX_ROWS + 1) + bytes(MAX_ROWS + 1)
 
     with pytest.raises(TraceError, match="at most 100000 are read"):
-        ColumnReader(kind, "f", ("a",)).read(data)
+        ColumnReader(kind, ("a",), "f").read(data)
     with pytest.raises(TraceError, match="no sequence of structures 'g'"):
-        ColumnReader(kind, "g", ("a",))
+        ColumnReader(kind, ("a",), "g")
 
 
 # Definitions --------------------------------------------------------------------------------------

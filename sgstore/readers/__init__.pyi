@@ -1,6 +1,6 @@
 # The face of this package: what others may import from it.
 
-from ._base import MessageDecoder as MessageDecoder
+from ._blocks import MessageDecoder as MessageDecoder
 from ._base import MessageTrace as MessageTrace
 from ._base import channels_of as channels_of
 from ._blocks import NAN as NAN
@@ -16,7 +16,6 @@ from ._media import read_carried as read_carried
 from ._media import record_reader as record_reader
 from ._registry import ENDINGS as ENDINGS
 from ._registry import READERS as READERS
-from ._registry import OpenTrace as OpenTrace
 from ._registry import RecordingReader as RecordingReader
 from ._registry import on_map as on_map
 from ._registry import open_recording as open_recording
@@ -53,7 +52,6 @@ __all__ = [
     "MessageDecoder",
     "MessageTrace",
     "NAN",
-    "OpenTrace",
     "OsiFile",
     "POSE",
     "READERS",

@@ -1,27 +1,27 @@
-"""The base of all flavours: the first reading of a recording, its decoder, and the open trace.
+"""The base of all flavours: the first reading of a recording, and the open trace.
 
 A flavour has a :class:`Survey`, which reads a recording once and finds out what must be known before its
-frames can be read; a :class:`MessageDecoder`, which makes frames of messages; and a :class:`MessageTrace`,
-which has what is known and hands out blocks. References of messages and counted losses are the same for all.
+frames can be read; a :class:`~sgstore.readers._blocks.MessageDecoder`, which makes frames of messages; and a
+:class:`MessageTrace`, which has what is known and hands out blocks.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.mcap import IDS, Findings, Loss
-from sgstore.readers._blocks import EntityTable, Raw, assemble, counted
+from sgstore.mcap import IDS, Findings
+from sgstore.readers._blocks import assemble, counted
 from sgstore.world import Channel, MessageRefs, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from sgstore.mcap import Messages, Recording
-    from sgstore.readers._blocks import FrameRows
+    from sgstore.readers._blocks import MessageDecoder
     from sgstore.world import FrameBlock
 
 Key = TypeVar("Key")
@@ -70,66 +70,33 @@ def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Chann
     return tuple(channels)
 
 
-class FrameRefs:
-    """References of the messages that belong to frames.
+def frame_refs(
+    channels: tuple[Channel, ...], window: tuple[int, int]
+) -> Callable[[Messages], MessageRefs]:
+    """A function that gives the references of those messages of a run that belong to frames.
 
     Parameters
     ----------
     channels : tuple of Channel
+        Messages of those whose role is neither ``ground_truth`` nor ``payload`` last, and belong to none.
     window : tuple of int
         Log times, both included; what a clip carries in from outside them belongs to no frame.
-
-    Notes
-    -----
-    Messages of channels whose role is neither ``ground_truth`` nor ``payload`` last, and belong to none.
     """
+    start, end = window
+    index = np.full(IDS, -1, np.int64)
+    for i, channel in enumerate(channels):
+        if channel.role in {"ground_truth", "payload"}:
+            index[channel.id] = i
 
-    def __init__(self, channels: tuple[Channel, ...], window: tuple[int, int]) -> None:
-        self._window = window
-        self._index = np.full(IDS, -1, np.int64)
-        for i, channel in enumerate(channels):
-            if channel.role in {"ground_truth", "payload"}:
-                self._index[channel.id] = i
-
-    def __call__(self, run: Messages) -> MessageRefs:
-        """Those of a run of messages."""
-        start, end = self._window
-        channel = self._index[run.channel]
+    def refs(run: Messages) -> MessageRefs:
+        channel = index[run.channel]
         kept = (channel >= 0) & (run.log_time_ns >= start) & (run.log_time_ns <= end)
         chunk = np.full(int(kept.sum()), run.chunk_offset, np.int64)
         return MessageRefs(
             channel[kept], run.log_time_ns[kept], chunk, run.offset[kept], run.length[kept]
         )
 
-
-class LossTally:
-    """Losses by their reason.
-
-    A reason that comes again adds to the loss that there is; beyond :attr:`MOST` reasons the others are
-    counted together.
-    """
-
-    MOST: ClassVar[int] = 1000
-
-    def __init__(self) -> None:
-        self._found: dict[str, Loss] = {}
-
-    def add(self, reason: str, log_time_ns: int, size: int = 0) -> None:
-        """Count one more, of ``size`` bytes."""
-        if reason not in self._found and len(self._found) >= self.MOST:
-            reason = "and more of the same kinds"
-        last = self._found.get(reason) or Loss(reason, 0, 0, log_time_ns, log_time_ns)
-        self._found[reason] = Loss(
-            reason,
-            last.messages + 1,
-            last.bytes + size,
-            min(last.start_ns, log_time_ns),
-            max(last.end_ns, log_time_ns),
-        )
-
-    def losses(self) -> list[Loss]:
-        """One loss for each reason; ``messages`` is how often."""
-        return list(self._found.values())
+    return refs
 
 
 # The first reading --------------------------------------------------------------------------------
@@ -267,74 +234,7 @@ class Survey(Generic[AnyLead]):
         return self.recording.channels[channel].topic
 
 
-# Frames -------------------------------------------------------------------------------------------
-
-
-class MessageDecoder(Generic[Raw]):
-    """Messages → frames, in two steps, so that the numbers of many frames can be read at once.
-
-    Parameters
-    ----------
-    channels : collection of int
-        Ids of the channels whose messages it asks for: those that are frames, and those that say more about the
-        same instants.
-    window : tuple of int
-        Log times, both included, between which messages are frames; others only tell what lasts.
-    report : TraceReport
-        Takes up what cannot be used.
-
-    Attributes
-    ----------
-    roster : EntityTable
-        Takes up entities while messages are decoded.
-    channels : frozenset of int
-    """
-
-    def __init__(
-        self, channels: Collection[int], window: tuple[int, int], report: TraceReport
-    ) -> None:
-        self.roster = EntityTable(report)
-        self.channels = frozenset(channels)
-        self._window = window
-        self._report = report
-        self._unreadable, self._unusable = LossTally(), LossTally()
-        self._untimed = 0
-
-    def decode(self, run: Messages, row: int) -> Raw | None:
-        """The frame that a message is, or ``None`` if it is none."""
-        raise NotImplementedError
-
-    def complete(self, frames: list[Raw]) -> list[FrameRows]:
-        """The same frames with their numbers.
-
-        Each has been followed by another, or by the end of the recording: what belongs to the same instant
-        may stand behind the message that leads.
-        """
-        raise NotImplementedError
-
-    def settle(self) -> None:
-        """Report what could not be used, once all frames are read."""
-        losses = self._report.losses
-        losses += self._unreadable.losses()
-        for loss in self._unusable.losses():  # of states, which are no messages
-            reason = f"{loss.reason}: {loss.messages} states were left out"
-            losses.append(replace(loss, reason=reason, messages=0, bytes=0))
-        if self._untimed:
-            words = f"{self._untimed} frames bear no time of their own: their log time is taken"
-            self._report.warnings.append(words)
-
-    def is_inside(self, log_time_ns: int) -> bool:
-        """Return whether a message logged then is a frame; a clip brings others for what lasts."""
-        return self._window[0] <= log_time_ns <= self._window[1]
-
-    def lose(self, reason: str, run: Messages, row: int) -> None:
-        """Count a message that cannot be read."""
-        self._unreadable.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
-
-    def _warn_of_egos(self, words: str) -> None:
-        """Warn of the lack of an ego; who names the egos is not concerned."""
-        self._report.warnings.append(words)
-        self._report.about_ego.append(words)
+# The recording ------------------------------------------------------------------------------------
 
 
 class MessageTrace:
@@ -416,7 +316,7 @@ class MessageTrace:
         """
         report = self.report = TraceReport()
         decoder = self.decoder(report)
-        refs = FrameRefs(self.info.channels, self.recording.window)
+        refs = frame_refs(self.info.channels, self.recording.window)
         runs = self.recording.walk(report)
         yield from counted(assemble(runs, size, decoder, refs), report)
         decoder.settle()

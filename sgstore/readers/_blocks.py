@@ -1,6 +1,7 @@
 """Blocks of frames: rows of decoded messages, entities, and numbers that a recording lacks.
 
-A flavour decodes a message into :class:`FrameRows` and enters what it meets into a :class:`EntityTable`.
+The :class:`MessageDecoder` of a flavour makes :class:`FrameRows` of messages and enters what it meets into a
+:class:`EntityTable`.
 :func:`assemble` makes blocks of that, ahead of what it hands out: a velocity that the recording lacks is
 the difference of two positions, the second of them may belong to the first frame of the next block, and
 what else is told of that frame may stand behind the message that leads. So a value never depends on where
@@ -10,11 +11,11 @@ a block begins or ends.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
-from sgstore.mcap import IDS
+from sgstore.mcap import IDS, Loss
 from sgstore.vocabulary import KIND_CODE
 from sgstore.world import POSE, Entities, FrameBlock, MessageRefs, States
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from sgstore.mcap import Messages
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Bools, Event, Floats, Ints, TraceReport
+
+    Steps = tuple[Ints, Ints, Floats, Floats]
 
 
 Raw = TypeVar("Raw")
@@ -209,23 +212,107 @@ class EntityTable:
         return entities, _states(np.array(nodes, np.int64), values.reshape(-1, len(POSE)))
 
 
-class Decoder(Protocol[Raw]):
-    """Messages → frames; see :class:`sgstore.readers.MessageDecoder`."""
+class LossTally:
+    """Losses by their reason.
 
-    roster: EntityTable
+    A reason that comes again adds to the loss that there is; beyond :attr:`MOST` reasons the others are
+    counted together.
+    """
 
-    @property
-    def channels(self) -> Collection[int]: ...
+    MOST: ClassVar[int] = 1000
 
-    def decode(self, run: Messages, row: int) -> Raw | None: ...
+    def __init__(self) -> None:
+        self._found: dict[str, Loss] = {}
 
-    def complete(self, frames: list[Raw]) -> list[FrameRows]: ...
+    def add(self, reason: str, log_time_ns: int, size: int = 0) -> None:
+        """Count one more, of ``size`` bytes."""
+        if reason not in self._found and len(self._found) >= self.MOST:
+            reason = "and more of the same kinds"
+        last = self._found.get(reason) or Loss(reason, 0, 0, log_time_ns, log_time_ns)
+        self._found[reason] = Loss(
+            reason,
+            last.messages + 1,
+            last.bytes + size,
+            min(last.start_ns, log_time_ns),
+            max(last.end_ns, log_time_ns),
+        )
+
+    def losses(self) -> list[Loss]:
+        """One loss for each reason; ``messages`` is how often."""
+        return list(self._found.values())
+
+
+class MessageDecoder(Generic[Raw]):
+    """Messages → frames, in two steps, so that the numbers of many frames can be read at once.
+
+    Parameters
+    ----------
+    channels : collection of int
+        Ids of the channels whose messages it asks for: those that are frames, and those that say more about the
+        same instants.
+    window : tuple of int
+        Log times, both included, between which messages are frames; others only tell what lasts.
+    report : TraceReport
+        Takes up what cannot be used.
+
+    Attributes
+    ----------
+    roster : EntityTable
+        Takes up entities while messages are decoded.
+    channels : frozenset of int
+    """
+
+    def __init__(
+        self, channels: Collection[int], window: tuple[int, int], report: TraceReport
+    ) -> None:
+        self.roster = EntityTable(report)
+        self.channels = frozenset(channels)
+        self._window = window
+        self._report = report
+        self._unreadable, self._unusable = LossTally(), LossTally()
+        self._untimed = 0
+
+    def decode(self, run: Messages, row: int) -> Raw | None:
+        """The frame that a message is, or ``None`` if it is none."""
+        raise NotImplementedError
+
+    def complete(self, frames: list[Raw]) -> list[FrameRows]:
+        """The same frames with their numbers.
+
+        Each has been followed by another, or by the end of the recording: what belongs to the same instant
+        may stand behind the message that leads.
+        """
+        raise NotImplementedError
+
+    def settle(self) -> None:
+        """Report what could not be used, once all frames are read."""
+        losses = self._report.losses
+        losses += self._unreadable.losses()
+        for loss in self._unusable.losses():  # of states, which are no messages
+            reason = f"{loss.reason}: {loss.messages} states were left out"
+            losses.append(replace(loss, reason=reason, messages=0, bytes=0))
+        if self._untimed:
+            words = f"{self._untimed} frames bear no time of their own: their log time is taken"
+            self._report.warnings.append(words)
+
+    def is_inside(self, log_time_ns: int) -> bool:
+        """Return whether a message logged then is a frame; a clip brings others for what lasts."""
+        return self._window[0] <= log_time_ns <= self._window[1]
+
+    def lose(self, reason: str, run: Messages, row: int) -> None:
+        """Count a message that cannot be read."""
+        self._unreadable.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
+
+    def _warn_of_egos(self, words: str) -> None:
+        """Warn of the lack of an ego; who names the egos is not concerned."""
+        self._report.warnings.append(words)
+        self._report.about_ego.append(words)
 
 
 def assemble(
     runs: Iterable[Messages],
     size: int,
-    decoder: Decoder[Raw],
+    decoder: MessageDecoder[Raw],
     refs: Callable[[Messages], MessageRefs],
 ) -> Iterator[FrameBlock]:
     """Blocks of frames from the messages of a recording.
@@ -236,7 +323,7 @@ def assemble(
         In file order.
     size : int
         Frames of a block; the last may have fewer.
-    decoder : Decoder
+    decoder : MessageDecoder
     refs : callable
         The references of those messages that belong to frames.
 
@@ -481,17 +568,8 @@ def derive(
     return wanted, derived
 
 
-@dataclass(frozen=True, slots=True)
-class _Steps:
+def _neighbours(node: Ints, frame: Ints, time_ns: Ints, rows: slice) -> Steps:
     """Rows of the same node one frame before and behind; steps of time to them, NaN where there is none."""
-
-    before: Ints
-    behind: Ints
-    since: Floats
-    until: Floats
-
-
-def _neighbours(node: Ints, frame: Ints, time_ns: Ints, rows: slice) -> _Steps:
     span = int(node.max()) + 1
     keys = frame * span + node
     order = np.argsort(keys)
@@ -505,31 +583,33 @@ def _neighbours(node: Ints, frame: Ints, time_ns: Ints, rows: slice) -> _Steps:
         step = side * (time_ns[frame[there]] - time_ns[frame[rows]]) / 1e9
         found.append(there)
         steps.append(np.where((sorted_keys[at] == key) & (step > 0), step, np.nan))
-    return _Steps(found[0], found[1], steps[0], steps[1])
+    return found[0], found[1], steps[0], steps[1]
 
 
-def _slope(values: Floats, rows: slice, steps: _Steps, turn: float = 0.0) -> Floats:
+def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floats:
     """Slope at each row: over both steps where there are two, else over the one there is.
 
     ``turn``: values are the same modulo this, and differences the smallest that there are.
     """
-    back = values[rows] - values[steps.before]
-    forth = values[steps.behind] - values[rows]
+    before, behind, since, until = steps
+    back = values[rows] - values[before]
+    forth = values[behind] - values[rows]
     if turn:
         back = back - turn * np.round(back / turn)
         forth = forth - turn * np.round(forth / turn)
-    since, until = steps.since[:, None], steps.until[:, None]
+    since, until = since[:, None], until[:, None]
     both = (back + forth) / (since + until)
     slopes = np.where(np.isfinite(both), both, back / since)
     return np.where(np.isfinite(slopes), slopes, forth / until)
 
 
-def _accelerations(values: Floats, rows: slice, steps: _Steps) -> Floats:
+def _accelerations(values: Floats, rows: slice, steps: Steps) -> Floats:
     velocity = values[:, _VELOCITY : _VELOCITY + 3]
     position = values[:, _X : _X + 3]
-    since, until = steps.since[:, None], steps.until[:, None]
-    back = (position[rows] - position[steps.before]) / since
-    forth = (position[steps.behind] - position[rows]) / until
+    before, behind, since, until = steps
+    since, until = since[:, None], until[:, None]
+    back = (position[rows] - position[before]) / since
+    forth = (position[behind] - position[rows]) / until
     bend = 2 * (forth - back) / (since + until)
     read = np.isfinite(velocity[rows]).all(axis=1, keepdims=True)
     return np.where(read, _slope(velocity, rows, steps), bend)

@@ -9,8 +9,8 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.mcap import digest_of
-from sgstore.readers._base import LossTally, MessageDecoder, MessageTrace, channels_of, ref_of
-from sgstore.readers._blocks import FrameRows
+from sgstore.readers._base import MessageTrace, channels_of, ref_of
+from sgstore.readers._blocks import FrameRows, LossTally, MessageDecoder
 from sgstore.step import Frame, check_entities
 from sgstore.vocabulary import KINDS, TypeMeaning
 from sgstore.world import POSE, Channel, TraceReport

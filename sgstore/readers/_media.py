@@ -23,7 +23,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice
+from itertools import chain, islice, repeat, starmap
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -33,7 +33,7 @@ from sgstore.mcap import (
     Findings,
     McapFile,
     bag_folder,
-    message_at,
+    messages_at,
     open_regular,
     parse_records,
     parts_of,
@@ -119,16 +119,6 @@ class Media:
     messages: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class _MessagePlace:
-    """Where a message stands; as :class:`~sgstore.world.MessageRefs` has it."""
-
-    path: Path
-    channel: int
-    chunk_offset: int
-    offset: int
-
-
 def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, length: int) -> Media:
     """What one message of a recording carries, by its channel's id and its place.
 
@@ -148,8 +138,8 @@ def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, le
     codec = next((codec for codec in _CODECS if codec.named.search(form.lower())), None)
     if codec is None or not data:
         return Media("message", message)
-    places = _places(_MessagePlace(path, channel, chunk_offset, offset))
-    before = map(unwrap, chain.from_iterable(map(_before, places)))
+    places = _places(path, channel, chunk_offset, offset)
+    before = map(unwrap, chain.from_iterable(starmap(_before, places)))
     try:
         run, sets = _decodable(codec, data, before)
     except TraceError as error:
@@ -403,68 +393,71 @@ def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
     return found
 
 
-def _places(place: _MessagePlace) -> Iterator[_MessagePlace]:
+# The messages of a channel before one of them; a message stands at a path, a channel's id, and its place there.
+
+Place = tuple["Path", int, int, int]
+
+
+def _places(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[Place]:
     """The place of a message in its file; of a bag then the ends of the files before it, the latest first."""
-    folder = bag_folder(place.path)
+    folder = bag_folder(path)
     if folder is None:
-        yield place
+        yield path, channel, chunk_offset, offset
         return
-    chunked = place.chunk_offset >= 0
-    at = place.chunk_offset if chunked else place.offset
+    chunked = chunk_offset >= 0
+    at = chunk_offset if chunked else offset
     with McapFile(folder) as bag:
-        wanted = bag.channels[place.channel]
+        wanted = bag.channels[channel]
     for part in reversed(parts_of(folder)):
         if part.base > at or part.size < 0:
             continue
         with McapFile(part.path) as file:
             own = [n for n, c in file.channels.items() if c.topic == wanted.topic]
         here = at < part.base + part.size
-        offsets = (at - part.base, place.offset) if chunked else (-1, at - part.base)
+        chunk, place = (at - part.base, offset) if chunked else (-1, at - part.base)
         if not here:
-            offsets = (_END, _END) if chunked else (-1, _END)
+            chunk, place = (_END, _END) if chunked else (-1, _END)
         for number in own:
-            yield _MessagePlace(part.path, number, *offsets)
+            yield part.path, number, chunk, place
 
 
-def _before(place: _MessagePlace) -> Iterator[bytes]:
+def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[bytes]:
     """The messages of a channel before one of them, the latest first, as they stand in the file."""
-    if place.chunk_offset < 0:
-        yield from _before_outside_chunks(place)
+    if chunk_offset < 0:
+        yield from _before_outside_chunks(path, channel, offset)
         return
-    with open_regular(place.path) as file:
-        for start in reversed(_chunks(place)):
-            records = read_records(file, read_chunk_head(file, start))
-            messages, _ = parse_records(records, start)
-            mine = messages.channel == place.channel
-            if start == place.chunk_offset:
-                mine &= messages.offset < place.offset
+    with open_regular(path) as file:
+        for start in reversed(_chunks(path, chunk_offset)):
+            messages, _ = parse_records(read_records(file, read_chunk_head(file, start)), start)
+            mine = messages.channel == channel
+            if start == chunk_offset:
+                mine &= messages.offset < offset
             for row in np.flatnonzero(mine)[::-1].tolist():
                 yield bytes(messages.data(row))
 
 
-def _chunks(place: _MessagePlace) -> list[int]:
-    """Where the chunks of a file begin, up to that of a message."""
-    with open_regular(place.path) as file:
-        size = file.seek(0, 2)
-        found: list[int] = read_summary(file, size).chunk_offsets.tolist()
-    if place.chunk_offset not in found and not (found and place.chunk_offset == _END):
+def _chunks(path: Path, last: int) -> list[int]:
+    """Where the chunks of a file begin, up to one of them."""
+    with open_regular(path) as file:
+        found: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
+    if last not in found and not (found and last == _END):
 
         def note(start: int) -> bool:
             found.append(start)
             return False
 
         found = []
-        with McapFile(place.path) as recording:
+        with McapFile(path) as recording:
             for _ in recording.walk(Findings(), note):
                 pass
-    return [start for start in found if start <= place.chunk_offset]
+    return [start for start in found if start <= last]
 
 
-def _before_outside_chunks(place: _MessagePlace) -> Iterator[bytes]:
-    offsets: list[tuple[int, int]] = []
-    with McapFile(place.path) as recording:
+def _before_outside_chunks(path: Path, channel: int, last: int) -> Iterator[bytes]:
+    places: list[tuple[int, int, int]] = []
+    with McapFile(path) as recording:
         for run in recording.walk(Findings(), lambda _: False):
-            mine = (run.channel == place.channel) & (run.offset < place.offset)
-            offsets += zip(run.offset[mine].tolist(), run.length[mine].tolist(), strict=True)
-    for offset, length in reversed(offsets):
-        yield message_at(place.path, chunk_offset=-1, offset=offset, length=length)
+            mine = (run.channel == channel) & (run.offset < last)
+            offsets, lengths = run.offset[mine].tolist(), run.length[mine].tolist()
+            places += zip(repeat(-1), offsets, lengths)
+    yield from map(bytes, messages_at(path, reversed(places)))

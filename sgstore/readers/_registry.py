@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Final, Protocol
 
 from sgstore import plugins
 from sgstore.errors import TraceError
@@ -23,39 +23,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from sgstore.mcap import Recording
+    from sgstore.readers._base import MessageTrace
     from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock, TraceInfo
 
 
 ENDINGS: Final = (".mcap", *_OSI_ENDINGS)
 """How the names of recordings end, where a folder is searched for them."""
-
-
-class OpenTrace(Protocol):
-    """A recording that is open.
-
-    Attributes
-    ----------
-    info : TraceInfo
-        What is known before frames are read.
-    report : TraceReport
-        What reading them brought to light; filled while blocks are read.
-    """
-
-    info: TraceInfo
-    report: TraceReport
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_exception: object) -> None: ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
-
-    def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """The frames, ``size`` at a time; block i begins at frame ``i * size``."""
-        ...
 
 
 class RecordingReader(Protocol):
@@ -63,7 +36,7 @@ class RecordingReader(Protocol):
 
     name: str
 
-    def __call__(self, recording: Recording, *, ego: str, digest: str) -> OpenTrace:
+    def __call__(self, recording: Recording, *, ego: str, digest: str) -> MessageTrace:
         """Open a recording of this flavour."""
         ...
 
@@ -104,7 +77,7 @@ def open_recording(path: str | Path) -> McapFile | OsiFile:
 
 def open_trace(
     path: str | Path, *, ego: str = "", digest: str = "", mapping: str | Path = ""
-) -> OpenTrace:
+) -> MessageTrace:
     """A recording, opened by the first reader that recognises it.
 
     Parameters
@@ -145,18 +118,14 @@ def open_trace(
         raise
 
 
-def on_map(trace: OpenTrace, road_map: RoadMap | None) -> None:
+def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
     """Tell a trace which road map it is read with, if that matters to its flavour.
 
     Then the flavour's class has a method ``on_map``; it is called before frames are read.
     """
-    if isinstance(trace, _OnMap):
-        trace.on_map(road_map)
-
-
-@runtime_checkable
-class _OnMap(Protocol):
-    def on_map(self, road_map: RoadMap | None) -> None: ...
+    tell = getattr(trace, "on_map", None)
+    if tell is not None:
+        tell(road_map)
 
 
 def _takes_mapping(reader: RecordingReader) -> bool:

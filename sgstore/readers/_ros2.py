@@ -520,8 +520,8 @@ class _StructLayout:
             to[:, column : column + count] = numbers
 
 
-class Fields:
-    """Reads some numbers of messages of one kind, and passes over the rest of them.
+class ColumnReader:
+    """Reads numbers of messages of one kind as columns, and passes over the rest of them.
 
     Parameters
     ----------
@@ -529,46 +529,9 @@ class Fields:
         Of the messages.
     columns : tuple of str
         Paths of the numbers: ``header.stamp.sec``, ``pose.covariance[0]``.
-    """
-
-    def __init__(self, kind: Struct, columns: tuple[str, ...]) -> None:
-        self._kind = kind
-        self._columns = {path: column for column, path in enumerate(columns)}
-        self._layouts: dict[str, list[_StructLayout]] = {}
-
-    def read(self, data: Data) -> Floats:
-        """The numbers of a message, (columns,) float64; NaN where it lacks one.
-
-        Raises
-        ------
-        TraceError
-            As :func:`decode`.
-        """
-        reader = _MessageReader.of(data)
-        values, order = reader.values, reader.order
-        layouts = self._layouts.setdefault(order, [])
-        for layout in layouts:
-            if layout.size <= len(values) and layout.agreeing(values, order, 0, 1):
-                break
-        else:
-            layout = _learned(reader, self._kind, self._columns)
-            _remember(layouts, layout)
-        numbers = np.full((1, len(self._columns)), np.nan)
-        layout.copy(values, 0, numbers)
-        return numbers[0]
-
-
-class ColumnReader:
-    """Reads a sequence of structures in messages of one kind as columns.
-
-    Parameters
-    ----------
-    kind : Struct
-        Of the messages.
     sequence : str
-        The field that is a sequence of structures.
-    columns : tuple of str
-        Paths of the numbers in an element: ``pose.position.x``, ``shape.dimensions[0]``.
+        The field that is a sequence of structures, each of which is a row with these numbers; empty: the
+        message is the only row.
 
     Raises
     ------
@@ -576,37 +539,40 @@ class ColumnReader:
         There is no such sequence.
     """
 
-    def __init__(self, kind: Struct, sequence: str, columns: tuple[str, ...]) -> None:
-        names = [name for name, _ in kind.fields]
-        found = dict(kind.fields).get(sequence)
-        if not isinstance(found, Sequence) or not isinstance(found.element, Struct):
-            raise TraceError(f"{kind.name} has no sequence of structures {sequence!r}")
-        self._head = kind.fields[: names.index(sequence)]
-        self._sequence = found
-        self._element: Struct = found.element
+    def __init__(self, kind: Struct, columns: tuple[str, ...], sequence: str = "") -> None:
+        self._head: tuple[tuple[str, Type], ...] = ()
+        self._sequence: Sequence | None = None
+        self._element = kind
+        if sequence:
+            names = [name for name, _ in kind.fields]
+            found = dict(kind.fields).get(sequence)
+            if not isinstance(found, Sequence) or not isinstance(found.element, Struct):
+                raise TraceError(f"{kind.name} has no sequence of structures {sequence!r}")
+            self._head = kind.fields[: names.index(sequence)]
+            self._sequence, self._element = found, found.element
         self._columns = {path: column for column, path in enumerate(columns)}
-        self._align = found.element.align
+        self._align = self._element.align
         self._layouts: dict[tuple[str, int], list[_StructLayout]] = {}
 
     def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
-        """The fields before the sequence, and the numbers in it.
+        """The fields before the sequence, and the numbers.
 
         Returns
         -------
         head : dict
             As :func:`decode` gives them.
         numbers : (n, columns) float64
-            NaN where an element lacks a number: its structure has none of that path, or a sequence in it is
+            NaN where a row lacks a number: its structure has none of that path, or a sequence in it is
             too short.
 
         Raises
         ------
         TraceError
-            As :func:`decode`; or there are more than :data:`MAX_ROWS` elements.
+            As :func:`decode`; or there are more than :data:`MAX_ROWS` rows.
         """
         reader = _MessageReader.of(data)
         head = {name: reader.value(kind) for name, kind in self._head}
-        count = reader.count(self._sequence)
+        count = 1 if self._sequence is None else reader.count(self._sequence)
         if count > MAX_ROWS:
             raise TraceError(f"a sequence of {count} elements; at most {MAX_ROWS} are read")
         numbers = np.full((count, len(self._columns)), np.nan)

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.readers._base import Lead, LossTally, Survey, ref_of
+from sgstore.readers._base import Lead, Survey, ref_of
+from sgstore.readers._blocks import LossTally
 from sgstore.readers._ros2 import (
     MAX_IDENT,
     ColumnReader,
@@ -356,29 +357,6 @@ _MOST_TRIES: Final = 200
 _MOST_NOTES: Final = 100
 
 
-@dataclass(slots=True)
-class _Whereabouts:
-    """Places of the vehicles with a role, to find them among objects that no list of actors names.
-
-    ``objects``: stamp, ids and places of those of the last frame; ``tries``: how often it was attempted.
-    """
-
-    odometry: dict[str, tuple[int, Floats]] = field(default_factory=dict[str, "tuple[int, Floats]"])
-    objects: tuple[int, Floats] = (0, np.zeros((0, 4)))
-    tries: int = 0
-
-    def found(self) -> dict[str, int]:
-        """Role → id of the only object that is where its odometry says, at the same instant."""
-        stamp, table = self.objects
-        self.tries += 1
-        ids: dict[str, int] = {}
-        for role, (when, place) in self.odometry.items():
-            near = np.abs(table[:, 1:] - place).max(axis=1, initial=0) <= SAME_PLACE
-            if abs(when - stamp) <= SAME_TICK and near.sum() == 1:
-                ids[role] = int(table[near, 0][0])
-        return ids
-
-
 class CarlaSurvey(Survey[Lead]):
     """Findings of the first reading of a recording.
 
@@ -413,7 +391,11 @@ class CarlaSurvey(Survey[Lead]):
         self.map_name = ""
         self.lost = LossTally()
         self._tables: dict[int, ColumnReader] = {}
-        self._whereabouts = _Whereabouts()
+        # Places of the vehicles with a role, to find them among objects that no list of actors names: their
+        # odometry by role; stamp, ids and places of the objects of the last frame.
+        self._odometry: dict[str, tuple[int, Floats]] = {}
+        self._objects: tuple[int, Floats] = (0, np.zeros((0, 4)))
+        self._tries = 0
         self._last: dict[int, bytes] = {}
         self._lasting: list[Ref] = []
 
@@ -473,7 +455,7 @@ class CarlaSurvey(Survey[Lead]):
             return
         self.structures[channel] = found
         if content == OBJECTS:
-            self._tables[channel] = ColumnReader(found, "objects", _PLACES)
+            self._tables[channel] = ColumnReader(found, _PLACES, "objects")
             self.leads[channel] = Lead()
 
     # One message -----------------------------------------------------------------------------------
@@ -565,26 +547,31 @@ class CarlaSurvey(Survey[Lead]):
     def _is_lost(self, channel: int) -> bool:
         """Return whether nobody knows which object the vehicle of an odometry is."""
         role = role_in(self.topic(channel))
-        tried = self._whereabouts.tries >= _MOST_TRIES
+        tried = self._tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
 
     def _take_odometry(self, channel: int, message: dict[str, Any]) -> None:
         place = np.array([number(message, path) for path in _ODOMETRY])
         role = role_in(self.topic(channel))
-        self._whereabouts.odometry[role] = (stamp_of(message), place)
+        self._odometry[role] = (stamp_of(message), place)
         self._find_egos()
 
     def _look_for_egos(self, data: memoryview, channel: int) -> None:
         egos, wanted = self.egos, self.egos.wanted
         named = wanted.isdecimal() and int(wanted) not in egos.actors.keys() | egos.seen
-        lost = any(egos.id_of(role) is None for role in self._whereabouts.odometry)
-        if not egos.seen or named or (lost and self._whereabouts.tries < _MOST_TRIES):
+        lost = any(egos.id_of(role) is None for role in self._odometry)
+        if not egos.seen or named or (lost and self._tries < _MOST_TRIES):
             head, table = self._tables[channel].read(data)
             table = table[(np.abs(table) < MAX_IDENT).all(axis=1)]
             egos.seen.update(table[:, 0].astype(np.int64).tolist())
-            self._whereabouts.objects = stamp_of(head), table
+            self._objects = stamp_of(head), table
             self._find_egos()
 
     def _find_egos(self) -> None:
-        for role, ident in self._whereabouts.found().items():
-            self.egos.by_role.setdefault(role, ident)
+        """Find the only object that is where the odometry of a role says, at the same instant."""
+        stamp, table = self._objects
+        self._tries += 1
+        for role, (when, place) in self._odometry.items():
+            near = np.abs(table[:, 1:] - place).max(axis=1, initial=0) <= SAME_PLACE
+            if abs(when - stamp) <= SAME_TICK and near.sum() == 1:
+                self.egos.by_role.setdefault(role, int(table[near, 0][0]))

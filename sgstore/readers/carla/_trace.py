@@ -32,9 +32,9 @@ import numpy as np
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import read_and_digest
 from sgstore.opendrive import read_map
-from sgstore.readers._base import MessageDecoder, MessageTrace, channels_of
-from sgstore.readers._blocks import FAR, NAN, FrameRows
-from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, Fields, decode
+from sgstore.readers._base import MessageTrace, channels_of
+from sgstore.readers._blocks import FAR, NAN, FrameRows, MessageDecoder
+from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
 from sgstore.readers.carla._signals import Lights, signals_of
 from sgstore.readers.carla._survey import (
     COMMANDS,
@@ -164,7 +164,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._survey = found
         self._leading = leading
         self._ego = ego
-        self._table = ColumnReader(found.structures[leading], "objects", COLUMNS)
+        self._table = ColumnReader(found.structures[leading], COLUMNS, "objects")
         self._nodes: dict[int, int] = {}
         self._idents: dict[int, int] = {}
         self._people: set[int] = set()
@@ -173,7 +173,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._controls: dict[int, tuple[int, Controls]] = {}
         self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
         self._odometry: tuple[int, Floats | None] = NEVER, None
-        self._fields: dict[int, Fields] = {}
+        self._fields: dict[int, ColumnReader] = {}
         self._driven = found.driven
         self._drivers: dict[int, int] = {}
         self._take = self._takers()
@@ -335,12 +335,12 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             applied = (STATUS, ident) in own.values()
             if content == (STATUS if applied else COMMANDS):
                 columns = tuple(("control." if applied else "") + name for name in CONTROLS)
-                self._fields[channel] = Fields(found.structures[channel], (*STAMP, *columns))
+                self._fields[channel] = ColumnReader(found.structures[channel], (*STAMP, *columns))
                 self._drivers[channel] = ident
                 takers[channel] = self._take_controls
             elif (content, ident) == (ODOMETRY, self._ego):
                 columns = (*STAMP, *ODOMETRY_COLUMNS)
-                self._fields[channel] = Fields(found.structures[channel], columns)
+                self._fields[channel] = ColumnReader(found.structures[channel], columns)
                 takers[channel] = self._take_odometry
         for channel, content in found.contents.items():
             if content == LIGHT_STATES:
@@ -355,7 +355,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._lights.update(decode(self._survey.structures[channel], data))
 
     def _take_controls(self, channel: int, _log_time: int, data: memoryview) -> None:
-        told = self._fields[channel].read(data)
+        told = self._fields[channel].read(data)[1][0]
         stamp, ident = stamp_from(told[:2]), self._drivers[channel]
         steer, throttle, brake = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
         self._controls[ident] = stamp, (0.0 - steer, throttle, brake)
@@ -382,7 +382,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
     def _take_odometry(self, channel: int, _log_time: int, data: memoryview) -> None:
         if self._frame is not None and self._ego in self._nodes and self._odometry[1] is None:
             return  # it is among the objects
-        told = self._fields[channel].read(data)
+        told = self._fields[channel].read(data)[1][0]
         self._odometry = stamp_from(told[:2]), told[2:]
         self._see_odometry()
 

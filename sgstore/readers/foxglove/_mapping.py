@@ -90,6 +90,30 @@ class EntityMapping:
     acceleration: tuple[str, ...] = ()
     light_state: str = ""
 
+    def ident_of(self, box: Box) -> str:
+        """The id of an entity; its own where the mapping's place for it is empty."""
+        return _text(self.id, box) or box.id
+
+    def type_of(self, box: Box) -> str:
+        """The type of an entity, or the empty string."""
+        if self.type:
+            told = _text(self.type, box)
+            if told or self.type != "metadata.type":
+                return told
+        lowered = {key.lower(): value for key, value in box.metadata.items()}
+        return next((lowered[key] for key in _TYPE_KEYS if lowered.get(key)), "")
+
+    def number_of(self, place: str, box: Box) -> float:
+        """The number at a place of an entity; NaN if there is none."""
+        try:
+            return float(_text(place, box) or math.nan)
+        except ValueError:
+            return math.nan
+
+    def shown(self, box: Box) -> str:
+        """State that a traffic light shows, as it is told; empty if nothing is."""
+        return _text(self.light_state, box)
+
 
 @dataclass(frozen=True, slots=True)
 class Ego:
@@ -167,38 +191,11 @@ _SECTIONS: Final[dict[str, type[Any]]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class EntityNames:
-    """Ids and types of entities, as a mapping says where they stand."""
-
-    entity: EntityMapping
-
-    def ident(self, box: Box) -> str:
-        """The id of an entity; its own where the mapping's place for it is empty."""
-        return self.text(self.entity.id, box) or box.id
-
-    def type_name(self, box: Box) -> str:
-        """The type of an entity, or the empty string."""
-        if self.entity.type:
-            told = self.text(self.entity.type, box)
-            if told or self.entity.type != "metadata.type":
-                return told
-        lowered = {key.lower(): value for key, value in box.metadata.items()}
-        return next((lowered[key] for key in _TYPE_KEYS if lowered.get(key)), "")
-
-    @staticmethod
-    def text(place: str, box: Box) -> str:
-        """Text at a place of an entity."""
-        if place.startswith(METADATA):
-            return box.metadata.get(place.removeprefix(METADATA), "")
-        return box.id if place == "id" else ""
-
-    def number(self, place: str, box: Box) -> float:
-        """The number at a place of an entity; NaN if there is none."""
-        try:
-            return float(self.text(place, box) or math.nan)
-        except ValueError:
-            return math.nan
+def _text(place: str, box: Box) -> str:
+    """Text at a place of an entity."""
+    if place.startswith(METADATA):
+        return box.metadata.get(place.removeprefix(METADATA), "")
+    return box.id if place == "id" else ""
 
 
 @cache

@@ -26,19 +26,9 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.mcap import read_and_digest
-from sgstore.readers._base import (
-    Lead,
-    LossTally,
-    MessageDecoder,
-    MessageTrace,
-    Ref,
-    Survey,
-    channels_of,
-    count_ref,
-    ref_of,
-)
-from sgstore.readers._blocks import FAR, NAN, FrameRows
-from sgstore.readers.foxglove._mapping import EntityNames, Mapping, mapping_for
+from sgstore.readers._base import Lead, MessageTrace, Ref, Survey, channels_of, count_ref, ref_of
+from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally, MessageDecoder
+from sgstore.readers.foxglove._mapping import Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
     ERRORS,
     ORIGIN,
@@ -95,7 +85,6 @@ class FoxgloveSurvey(Survey[Lead]):
         super().__init__(recording)
         self.readers: dict[int, ChannelReader] = {}
         self._mapping = mapping
-        self._names = EntityNames(mapping.entity)
         self._entities: dict[str, tuple[int, Ref]] = {}
         self._types: dict[str, str] = {}
         self._entity_axes: Counter[str] = Counter()
@@ -190,9 +179,9 @@ class FoxgloveSurvey(Survey[Lead]):
     def _look_at_scene(self, scene: SceneUpdate, run: Messages, row: int) -> None:
         self.count(run, row, bool(scene.boxes))
         for box in scene.boxes:
-            ident = self._names.ident(box)
+            ident = self._mapping.entity.ident_of(box)
             if not count_ref(self._entities, ident, ref_of(run, row)):
-                self._types[ident] = self._names.type_name(box)
+                self._types[ident] = self._mapping.entity.type_of(box)
                 self._entity_axes[box.axes] += 1
 
     def _look_at_transforms(self, told: list[Transform], run: Messages, row: int) -> None:
@@ -249,7 +238,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._readers = readers
         self._leading = leading
         self._mapping = mapping
-        self._names = EntityNames(mapping.entity)
         self._root = root
         self._ego_entity, self._ego_axes = ego
         self._axes = Axes()
@@ -348,7 +336,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._bodiless += scene.bodiless
         seen: set[str] = set()
         for box in scene.boxes:
-            ident = self._names.ident(box)
+            ident = self._mapping.entity.ident_of(box)
             if ident in seen:
                 self._left_out.add(f"entity {ident} comes more than once in a message", log_time)
                 continue
@@ -361,7 +349,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             standing[ident] = (box.time_ns or time_ns, box)
 
     def _enter(self, ident: str, box: Box) -> int:
-        type_name = self._names.type_name(box)
+        type_name = self._mapping.entity.type_of(box)
         meaning = self._mapping.meaning(type_name)
         if meaning.kind == "vehicle" and type_name.lower() not in self._mapping.types:
             self.roster.count_unknown(type_name)
@@ -395,7 +383,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
                 continue
             nodes.append(node)
             rows.append(values)
-            state = normalize_name(self._names.text(self._mapping.entity.light_state, box))
+            state = normalize_name(self._mapping.entity.shown(box))
             states.append(
                 _STATES.get(state, 0) if self._mapping.entity.light_state and state else -1
             )
@@ -426,7 +414,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         if not (np.abs(place) < FAR).all():
             return None
         row = _row((place, product(outer[1], box.pose[1])), box.size)
-        entity, number = self._mapping.entity, self._names.number
+        entity, number = self._mapping.entity, self._mapping.entity.number_of
         for column, places in ((_VELOCITY, entity.velocity), (_ACCELERATION, entity.acceleration)):
             if places:
                 told = np.array([number(place, box) for place in places])

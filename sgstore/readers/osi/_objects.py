@@ -91,10 +91,6 @@ Tree = dict[int, "Tree | int | NDArray[np.int64]"]
 """Fields that are read: number → those within, or the column of a double, or what states of a light mean."""
 
 
-class OddError(ValueError):
-    """A message that is well formed, perhaps, but has no layout that others could share."""
-
-
 @dataclass(slots=True)
 class _ObjectLayout:
     """Places of the fields in serialised objects of one shape.
@@ -271,7 +267,7 @@ class MovingObjects:
                 or wire in {_GROUP, _GROUP_END}
                 or (known is not None and number in seen)
             ):
-                raise OddError(f"field {number} of wire type {wire}")
+                raise ValueError(f"field {number} of wire type {wire}: no layout that others share")
             seen.add(number)
             # Of a number of variable length only that each of its bytes is followed by another, or not.
             found.mask[at:end] = 0x80 if wire == _VARINT else 0

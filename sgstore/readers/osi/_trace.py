@@ -21,8 +21,8 @@ from google.protobuf import message_factory
 
 from sgstore.errors import TraceError
 from sgstore.mcap import Loss, read_and_digest
-from sgstore.readers._base import LossTally, MessageDecoder, MessageTrace, channels_of
-from sgstore.readers._blocks import NAN, FrameRows
+from sgstore.readers._base import MessageTrace, channels_of
+from sgstore.readers._blocks import NAN, FrameRows, LossTally, MessageDecoder
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
