@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.mcap import IDS, Findings
-from sgstore.readers._blocks import assemble, counted
+from sgstore.mcap import IDS, Findings, read_and_digest
+from sgstore.readers._blocks import LossTally, assemble, counted
 from sgstore.world import Channel, MessageRefs, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
@@ -142,20 +142,37 @@ class Survey(Generic[AnyLead]):
     Parameters
     ----------
     recording : Recording
+    wanted : str
+        Id or name that the user gave for the ego; empty: as the recording says.
 
     Attributes
     ----------
     recording : Recording
+    wanted : str
     leads : dict
         Channel id → :class:`Lead`, of the channels that may lead.
-    notes : list of str
-        What is odd but lost nothing.
+    leading : int
+        Id of the one that does, whose messages are the frames; -1: it is not known yet.
+    map_text, map_name : str
+        The road map, and what the recording calls it; empty if it has none.
+    lost_lanes : list of str
+        Lanes that make no part of it, and why.
+    notes, about_ego : list of str
+        What is odd but lost nothing: of the recording, and of the choice of the ego.
+    lost : LossTally
+        What could not be used.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, wanted: str) -> None:
         self.recording = recording
+        self.wanted = wanted
         self.leads: dict[int, AnyLead] = {}
+        self.leading = -1
+        self.map_text = self.map_name = ""
+        self.lost_lanes: list[str] = []
         self.notes: list[str] = []
+        self.about_ego: list[str] = []
+        self.lost = LossTally()
         self._others: dict[int, tuple[int, Ref]] = {}
         self._window = recording.window
 
@@ -213,12 +230,40 @@ class Survey(Generic[AnyLead]):
             lead.weight += weight
             lead.first_ns = min(lead.first_ns, log_time)
 
-    def leading(self) -> int | None:
-        """The channel whose messages are the frames; ``None`` if none has any."""
+    def first_lead(self) -> int:
+        """The channel that leads all others; -1 if none has a frame."""
         ranked = [
             (*self.rank(lead), -channel) for channel, lead in self.leads.items() if lead.frames
         ]
-        return -max(ranked)[-1] if ranked else None
+        return -max(ranked)[-1] if ranked else -1
+
+    def no_frames(self) -> str:
+        """The reason why no channel leads."""
+        raise NotImplementedError
+
+    def find_ego(self) -> str:
+        """Find the ego, and return its id; empty if there is none.
+
+        Raises
+        ------
+        TraceError
+            Nothing bears the name that the user gave, or several things do.
+        """
+        raise NotImplementedError
+
+    def role(self, channel: int) -> str:
+        """The role of a channel."""
+        return "ground_truth" if channel == self.leading else "payload"
+
+    def context(self) -> Iterable[Ref]:
+        """Messages that later ones depend on."""
+        return self.once(self.leads[self.leading].first_ns)
+
+    def tell(self, report: TraceReport) -> None:
+        """Say in a report what is known before the frames are read."""
+        report.warnings += [*self.notes, *self.about_ego]
+        report.about_ego += self.about_ego
+        report.losses += self.lost.losses()
 
     def once(self, first_ns: int) -> list[Ref]:
         """The only message of each channel that has no other and came with the first frame.
@@ -324,3 +369,40 @@ class MessageTrace:
             topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")
             reason = report.losses[0].reason if report.losses else "it has no messages"
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
+
+
+class SurveyedTrace(MessageTrace):
+    """A recording that was read once when it was opened.
+
+    Parameters
+    ----------
+    survey : Survey
+        That first reading, not begun yet.
+    digest : str
+        SHA-256 of the file, if it is known; else the file is hashed.
+    **more
+        Other attributes of :class:`~sgstore.world.TraceInfo`.
+
+    Raises
+    ------
+    TraceError
+        A schema is malformed, no frame can be read, or nothing bears the name given for the ego.
+    """
+
+    def __init__(self, survey: Survey[Any], digest: str, **more: Any) -> None:
+        recording = survey.recording
+        _, digest = read_and_digest(recording.path, digest, survey.read)
+        survey.leading = survey.first_lead()
+        if survey.leading < 0:
+            raise TraceError(survey.no_frames(), path=recording.path)
+        super().__init__(
+            recording,
+            digest,
+            ego=survey.find_ego(),
+            channels=channels_of(recording, survey.role),
+            context=survey.context(),
+            map_text=survey.map_text,
+            map_name=survey.map_name,
+            lost_lanes=tuple(dict.fromkeys(survey.lost_lanes)),
+            **more,
+        )

@@ -16,7 +16,6 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.readers._base import Lead, Survey, ref_of
-from sgstore.readers._blocks import LossTally
 from sgstore.readers._ros2 import (
     MAX_IDENT,
     ColumnReader,
@@ -360,12 +359,6 @@ _MOST_NOTES: Final = 100
 class CarlaSurvey(Survey[Lead]):
     """Findings of the first reading of a recording.
 
-    Parameters
-    ----------
-    recording : Recording
-    ego : str
-        Id or role name that the user gave for the ego; empty: as the recording says.
-
     Attributes
     ----------
     contents : dict
@@ -376,20 +369,17 @@ class CarlaSurvey(Survey[Lead]):
         With the actors of the recording.
     lights : dict
         Id → :class:`~sgstore.readers.carla._signals.Light`.
-    map_text, map_name : str
-    lost : LossTally
-        What could not be used.
+    ego : int or None
+        Id of the ego.
     """
 
-    def __init__(self, recording: Recording, ego: str) -> None:
-        super().__init__(recording)
+    def __init__(self, recording: Recording, wanted: str) -> None:
+        super().__init__(recording, wanted)
         self.contents: dict[int, str] = {}
         self.structures: dict[int, Struct] = {}
-        self.egos = Egos(ego)
+        self.egos = Egos(wanted)
+        self.ego: int | None = None
         self.lights: dict[int, Light] = {}
-        self.map_text = ""
-        self.map_name = ""
-        self.lost = LossTally()
         self._tables: dict[int, ColumnReader] = {}
         # Places of the vehicles with a role, to find them among objects that no list of actors names: their
         # odometry by role; stamp, ids and places of the objects of the last frame.
@@ -412,9 +402,24 @@ class CarlaSurvey(Survey[Lead]):
             if content in OF_ONE_VEHICLE
         }
 
-    def context(self, leading: int) -> list[Ref]:
+    def no_frames(self) -> str:
+        """The reason why no channel leads."""
+        lost = self.lost.losses()
+        return lost[0].reason if lost else "no list of objects can be read"
+
+    def find_ego(self) -> str:
+        """Find the vehicle with the role of the ego, and return its id."""
+        self.ego, self.about_ego = self.egos.settle(self.driven.values())
+        return "" if self.ego is None else str(self.ego)
+
+    def role(self, channel: int) -> str:
+        """The role of a channel; messages of some of them last."""
+        lasts = channel != self.leading and self.contents.get(channel) in LASTING
+        return "lasting" if lasts else super().role(channel)
+
+    def context(self) -> list[Ref]:
         """Messages that later ones depend on: those that last, where they tell something new; calibrations."""
-        return [*self._lasting, *self.once(self.leads[leading].first_ns)]
+        return [*self._lasting, *super().context()]
 
     # Channels ----------------------------------------------------------------------------------------
 

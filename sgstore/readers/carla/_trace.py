@@ -30,16 +30,14 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import MapError, TraceError
-from sgstore.mcap import read_and_digest
 from sgstore.opendrive import read_map
-from sgstore.readers._base import MessageTrace, channels_of
+from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import FAR, NAN, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
 from sgstore.readers.carla._signals import Lights, signals_of
 from sgstore.readers.carla._survey import (
     COMMANDS,
     EVENTS,
-    LASTING,
     LIGHT_STATES,
     NEVER,
     OBJECTS,
@@ -138,11 +136,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
 
     Parameters
     ----------
-    found : CarlaSurvey
-    leading : int
-        Channel whose messages are frames.
-    ego : int or None
-        Id of the ego.
+    survey : CarlaSurvey
     signals : mapping
         Traffic light → id of the signal of the road map that it is.
     road_map : RoadMap or None
@@ -153,18 +147,14 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
 
     def __init__(
         self,
-        found: CarlaSurvey,
-        leading: int,
-        *,
-        ego: int | None,
+        survey: CarlaSurvey,
         signals: Mapping[int, str],
         road_map: RoadMap | None,
         report: TraceReport,
     ) -> None:
-        self._survey = found
-        self._leading = leading
-        self._ego = ego
-        self._table = ColumnReader(found.structures[leading], COLUMNS, "objects")
+        self._survey = survey
+        self._leading, self._ego = survey.leading, survey.ego
+        self._table = ColumnReader(survey.structures[survey.leading], COLUMNS, "objects")
         self._nodes: dict[int, int] = {}
         self._idents: dict[int, int] = {}
         self._people: set[int] = set()
@@ -174,11 +164,11 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
         self._odometry: tuple[int, Floats | None] = NEVER, None
         self._fields: dict[int, ColumnReader] = {}
-        self._driven = found.driven
+        self._driven = survey.driven
         self._drivers: dict[int, int] = {}
         self._take = self._takers()
-        super().__init__({leading, *self._take}, found.recording.window, report)
-        self._lights = Lights(found.lights, signals, road_map, self.roster)
+        super().__init__({survey.leading, *self._take}, survey.recording.window, report)
+        self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
         """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
@@ -509,7 +499,7 @@ def _our_lights(bits: int) -> int:
 # The recording ------------------------------------------------------------------------------------
 
 
-class CarlaTrace(MessageTrace):
+class CarlaTrace(SurveyedTrace):
     """A recording of CARLA's ROS bridge.
 
     Parameters
@@ -537,27 +527,11 @@ class CarlaTrace(MessageTrace):
     name: ClassVar[str] = "carla"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        survey = CarlaSurvey(recording, ego)
-        _, digest = read_and_digest(recording.path, digest, survey.read)
-        leading = survey.leading()
-        if leading is None:
-            lost = survey.lost.losses()
-            reason = lost[0].reason if lost else "no list of objects can be read"
-            raise TraceError(reason, path=recording.path)
-        self._survey, self._leading = survey, leading
-        self._ego, self._notes = survey.egos.settle(survey.driven.values())
+        self._survey = CarlaSurvey(recording, ego)
+        super().__init__(self._survey, digest)
         self._signals: dict[int, str] = {}
         self._road_map: RoadMap | None = None
         self.on_map(self._own_map())
-        super().__init__(
-            recording,
-            digest,
-            channels_of(recording, self._role),
-            ego="" if self._ego is None else str(self._ego),
-            context=survey.context(leading),
-            map_text=survey.map_text,
-            map_name=survey.map_name,
-        )
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
@@ -566,17 +540,8 @@ class CarlaTrace(MessageTrace):
 
     def decoder(self, report: TraceReport) -> CarlaDecoder:
         """A decoder that has read nothing yet."""
-        report.warnings += [*self._survey.notes, *self._notes]
-        report.about_ego += self._notes
-        report.losses += self._survey.lost.losses()
-        return CarlaDecoder(
-            self._survey,
-            self._leading,
-            ego=self._ego,
-            signals=self._signals,
-            road_map=self._road_map,
-            report=report,
-        )
+        self._survey.tell(report)
+        return CarlaDecoder(self._survey, self._signals, self._road_map, report)
 
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the lanes of traffic lights in the road map that the recording is read with."""
@@ -592,8 +557,3 @@ class CarlaTrace(MessageTrace):
             return read_map(self._survey.map_text, self._survey.map_name)
         except MapError:  # whoever reads the map for its lanes says so
             return None
-
-    def _role(self, channel: int) -> str:
-        if channel == self._leading:
-            return "ground_truth"
-        return "lasting" if self._survey.contents.get(channel) in LASTING else "payload"

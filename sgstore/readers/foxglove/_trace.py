@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.mcap import read_and_digest
-from sgstore.readers._base import Lead, MessageTrace, Ref, Survey, channels_of, count_ref, ref_of
+from sgstore.readers._base import Lead, Ref, Survey, SurveyedTrace, count_ref, ref_of
 from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally, MessageDecoder
 from sgstore.readers.foxglove._mapping import Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
@@ -79,12 +78,16 @@ class FoxgloveSurvey(Survey[Lead]):
     ----------
     readers : dict
         Channel id → reader, of the scenes that the mapping names and of the transforms.
+    mapping : Mapping
+    ego : tuple of str
+        Id of the entity, and name of the axes, that are the ego; empty where they are not.
     """
 
-    def __init__(self, recording: Recording, mapping: Mapping) -> None:
-        super().__init__(recording)
+    def __init__(self, recording: Recording, wanted: str, mapping: Mapping) -> None:
+        super().__init__(recording, wanted)
         self.readers: dict[int, ChannelReader] = {}
-        self._mapping = mapping
+        self.mapping = mapping
+        self.ego = ("", "")
         self._entities: dict[str, tuple[int, Ref]] = {}
         self._types: dict[str, str] = {}
         self._entity_axes: Counter[str] = Counter()
@@ -93,31 +96,36 @@ class FoxgloveSurvey(Survey[Lead]):
 
     def root(self) -> str:
         """The axes that stand still."""
-        if self._mapping.scene.axes:
-            return self._mapping.scene.axes
+        if self.mapping.scene.axes:
+            return self.mapping.scene.axes
         most = [axes for axes, _ in self._entity_axes.most_common(1)]
         return self._axes.root() or (most or [""])[0]
 
-    def ego(self, wanted: str, notes: list[str]) -> tuple[str, str]:
-        """Id of the entity, and name of the axes, that are the ego; empty where they are not.
+    def no_frames(self) -> str:
+        """The reason why no channel leads."""
+        named = ", ".join(self.mapping.scene.topics)
+        where = f" on the topics of the mapping: {named}" if named else ""
+        return f"no {SCENE} can be read{where}"
 
-        Raises
-        ------
-        TraceError
-            Nothing bears the name that the user gave.
-        """
-        told = self._mapping.ego
-        if wanted:
-            if wanted in self._entities:
-                return wanted, ""
-            if wanted in self._transforms:
-                return "", wanted
-            entities = ", ".join([*self._entities][:LISTED]) or "none"
-            axes = ", ".join([*self._transforms][:LISTED]) or "none"
-            raise TraceError(
-                f"no entity and no axes are called {wanted!r}; entities: {entities}; axes: {axes}",
-                path=self.recording.path,
-            )
+    def find_ego(self) -> str:
+        """Find the entity or the axes that are the ego, and return their name."""
+        self.ego = self._named(self.wanted) if self.wanted else self._meant()
+        return self.ego[0] or self.ego[1]
+
+    def _named(self, wanted: str) -> tuple[str, str]:
+        if wanted in self._entities:
+            return wanted, ""
+        if wanted in self._transforms:
+            return "", wanted
+        entities = ", ".join([*self._entities][:LISTED]) or "none"
+        axes = ", ".join([*self._transforms][:LISTED]) or "none"
+        raise TraceError(
+            f"no entity and no axes are called {wanted!r}; entities: {entities}; axes: {axes}",
+            path=self.recording.path,
+        )
+
+    def _meant(self) -> tuple[str, str]:
+        told = self.mapping.ego
         names = {told.entity.lower()} if told.entity else EGO_NAMES
         named = [
             ident
@@ -130,7 +138,7 @@ class FoxgloveSurvey(Survey[Lead]):
             return "", told.axes if told.axes in self._transforms else ""
         axes = next((axes for axes in EGO_AXES if axes in self._transforms), "")
         if axes:
-            notes.append(
+            self.about_ego.append(
                 f"the ego is the axes {axes!r}, a box without a size: a mapping can tell one"
             )
         return "", axes
@@ -138,7 +146,7 @@ class FoxgloveSurvey(Survey[Lead]):
     def context(self) -> list[Ref]:
         """Messages that later ones depend on: what comes once, with the first frame or to stay."""
         lasting = self._transforms
-        if not self._mapping.scene.snapshot:
+        if not self.mapping.scene.snapshot:
             lasting = self._entities | self._transforms
         first = min(lead.first_ns for lead in self.leads.values())
         return [*self.once(first), *(ref for count, ref in lasting.values() if count == 1)]
@@ -153,7 +161,7 @@ class FoxgloveSurvey(Survey[Lead]):
             return True
         encoding = encoding_of(self.recording, channel)
         record = self.recording.channels[channel]
-        topics = self._mapping.scene.topics
+        topics = self.mapping.scene.topics
         schema = self.recording.schemas.get(record.schema_id)
         if not encoding or schema is None:
             return False
@@ -179,9 +187,9 @@ class FoxgloveSurvey(Survey[Lead]):
     def _look_at_scene(self, scene: SceneUpdate, run: Messages, row: int) -> None:
         self.count(run, row, bool(scene.boxes))
         for box in scene.boxes:
-            ident = self._mapping.entity.ident_of(box)
+            ident = self.mapping.entity.ident_of(box)
             if not count_ref(self._entities, ident, ref_of(run, row)):
-                self._types[ident] = self._mapping.entity.type_of(box)
+                self._types[ident] = self.mapping.entity.type_of(box)
                 self._entity_axes[box.axes] += 1
 
     def _look_at_transforms(self, told: list[Transform], run: Messages, row: int) -> None:
@@ -210,36 +218,15 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     Parameters
     ----------
-    readers : dict
-        Channel id → reader, of the scenes and transforms.
-    leading : int
-        Id of the channel whose messages are frames.
-    mapping : Mapping
-    root : str
-        The axes that stand still.
-    ego : tuple of str
-        Id of the entity, and name of the axes, that are the ego; empty where they are not.
-    window : tuple of int
-        Log times, both included, between which messages are frames.
+    survey : FoxgloveSurvey
     report : TraceReport
     """
 
-    def __init__(
-        self,
-        readers: dict[int, ChannelReader],
-        leading: int,
-        mapping: Mapping,
-        root: str,
-        ego: tuple[str, str],
-        window: tuple[int, int],
-        report: TraceReport,
-    ) -> None:
-        super().__init__(readers, window, report)
-        self._readers = readers
-        self._leading = leading
-        self._mapping = mapping
-        self._root = root
-        self._ego_entity, self._ego_axes = ego
+    def __init__(self, survey: FoxgloveSurvey, report: TraceReport) -> None:
+        super().__init__(survey.readers, survey.recording.window, report)
+        self._readers, self._leading = survey.readers, survey.leading
+        self._mapping, self._root = survey.mapping, survey.root()
+        self._ego_entity, self._ego_axes = survey.ego
         self._axes = Axes()
         self._nodes: dict[tuple[int, str], int] = {}
         self._idents: list[str] = []
@@ -447,7 +434,7 @@ def _size(ego: Ego) -> tuple[float, float, float]:
 # The recording ------------------------------------------------------------------------------------
 
 
-class FoxgloveTrace(MessageTrace):
+class FoxgloveTrace(SurveyedTrace):
     """A recording of Foxglove scenes.
 
     Parameters
@@ -484,25 +471,10 @@ class FoxgloveTrace(MessageTrace):
         mapping: str | Path = "",
     ) -> None:
         topics = [record.topic for record in recording.channels.values()]
-        self._mapping = mapping_for(mapping, topics)
-        survey = FoxgloveSurvey(recording, self._mapping)
-        _, digest = read_and_digest(recording.path, digest, survey.read)
-        leading = survey.leading()
-        if leading is None:
-            named = ", ".join(self._mapping.scene.topics)
-            where = f" on the topics of the mapping: {named}" if named else ""
-            raise TraceError(f"no {SCENE} can be read{where}", path=recording.path)
-        self._survey, self._leading = survey, leading
-        self._notes: list[str] = []
-        self._ego = survey.ego(ego, self._notes)
-        super().__init__(
-            recording,
-            digest,
-            channels_of(recording, self._role),
-            ego=self._ego[0] or self._ego[1],
-            context=survey.context(),
-            mapping=sha256(repr(self._mapping).encode("utf-8", "replace")).hexdigest(),
-        )
+        found = mapping_for(mapping, topics)
+        self._survey = FoxgloveSurvey(recording, ego, found)
+        known_by = sha256(repr(found).encode("utf-8", "replace")).hexdigest()
+        super().__init__(self._survey, digest, mapping=known_by)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
@@ -515,17 +487,5 @@ class FoxgloveTrace(MessageTrace):
 
     def decoder(self, report: TraceReport) -> FoxgloveDecoder:
         """A decoder that has read nothing yet."""
-        report.warnings += self._notes
-        report.about_ego += self._notes
-        return FoxgloveDecoder(
-            self._survey.readers,
-            self._leading,
-            self._mapping,
-            self._survey.root(),
-            self._ego,
-            self.recording.window,
-            report,
-        )
-
-    def _role(self, channel: int) -> str:
-        return "ground_truth" if channel == self._leading else "payload"
+        self._survey.tell(report)
+        return FoxgloveDecoder(self._survey, report)

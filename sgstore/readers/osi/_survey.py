@@ -298,6 +298,8 @@ def schema_name(recording: Recording, channel: int) -> str:
 class OsiSurvey(Survey[OsiLead]):
     """Findings of the first reading of a recording.
 
+    Its map is OpenDRIVE; in a recording that carries none, the lanes of its ground truth.
+
     Attributes
     ----------
     hosts : dict
@@ -306,22 +308,18 @@ class OsiSurvey(Survey[OsiLead]):
         The moving objects.
     statics : Statics
         What stands still.
-    map_text, map_name : str
-        OpenDRIVE; in a recording that carries none, the lanes of its ground truth.
-    lost_lanes : list of str
-        Lanes that make no part of the map of its lanes, and why.
+    ego : int or None
+        Id of the ego.
     signals : dict
         First bulb of each traffic light that is assigned to lanes → the signal of the map of its lanes.
     """
 
-    def __init__(self, recording: Recording) -> None:
-        super().__init__(recording)
+    def __init__(self, recording: Recording, wanted: str) -> None:
+        super().__init__(recording, wanted)
         self.hosts: dict[int, type[Any]] = {}
         self.cast = Cast()
         self.statics = Statics()
-        self.map_text = ""
-        self.map_name = ""
-        self.lost_lanes: list[str] = []
+        self.ego: int | None = None
         self.signals: dict[int, LaneSignal] = {}
         self._maps: dict[int, type[Any]] = {}
         self._map_refs: list[Ref] = []
@@ -335,20 +333,36 @@ class OsiSurvey(Survey[OsiLead]):
         """Read the recording from end to end, and make a map of its lanes if it has no other."""
         super().read()
         if not self.map_text:
-            leading = self.leading()
-            self.signals = {} if leading is None else self._lights[leading].signals()
+            leading = self.first_lead()
+            self.signals = {} if leading < 0 else self._lights[leading].signals()
             self._make_map_of_lanes(leading)
         return self
 
-    def context(self, leading: int) -> set[Ref]:
+    def no_frames(self) -> str:
+        """The reason why no channel leads."""
+        topics = [repr(self.topic(channel)) for channel in self.leads]
+        where = ", ".join(topics) or "the channels of its schema"
+        return f"no ground truth message can be read from {where}"
+
+    def find_ego(self) -> str:
+        """Find the ego among the moving objects, and return its ident."""
+        self.ego = self.cast.ego(self.wanted, self.about_ego)
+        return "" if self.ego is None else self.cast.idents()[self.ego]
+
+    def role(self, channel: int) -> str:
+        """The role of a channel; one of them may carry maps."""
+        is_map = channel != self.leading and schema_name(self.recording, channel) == ROAD_MAP
+        return "map" if is_map else super().role(channel)
+
+    def context(self) -> set[Ref]:
         """Messages that later ones depend on.
 
         Of a channel beside the leading one it is whatever tells of static things for the first time.
         """
-        refs = {*self._map_refs, *self.once(self.leads[leading].first_ns)}
+        refs = {*self._map_refs, *super().context()}
         for channel, other in self.leads.items():
             refs.update(other.latch.refs)
-            if channel != leading:
+            if channel != self.leading:
                 refs.update(other.latch.told_by.values())
         return refs
 
@@ -433,7 +447,7 @@ class OsiSurvey(Survey[OsiLead]):
             return
         self.count(run, row, len(ground.moving_object) > 0)
 
-    def _make_map_of_lanes(self, leading: int | None) -> None:
+    def _make_map_of_lanes(self, leading: int) -> None:
         """Make the map of the lanes, those of the leading channel before those of others."""
         for _, lead in sorted(self.leads.items(), key=lambda item: item[0] != leading):
             if lead.lanes is None:

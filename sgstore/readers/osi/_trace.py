@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 from google.protobuf import message_factory
 
-from sgstore.errors import TraceError
-from sgstore.mcap import Loss, read_and_digest
-from sgstore.readers._base import MessageTrace, channels_of
+from sgstore.mcap import Loss
+from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import NAN, FrameRows, LossTally, MessageDecoder
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights
 from sgstore.readers.osi._schema import (
@@ -29,7 +28,6 @@ from sgstore.readers.osi._schema import (
     GROUND_TRUTH,
     LATEST_NS,
     NO_VECTOR,
-    ROAD_MAP,
     SENSOR_VIEW,
     enum_name,
     ground_truth_of,
@@ -191,21 +189,14 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     ----------
     survey : OsiSurvey
         What the first reading found.
-    leading : int
-        Id of the channel whose messages are frames.
-    ego : int or None
-        Id of the ego.
     report : TraceReport
         Takes up what cannot be used.
     """
 
-    def __init__(
-        self, survey: OsiSurvey, leading: int, ego: int | None, report: TraceReport
-    ) -> None:
+    def __init__(self, survey: OsiSurvey, report: TraceReport) -> None:
         super().__init__({*survey.leads, *survey.hosts}, survey.recording.window, report)
         self._survey = survey
-        self._leading = leading
-        self._ego = ego
+        self._leading, self._ego = survey.leading, survey.ego
         self._idents = survey.cast.idents()
         self._nodes: dict[int, int] = {}
         self._keys: dict[bytes, int] = {}
@@ -215,7 +206,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         self._ahead: dict[int, list[bytes]] = {}
         self._aside: dict[int, int] = {}
         self._controls = NO_VECTOR
-        lead = survey.leads[leading]
+        lead = survey.leads[survey.leading]
         self._class = lead.objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
         names = {bulb: one.name for bulb, one in survey.signals.items()}
@@ -484,7 +475,7 @@ def _number(message: Any, part: str, name: str) -> float:
 # The recording ------------------------------------------------------------------------------------
 
 
-class OsiTrace(MessageTrace):
+class OsiTrace(SurveyedTrace):
     """A recording of OSI ground truth.
 
     Parameters
@@ -511,27 +502,8 @@ class OsiTrace(MessageTrace):
     name: ClassVar[str] = "osi"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        survey = OsiSurvey(recording)
-        _, digest = read_and_digest(recording.path, digest, survey.read)
-        leading = survey.leading()
-        if leading is None:
-            topics = [repr(survey.topic(channel)) for channel in survey.leads]
-            where = ", ".join(topics) or "the channels of its schema"
-            reason = f"no ground truth message can be read from {where}"
-            raise TraceError(reason, path=recording.path)
-        self._survey, self._leading = survey, leading
-        self._notes: list[str] = []
-        self._ego = survey.cast.ego(ego, self._notes)
-        super().__init__(
-            recording,
-            digest,
-            channels_of(recording, self._role),
-            ego="" if self._ego is None else survey.cast.idents()[self._ego],
-            context=survey.context(leading),
-            map_text=survey.map_text,
-            map_name=survey.map_name,
-            lost_lanes=tuple(dict.fromkeys(survey.lost_lanes)),
-        )
+        self._survey = OsiSurvey(recording, ego)
+        super().__init__(self._survey, digest)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
@@ -541,11 +513,5 @@ class OsiTrace(MessageTrace):
 
     def decoder(self, report: TraceReport) -> OsiDecoder:
         """A decoder that has read nothing yet."""
-        report.warnings += [*self._survey.notes, *self._notes]
-        report.about_ego += self._notes
-        return OsiDecoder(self._survey, self._leading, self._ego, report)
-
-    def _role(self, channel: int) -> str:
-        if channel == self._leading:
-            return "ground_truth"
-        return "map" if schema_name(self._survey.recording, channel) == ROAD_MAP else "payload"
+        self._survey.tell(report)
+        return OsiDecoder(self._survey, report)
