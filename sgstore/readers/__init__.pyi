@@ -35,13 +35,10 @@ from .carla._live import Sensors as Sensors
 from .carla._live import load_sensors as load_sensors
 from .foxglove._messages import DERIVED as DERIVED
 from .osi._file import OsiFile as OsiFile
-from .osi._schema import DECODE_ERRORS as DECODE_ERRORS
-from .osi._schema import SENSOR_VIEW as SENSOR_VIEW
 from .osi._schema import descriptors as descriptors
 from .osi._schema import message_class as message_class
 
 __all__ = [
-    "DECODE_ERRORS",
     "DERIVED",
     "ENDINGS",
     "EntityTable",
@@ -56,7 +53,6 @@ __all__ = [
     "POSE",
     "READERS",
     "RecordingReader",
-    "SENSOR_VIEW",
     "Sensor",
     "SensorCloud",
     "SensorPicture",

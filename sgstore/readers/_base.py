@@ -31,7 +31,7 @@ Ref = tuple[int, int, int, int, int]
 
 
 def ref_of(run: Messages, row: int) -> Ref:
-    """Where one message of a run stands."""
+    """Reference to one message of a run."""
     return (
         int(run.channel[row]),
         int(run.log_time_ns[row]),

@@ -102,7 +102,7 @@ _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Media:
-    """What a message carries.
+    """Content that a message carries.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class Media:
 
 
 def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, length: int) -> Media:
-    """What one message of a recording carries, by its channel's id and its place.
+    """Content of one message of a recording, by its channel's id and its place.
 
     Raises
     ------
@@ -437,7 +437,7 @@ def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterato
 
 
 def _chunks(path: Path, last: int) -> list[int]:
-    """Where the chunks of a file begin, up to one of them."""
+    """Byte offsets of the chunks of a file, up to one of them."""
     with open_regular(path) as file:
         found: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
     if last not in found and not (found and last == _END):

@@ -41,7 +41,7 @@ class RecordingReader(Protocol):
         ...
 
     def recognises(self, recording: Recording) -> bool:
-        """Whether a recording is of this flavour, by the schemas of its channels."""
+        """Return whether a recording is of this flavour, by the schemas of its channels."""
         ...
 
 
@@ -181,7 +181,7 @@ def read_messages(
 
 
 def _no_reader(recording: Recording) -> str:
-    """Why nothing recognises a recording, and what is in it."""
+    """The reason why nothing recognises a recording: its channels."""
     listed: list[str] = []
     for _, record in sorted(recording.channels.items()):
         schema = recording.schemas.get(record.schema_id)

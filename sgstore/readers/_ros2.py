@@ -460,7 +460,7 @@ class _MessageReader:
         return {name: self.value(inner) for name, inner in kind.fields}
 
     def count(self, kind: Sequence) -> int:
-        """How many elements follow."""
+        """Number of the elements that follow."""
         smallest = least(kind.element)
         if kind.count < 0:
             return self.length(smallest, kind.bound, "sequence")
@@ -490,7 +490,7 @@ def _dtype(order: str, kind: Number) -> np.dtype[Any]:
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Where things stand in an element that begins at a given alignment.
+    """Places of the numbers in an element that begins at a given alignment.
 
     ``size``: bytes from its begin to that of the next; ``prefixes``: place and value of each length in it;
     ``runs``: first column, place, number and type of numbers that stand side by side.
@@ -501,7 +501,7 @@ class _StructLayout:
     runs: list[tuple[int, int, int, np.dtype[Any]]]
 
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
-        """How many of the elements from a place on have this layout, one after another."""
+        """Number of the elements from a place on that have this layout, one after another."""
         for offset, expected in self.prefixes:
             if most < 1:
                 break
