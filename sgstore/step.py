@@ -255,7 +255,7 @@ def _mask_of(lights: Iterable[str] | None) -> int:
     return mask
 
 
-def _one_of(what: str, name: str, known: tuple[str, ...]) -> str:
+def _one_of(what: str, name: str, known: Sequence[str]) -> str:
     if name in known:
         return name
     like = suggestion(name, known)
