@@ -7,6 +7,7 @@ returns a part of the syntax tree. Signs and keywords are no children; an absent
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sgstore.errors import TextSpan
@@ -110,7 +111,7 @@ def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
     return s.AttributeOf(owner, f"class_{_unquoted(value.text)}", span)
 
 
-def _arguments(_: TextSpan, children: Children) -> tuple[s.Expression, ...]:
+def _all(_: TextSpan, children: Children) -> tuple[Any, ...]:
     return tuple(children)
 
 
@@ -138,9 +139,9 @@ def _count_values(span: TextSpan, children: Children) -> s.Call:
 
 
 def _logic(
-    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"],
-) -> Callable[[TextSpan, Children], s.Logic]:
-    return lambda span, children: s.Logic(word, tuple(children), span)
+    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"], span: TextSpan, children: Children
+) -> s.Logic:
+    return s.Logic(word, tuple(children), span)
 
 
 def _compare(span: TextSpan, children: Children) -> s.Comparison:
@@ -148,25 +149,21 @@ def _compare(span: TextSpan, children: Children) -> s.Comparison:
     return s.Comparison("<>" if sign.text == "!=" else sign.text, left, right, span)
 
 
-def _comparison(word: str) -> Callable[[TextSpan, Children], s.Comparison]:
-    return lambda span, children: s.Comparison(word, children[0], children[1], span)
+def _comparison(word: str, span: TextSpan, children: Children) -> s.Comparison:
+    return s.Comparison(word, children[0], children[1], span)
 
 
-def _null_test(*, negated: bool) -> Callable[[TextSpan, Children], s.NullTest]:
-    return lambda span, children: s.NullTest(children[0], negated, span)
+def _null_test(span: TextSpan, children: Children, *, negated: bool) -> s.NullTest:
+    return s.NullTest(children[0], negated, span)
 
 
-def _membership(*, negated: bool) -> Callable[[TextSpan, Children], s.Membership]:
-    return lambda span, children: s.Membership(children[0], children[1], negated, span)
+def _membership(span: TextSpan, children: Children, *, negated: bool) -> s.Membership:
+    return s.Membership(children[0], children[1], negated, span)
 
 
 def _arithmetic(span: TextSpan, children: Children) -> s.Arithmetic:
     pairs = zip(children[1::2], children[2::2], strict=True)
     return s.Arithmetic(children[0], tuple((sign.text, term) for sign, term in pairs), span)
-
-
-def _times(_: TextSpan, children: Children) -> Any:
-    return children[0]
 
 
 def _sign(span: TextSpan, children: Children) -> s.Expression:
@@ -201,8 +198,8 @@ def _end(text: str, span: TextSpan) -> s.Duration | s.Parameter:
     return s.Duration(float(found[1]), found[2].lower(), span)
 
 
-def _block_expression(word: str) -> Callable[[TextSpan, Children], s.BlockExpression]:
-    return lambda span, children: s.BlockExpression(word, children[0], None, span)
+def _block_expression(word: str, span: TextSpan, children: Children) -> s.BlockExpression:
+    return s.BlockExpression(word, children[0], None, span)
 
 
 def _aggregate_block(span: TextSpan, children: Children) -> s.BlockExpression:
@@ -221,12 +218,8 @@ def _label_any(span: TextSpan, _: Children) -> s.Label:
     return s.Label("%", span)
 
 
-def _label_logic(word: Literal["!", "&", "|"]) -> Callable[[TextSpan, Children], s.LabelLogic]:
-    return lambda span, children: s.LabelLogic(word, tuple(children), span)
-
-
-def _props(_: TextSpan, children: Children) -> tuple[s.Property, ...]:
-    return tuple(children)
+def _label_logic(word: Literal["!", "&", "|"], span: TextSpan, children: Children) -> s.LabelLogic:
+    return s.LabelLogic(word, tuple(children), span)
 
 
 def _prop(_: TextSpan, children: Children) -> s.Property:
@@ -249,23 +242,19 @@ def _edge_body(span: TextSpan, children: Children) -> tuple[Any, ...]:
     return name and name.text, label, star, props or (), where, span
 
 
-def _edge(
-    direction: Literal["right", "left", "any"],
-) -> Callable[[TextSpan, Children], s.EdgePattern]:
-    def build(span: TextSpan, children: Children) -> s.EdgePattern:
-        (name, label, star, props, where, _), repeat = children
-        if star and repeat:
-            raise BuildError("an edge is repeated twice, by '*' and by '{…}'")
-        low, high = star or repeat or (None, None)
-        return s.EdgePattern(name, label, low, high, props, where, direction, span)
-
-    return build
+_Direction = Literal["right", "left", "any"]
 
 
-def _bare(
-    direction: Literal["right", "left", "any"],
-) -> Callable[[TextSpan, Children], s.EdgePattern]:
-    return lambda span, _: s.EdgePattern(None, None, None, None, (), None, direction, span)
+def _edge(direction: _Direction, span: TextSpan, children: Children) -> s.EdgePattern:
+    (name, label, star, props, where, _), repeat = children
+    if star and repeat:
+        raise BuildError("an edge is repeated twice, by '*' and by '{…}'")
+    low, high = star or repeat or (None, None)
+    return s.EdgePattern(name, label, low, high, props, where, direction, span)
+
+
+def _bare(direction: _Direction, span: TextSpan, _: Children) -> s.EdgePattern:
+    return s.EdgePattern(None, None, None, None, (), None, direction, span)
 
 
 def _star(span: TextSpan, children: Children) -> tuple[int, int]:
@@ -310,10 +299,6 @@ def _range(low: int, high: int, span: TextSpan) -> tuple[int, int]:
 
 def _path(_: TextSpan, children: Children) -> s.Path:
     return s.Path(tuple(children[::2]), tuple(children[1::2]))
-
-
-def _patterns(_: TextSpan, children: Children) -> tuple[s.Path, ...]:
-    return tuple(children)
 
 
 def _block_body(span: TextSpan, children: Children) -> s.Block:
@@ -381,8 +366,8 @@ def _immediately(_: TextSpan, __: Children) -> tuple[str, None, None]:
     return "immediately", None, None
 
 
-def _other_link(kind: Literal["until", "while"]) -> Callable[[TextSpan, Children], s.LinkClause]:
-    return lambda span, _: s.LinkClause(kind, None, None, span)
+def _other_link(kind: Literal["until", "while"], span: TextSpan, _: Children) -> s.LinkClause:
+    return s.LinkClause(kind, None, None, span)
 
 
 def _sequence(span: TextSpan, children: Children) -> s.SequenceClause:
@@ -416,10 +401,6 @@ def _quantified(span: TextSpan, children: Children) -> s.QuantifiedNode:
 
 def _absent(_: TextSpan, children: Children) -> bool:
     return children[0].text.upper() == "TRUE"
-
-
-def _using(_: TextSpan, children: Children) -> tuple[s.Setting, ...]:
-    return tuple(children)
 
 
 def _setting(span: TextSpan, children: Children) -> s.Setting:
@@ -461,9 +442,9 @@ def _item(span: TextSpan, children: Children) -> s.Item:
 
 
 def _form(
-    form: Literal["all", "frames", "intervals", "subgraphs"],
-) -> Callable[[TextSpan, Children], s.Item]:
-    return lambda span, _: s.Item(form, None, None, 0, 0, span)
+    form: Literal["all", "frames", "intervals", "subgraphs"], span: TextSpan, _: Children
+) -> s.Item:
+    return s.Item(form, None, None, 0, 0, span)
 
 
 def _clips(span: TextSpan, children: Children) -> s.Item:
@@ -498,7 +479,7 @@ def _returns(span: TextSpan, children: Children) -> tuple[bool, tuple[s.Item, ..
 BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "start": _statements,
     "define": _define,
-    "params": _arguments,
+    "params": _all,
     "param": _param,
     "match": _match,
     "check": _check,
@@ -506,7 +487,7 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "qvar": _quantified,
     "absent": _absent,
     "reset": _only,
-    "using": _using,
+    "using": _all,
     "setting": _setting,
     "sequence": _sequence,
     "absent_step": _absent_step,
@@ -517,54 +498,54 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "hold": _hold,
     "step_name": _step_name,
     "link": _link,
-    "until_link": _other_link("until"),
-    "while_link": _other_link("while"),
+    "until_link": partial(_other_link, "until"),
+    "while_link": partial(_other_link, "while"),
     "within": lambda _, children: ("then", None, children[0]),
     "after": lambda _, children: ("then", *children),
     "immediately": _immediately,
     "where": _only,
-    "patterns": _patterns,
+    "patterns": _all,
     "path": _path,
     "node": _node,
-    "edge_right": _edge("right"),
-    "edge_left": _edge("left"),
-    "edge_any": _edge("any"),
-    "bare_right": _bare("right"),
-    "bare_left": _bare("left"),
-    "bare_any": _bare("any"),
+    "edge_right": partial(_edge, "right"),
+    "edge_left": partial(_edge, "left"),
+    "edge_any": partial(_edge, "any"),
+    "bare_right": partial(_bare, "right"),
+    "bare_left": partial(_bare, "left"),
+    "bare_any": partial(_bare, "any"),
     "edge_body": _edge_body,
     "star": _star,
     "repeat": _repeat,
     "repeat_exactly": _repeat_exactly,
     "label_expr": _only,
-    "label_or": _label_logic("|"),
-    "label_and": _label_logic("&"),
-    "label_neg": _label_logic("!"),
+    "label_or": partial(_label_logic, "|"),
+    "label_and": partial(_label_logic, "&"),
+    "label_neg": partial(_label_logic, "!"),
     "label": _label,
     "label_any": _label_any,
-    "props": _props,
+    "props": _all,
     "prop": _prop,
-    "implies": _logic("IMPLIES"),
-    "disjunction": _logic("OR"),
-    "exclusion": _logic("XOR"),
-    "conjunction": _logic("AND"),
-    "negation": _logic("NOT"),
+    "implies": partial(_logic, "IMPLIES"),
+    "disjunction": partial(_logic, "OR"),
+    "exclusion": partial(_logic, "XOR"),
+    "conjunction": partial(_logic, "AND"),
+    "negation": partial(_logic, "NOT"),
     "temporal": _temporal,
     "temporal_pair": _temporal_pair,
     "bound": _bound,
     "compare": _compare,
-    "equal": _comparison("="),
-    "is_null": _null_test(negated=False),
-    "is_known": _null_test(negated=True),
-    "is_in": _membership(negated=False),
-    "is_not_in": _membership(negated=True),
-    "starts_with": _comparison("STARTS WITH"),
-    "ends_with": _comparison("ENDS WITH"),
-    "contains": _comparison("CONTAINS"),
-    "resembles": _comparison("=~"),
+    "equal": partial(_comparison, "="),
+    "is_null": partial(_null_test, negated=False),
+    "is_known": partial(_null_test, negated=True),
+    "is_in": partial(_membership, negated=False),
+    "is_not_in": partial(_membership, negated=True),
+    "starts_with": partial(_comparison, "STARTS WITH"),
+    "ends_with": partial(_comparison, "ENDS WITH"),
+    "contains": partial(_comparison, "CONTAINS"),
+    "resembles": partial(_comparison, "=~"),
     "sum": _arithmetic,
     "product": _arithmetic,
-    "times": _times,
+    "times": _only,
     "sign": _sign,
     "attribute": _attribute,
     "attribute_in": _attribute_in,
@@ -574,10 +555,10 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "call": _call,
     "count_all": _count_all,
     "count_values": _count_values,
-    "exists": _block_expression("EXISTS"),
-    "count_block": _block_expression("COUNT"),
+    "exists": partial(_block_expression, "EXISTS"),
+    "count_block": partial(_block_expression, "COUNT"),
     "aggregate_block": _aggregate_block,
-    "arguments": _arguments,
+    "arguments": _all,
     "list": _list,
     "block": _only,
     "block_body": _block_body,
@@ -587,15 +568,15 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "null": lambda span, _: s.Constant(None, span),
     "duration": _duration,
     "returns": _returns,
-    "items": _arguments,
+    "items": _all,
     "item": _item,
-    "item_all": _form("all"),
-    "item_frames": _form("frames"),
-    "item_intervals": _form("intervals"),
-    "item_subgraphs": _form("subgraphs"),
+    "item_all": partial(_form, "all"),
+    "item_frames": partial(_form, "frames"),
+    "item_intervals": partial(_form, "intervals"),
+    "item_subgraphs": partial(_form, "subgraphs"),
     "item_clips": _clips,
     "offset": _offset,
-    "order": _arguments,
+    "order": _all,
     "sort": _sort,
     "sample": _sample,
     "limit": _limit,
