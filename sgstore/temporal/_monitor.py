@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 from sgstore.config import Config
 from sgstore.errors import QueryError, TraceError
 from sgstore.lang import (
+    MOTION,
     Catalog,
     FrameView,
     RelationScope,
@@ -32,7 +33,7 @@ from sgstore.sgg import SceneGraphGenerator
 from sgstore.step import GcPaused, Replay
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._checks import Verdict
-from sgstore.temporal._query_cache import NodeNames, QueryCache, Wanted
+from sgstore.temporal._query_cache import NodeNames, QueryCache
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
 from sgstore.temporal._signal_state import StreamClock
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.graph import SceneGraph
+    from sgstore.lang import Need
     from sgstore.lang.ir import BoundCheck, Query
     from sgstore.lang.syntax import Statement
     from sgstore.roads import RoadMap
@@ -217,7 +219,7 @@ class Monitor:
             if check.relations <= answers or check.unknown_is_false:
                 ego, questions = self._of_ego(check.ego)
                 watch = CheckMonitor(check, questions, self._pulse, compat=sgsm_compat)
-                self._watches.append((ego, watch, _PendingEvents(Wanted(of_check(check)))))
+                self._watches.append((ego, watch, _PendingEvents(of_check(check))))
             else:
                 missing = ", ".join(sorted(check.relations - answers))
                 self._unknown[check.name] = f"it knows nothing of {missing}"
@@ -225,7 +227,7 @@ class Monitor:
         for name, query in zip(_names(called, len(queries)), queries, strict=True):
             if query.relations <= answers or query.unknown_is_false:
                 ego, questions = self._of_ego(query.ego)
-                waiting = _PendingEvents(Wanted(of_query(query) if query.steps else ()))
+                waiting = _PendingEvents(of_query(query) if query.steps else ())
                 self._follows.append(
                     (ego, SequenceMonitor(name, query, questions, self._pulse), waiting)
                 )
@@ -370,27 +372,53 @@ class Monitor:
         return (*verdicts, *told)
 
 
-@dataclass(slots=True)
 class _PendingEvents:
-    """Events that wait until the trace has shown what they need: till then they may be of what nobody knows."""
+    """Events that wait until the trace has shown what they need: till then they may be of what nobody knows.
 
-    wanted: Wanted
-    events: list[MonitorEvent] = field(default_factory=list[MonitorEvent])
-    reason: str = ""
+    Parameters
+    ----------
+    needs : iterable of Need
+
+    Attributes
+    ----------
+    reason : str
+        The needs that the trace has not met, as text. Nothing is needed of what was never there.
+    """
+
+    def __init__(self, needs: Iterable[Need]) -> None:
+        self._open = list(needs)
+        self._met: set[Need] = set()
+        self._events: list[MonitorEvent] = []
+        self.reason = ""
 
     def passed(
         self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
     ) -> list[MonitorEvent]:
         """Return the events of a frame, of what was found up to it."""
-        if not self.wanted.open:
+        if not self._open:
             return found
-        self.wanted.look(people)
-        self.reason = self.wanted.reason
-        self.events += found
+        self._open = [need for need in self._open if not self._told(need, people)]
+        left = (n for n in self._open if n.attribute is None or n.kinds is None or n in self._met)
+        self.reason = "; ".join(dict.fromkeys(need.reason for need in left))
+        self._events += found
         if self.reason:
             return []
-        told, self.events = [replace(event, told=here) for event in self.events], []
+        told, self._events = [replace(event, told=here) for event in self._events], []
         return told
+
+    def _told(self, need: Need, people: NodeNames) -> bool:
+        if need.kinds is None:
+            return False  # nobody tells it while a trace goes on
+        present = people.of(need.kinds)
+        if need.attribute is None:
+            return bool(present)
+        name = need.attribute.name
+        asked = [
+            node for node in present if name not in MOTION or not people.tells(node, "is_static")
+        ]
+        if asked:
+            self._met.add(need)
+        return any(people.tells(node, name) is not None for node in asked)
 
 
 def _names(called: str | Sequence[str], count: int) -> Sequence[str]:

@@ -37,10 +37,10 @@ from sgstore.lang import ir as b
 from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from sgstore.lang import Catalog, SqlStatement
-    from sgstore.lang.ir import BoundHold, Length, StepLink
+    from sgstore.lang.ir import BoundHold, BoundStep, Length, StepLink
 
 
 _CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
@@ -308,6 +308,15 @@ class Plan:
             self.whole.ego,
             self.whole.unknown_is_false,
         )
+
+
+def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
+    """Return a plan for conditions of steps, whose bindings are of all their nodes."""
+    nodes = {key: node for step in reversed(steps) for key, node in step.scope.nodes.items()}
+    edges = tuple(edge for step in steps for edge in step.scope.edges)
+    scope = b.Scope(nodes, {}, edges, (), frozenset())
+    whole = replace(query, scope=scope, result=b.Result(), steps=(), links=())
+    return Plan(whole, frozenset(nodes))
 
 
 def _all(parts: list[b.Bound]) -> b.Bound:

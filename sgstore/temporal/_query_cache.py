@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
-from sgstore.lang import MOTION, Binding, ScopeSearch, expression, unnumbered_text
+from sgstore.lang import Binding, ScopeSearch, expression, unnumbered_text
 from sgstore.temporal._signal_state import Memory, SignalState, column_of
 from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from sgstore.lang import Column, Evaluate, FrameView, Need
+    from sgstore.lang import Column, Evaluate, FrameView
     from sgstore.lang import ir as b
     from sgstore.temporal._plan import Plan, Signal
     from sgstore.temporal._signal_state import StreamClock
@@ -238,48 +238,6 @@ class NodeNames:
     def name(self, node: int) -> str:
         """Return the name of a node."""
         return str(self._view.nodes[node].get("name", node))
-
-
-class Wanted:
-    """Needs that a trace has not met yet, frame by frame.
-
-    Parameters
-    ----------
-    needs : iterable of Need
-    """
-
-    def __init__(self, needs: Iterable[Need]) -> None:
-        self._open = list(needs)
-        self._met: set[Need] = set()
-
-    @property
-    def open(self) -> bool:
-        """Tell whether something is not known yet."""
-        return bool(self._open)
-
-    def look(self, people: NodeNames) -> None:
-        """A frame has come."""
-        self._open = [need for need in self._open if not self._told(need, people)]
-
-    def _told(self, need: Need, people: NodeNames) -> bool:
-        if need.kinds is None:
-            return False  # nobody tells it while a trace goes on
-        present = people.of(need.kinds)
-        if need.attribute is None:
-            return bool(present)
-        name = need.attribute.name
-        asked = [
-            node for node in present if name not in MOTION or not people.tells(node, "is_static")
-        ]
-        if asked:
-            self._met.add(need)
-        return any(people.tells(node, name) is not None for node in asked)
-
-    @property
-    def reason(self) -> str:
-        """The needs that the trace has not met, as text. Nothing is needed of what was never there."""
-        left = (n for n in self._open if n.attribute is None or n.kinds is None or n in self._met)
-        return "; ".join(dict.fromkeys(need.reason for need in left))
 
 
 @dataclass(slots=True)

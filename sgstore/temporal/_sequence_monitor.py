@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import TextSpan
-from sgstore.lang.ir import BoundStep, Query, Result, Scope, StepLink
+from sgstore.lang.ir import BoundStep, Query, Result, StepLink
 from sgstore.temporal._formula import And, Formula
-from sgstore.temporal._plan import Plan
+from sgstore.temporal._plan import plan_of_steps
 from sgstore.temporal._progression import Past, Progression, ProgressionFrame, Term
 from sgstore.temporal._query_cache import BindingTable, Partial, Valuation
 
@@ -265,12 +265,6 @@ FAILED: Final = "failed"
 OPEN: Final = "open"
 Ways = tuple[StepFrame, ...] | str
 """The places of the steps from one on; :data:`FAILED`: there are none; :data:`OPEN`: it is not known yet."""
-
-
-@dataclass(frozen=True, slots=True)
-class _SequenceEntry:
-    past: Past
-    memory: Memory
 
 
 class SequenceMonitor:
@@ -610,11 +604,7 @@ class _Conditions:
     def __init__(
         self, query: Query, steps: Sequence[BoundStep], questions: QueryCache, pulse: StreamClock
     ) -> None:
-        nodes = {key: node for step in reversed(steps) for key, node in step.scope.nodes.items()}
-        edges = tuple(edge for step in steps for edge in step.scope.edges)
-        scope = Scope(nodes, {}, edges, (), frozenset())
-        whole = replace(query, scope=scope, result=Result(), steps=(), links=())
-        plan = Plan(whole, frozenset(nodes))
+        plan = plan_of_steps(query, steps)
         when = [And(tuple(map(plan.formula, step.when))) for step in steps]
         self._progression = Progression(And(tuple(when)))
         whole_formula = self._progression.formula
@@ -626,9 +616,8 @@ class _Conditions:
         bridge = query.gaps == "bridge"
         self._letters = Valuation(plan, self._variables, questions, pulse, bridge=bridge)
         self._pulse = pulse
-        self._known = BindingTable(
-            self._letters.lattice, _SequenceEntry(self._progression.begun, self._letters.begun)
-        )
+        begun: tuple[Past, Memory] = self._progression.begun, self._letters.begun
+        self._known = BindingTable(self._letters.lattice, begun)
         self._frames: dict[Partial, ProgressionFrame] = {}
 
     def step(self) -> None:
@@ -636,19 +625,19 @@ class _Conditions:
         if not any(self._asked):
             return
         known = self._known
-        letters, memories = self._letters.read(known.held, lambda row: known.of(row).memory)
+        letters, memories = self._letters.read(known.held, lambda row: known.of(row)[1])
         shared: dict[tuple[Past, int], ProgressionFrame] = {}
-        entries: dict[Partial, _SequenceEntry] = {}
+        entries: dict[Partial, tuple[Past, Memory]] = {}
         self._frames = {}
         for row, letter in letters.items():
-            past = known.of(row).past
+            past, _ = known.of(row)
             if (past, letter) not in shared:
                 named = {n: bool(letter & self._letters.bits[n]) for n in self._progression.names}
                 shared[past, letter] = ProgressionFrame(
                     self._progression, past, named, self._pulse.tick
                 )
             frame = self._frames[row] = shared[past, letter]
-            entries[row] = _SequenceEntry(frame.past(), memories.get(row, ()))
+            entries[row] = frame.past(), memories.get(row, ())
         known.keep(entries, lambda one, other: one == other)
 
     def row(self, nodes: Binding) -> Partial:
