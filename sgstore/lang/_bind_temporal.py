@@ -7,6 +7,7 @@ returns, and in a ``CHECK``; inside braces only one frame is looked at.
 from __future__ import annotations
 
 import re
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,7 +24,7 @@ from sgstore.lang.library import patterns
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterator, Mapping
 
     from sgstore.errors import TextSpan
 
@@ -549,7 +550,7 @@ def _bind_step(
     session, step = found.session, written.step
     scope = StepScope(session, known=dict(found.known))
     names = SymbolTable(session, scope, dict(found.meanings))
-    with _Values(session, written):
+    with _parameters(session, written.values, written.name, written.called):
         if step.block.paths:
             bind_block(step.block, names)
         elif step.block.where is not None:
@@ -585,7 +586,7 @@ def _hold(hold: s.HoldClause, names: SymbolTable) -> o.BoundHold:
 
 def _link(link: s.LinkClause, values: Mapping[str, Any] | None, session: Session) -> o.StepLink:
     names = SymbolTable(session, ScopeBuilder(session))
-    with _Values(session, _Written(_NOTHING, values, "")):
+    with _parameters(session, values):
         after = length(link.after, names) if link.after else None
         within = length(link.within, names) if link.within else None
     if after and within:
@@ -596,26 +597,23 @@ def _link(link: s.LinkClause, values: Mapping[str, Any] | None, session: Session
     return o.StepLink(link.kind, after, within)
 
 
-_NOTHING: Any = None
-
-
-class _Values:
+@contextmanager
+def _parameters(
+    session: Session,
+    values: Mapping[str, Any] | None,
+    name: str = "",
+    called: TextSpan | None = None,
+) -> Generator[None]:
     """While a scenario's text is bound, its parameters are its own, and its errors say its name."""
-
-    def __init__(self, session: Session, written: _Written) -> None:
-        self._session, self._written = session, written
-        self._outside = session.parameters
-
-    def __enter__(self) -> None:
-        if self._written.values is not None:
-            self._session.parameters = self._written.values
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self._session.parameters = self._outside
-        if self._written.name and isinstance(error, QueryError):
-            raise type(error)(
-                f"in {self._written.name}(): {error.reason}",
-                text=self._session.text,
-                span=self._written.called or error.span,
-                hint=error.hint,
-            ) from None
+    outside = session.parameters
+    if values is not None:
+        session.parameters = values
+    try:
+        yield
+    except QueryError as error:
+        if not name:
+            raise
+        reason, span = f"in {name}(): {error.reason}", called or error.span
+        raise type(error)(reason, text=session.text, span=span, hint=error.hint) from None
+    finally:
+        session.parameters = outside

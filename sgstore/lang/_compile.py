@@ -575,16 +575,13 @@ class Compiled:
         query, places = with_places(query)
         span = SPAN if len(query.steps) > 1 else None
         told = (*places.values(), *(span or ()))
-        find, asked = self.finder, tuple(places)
-        if find is None:
-            return (
-                query,
-                ExternalMatches(query, self.catalog, nothing(query, len(told)), told),
-                span,
-            )
-        if window is not None:
-            return query, ExternalMatches(query, self.catalog, find(asked, window), told), span
-        return query, ExternalMatches(query, self.catalog, partial(find, asked), told), span
+        if self.finder is None:
+            found = nothing(query, len(told))
+        elif window is not None:
+            found = self.finder(tuple(places), window)
+        else:
+            found = partial(self.finder, tuple(places))
+        return query, ExternalMatches(query, self.catalog, found, told), span
 
     def frames(self, window: Window | None = None) -> SqlStatement:
         """The frames that match, each once, with their log times."""

@@ -355,7 +355,7 @@ def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
     held: list[str] = []
     for part, wider in _growing(asked, scope, parts):
         if not _first(wider, query, view):
-            return _failure(part, scope, _AskedPart(query, view, writer), tuple(held))
+            return _failure(part, scope, query, view, writer, tuple(held))
         scope = wider
         held.append(_text(part, scope, writer))
     at = _first(scope, query, view)
@@ -424,15 +424,14 @@ def _first(scope: b.Scope, query: b.Query, view: FrameView) -> Binding | None:
     return next(_bindings(scope, query, view), None)
 
 
-@dataclass(frozen=True, slots=True)
-class _AskedPart:
-    query: b.Query
-    view: FrameView
-    writer: Writer
-
-
-def _failure(part: _Part, scope: b.Scope, asked: _AskedPart, held: tuple[str, ...]) -> WhyNot:
-    query, view, writer = asked.query, asked.view, asked.writer
+def _failure(
+    part: _Part,
+    scope: b.Scope,
+    query: b.Query,
+    view: FrameView,
+    writer: Writer,
+    held: tuple[str, ...],
+) -> WhyNot:
     best, nearest, found = math.inf, dict[str, str](), ""
     if isinstance(part, b.Node):
         at = _first(scope, query, view)
@@ -445,7 +444,7 @@ def _failure(part: _Part, scope: b.Scope, asked: _AskedPart, held: tuple[str, ..
         if short < best or not found:
             best, nearest = short, _named(at, scope)
             between = isinstance(part, b.Edge)
-            found = _between(part, at, writer) if between else _values(part, at, asked)
+            found = _between(part, at, writer) if between else _values(part, at, query, writer)
     return WhyNot(held, _text(part, scope, writer), nearest, found)
 
 
@@ -530,15 +529,15 @@ def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
     return ", ".join(ways) + (f" WHERE {apart}" if apart else "")
 
 
-def _values(condition: b.Bound, at: Binding, asked: _AskedPart) -> str:
+def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> str:
     """Return the values in a condition."""
     texts: dict[str, str] = {}
     for leaf in leaves(condition):
-        name = asked.writer.expression(leaf)
+        name = writer.expression(leaf)
         if isinstance(leaf, b.NodeValue):
             texts[name] = f"{name}.name = {text_written(_name(at.view, at.nodes[leaf.node]))}"
         else:
-            texts[name] = _shown(name, _value(leaf, at, asked.query))
+            texts[name] = _shown(name, _value(leaf, at, query))
     return " AND ".join(texts.values())
 
 
