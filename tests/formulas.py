@@ -15,10 +15,13 @@ from sgstore.temporal._formula import (
     WHOLE,
     Bound,
     Formula,
+    Progression,
+    ProgressionFrame,
     Proposition,
+    Term,
+    Tick,
     TruthConstant,
 )
-from sgstore.temporal._progression import Progression, ProgressionFrame, Term, Tick
 from sgstore.temporal._signals import PropositionTable
 
 if TYPE_CHECKING:

@@ -24,10 +24,22 @@ from sgstore.temporal._checks import (
     levels_of,
     verdict_of,
 )
-from sgstore.temporal._formula import TRUE, And, Formula, Since, looks_ahead, propositions
-from sgstore.temporal._progression import Past, Progression, ProgressionFrame, Term, Tick, least
-from sgstore.temporal._query_cache import BindingTable, Partial, Valuation
+from sgstore.temporal._formula import (
+    TRUE,
+    And,
+    Formula,
+    Past,
+    Progression,
+    ProgressionFrame,
+    Since,
+    Term,
+    Tick,
+    least,
+    looks_ahead,
+    propositions,
+)
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
+from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 from sgstore.temporal._verdicts import (
     CERTAINLY_TRUE,
     FALSE,
@@ -44,8 +56,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang.ir import BoundCheck, BoundQuantifier
-    from sgstore.temporal._query_cache import Key, QueryCache
-    from sgstore.temporal._signal_state import Memory, StreamClock
+    from sgstore.temporal._valuation import Key, Memory, QueryCache, StreamClock
     from sgstore.world import Bools
 
     Keys = NDArray[np.int64]

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakValueDictionary
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,3 +286,412 @@ def bound_text(bound: Bound) -> str:
 
 def _length(amount: int, bound: Bound) -> str:
     return f"{amount}frames" if bound.frames else f"{amount / 1e9:g}s"
+
+
+# Progression: obligations after each frame, in bounded memory ----------------------------------------
+# At each frame a formula becomes a combination by *and*, *or* and *not* of **duties**: formulas that the next
+# frame must show (or need not, where there is none). What is already known vanishes in it. Equal combinations
+# are one object, so duties that come back are recognised, and a formula without bounds meets few of them:
+# they are the states of an automaton that is built as it is walked.
+#
+# Operators of the past keep the combination that stood for them one frame before, for the present may depend
+# on the future of the past (``ONCE NEXT p``). Nothing here is changed in place: a state can be kept, compared,
+# and gone on from more than once.
+
+
+class Term:
+    """A combination of duties; equal ones are the same object.
+
+    Attributes
+    ----------
+    word : str
+        ``true``, ``false``, ``duty``, ``not``, ``and``, ``or``.
+    operands : tuple
+        Terms; of a duty the formula, from where its bound counts (``None``: that has not begun), and whether
+        it is met where no frame follows.
+    timed : bool
+        Whether a duty in it counts from some frame on.
+    sense : int
+        Of two terms of the same :attr:`shape`, the one all of whose bounds begin no later makes the other true
+        (1), or the one all of whose bounds begin no earlier (-1); 0: that tells nothing.
+    shape : object
+        What it is but for where its bounds begin.
+    begins : tuple of int
+        Where they do.
+    """
+
+    __slots__ = ("__weakref__", "begins", "operands", "sense", "shape", "timed", "word")
+
+    def __init__(self, word: str, operands: tuple[Any, ...]) -> None:
+        self.word = word
+        self.operands = operands
+        self.sense, self.shape, self.begins = 0, None, tuple[int, ...]()
+        if word == "duty":
+            formula, since, _ = operands
+            self.timed: bool = since is not None
+            # Who keeps to the bound that ends first keeps to the other; if they begin here, both do.
+            if since is not None and not formula.bound.low:
+                self.sense, self.shape, self.begins = 1, id(formula), (since,)
+            return
+        self.timed = any(operand.timed for operand in operands)
+        if self.timed:
+            self._liken(operands)
+
+    def _liken(self, operands: tuple[Term, ...]) -> None:
+        senses = {operand.sense for operand in operands if operand.timed}
+        if len(senses) == 1 and 0 not in senses:
+            (sense,) = senses
+            self.sense = -sense if self.word == "not" else sense
+            self.shape = self.word, *(o.shape if o.timed else id(o) for o in operands)
+            self.begins = tuple(since for operand in operands for since in operand.begins)
+
+    def bounds(self) -> Iterator[tuple[Bound, int]]:
+        """The bounds that have begun in it, and from where each counts."""
+        if self.word == "duty":
+            if self.timed:
+                yield self.operands[0].bound, self.operands[1]
+        elif self.timed:
+            for operand in self.operands:
+                yield from operand.bounds()
+
+    def implies(self, other: Term) -> bool:
+        """Tell whether it makes another one of its shape true; both of sense 1, or -1."""
+        pairs = zip(self.begins, other.begins, strict=True)
+        return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
+
+    @property
+    def ended(self) -> bool:
+        """Its value if no frame follows."""
+        match self.word:
+            case "true" | "false":
+                return self.word == "true"
+            case "duty":
+                return self.operands[2]
+            case "not":
+                return not self.operands[0].ended
+            case "and":
+                return all(operand.ended for operand in self.operands)
+            case _:
+                return any(operand.ended for operand in self.operands)
+
+
+class Terms:
+    """All combinations that are in use."""
+
+    def __init__(self) -> None:
+        self._known: WeakValueDictionary[tuple[Any, ...], Term] = WeakValueDictionary()
+        self.true = self._made("true", ())
+        self.false = self._made("false", ())
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def _made(self, word: str, operands: tuple[Any, ...], key: tuple[Any, ...] = ()) -> Term:
+        term = self._known.get((word, key))
+        if term is None:
+            term = Term(word, operands)
+            self._known[word, key] = term
+        return term
+
+    def constant(self, value: bool) -> Term:  # noqa: FBT001 - it is the value
+        """Return the term of a known value."""
+        return self.true if value else self.false
+
+    def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
+        """Return the obligation on the next frame; ``since``: the start of its bound, if that has begun.
+
+        The formula is told by identity: equal parts of a formula are to be one object.
+        """
+        return self._made("duty", (formula, since, weak), (id(formula), since, weak))
+
+    def negated(self, term: Term) -> Term:
+        """Return the negation of a term."""
+        if term is self.true or term is self.false:
+            return self.constant(term is self.false)
+        if term.word == "not":
+            return term.operands[0]
+        return self._made("not", (term,), (id(term),))
+
+    def joined(self, word: str, terms: Iterable[Term]) -> Term:
+        """``and`` or ``or`` of some terms, without what does not matter.
+
+        Something and its contrary are left to be told by the frames that follow: verdicts over columns
+        (:mod:`sgstore.temporal._verdicts`) do not look for them either, and both are to know the same.
+        """
+        neutral, absorbing = (self.true, self.false) if word == "and" else (self.false, self.true)
+        parts: dict[int, Term] = {}
+        timed = 0
+        for term in terms:
+            for part in term.operands if term.word == word else (term,):
+                if part is absorbing:
+                    return absorbing
+                if part is not neutral:
+                    parts[id(part)] = part
+                    timed += part.timed
+        if timed > 1:
+            parts = {id(part): part for part in least(parts.values(), word)}
+        if len(parts) < 2:
+            return next(iter(parts.values()), neutral)
+        return self._made(word, tuple(parts.values()), tuple(sorted(parts)))
+
+
+def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
+    """Of some terms that are joined those that matter: without what another one makes true, or false, anyway.
+
+    So what an ``ALWAYS`` owes since many frames is owed once.
+    """
+    kept: list[Term] = []
+    best: dict[Any, Term] = {}
+    for term in terms:
+        if not term.sense:
+            kept.append(term)
+            continue
+        other = best.get(term.shape)
+        if other is not None:
+            strong, weak = (term, other) if term.implies(other) else (other, term)
+            if not strong.implies(weak):
+                kept.append(other)
+            else:
+                term = strong if word == "and" else weak  # noqa: PLW2901 - the better of the two
+        best[term.shape] = term
+    return kept + list(best.values())
+
+
+Entry = tuple[int, int, Term]
+"""A frame back (time, number) at which the right side of a bounded *since* stood, and what that still needs."""
+
+Past = tuple[tuple[Term, tuple[Entry, ...]], ...]
+"""What the operators of the past keep from one frame to the next: what stood for each, and its entries."""
+
+
+class Progression:
+    """A formula, ready to be told frame after frame.
+
+    Parameters
+    ----------
+    formula : Formula
+
+    Attributes
+    ----------
+    formula : Formula
+        The same, equal parts being one object.
+    names : tuple of str
+        Its propositions, in alphabetical order.
+    terms : Terms
+    past : tuple of Formula
+        Operators of the past, parts first.
+    begun : Past
+        What they keep before the first frame.
+    """
+
+    def __init__(self, formula: Formula, terms: Terms | None = None) -> None:
+        self.formula = interned(formula)
+        self.names = tuple(sorted(propositions(formula)))
+        self.terms = terms or Terms()
+        parts = {id(part): part for part in walk(self.formula)}
+        self.past = tuple(p for p in parts.values() if isinstance(p, Previous | Since))
+        self.looking = frozenset(id(p) for p in parts.values() if looks_ahead(p))
+        self.begun: Past = tuple((self.terms.false, ()) for _ in self.past)
+
+    @property
+    def untimed(self) -> bool:
+        """Tell whether time stamps do not matter."""
+        return not any(
+            isinstance(p, Until | Since) and (p.bound.low or p.bound.high is not None)
+            for p in walk(self.formula)
+        )
+
+
+def interned(formula: Formula, known: dict[Formula, Formula] | None = None) -> Formula:
+    """A formula of which equal parts are one object."""
+    known = {} if known is None else known
+    if formula not in known:
+        known[formula] = with_operands(formula, lambda part: interned(part, known))
+    return known[formula]
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """The time of a frame.
+
+    Attributes
+    ----------
+    time : int
+        ns.
+    number : int
+        From 0.
+    tolerance : int
+        Times that differ by no more are the same; ns.
+    """
+
+    time: int
+    number: int
+    tolerance: int = 0
+
+    def begun(self, bound: Bound, age: int) -> bool:
+        """Tell whether what is so old (ns, or frames) lies behind the lower end of a bound."""
+        return age >= bound.low - (0 if bound.frames else self.tolerance)
+
+    def over(self, bound: Bound, age: int) -> bool:
+        """Tell whether it lies behind the upper end, too."""
+        if bound.high is None:
+            return False
+        return age > bound.high + (0 if bound.frames else self.tolerance)
+
+
+class ProgressionFrame:
+    """One frame while it is told.
+
+    Parameters
+    ----------
+    progression : Progression
+    past : Past
+        As the frame before left it.
+    letter : mapping of str to bool
+        The propositions.
+    tick : Tick
+    """
+
+    def __init__(
+        self, progression: Progression, past: Past, letter: Mapping[str, bool], tick: Tick
+    ) -> None:
+        self._terms, self._looking = progression.terms, progression.looking
+        self._parts = progression.past
+        self._letter, self._tick = letter, tick
+        self._known: dict[tuple[int, int], Term] = {}
+        self._resolved: dict[Term, Term] = {}
+        self._present: dict[int, Term] = {}
+        self._entries: list[tuple[Entry, ...]] = []
+        for part, (before, entries) in zip(self._parts, past, strict=True):
+            self._present[id(part)], kept = self._of_past(part, before, entries)
+            self._entries.append(kept)
+
+    def now(self, formula: Formula, since: int | None = None) -> Term:
+        """A formula at this frame; ``since``: from where the bound of an *until* counts, if not from here."""
+        if since is None:
+            counted = isinstance(formula, Until) and formula.bound.frames
+            since = self._tick.number if counted else self._tick.time
+        key = id(formula), since
+        if key not in self._known:
+            self._known[key] = self._now(formula, since, self._terms)
+        return self._known[key]
+
+    def _now(self, formula: Formula, start: int, terms: Terms) -> Term:  # noqa: PLR0911 - a case each
+        match formula:
+            case TruthConstant(value=value):
+                return terms.constant(value)
+            case Proposition(name=name):
+                return terms.constant(bool(self._letter[name]))
+            case Not(operand=operand):
+                return terms.negated(self.now(operand))
+            case And(operands=operands):
+                return terms.joined("and", (self.now(operand) for operand in operands))
+            case Or(operands=operands):
+                return terms.joined("or", (self.now(operand) for operand in operands))
+            case Next(operand=operand, weak=weak):
+                return terms.duty(operand, None, weak=weak)
+            case Previous() | Since():
+                return self._present[id(formula)]
+            case Until():
+                return self._until(formula, start, terms)
+
+    def _until(self, formula: Until, start: int, terms: Terms) -> Term:
+        bound = formula.bound
+        age = (self._tick.number if bound.frames else self._tick.time) - start
+        if self._tick.over(bound, age):
+            return terms.false
+        right = self.now(formula.right) if self._tick.begun(bound, age) else terms.false
+        if right is terms.true:
+            return right
+        left = self.now(formula.left)
+        if left is terms.false:
+            return right
+        timed = bool(bound.low) or bound.high is not None
+        later = terms.duty(formula, start if timed else None, weak=False)
+        return terms.joined("or", (right, terms.joined("and", (left, later))))
+
+    def resolved(self, term: Term) -> Term:
+        """A combination of the frame before, with what this frame shows of its duties."""
+        if term not in self._resolved:
+            self._resolved[term] = self._resolve(term)
+        return self._resolved[term]
+
+    def _resolve(self, term: Term) -> Term:
+        match term.word:
+            case "true" | "false":
+                return term
+            case "duty":
+                formula, since, _ = term.operands
+                return self.now(formula, since)
+            case "not":
+                return self._terms.negated(self.resolved(term.operands[0]))
+            case word:
+                return self._terms.joined(word, (self.resolved(o) for o in term.operands))
+
+    def _of_past(
+        self, part: Formula, before: Term, entries: tuple[Entry, ...]
+    ) -> tuple[Term, tuple[Entry, ...]]:
+        """Return the value of an operator of the past at this frame, and the entries that it keeps."""
+        terms, before = self._terms, self.resolved(before)
+        if isinstance(part, Previous):
+            return before, ()
+        assert isinstance(part, Since)  # noqa: S101 - there is no other
+        left, right = self.now(part.left), self.now(part.right)
+        bound = part.bound
+        if not bound.low and bound.high is None:
+            return terms.joined("or", [right, terms.joined("and", [left, before])]), ()
+        if id(part) not in self._looking:
+            return self._known_past(part, entries if left is terms.true else (), right)
+        return self._open_past(part, entries, left, right)
+
+    def _known_past(
+        self, part: Since, entries: tuple[Entry, ...], right: Term
+    ) -> tuple[Term, tuple[Entry, ...]]:
+        """A *since* whose sides are known: its entries are the frames at which the right side was true."""
+        bound = part.bound
+        if right is self._terms.true:
+            # Without a lower bound the latest of them is as good as any before it.
+            here = (self._tick.time, self._tick.number, right)
+            entries = (*entries, here) if bound.low else (here,)
+        old = 0
+        if bound.high is not None:
+            while old < len(entries) and self._tick.over(bound, self._age(part, entries[old])):
+                old += 1
+        entries = entries[old:] if old else entries
+        if bound.high is None and len(entries) > 1:
+            entries = entries[:1]  # of these the earliest is as good as any after it
+        holds = bool(entries) and self._tick.begun(bound, self._age(part, entries[0]))
+        return self._terms.constant(holds), entries
+
+    def _open_past(
+        self,
+        part: Since,
+        entries: tuple[Entry, ...],
+        left: Term,
+        right: Term,
+    ) -> tuple[Term, tuple[Entry, ...]]:
+        terms, bound = self._terms, part.bound
+        moved = [
+            (time, number, terms.joined("and", [self.resolved(term), left]))
+            for time, number, term in entries
+        ]
+        kept: list[Entry] = []
+        found: list[Term] = []
+        for entry in [*moved, (self._tick.time, self._tick.number, right)]:
+            age = self._age(part, entry)
+            if entry[2] is not terms.false and not self._tick.over(bound, age):
+                kept.append(entry)
+                found += [entry[2]] if self._tick.begun(bound, age) else []
+        return terms.joined("or", found), tuple(kept)
+
+    def _age(self, part: Since, entry: Entry) -> int:
+        if part.bound.frames:
+            return self._tick.number - entry[1]
+        return self._tick.time - entry[0]
+
+    def past(self) -> Past:
+        """Return the memory of operators of the past for the next frame."""
+        return tuple(
+            (self.now(p.operand) if isinstance(p, Previous) else self._present[id(p)], entries)
+            for p, entries in zip(self._parts, self._entries, strict=True)
+        )

@@ -33,9 +33,8 @@ from sgstore.sgg import SceneGraphGenerator
 from sgstore.step import GcPaused, Replay
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._checks import Verdict
-from sgstore.temporal._query_cache import NodeNames, QueryCache
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
-from sgstore.temporal._signal_state import StreamClock
+from sgstore.temporal._valuation import NodeNames, QueryCache, StreamClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence

@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import TextSpan
 from sgstore.lang.ir import BoundStep, Query, Result, StepLink
-from sgstore.temporal._formula import And, Formula
+from sgstore.temporal._formula import And, Formula, Past, Progression, ProgressionFrame, Term
 from sgstore.temporal._plan import plan_of_steps
-from sgstore.temporal._progression import Past, Progression, ProgressionFrame, Term
-from sgstore.temporal._query_cache import BindingTable, Partial, Valuation
+from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from sgstore.lang.ir import BoundHold
-    from sgstore.temporal._query_cache import Key, NodeNames, QueryCache
-    from sgstore.temporal._signal_state import Memory, StreamClock
+    from sgstore.temporal._valuation import Key, Memory, NodeNames, QueryCache, StreamClock
 
 
 @dataclass(frozen=True, slots=True)

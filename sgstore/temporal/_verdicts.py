@@ -25,15 +25,18 @@ from sgstore.temporal._formula import (
     Not,
     Or,
     Previous,
+    Progression,
+    ProgressionFrame,
     Proposition,
     Since,
+    Term,
+    Tick,
     TruthConstant,
     Until,
     looks_ahead,
     walk,
     with_operands,
 )
-from sgstore.temporal._progression import Progression, ProgressionFrame, Term, Tick
 from sgstore.temporal._signals import PropositionTable, evaluate_rows
 
 if TYPE_CHECKING:
@@ -209,7 +212,7 @@ def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
 # For each frame of a trace two numbers: from which frame on it is known that a formula is true there, and from
 # which on that it is false; the number of frames, if the trace ends before that is known. They are made of
 # those of the parts, as logic without search tells: a conjunction is false once one of its parts is known to
-# be, and true once all are. It is what :mod:`sgstore.temporal._progression` knows frame by frame, for all
+# be, and true once all are. It is what :mod:`sgstore.temporal._formula` knows frame by frame, for all
 # frames at once.
 #
 # An *until* asks at each frame of its bound the same, so what is known of it is a chain of the least and the

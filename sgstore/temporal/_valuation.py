@@ -1,0 +1,816 @@
+"""The monitor's queries on one frame, each asked once; the truth of bindings, and their values over time.
+
+A binding says of each variable which node it is, or ``None``: any node of which nothing is known. What is known
+of a binding that is not held is what is known of the one held that says most of what it says; so a check over a
+hundred vehicles of which five come near costs what five cost.
+
+Whatever is told is closed: with two bindings that do not contradict one another, the one that says both is
+told.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+import numpy as np
+
+from sgstore.errors import QueryError
+from sgstore.lang import FUTURE, Binding, Column, ScopeSearch, expression, unnumbered_text
+from sgstore.lang import ir as b
+from sgstore.temporal._formula import Progression, ProgressionFrame, Tick
+from sgstore.temporal._signals import NS, Clock, SignalValues, evaluator_over_time, is_angle
+from sgstore.vocabulary import RELATIONS
+from sgstore.world import longest_step_ns, tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.lang import Evaluate, FrameView
+    from sgstore.temporal._plan import Plan, Signal, Test
+    from sgstore.world import Bools
+
+
+Partial = tuple["int | None", ...]
+T = TypeVar("T")
+
+
+class Lattice:
+    """Order of partial bindings of some variables, from none bound to all.
+
+    Parameters
+    ----------
+    size : int
+        How many variables there are.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.stranger: Partial = (None,) * size
+        patterns = [c for n in range(size, -1, -1) for c in combinations(range(size), n)]
+        self._patterns = [frozenset(pattern) for pattern in patterns]
+
+    def placed(self, key: Key, places: tuple[int, ...]) -> Partial:
+        """Return the binding in which some variables have these values."""
+        if self.size == 1:
+            return key or self.stranger
+        told: list[int | None] = [None] * self.size
+        for place, node in zip(places, key, strict=True):
+            told[place] = node
+        return tuple(told)
+
+    def wider(self, binding: Partial) -> Iterator[Partial]:
+        """Bindings that say the same and no more, those that say most first, itself among them."""
+        if self.size == 1:
+            yield binding
+            if binding[0] is not None:
+                yield self.stranger
+            return
+        bound = {place for place, node in enumerate(binding) if node is not None}
+        for pattern in self._patterns:
+            if pattern <= bound:
+                yield tuple(n if place in pattern else None for place, n in enumerate(binding))
+
+    def closed(self, bindings: Iterable[Partial]) -> set[Partial]:
+        """Bindings, the one of strangers, and those that say what several of them say."""
+        found = {self.stranger}
+        if self.size < 2:
+            found.update(bindings)
+            return found
+        for binding in bindings:
+            if binding in found:
+                continue
+            both = (_both(binding, other) for other in found)
+            found |= {one for one in both if one is not None}
+        return found
+
+    def ordered(self, bindings: Iterable[Partial]) -> list[Partial]:
+        """Those first that say less."""
+        if self.size < 2:
+            return sorted(bindings, key=lambda one: one != self.stranger)
+        return sorted(bindings, key=lambda one: sum(node is not None for node in one))
+
+
+def _both(one: Partial, other: Partial) -> Partial | None:
+    """Return the union of two bindings; ``None`` if they contradict one another."""
+    told: list[int | None] = []
+    for first, second in zip(one, other, strict=True):
+        if first is not None and second is not None and first != second:
+            return None
+        told.append(second if first is None else first)
+    return tuple(told)
+
+
+class BindingTable(Generic[T]):
+    """Values by binding; a binding without an entry has that of a wider one.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    strangers : T
+        What is known of nodes of which nothing is.
+    """
+
+    def __init__(self, lattice: Lattice, strangers: T) -> None:
+        self.lattice = lattice
+        self.held: dict[Partial, T] = {lattice.stranger: strangers}
+
+    def of(self, binding: Partial) -> T:
+        """Return the value of a binding."""
+        held = self.held
+        found = held.get(binding)
+        if found is not None:
+            return found
+        return next(held[wider] for wider in self.lattice.wider(binding) if wider in held)
+
+    def keep(self, found: dict[Partial, T], same: Callable[[T, T], bool]) -> None:
+        """Hold what is known now, but for bindings of which the same is known as of wider ones."""
+        lattice = self.lattice
+        strangers = found[lattice.stranger]
+        if lattice.size < 2:
+            self.held = {one: value for one, value in found.items() if not same(value, strangers)}
+            self.held[lattice.stranger] = strangers
+            return
+        held: dict[Partial, T] = {}
+        for binding in lattice.ordered(found):
+            value = found[binding]
+            wider = next((w for w in lattice.wider(binding) if w in held), None)
+            if wider is None or not same(value, held[wider]):
+                held[binding] = value
+        self.held = held
+
+
+# What checks and patterns ask of one frame: each question once, whoever asks it -----------------
+
+Key = tuple[int, ...]
+"""What some variables are bound to, in their order."""
+
+
+class FrameQuery:
+    """A pattern of one frame, and what is asked of its matches.
+
+    Parameters
+    ----------
+    query : Query
+    variables : tuple of str
+        Keys of its nodes that an answer tells; the others are only asked to exist.
+    value : Bound, optional
+        What is asked of each match.
+    edges : tuple of str
+        Keys of its edges that an answer tells, behind the nodes: by places in :data:`RELATIONS`.
+    first : tuple of str
+        Keys of its edges of which, where matches differ in these alone, the relations count that come first in
+        the alphabet.
+    """
+
+    def __init__(
+        self,
+        query: b.Query,
+        variables: tuple[str, ...],
+        value: b.Bound | None = None,
+        edges: tuple[str, ...] = (),
+        first: tuple[str, ...] = (),
+    ) -> None:
+        scope = query.scope
+        self._variables, self._edges, self._first = variables, edges, first
+        self._search = ScopeSearch(scope, injective=query.injective)
+        self._value: Evaluate | None = None
+        if value is not None:
+            self._value = expression(value, injective=query.injective)
+        self._kinds: b.Kinds | None = None
+        if value is None and len(scope.nodes) == 1 and not scope.where and not scope.edges:
+            self._kinds = next(iter(scope.nodes.values())).kinds
+
+    def answers(self, view: FrameView, people: NodeNames) -> Mapping[Key, Any]:
+        """Return the bindings of the variables in a graph, each with its value (``None``: unknown)."""
+        if self._kinds is not None:
+            present = people.of(self._kinds)
+            if self._variables:
+                return {(node,): None for node in present}
+            return {(): None} if present else {}
+        at, found = Binding(view), dict[Key, Any]()
+        words: dict[Key, tuple[str, ...]] = {}
+        for _ in self._search.run(at):
+            key = tuple(at.nodes[name] for name in self._variables)
+            if self._edges:
+                key += tuple(RELATIONS.index(at.edges[name][0]) for name in self._edges)
+            if self._first:
+                word = tuple(at.edges[name][0] for name in self._first)
+                if words.setdefault(key, word) > word:
+                    words[key] = word
+                    del found[key]
+            if key not in found:
+                found[key] = self._value(at) if self._value is not None else None
+                if not (key or self._first):
+                    break
+        return found
+
+
+class NodeNames:
+    """The nodes of one graph by what they may be.
+
+    Parameters
+    ----------
+    view : FrameView
+    """
+
+    def __init__(self, view: FrameView) -> None:
+        self._view = view
+        self._found: dict[b.Kinds, frozenset[int]] = {}
+
+    def __contains__(self, node: int) -> bool:
+        return node in self._view.nodes
+
+    def of(self, kinds: b.Kinds) -> frozenset[int]:
+        """Those that are of some kinds."""
+        if kinds not in self._found:
+            view, ego = self._view, self._view.graph.ego
+            found = {n for kind in kinds.other for n in view.by_kind.get(kind, ())}
+            found.discard(-1 if ego is None else ego)
+            if ego is not None and ego in view.nodes and view.is_one(ego, kinds):
+                found.add(ego)
+            self._found[kinds] = frozenset(found)
+        return self._found[kinds]
+
+    def tells(self, node: int, attribute: str) -> Any:
+        """An attribute of a node; ``None``: it is not known."""
+        return self._view.nodes[node].get(attribute)
+
+    def name(self, node: int) -> str:
+        """Return the name of a node."""
+        return str(self._view.nodes[node].get("name", node))
+
+
+@dataclass(slots=True)
+class QueryCache:
+    """All questions about the graphs of one ego, and their answers in the last frame.
+
+    Attributes
+    ----------
+    answers : list of mapping
+        By the number of the question.
+    fresh : set of Kinds
+        Of which somebody is in the last frame who was in none before.
+    """
+
+    _known: dict[Any, int] = field(default_factory=dict[Any, int])
+    _all: list[FrameQuery] = field(default_factory=list["FrameQuery"])
+    _met: dict[b.Kinds, dict[int, str]] = field(default_factory=dict["b.Kinds", dict[int, str]])
+    answers: list[Mapping[Key, Any]] = field(default_factory=list["Mapping[Key, Any]"])
+    fresh: set[b.Kinds] = field(default_factory=set["b.Kinds"])
+
+    def met(self, kinds: b.Kinds) -> Mapping[int, str]:
+        """Return the nodes of some kinds seen so far: node → name; it grows with each frame."""
+        return self._met.setdefault(kinds, {})
+
+    def add(
+        self,
+        query: b.Query,
+        variables: tuple[str, ...],
+        value: b.Bound | None = None,
+        edges: tuple[str, ...] = (),
+        first: tuple[str, ...] = (),
+    ) -> int:
+        """The number of a question; the same for those that ask the same."""
+        asked = None if value is None else unnumbered_text(value)
+        key = _told(query), variables, asked, edges, first
+        if key not in self._known:
+            self._known[key] = len(self._all)
+            self._all.append(FrameQuery(query, variables, value, edges, first))
+        return self._known[key]
+
+    def ask(self, view: FrameView, people: NodeNames) -> None:
+        """Ask them all of a graph."""
+        self.fresh.clear()
+        for kinds, known in self._met.items():
+            present = people.of(kinds)
+            if not present <= known.keys():
+                known.update((node, people.name(node)) for node in present - known.keys())
+                self.fresh.add(kinds)
+        self.answers = [question.answers(view, people) for question in self._all]
+
+
+def _told(query: b.Query) -> tuple[Any, ...]:
+    scope = query.scope
+    nodes = tuple((key, node.kinds) for key, node in sorted(scope.nodes.items()))
+    edges = tuple((e.key, e.src, e.dst, e.relations, e.both, e.low, e.high) for e in scope.edges)
+    where = tuple(map(unnumbered_text, scope.where))
+    return nodes, edges, where, scope.distinct, query.injective
+
+
+# Values over time frame by frame: what ``prev``, ``delta``, ``run_length``, ``since_true`` and ``age`` keep ---
+# The twin of :mod:`sgstore.temporal._signals`: the same numbers, of one frame at a time, for many bindings at
+# once. What a binding must remember is a value that nobody changes in place, so that a binding that is new goes
+# on from what is remembered of those that were never seen.
+
+TIMES: Final = 1001
+"""Times between frames of which the median is taken, the latest ones."""
+
+Memory = tuple[Any, ...]
+"""What a binding remembers: for each course, and each condition in one, what it needs of former frames."""
+
+
+class StreamClock:
+    """The frames that came so far, as far back as somebody looks.
+
+    Parameters
+    ----------
+    period_ns : int, optional
+        The time between two frames; by default the median of those seen before, the last :data:`TIMES` of them.
+
+    Attributes
+    ----------
+    tick : Tick
+        The last frame.
+    start : int
+        The time of the first frame; ns.
+    gap : bool
+        Whether a gap lies before the last frame.
+    """
+
+    def __init__(self, period_ns: int | None = None) -> None:
+        self._period = period_ns
+        self._spans: deque[int] = deque()
+        self._sorted: list[int] = []
+        self.tick = Tick(0, -1)
+        self.start = 0
+        self.gap = False
+
+    @property
+    def period(self) -> int:
+        """The time between two frames; ns. 0 before there are two."""
+        if self._period is not None:
+            return self._period
+        return self._sorted[(len(self._sorted) - 1) // 2] if self._sorted else 0
+
+    def step(self, time_ns: int) -> None:
+        """The next frame; one that is not later than the one before counts as a nanosecond later."""
+        last = self.tick
+        if last.number < 0:
+            self.start = time_ns
+        else:
+            time_ns = max(time_ns, last.time + 1)
+            span = time_ns - last.time
+            self.gap = bool(self.period) and span > longest_step_ns(self.period)
+            if self._period is None:
+                self._remember(span)
+        self.tick = Tick(time_ns, last.number + 1, tolerance_ns(self.period))
+
+    def _remember(self, span: int) -> None:
+        if len(self._spans) == TIMES:
+            del self._sorted[bisect_left(self._sorted, self._spans.popleft())]
+        self._spans.append(span)
+        insort(self._sorted, span)
+
+
+class SignalState:
+    """The tests of a plan, frame by frame.
+
+    Parameters
+    ----------
+    plan : Plan
+    pulse : StreamClock
+        Told of each frame before this is.
+    bridge : bool
+        Whether gaps do not matter.
+
+    Raises
+    ------
+    QueryError
+        The value of a test depends on later frames.
+    """
+
+    def __init__(self, plan: Plan, pulse: StreamClock, *, bridge: bool = False) -> None:
+        self.plan, self.pulse, self._bridge = plan, pulse, bridge
+        self.places: dict[b.Bound, int] = {}
+        self.conditions: dict[b.Bound, Progression] = {}
+        self.evaluators = {name: evaluator_over_time(test) for name, test in plan.tests.items()}
+        for test in plan.tests.values():
+            for part in b.walk(test.expression):
+                if isinstance(part, b.Tense) and part.word in FUTURE:
+                    raise QueryError(
+                        f"{part.word} stands where its value must be known at once, and it looks ahead",
+                        hint="join conditions by AND, OR, NOT, IMPLIES",
+                    )
+                if isinstance(part, b.SignalCall):
+                    self.places.setdefault(part, len(self.places))
+            for condition, formula in test.formulas.items():
+                self.conditions[condition] = Progression(formula)
+        self._frames: deque[tuple[int, int]] = deque()  # times and numbers since the last gap
+        deltas = [c for c in self.places if isinstance(c, b.SignalCall) and c.word == "delta"]
+        self._back = max((c.by for c in deltas if not c.frames), default=0)
+        self._many = max((c.by for c in deltas if c.frames), default=0)
+
+    @property
+    def begun(self) -> Memory:
+        """The memory before the first frame."""
+        pasts = (progression.begun for progression in self.conditions.values())
+        return (*(None for _ in self.places), *pasts)
+
+    def step(self) -> None:
+        """A frame has come, and the pulse has been told."""
+        tick = self.pulse.tick
+        if self.gap:
+            self._frames.clear()
+        self._frames.append((tick.time, tick.number))
+        while len(self._frames) > self._many + 1 and self._frames[1][0] <= tick.time - self._back:
+            self._frames.popleft()
+
+    @property
+    def gap(self) -> bool:
+        """Tell whether a gap lies before this frame."""
+        return self.pulse.gap and not self._bridge
+
+    @property
+    def oldest(self) -> int:
+        """The number of the first frame that is still looked back to."""
+        return self._frames[0][1]
+
+    def there(self, course: b.SignalCall) -> int:
+        """The number of the frame that ``delta`` compares this one with; -1: there is none."""
+        tick = self.pulse.tick
+        if course.frames:
+            number = tick.number - course.by
+            return number if number >= self.oldest else -1
+        found = -1
+        for time, number in self._frames:
+            if time > tick.time - course.by + tick.tolerance:
+                break
+            found = number
+        return found
+
+    def values(
+        self,
+        memories: Sequence[Memory],
+        atom: Callable[[str], Bools],
+        signal: Callable[[Signal], Column],
+    ) -> tuple[dict[str, Column], list[Memory]]:
+        """The values of all tests in this frame for some bindings, and what these remember from now on.
+
+        Parameters
+        ----------
+        memories : sequence of B
+        atom : function
+            (B,) where the atom of that name is true.
+        signal : function
+            The values of a signal: (B, 1).
+
+        Returns
+        -------
+        tests : dict of str to Column
+            (B, 1), or (1, 1), by name.
+        memories : list of B
+        """
+        now = _Now(self, memories, atom, signal)
+        tests = {name: now.test(test) for name, test in self.plan.tests.items()}
+        return tests, now.memories()
+
+
+class _Now:
+    """One frame of some bindings, while it is worked out."""
+
+    def __init__(
+        self,
+        courses: SignalState,
+        memories: Sequence[Memory],
+        atom: Callable[[str], Bools],
+        signal: Callable[[Signal], Column],
+    ) -> None:
+        self._all, self._atom, self.signal = courses, atom, signal
+        self._tick = courses.pulse.tick
+        self.tolerance = self._tick.tolerance
+        places = len(courses.places)
+        columns = list(zip(*memories, strict=True)) or [()] * len(courses.begun)
+        self._old = dict(zip(courses.places, columns, strict=False))
+        self._pasts = dict(zip(courses.conditions, columns[places:], strict=True))
+        self._new: dict[b.Bound, list[Any]] = {}
+        self._kept: dict[b.Bound, list[Any]] = {}
+        self._tests: dict[str, Column] = {}
+        self._courses: dict[b.Bound, Column] = {}
+        self._flags: dict[b.Bound, Bools] = {}
+        self._rows = len(memories)
+
+    def memories(self) -> list[Memory]:
+        """Return the memory of each binding from now on."""
+        columns = [self._new[course] for course in self._all.places]
+        columns += [self._kept[condition] for condition in self._all.conditions]
+        return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
+
+    def test(self, test: Test) -> Column:
+        """The value of a test."""
+        if test.name not in self._tests:
+            evaluate = self._all.evaluators[test.name]
+            self._tests[test.name] = _Momentary(test, self).column(evaluate)
+        return self._tests[test.name]
+
+    def proposition(self, name: str) -> Bools:
+        """(B,) where an atom, or a test, is true."""
+        if name in self._all.plan.tests:
+            return np.broadcast_to(self.test(self._all.plan.tests[name]).true[:, 0], self._rows)
+        return self._atom(name)
+
+    def condition(self, condition: b.Bound) -> Bools:
+        """(B,) where a condition within a test is true."""
+        if condition in self._flags:
+            return self._flags[condition]
+        progression = self._all.conditions[condition]
+        letters = [self.proposition(name).tolist() for name in progression.names]
+        known: dict[tuple[Any, ...], tuple[bool, Any]] = {}
+        found: list[tuple[bool, Any]] = []
+        for past, *letter in zip(self._pasts[condition], *letters, strict=True):
+            key = past, *letter
+            if key not in known:
+                named = dict(zip(progression.names, letter, strict=True))
+                frame = ProgressionFrame(progression, past, named, self._tick)
+                value = frame.now(progression.formula) is progression.terms.true
+                known[key] = value, frame.past()
+            found.append(known[key])
+        self._kept[condition] = [past for _, past in found]
+        self._flags[condition] = np.array([value for value, _ in found], np.bool_)
+        return self._flags[condition]
+
+    def course(self, course: b.SignalCall, test: Test) -> Column:
+        """The value of a course."""
+        if course not in self._courses:
+            self._courses[course] = self._course(course, test)
+        return self._courses[course]
+
+    def _course(self, course: b.SignalCall, test: Test) -> Column:
+        match course.word:
+            case "prev" | "delta":
+                column = self.signal(test.signals[course.operand])
+                known = np.broadcast_to(column.known[:, 0], self._rows).tolist()
+                values = np.broadcast_to(column.values[:, 0], self._rows).tolist()
+                now = [value if told else None for value, told in zip(values, known, strict=True)]
+                return (
+                    self._prev(course, now) if course.word == "prev" else self._delta(course, now)
+                )
+            case "run_length" | "since_true":
+                flags = self.condition(course.operand).tolist()
+                if course.word == "run_length":
+                    return self._run_length(course, flags)
+                return self._since_true(course, flags)
+            case word:
+                (node,) = b.nodes_of(course.operand)
+                seen = self.proposition(test.presence[node])
+                first: list[int | None] = [
+                    old if old is not None or not flag else self._tick.time
+                    for old, flag in zip(self._old[course], seen.tolist(), strict=True)
+                ]
+                self._new[course] = first
+                if word == "exists_now":
+                    return column_of(seen.tolist())
+                now = self._tick.time
+                ages = zip(first, seen.tolist(), strict=True)
+                return column_of(
+                    [(now - f) / NS if flag and f is not None else None for f, flag in ages]
+                )
+
+    def _prev(self, course: b.SignalCall, now: list[Any]) -> Column:
+        here, gap = self._tick.number, self._all.gap
+        self._new[course] = [None if value is None else (here, value) for value in now]
+        known = (None if gap or o is None or o[0] != here - 1 else o[1] for o in self._old[course])
+        return column_of(list(known))
+
+    def _delta(self, course: b.SignalCall, now: list[Any]) -> Column:
+        there, turns = self._all.there(course), is_angle(course.operand)
+        told: list[float | None] = []
+        kept: list[_Trail | None] = []
+        for old, value in zip(self._old[course], now, strict=True):
+            trail = _moved(old, value, self._tick.number, self._all.oldest)
+            kept.append(trail)
+            before = (
+                next((point for point in trail[1] if point[0] == there), None) if trail else None
+            )
+            if value is None or before is None or trail is None:
+                told.append(None)
+                continue
+            change = value - before[1]
+            if turns:
+                total, chain = trail[0][2:]
+                change = total - before[2] if chain <= there else _wrapped(change)
+            told.append(change)
+        self._new[course] = kept
+        return column_of(told)
+
+    def _run_length(self, course: b.SignalCall, flags: list[bool]) -> Column:
+        tick, gap = self._tick, self._all.gap
+        self._new[course] = [
+            (old if old is not None and not gap else tick) if flag else None
+            for old, flag in zip(self._old[course], flags, strict=True)
+        ]
+        return column_of([self._length(course, start, 1) for start in self._new[course]])
+
+    def _since_true(self, course: b.SignalCall, flags: list[bool]) -> Column:
+        self._new[course] = [
+            self._tick if flag else old for old, flag in zip(self._old[course], flags, strict=True)
+        ]
+        known = self._new[course]
+        return column_of([None if at is None else self._length(course, at, 0) for at in known])
+
+    def _length(self, course: b.SignalCall, start: Tick | None, more: int) -> float:
+        if start is None:
+            return 0
+        if course.frames:
+            return self._tick.number - start.number + more
+        return (self._tick.time - start.time) / NS
+
+
+class _Momentary(SignalValues):
+    """The value of a test in one frame."""
+
+    def __init__(self, test: Test, now: _Now) -> None:
+        def condition(expression: b.Bound) -> Bools:
+            return now.condition(expression)[:, None]
+
+        def present(name: str) -> Bools:
+            return now.proposition(name)[:, None]
+
+        nothing = np.zeros(0, np.int64)
+        clock = Clock(nothing, nothing, 0, now.tolerance)
+        super().__init__(test, clock, now.signal, condition, present)
+        self._now = now
+
+    def course(self, course: b.SignalCall) -> Column:
+        return self._now.course(course, self.test)
+
+
+_Point = tuple[int, float, float, int]
+"""A frame in which a value was known: its number, the value, how far it had turned, since when it is known."""
+
+_Trail = tuple[_Point, tuple[_Point, ...]]
+"""The last frame in which a value was known, and those of them that are still looked back to."""
+
+
+def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:
+    """A trail with the value of one more frame."""
+    points = old[1] if old is not None else ()
+    if points and points[0][0] < oldest:
+        points = tuple(point for point in points if point[0] >= oldest)
+    if value is None:
+        return (old[0], points) if old is not None else None
+    total, chain = 0.0, here
+    if old is not None:
+        number, before, total, since = old[0]
+        if number == here - 1:
+            total, chain = total + _wrapped(value - before), since
+    point = here, value, total, chain
+    return point, (*points, point)
+
+
+def _wrapped(degrees: float) -> float:
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def column_of(values: list[Any]) -> Column:
+    """A value of each binding in one frame: (B, 1); ``None`` is not known."""
+    known = [value is not None for value in values]
+    like = next((value for value in values if value is not None), 0.0)
+    empty = "" if isinstance(like, str) else type(like)()
+    told = np.array([empty if value is None else value for value in values])
+    return Column(told[:, None], np.array(known, np.bool_)[:, None])
+
+
+# What is true of bindings in a frame: the atoms and tests of a plan, a bit each -----------------
+
+
+class Valuation:
+    """The atoms and tests of a plan, for the bindings of which something is known.
+
+    Parameters
+    ----------
+    plan : Plan
+    variables : tuple of str
+        What bindings are about, in their order.
+    questions : QueryCache
+        Those of the plan become part of them.
+    pulse : StreamClock
+    bridge : bool
+        Whether gaps do not matter.
+
+    Attributes
+    ----------
+    lattice : Lattice
+    bits : dict of str to int
+        The bit of each atom and test.
+    begun : Memory
+        What is remembered before the first frame.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        variables: tuple[str, ...],
+        questions: QueryCache,
+        pulse: StreamClock,
+        *,
+        bridge: bool,
+    ) -> None:
+        self._variables, self._questions = variables, questions
+        self.lattice = Lattice(len(variables))
+        self._courses = SignalState(plan, pulse, bridge=bridge)
+        self._measured = bool(plan.tests)
+        self.begun = self._courses.begun
+        self.bits = {name: 1 << number for number, name in enumerate([*plan.atoms, *plan.tests])}
+        self._atoms = [
+            (self.bits[name], questions.add(one.query, one.variables), self._places(one.variables))
+            for name, one in plan.atoms.items()
+        ]
+        self._signals = {
+            name: (
+                questions.add(one.query, one.variables, one.value, (), one.edges),
+                self._places(one.variables),
+            )
+            for name, one in plan.signals.items()
+        }
+
+    def _places(self, variables: tuple[str, ...]) -> tuple[int, ...]:
+        return tuple(self._variables.index(name) for name in variables)
+
+    def read(
+        self, held: Iterable[Partial], memory: Callable[[Partial], Memory | None]
+    ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
+        """A frame has come, and the questions were asked of it.
+
+        Parameters
+        ----------
+        held : iterable of Partial
+            Bindings of which something is known from former frames.
+        memory : function
+            What a binding remembers; ``None``: nobody asks for it any more.
+
+        Returns
+        -------
+        letters : dict of Partial to int
+            Of all bindings of which something is known now, closed.
+        memories : mapping of Partial to Memory
+            What they remember from now on; empty if there is nothing to.
+        """
+        told = self._told()
+        lattice = self.lattice
+        rows = lattice.closed([*held, *told, *self._told_signals()])
+        if self._measured:
+            rows = {row for row in rows if memory(row) is not None}
+        if lattice.size < 2:
+            base = told.get(lattice.stranger, 0)
+            letters = {row: base | told.get(row, 0) for row in rows}
+        else:
+            letters = {row: self._letter(row, told) for row in rows}
+        if not self._measured:
+            return letters, {}
+        return letters, self._measure(list(rows), letters, memory)
+
+    def _told(self) -> dict[Partial, int]:
+        """The atoms that are true of bindings which say no more than the atom asks."""
+        answers, placed = self._questions.answers, self.lattice.placed
+        told: dict[Partial, int] = {}
+        for bit, number, places in self._atoms:
+            for key in answers[number]:
+                row = placed(key, places)
+                told[row] = told.get(row, 0) | bit
+        return told
+
+    def _letter(self, row: Partial, told: Mapping[Partial, int]) -> int:
+        found = 0
+        for wider in self.lattice.wider(row):
+            found |= told.get(wider, 0)
+        return found
+
+    def _told_signals(self) -> Iterator[Partial]:
+        for number, places in self._signals.values():
+            for key, value in self._questions.answers[number].items():
+                if value is not None:
+                    yield self.lattice.placed(key, places)
+
+    def _measure(
+        self,
+        rows: list[Partial],
+        letters: dict[Partial, int],
+        memory: Callable[[Partial], Memory | None],
+    ) -> dict[Partial, Memory]:
+        """Tell letters the tests that are true; what bindings remember from now on."""
+        self._courses.step()
+        columns: dict[str, Bools] = {}
+
+        def atom(name: str) -> Bools:
+            if name not in columns:
+                bit = self.bits[name]
+                columns[name] = np.array([bool(letters[row] & bit) for row in rows], np.bool_)
+            return columns[name]
+
+        def signal(one: Signal) -> Column:
+            number, places = self._signals[one.name]
+            answers: Mapping[Partial, object] = self._questions.answers[number]  # type: ignore[assignment]
+            return column_of([answers.get(tuple(row[p] for p in places)) for row in rows])
+
+        tests, memories = self._courses.values([memory(row) or () for row in rows], atom, signal)
+        for name, column in tests.items():
+            bit = self.bits[name]
+            true = np.broadcast_to(column.true[:, 0], len(rows)).tolist()
+            for row, flag in zip(rows, true, strict=True):
+                if flag:
+                    letters[row] |= bit
+        return dict(zip(rows, memories, strict=True))
