@@ -4,15 +4,15 @@ from ._charts import draw_curve as draw_curve
 from ._charts import draw_growth as draw_growth
 from ._charts import draw_matrix as draw_matrix
 from ._charts import draw_rank_sizes as draw_rank_sizes
-from ._images import camera_image as camera_image
-from ._images import frame_image as frame_image
 from ._links import Relations as Relations
 from ._picture import SheetFrame as SheetFrame
 from ._picture import draw_frame as draw_frame
 from ._picture import draw_map as draw_map
 from ._picture import draw_sheet as draw_sheet
+from ._stored import camera_image as camera_image
 from ._stored import draw_clip as draw_clip
 from ._stored import draw_stored as draw_stored
+from ._stored import frame_image as frame_image
 from ._stored import range_of as range_of
 from ._swimlanes import LETTERS as LETTERS
 from ._swimlanes import NAME as NAME

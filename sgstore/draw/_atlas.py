@@ -17,8 +17,7 @@ from matplotlib.patches import Circle
 
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
-from sgstore.draw._furniture import paint_compass, paint_scale
-from sgstore.draw._ground import GroundView, paint_ground, rings_of
+from sgstore.draw._ground import GroundView, paint_compass, paint_ground, paint_scale, rings_of
 from sgstore.draw._labels import Placer
 from sgstore.draw._legend import Entry, ground_entries, paint_swatch
 from sgstore.draw._links import seen_from_ego, sentences

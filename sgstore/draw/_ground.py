@@ -1,4 +1,4 @@
-"""The ground that a frame stands on: lanes, their markings and directions, crosswalks, scenery."""
+"""The ground that a frame stands on: lanes, their markings, crosswalks, scenery; rings, scale and compass."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from matplotlib.patches import Circle
 from matplotlib.path import Path as Outline
 
 import sgstore.draw._page as layers
@@ -18,6 +19,7 @@ from sgstore.vocabulary import KINDS
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from sgstore.draw._labels import Rect
     from sgstore.draw._page import Stage
     from sgstore.draw._view import MapWindow
     from sgstore.roads import MapNodes, RoadMap
@@ -182,7 +184,7 @@ def paint_ground(stage: Stage, ground: GroundView, *, arrows: bool = True) -> No
     for row in ground.of_kind("crosswalk"):
         stage.fill_all(_stripes(ground, row), palette.CROSSWALK, z=layers.MARKS, edge=0.0)
     for row in ground.of_kind(*SCENERY, "unknown"):
-        colour = palette.entity_tint(KINDS[nodes.kind[row]])
+        colour = palette.entity_tint(KINDS[int(nodes.kind[row])])
         # Props of a map are mostly areas, traffic islands for example: what stands there must show.
         thin = 0.18 if KINDS[nodes.kind[row]] == "prop" else 1.0
         stage.fill_all(ground.outlines_of([row]), colour, z=layers.SCENERY, edge=0.8, alpha=thin)
@@ -300,3 +302,65 @@ def _dense(line: Floats) -> Floats:
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     at = np.linspace(0.0, along[-1], int(np.clip(along[-1] / 2.0, 2, 1000)))
     return np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])
+
+
+# Aids to read a picture of the ground: rings about the ego, a scale, a compass ------------------
+
+_LENGTHS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000)
+_SMALL: Final = {"fontsize": 6.5, "ha": "center"}
+
+
+def paint_rings(stage: Stage) -> list[Rect]:
+    """Faint circles about the middle, for the eye to measure by; returns the room of their figures."""
+    taken: list[Rect] = []
+    for metres in (10, 25, 50, 100, 200):
+        if metres > stage.view.radius * 1.05:
+            break
+        ring = Circle(
+            (0, 0),
+            metres,
+            fill=False,
+            edgecolor=palette.RING,
+            linewidth=0.5,
+            linestyle=(0, (2, 4)),
+            zorder=layers.RINGS,
+        )
+        stage.axes.add_artist(ring)
+        at = metres * math.sqrt(0.5)
+        look = _SMALL | {"fontsize": 5.5, "color": palette.FAINT_INK, "va": "center"}
+        stage.text(at, -at, f"{metres} m", zorder=layers.RINGS, **look)
+        taken.append(stage.rect(9 * stage.metre, 4 * stage.metre, (at, -at)))
+    return taken
+
+
+def paint_scale(stage: Stage) -> Rect:
+    """A bar of a round length in the lower left corner; returns the room it takes."""
+    half_x, half_y = stage.half
+    metres = max(m for m in _LENGTHS if m <= max(1.0, min(half_x, half_y) / 2.2))
+    margin, tick = 12 * stage.metre, 3 * stage.metre
+    left, bottom, right = -half_x + margin, -half_y + margin, -half_x + margin + metres
+    bar = ((left, bottom + tick), (left, bottom), (right, bottom), (right, bottom + tick))
+    stage.lines([np.array(bar)], palette.INK, z=layers.FURNITURE, width=1.1)
+    stage.text((left + right) / 2, bottom + tick, f"{metres} m", zorder=layers.FURNITURE, **_SMALL)
+    return stage.rect(metres / 2, 8 * stage.metre, ((left + right) / 2, bottom))
+
+
+def paint_compass(stage: Stage) -> Rect:
+    """A needle to the north in the upper right corner; returns the room it takes."""
+    reach = min(11 * stage.metre, 0.05 * min(stage.half))
+    middle = np.array(stage.half) - 1.8 * reach
+    angle = stage.view.angle(math.pi / 2)
+    north = np.array((math.cos(angle), math.sin(angle))) * reach
+    aside = np.array((-north[1], north[0]))
+    x, y = middle.tolist()
+    dial = Circle(
+        (x, y), 1.55 * reach, facecolor=palette.PAPER, alpha=0.75, zorder=layers.FURNITURE
+    )
+    stage.axes.add_artist(dial)
+    for colour, wing in ((palette.INK, 0.45 * aside), (palette.FAINT_INK, -0.45 * aside)):
+        half = np.array((0.75 * north, -north + wing, -0.65 * north))
+        stage.fill(Outline(middle + half), colour, z=layers.FURNITURE + 0.1)
+    x_n, y_n = (middle + 1.12 * north).tolist()
+    look = {"fontsize": 0.6 * reach * stage.points, "ha": "center", "va": "center"}
+    stage.text(x_n, y_n, "N", zorder=layers.FURNITURE + 0.2, weight="bold", **look)
+    return stage.rect(1.6 * reach, 1.6 * reach, (x, y))

@@ -88,7 +88,7 @@ def ground_entries(ground: GroundView) -> list[Entry]:
     entries = [Entry("area", _lanes_called(names), tint) for tint, names in by_tint.items()]
     if ground.of_kind("crosswalk"):
         entries.append(Entry("zebra", "crosswalk", palette.CROSSWALK))
-    standing = {KINDS[ground.nodes.kind[row]] for row in ground.of_kind(*SCENERY)}
+    standing = {KINDS[int(ground.nodes.kind[row])] for row in ground.of_kind(*SCENERY)}
     return entries + [Entry("area", k, palette.entity_tint(k)) for k in sorted(standing)]
 
 

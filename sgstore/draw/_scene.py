@@ -15,8 +15,15 @@ from matplotlib.path import Path as Outline
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
 from sgstore.draw._bodies import half_extents, halo, paint_body, velocity_arrow
-from sgstore.draw._furniture import paint_compass, paint_rings, paint_scale
-from sgstore.draw._ground import STOREY_HEIGHT, GroundView, paint_ground, tint
+from sgstore.draw._ground import (
+    STOREY_HEIGHT,
+    GroundView,
+    paint_compass,
+    paint_ground,
+    paint_rings,
+    paint_scale,
+    tint,
+)
 from sgstore.draw._labels import Placer
 from sgstore.draw._links import ego_lane, links_of, sentences
 from sgstore.draw._view import SCENERY, bodies_of, caption, clean, number, place_of

@@ -31,7 +31,7 @@ from sgstore.vocabulary import natural, suggestion
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterator
     from pathlib import Path
 
     from sgstore.exporters._labels import ClipFrames, Export
@@ -150,7 +150,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
             place = folder / clip_name(frames.clip.trace, frames.number, "")
             place.mkdir()
             places.append(place)
-            _write_frames(export, frames, tables, names)
+            _write_frames(export, frames, tables)
             with _recording(export, frames) as (trace, recording):
                 _Writing(export, trace, recording, frames, place, tables).write()
             export.tell(frames.number, len(export.clips))
@@ -190,30 +190,12 @@ def _recording(export: Export, frames: ClipFrames) -> Generator[tuple[StoredTrac
         yield trace, recording
 
 
-def _write_frames(
-    export: Export, frames: ClipFrames, tables: _Tables, names: Sequence[str]
-) -> None:
-    labels = export.label_columns(frames.frame_id)
-    for row in range(len(frames)):
-        tables.frames.writerow(
-            (
-                frames.number,
-                int(frames.frame_id[row]),
-                frames.clip.trace,
-                int(frames.seq[row]),
-                int(frames.time_ns[row]),
-                int(frames.log_time_ns[row]),
-                float(frames.t[row]),
-                *(_cell(labels[name][row]) for name in names),
-            )
-        )
+def _write_frames(export: Export, frames: ClipFrames, tables: _Tables) -> None:
+    of = (frames.frame_id, frames.seq, frames.time_ns, frames.log_time_ns, frames.t)
+    rows = zip(*(column.tolist() for column in of), strict=True)
+    for (frame_id, *rest), labels in zip(rows, export.label_cells(frames.frame_id), strict=True):
+        tables.frames.writerow((frames.number, frame_id, frames.clip.trace, *rest, *labels))
     tables.frame_rows += len(frames)
-
-
-def _cell(value: Any) -> Any:
-    if value is None:
-        return ""
-    return str(value).lower() if isinstance(value, bool) else value
 
 
 def _by_trace(of: dict[tuple[str, str], _Count]) -> list[tuple[tuple[str, str], _Count]]:

@@ -295,9 +295,25 @@ class Export:
         if self.progress is not None:
             self.progress(done, of)
 
+    def named_graphs(
+        self, frames: ClipFrames, abstraction: str
+    ) -> Iterator[tuple[dict[str, str], list[tuple[str, str, str]]]]:
+        """Nodes and edges of the graphs of some frames by names, as an abstraction has them."""
+        found, _, graphs = self.store.file.abstracted.frames(abstraction, **frames.bounds)
+        for row in np.searchsorted(found, frames.seq).tolist():
+            yield graphs.named(row)
+
     def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
         """The labels of frames, by name."""
         return {} if self.labels is None else self.labels.of(frame_id)
+
+    def label_cells(self, frame_id: Ints) -> Iterator[list[Any]]:
+        """The labels of one frame after another, as cells of CSV."""
+        columns = self.label_columns(frame_id).values()
+        for values in zip(*columns, strict=True) if columns else [()] * len(frame_id):
+            yield [
+                "" if v is None else str(v).lower() if isinstance(v, bool) else v for v in values
+            ]
 
     def about(self) -> dict[str, Any]:
         """Values of the manifest: clips, labels, and their sources."""

@@ -19,12 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 
-from sgstore.abstractions import abstractions
+from sgstore.abstractions import abstraction_named, abstractions
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile, clip_name
 from sgstore.exporters._labels import FEW
 from sgstore.graph import named_graph
-from sgstore.store import FrameSpans
 from sgstore.vocabulary import RELATION_CODE, normalize_name
 
 if TYPE_CHECKING:
@@ -46,16 +45,16 @@ def graphs_of(export: Export, frames: ClipFrames) -> Iterator[SceneGraph]:
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write the graphs of all frames, each of which is read again by networkx."""
-    spans: FrameSpans | None = None
-    if export.abstraction and not _is_derived(export):
-        spans = FrameSpans(export.store.file, export.abstraction)
+    abstraction = export.abstraction
+    if abstraction and not _is_derived(export):
+        abstraction = abstraction_named(abstraction).name
     written: list[WrittenFile] = []
     for frames in export.frames():
         name = clip_name(frames.clip.trace, frames.number, "")
         lines, drawn = folder / f"{name}.jsonl", folder / name
         drawn.mkdir()
         with lines.open("x", encoding="utf-8", newline="\n") as stream:
-            for graph in _graphs(export, frames, spans):
+            for graph in _graphs(export, frames, abstraction):
                 stream.write(_line(graph) + "\n")
                 _write_graphml(graph, drawn / f"{graph.graph['seq']:06d}.graphml")
         written += [
@@ -73,10 +72,10 @@ def _is_derived(export: Export) -> bool:
     return name in derived and name not in abstractions()
 
 
-def _graphs(export: Export, frames: ClipFrames, spans: FrameSpans | None) -> Iterator[Graph]:
+def _graphs(export: Export, frames: ClipFrames, abstraction: str) -> Iterator[Graph]:
     for window in frames.windows(FEW):
         columns = export.label_columns(window.frame_id)
-        for row, graph in enumerate(_of_window(export, window, spans)):
+        for row, graph in enumerate(_of_window(export, window, abstraction)):
             labels = {f"label_{name}": values[row] for name, values in columns.items()}
             graph.graph["t"] = float(window.t[row])
             graph.graph["log_time_ns"] = int(window.log_time_ns[row])
@@ -86,27 +85,21 @@ def _graphs(export: Export, frames: ClipFrames, spans: FrameSpans | None) -> Ite
             yield graph
 
 
-def _of_window(export: Export, frames: ClipFrames, spans: FrameSpans | None) -> Iterator[Graph]:
-    if spans is None and not export.abstraction:
+def _of_window(export: Export, frames: ClipFrames, abstraction: str) -> Iterator[Graph]:
+    if not abstraction:
         yield from (graph.to_networkx() for graph in graphs_of(export, frames))
-        return
-    if spans is None:
-        yield from (
-            export.store.graph(int(frame_id), export.abstraction) for frame_id in frames.frame_id
-        )
-        return
-    found, _, labelled = spans.labelled(**frames.bounds)
-    number = {seq: i for i, seq in enumerate(found.tolist())}
-    for row, seq in enumerate(frames.seq.tolist()):
-        nodes, edges = labelled.named(number[seq])
-        about = {
-            "frame_id": int(frames.frame_id[row]),
-            "trace": frames.clip.trace,
-            "seq": seq,
-            "time_ns": int(frames.time_ns[row]),
-            "abstraction": spans.abstraction.name,
-        }
-        yield named_graph(nodes, edges, **about)
+    elif _is_derived(export):
+        yield from (export.store.graph(one, abstraction) for one in frames.frame_id.tolist())
+    else:
+        for row, graph in enumerate(export.named_graphs(frames, abstraction)):
+            about = {
+                "frame_id": int(frames.frame_id[row]),
+                "trace": frames.clip.trace,
+                "seq": int(frames.seq[row]),
+                "time_ns": int(frames.time_ns[row]),
+                "abstraction": abstraction,
+            }
+            yield named_graph(*graph, **about)
 
 
 def _line(graph: Graph) -> str:

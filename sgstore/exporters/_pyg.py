@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
+from sgstore.abstractions import abstraction_named
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
 from sgstore.exporters.graph_data import ABOUT, FOLDER, FORMAT, VERSION, GraphData
-from sgstore.store import FrameSpans
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ class _LabelKind:
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write the graphs of all frames, and read them again."""
-    spans = FrameSpans(export.store.file, export.abstraction or BY_ITSELF)
+    abstraction = abstraction_named(export.abstraction or BY_ITSELF).name
     labels = (
         {}
         if export.labels is None
@@ -184,17 +184,17 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     place = folder / FOLDER
     place.mkdir()
     columns = _TensorColumns(place, labels)
-    fixed = normalize_name(spans.abstraction.name) == normalize_name(BY_ITSELF)
+    fixed = normalize_name(abstraction) == normalize_name(BY_ITSELF)
     if fixed:
         columns.types += ACTORS
         columns.relations += RELATIONS
     with columns:
         for frames in export.windows():
-            columns.add(frames, _columns_of(export, frames, spans, columns))
+            columns.add(frames, _columns_of(export, frames, abstraction, columns))
     if not fixed:
         columns.types = _sorted(place / "node_type.npy", columns.types)
         columns.relations = _sorted(place / "edge_type.npy", columns.relations)
-    about = _about(export, spans.abstraction.name, columns)
+    about = _about(export, abstraction, columns)
     text = json.dumps(about, indent=2, ensure_ascii=False) + "\n"
     (folder / ABOUT).write_text(text, encoding="utf-8")
     _test(folder, columns)
@@ -228,10 +228,10 @@ def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[st
 
 
 def _columns_of(
-    export: Export, frames: ClipFrames, spans: FrameSpans, columns: _TensorColumns
+    export: Export, frames: ClipFrames, abstraction: str, columns: _TensorColumns
 ) -> dict[str, NDArray[Any]]:
     """The columns of the graphs of some frames; ``nodes`` and ``edges`` say how many each has."""
-    found, seen, labelled = spans.labelled(**frames.bounds)
+    found, seen, labelled = export.store.file.abstracted.frames(abstraction, **frames.bounds)
     wanted = np.full(len(found), -1)
     wanted[np.searchsorted(found, frames.seq)] = np.arange(len(frames))
     of_node = wanted[labelled.node_frame]
@@ -247,7 +247,7 @@ def _columns_of(
     order = order[np.argsort(of_edge[order], kind="stable")]
     ends = [local[_row(labelled, frame[order], end[order])] for end in (src, dst)]
     named = np.array(labelled.labels or ("",), object)
-    own = normalize_name(spans.abstraction.name) == normalize_name(BY_ITSELF)
+    own = normalize_name(abstraction) == normalize_name(BY_ITSELF)
     numbers = export.label_columns(frames.frame_id)
     return {
         "nodes": nodes,

@@ -12,18 +12,17 @@ Source: S3C (Woodlief et al., ICSE 2024), its data sets of triples; "ELR" of its
 from __future__ import annotations
 
 import csv
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
+from sgstore.abstractions import abstraction_named
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
 from sgstore.mcap import Loss
-from sgstore.store import FrameSpans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._labels import Export
 
 
 HEADER: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")
@@ -35,17 +34,18 @@ BY_ITSELF: Final = "RSV"
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write the rows, and read them again."""
-    spans = FrameSpans(export.store.file, export.abstraction or BY_ITSELF)
+    abstraction = abstraction_named(export.abstraction or BY_ITSELF).name
     rows = alone = 0
     with (folder / GRAPHS).open("x", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(HEADER)
         for frames in export.fresh_windows():
-            for name, nodes, edges in _graphs(frames, spans):
+            trace, graphs = frames.clip.trace, export.named_graphs(frames, abstraction)
+            for seq, (nodes, edges) in zip(frames.seq.tolist(), graphs, strict=True):
                 ends = {end for src, _, dst in edges for end in (src, dst)}
                 alone += len(nodes.keys() - ends)
-                for number, (src, label, dst) in enumerate(edges):
-                    writer.writerow((frames.clip.trace, name, 1, number, src, label, dst))
+                for number, edge in enumerate(edges):
+                    writer.writerow((trace, f"{trace}#{seq}", 1, number, *edge))
                 rows += len(edges)
     reason = f"{alone} nodes without an edge stand in no row"
     losses = [Loss(reason, 0, 0)] if alone else []
@@ -56,16 +56,6 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     return written
 
 
-def _graphs(
-    frames: ClipFrames, spans: FrameSpans
-) -> Iterator[tuple[str, dict[str, str], list[tuple[str, str, str]]]]:
-    """Names of frames, and their nodes and edges by names."""
-    found, _, labelled = spans.labelled(**frames.bounds)
-    number = {seq: i for i, seq in enumerate(found.tolist())}
-    for seq in frames.seq.tolist():
-        yield f"{frames.clip.trace}#{seq}", *labelled.named(number[seq])
-
-
 def _write_labels(export: Export, file: Path) -> WrittenFile:
     names = list(export.labels.texts) if export.labels is not None else []
     count = 0
@@ -73,18 +63,11 @@ def _write_labels(export: Export, file: Path) -> WrittenFile:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(("sg", *names))
         for frames in export.fresh_windows():
-            columns = export.label_columns(frames.frame_id)
-            for row, seq in enumerate(frames.seq.tolist()):
-                cells = (_cell(columns[one][row]) for one in names)
-                writer.writerow((f"{frames.clip.trace}#{seq}", *cells))
+            cells = export.label_cells(frames.frame_id)
+            for seq, labels in zip(frames.seq.tolist(), cells, strict=True):
+                writer.writerow((f"{frames.clip.trace}#{seq}", *labels))
             count += len(frames)
     return WrittenFile.of(file, "labels", count)
-
-
-def _cell(value: Any) -> Any:
-    if value is None:
-        return ""
-    return str(value).lower() if isinstance(value, bool) else value
 
 
 def _test(file: Path, rows: int) -> None:

@@ -2,7 +2,6 @@
 
 from ._contents import DIGEST_BYTES as DIGEST_BYTES
 from ._contents import WINDOW as WINDOW
-from ._contents import FrameSpans as FrameSpans
 from ._contents import Mark as Mark
 from ._contents import MessagePlaces as MessagePlaces
 from ._contents import graph_digests as graph_digests
@@ -52,7 +51,6 @@ __all__ = [
     "DIGEST_BYTES",
     "Folder",
     "FrameRef",
-    "FrameSpans",
     "GivenTable",
     "Mark",
     "MessagePlaces",

@@ -261,6 +261,21 @@ class Abstracted:
             for rows, seen in self._graphs.of_ids(connection, frame_id):
                 yield rows, triples(function(seen))
 
+    def frames(self, name: str, first: int, last: int) -> tuple[Ints, GraphColumns, Labelled]:
+        """The frames of one trace from one id to another: numbers, graphs, and what is made of these.
+
+        Raises
+        ------
+        AbstractionError
+            There is no such abstraction.
+        StoreError
+            Others keep the store for too long.
+        """
+        function = abstraction_named(name).function
+        with self._access.reading() as connection:
+            seq, seen = self._graphs.of_frames(connection, first, last)
+        return seq, seen, function(seen)
+
     def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
         """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.
 

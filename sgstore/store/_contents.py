@@ -1,6 +1,4 @@
-"""Content digests of frames, and frames under an abstraction.
-
-What frames hold, as digests: equal exactly where the public views show the same, in every store.
+"""Digests of the content of frames: equal exactly where the public views show the same, in every store.
 
 Numbers count by their bits, texts by their letters, and a frame by its number in its trace, so that the digest
 of a part of a trace does not depend on the store that it is in, nor on what else is there.
@@ -14,8 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.abstractions import abstraction_named
-from sgstore.store._graphs import Graphs
 from sgstore.store._packing import seq_of, trace_of
 
 if TYPE_CHECKING:
@@ -23,7 +19,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.abstractions import GraphColumns, Labelled
     from sgstore.store._file import StoreFile
     from sgstore.world import Ints
 
@@ -229,38 +224,3 @@ def lengths_of_messages(file: StoreFile, frame_id: Ints) -> Iterator[tuple[Ints,
         found = file.arrays(_LENGTHS, {"frames": frame_id[low:high].tolist()})
         yield found["frame_id"].astype(np.int64), found["length"].astype(np.int64)
         low = high
-
-
-# Frames of a store as an abstraction has them, many at a time: what writes graphs to files asks for ----
-
-
-class FrameSpans:
-    """Ranges of frames of a store, seen as an abstraction has them. Maps are remembered between them.
-
-    Parameters
-    ----------
-    file : StoreFile
-    abstraction : str
-
-    Raises
-    ------
-    AbstractionError
-        There is no such abstraction.
-    """
-
-    def __init__(self, file: StoreFile, abstraction: str) -> None:
-        self.abstraction = abstraction_named(abstraction)
-        self._access = file.access
-        self._graphs = Graphs()
-
-    def labelled(self, first: int, last: int) -> tuple[NDArray[np.int64], GraphColumns, Labelled]:
-        """The frames of one trace from one id to another: their numbers, what was seen, and what is made of it.
-
-        Raises
-        ------
-        StoreError
-            Others keep the store for too long.
-        """
-        with self._access.reading() as connection:
-            seq, seen = self._graphs.of_frames(connection, first, last)
-        return seq, seen, self.abstraction.function(seen)
