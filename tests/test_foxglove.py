@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 import tracemalloc
 from time import process_time
 from typing import TYPE_CHECKING, Any
@@ -388,6 +390,30 @@ def test_a_mapping_says_where_everything_stands(file: Path) -> None:
     assert of(blocks, "right").vy.tolist() == pytest.approx([12.5, 12.5])
     assert (of(blocks, "right").derived & 1).tolist() == [0, 0]
     assert {LIGHT_STATES[code] for code in of(blocks, "lamp").light_state} == {"red_yellow"}
+
+
+def test_a_state_of_lights_that_a_process_makes_known_is_read(file: Path) -> None:
+    with SceneRecorder.of(file, "protobuf") as recorder:
+        recorder.scene(1, [cube("x", what="traffic_light", shows="White_Bar")])
+    mapping = file.with_suffix(".toml")
+    mapping.write_text('[entity]\ntype = "metadata.what"\nlight_state = "metadata.shows"')
+    script = """
+import sys
+from sgstore.readers import open_trace
+from sgstore.vocabulary import LIGHT_STATES, add_light_state
+open_trace(sys.argv[1], mapping=sys.argv[2]).close()  # what was read before changes nothing
+add_light_state("white_bar")
+with open_trace(sys.argv[1], mapping=sys.argv[2]) as trace:
+    print([LIGHT_STATES[code] for block in trace.blocks() for code in block.states.light_state])
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script, str(file), str(mapping)],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+
+    assert told == "['white_bar']\n"
 
 
 @pytest.mark.parametrize(

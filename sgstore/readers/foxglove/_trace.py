@@ -66,7 +66,6 @@ EGO_AXES: Final = ("base_link", "ego_vehicle", "ego", "hero")
 """Axes that move with the ego where no mapping says which do."""
 
 _HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
-_STATES: Final = {normalize_name(name): code for name, code in LIGHT_STATE_CODE.items()}
 
 
 class FoxgloveSurvey(Survey[Lead]):
@@ -227,6 +226,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._readers, self._leading = survey.readers, survey.leading
         self._mapping, self._root = survey.mapping, survey.root()
         self._ego_entity, self._ego_axes = survey.ego
+        self._states = {normalize_name(name): code for name, code in LIGHT_STATE_CODE.items()}
         self._axes = Axes()
         self._nodes: dict[tuple[int, str], int] = {}
         self._idents: list[str] = []
@@ -372,7 +372,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             rows.append(values)
             state = normalize_name(self._mapping.entity.shown(box))
             states.append(
-                _STATES.get(state, 0) if self._mapping.entity.light_state and state else -1
+                self._states.get(state, 0) if self._mapping.entity.light_state and state else -1
             )
         if self._ego >= 0 and self._ego_axes:
             pose = self._pose_of_ego(frame.time_ns)
