@@ -15,8 +15,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 
+SIDE_BY_SIDE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
 TESTS = {
     "abstractions": "abstractions lane_roles",
+    "cli": "cli cli_ending cli_errors cli_ingest cli_library cli_map cli_repeated",  # streams: minutes
     "config": "config config_graphs",
     "contrib": "lang_sgl",
     "demo": "api",
@@ -104,7 +106,7 @@ def main() -> int:
         for command in (
             [BIN / "ruff", "format", "--check", "-q", "."],
             [BIN / "ruff", "check", "-q", "."],
-            [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", *tests],
+            [sys.executable, "-m", "pytest", "-q", *SIDE_BY_SIDE, *tests],
         )
     ]
     if types is not None:

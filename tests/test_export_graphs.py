@@ -1,5 +1,7 @@
 """Scene graphs and labels in clips, against the store and Foxglove's own definitions; and MCAP's rules."""
 
+# pyright: basic, reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
+
 from __future__ import annotations
 
 import json
@@ -40,6 +42,8 @@ from sgstore.readers import open_trace
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from mcap.writer import Writer
 
     from sgstore.query import Store
@@ -49,11 +53,13 @@ OURS = {"/sgstore/graph", "/sgstore/scene", "/sgstore/labels"}
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     folder = tmp_path_factory.mktemp("town")
     recording = Path(shutil.copy(RECORDING, folder / "town.mcap"))
     ingest(folder / "town.sgstore", [recording], until=27)
-    return sgstore.open(folder / "town.sgstore")
+    store = sgstore.open(folder / "town.sgstore")
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from sgstore.store import StoreFile
 from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.roads import RoadMap
@@ -33,12 +34,14 @@ DRIVE = RandomTrace(seed=4, frames=70, road_map=ROADS, path="/r/drive.mcap")
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     path = tmp_path_factory.mktemp("store") / "s.db"
     file = StoreFile.create(path)
     publish(file, DRIVE)
     publish(file, RandomTrace(seed=5, frames=20, path="/r/field.mcap"))
-    return Store(path)
+    store = Store(path)
+    with store.file.snapshot():
+        yield store
 
 
 def lane_ways(road_map: RoadMap) -> Ways:

@@ -16,6 +16,8 @@ from sgstore.step import Replay
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from sgstore.query import Store
 
 ROAD = street("driving", "driving", left=("driving",))
@@ -39,10 +41,12 @@ def scene(road: Any = ROAD) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def lanes(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def lanes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     path = tmp_path_factory.mktemp("lanes") / "lanes.sgstore"
     bare = Scene(None, *PEOPLE[:2], seconds=1.0)  # type: ignore[arg-type]
-    return store_of(path, {"street": [scene(street("driving"))], "nowhere": [bare]})
+    store = store_of(path, {"street": [scene(street("driving"))], "nowhere": [bare]})
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.mark.parametrize("relation", ["laneChange", "conflictsWith", "controlsTrafficOf"])
@@ -80,9 +84,11 @@ CONFIGS = {
 
 
 @pytest.fixture(scope="module")
-def related(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def related(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     path = tmp_path_factory.mktemp("related") / "related.sgstore"
-    return store_of(path, {name: [scene()] for name in CONFIGS}, CONFIGS)
+    store = store_of(path, {name: [scene()] for name in CONFIGS}, CONFIGS)
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.fixture(scope="module")

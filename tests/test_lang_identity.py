@@ -1,5 +1,7 @@
 """Which nodes of several traces are the same: an entity is a trace and a number, a lane a map and a number."""
 
+# pyright: basic, reportReturnType=false
+
 from __future__ import annotations
 
 import json
@@ -17,6 +19,7 @@ from sgstore.sandbox import Sandbox
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.query import Store
@@ -39,9 +42,11 @@ def world(path: Path) -> World:
 
 
 @pytest.fixture(scope="module")
-def store(world: World, path: Path) -> Store:
+def store(world: World, path: Path) -> Iterator[Store]:
     assert len({trace.map_id for trace in world.traces}) == 2
-    return sgstore.open(path)
+    store = sgstore.open(path)
+    with store.file.snapshot():
+        yield store
 
 
 def matched(store: Store, label: str) -> list[tuple[str, str, int]]:

@@ -17,6 +17,7 @@ from sgstore.ingest import ingest
 from sgstore.query import Store
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 NAMES = ["t1", "t2", "T3", "t10", "t11"]
@@ -27,7 +28,7 @@ MOVES = "MATCH (e:Ego) WHERE e.speed > 1 THEN MATCH (e) WHERE e.speed > 1"
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """Five traces of several buckets, read in another order; one has no ego."""
     folder = tmp_path_factory.mktemp("order")
     for number, name in enumerate(NAMES):
@@ -41,7 +42,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     ids = [store.file.trace(name).trace_id for name in NAMES]
     assert ids != sorted(ids)
     assert any(min(two) < one < max(two) for two in pairwise(ids) for one in ids)
-    return store
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.fixture(params=[1, 4, 7, 64])

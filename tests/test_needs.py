@@ -25,13 +25,14 @@ from sgstore.temporal import Monitor
 from sgstore.vocabulary import VEHICLE_LIGHTS, natural, normalize_name
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.temporal import Verdict
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """One drive with an ego and one without."""
     folder = tmp_path_factory.mktemp("drives")
     for name, host in (("with", 7), ("without", None)):
@@ -39,11 +40,13 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Store:
             for i in range(5):
                 recorder.ground_truth(i * 0.1, [car(7, i, v=(10, 0)), car(8, 20)], host=host)
     ingest(folder / "drives.sgstore", [folder / "with.mcap", folder / "without.mcap"])
-    return Store(folder / "drives.sgstore")
+    store = Store(folder / "drives.sgstore")
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.fixture(scope="module")
-def silent(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def silent(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """A random world of three traces, the second of which tells nothing that is measured."""
     _, store = worlds(5, tmp_path_factory.mktemp("silent"))
     columns = ["speed", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate", "heading", "pitch", "roll"]
@@ -54,7 +57,9 @@ def silent(tmp_path_factory: pytest.TempPathFactory) -> Store:
             cleared = ", ".join(f"{column} = NULL" for column in some)
             connection.execute(f"UPDATE {table} SET {cleared} WHERE {trace} = 2")
         connection.execute("UPDATE map_node SET speed_limit = 10, curvature = 0")
-    return Store(store.file.path)
+    store = Store(store.file.path)
+    with store.file.snapshot():
+        yield store
 
 
 OF_ENTITIES = sorted(MEASURED - {"speed_limit", "curvature", "light_state"})

@@ -33,6 +33,7 @@ from sgstore.temporal._signals import Clock, PropositionTable
 from sgstore.temporal._verdicts import STATUS, Settled, known, within_bounds
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from oracle_worlds import World
@@ -43,8 +44,10 @@ PAIR = "MATCH (e:Ego)-[:near|visible]-(v:Entity)"
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory: pytest.TempPathFactory) -> tuple[World, Store]:
-    return worlds(7, tmp_path_factory.mktemp("worlds"))
+def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[World, Store]]:
+    world, store = worlds(7, tmp_path_factory.mktemp("worlds"))
+    with store.file.snapshot():
+        yield world, store
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from sgstore.errors import MissingExtraError, SqlError
 from sgstore.query import Store
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.store import Rows
@@ -41,8 +42,10 @@ RUNAWAY = "SELECT a.range + b.range AS x FROM range(1000000) a, range(1000000) b
 
 
 @pytest.fixture(scope="module")
-def store(town_store: Path) -> Store:
-    return Store(town_store)
+def store(town_store: Path) -> Iterator[Store]:
+    store = Store(town_store)
+    with store.file.snapshot():
+        yield store
 
 
 def nothing(*_: object) -> None:

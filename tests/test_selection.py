@@ -8,7 +8,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -42,6 +42,9 @@ from sgstore.selection._cover import bounded
 from sgstore.selection._curve import expected
 from sgstore.selection._sets import greedy
 from sgstore.store import seq_of, trace_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 SEEDS = range(36)
@@ -162,13 +165,15 @@ def test_ties_are_broken_by_rank_alone() -> None:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     folder = tmp_path_factory.mktemp("selection")
     copy = folder / "one.mcap"
     copy.symlink_to(SAMPLE)
     ingest(folder / "s.sgstore", [copy], until=20)
     import_two(folder)
-    return Store(folder / "s.sgstore")
+    store = Store(folder / "s.sgstore")
+    with store.file.snapshot():
+        yield store
 
 
 def import_two(folder: Path) -> None:

@@ -6,7 +6,7 @@ from collections import Counter
 from importlib.util import find_spec
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -39,15 +39,20 @@ from sgstore.selection import (
 from sgstore.selection._cover import reduced
 from sgstore.store import seq_of
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     folder = tmp_path_factory.mktemp("overlapping")
     (folder / "one.mcap").symlink_to(SAMPLE)
     ingest(folder / "s.sgstore", [folder / "one.mcap"], until=20)
-    return Store(folder / "s.sgstore")
+    store = Store(folder / "s.sgstore")
+    with store.file.snapshot():
+        yield store
 
 
 def whole(store: Store) -> ChosenFrames:

@@ -1,5 +1,7 @@
 """Clocks jitter: times that miss a bound by a hundredth of a period, or by a microsecond, keep it."""
 
+# pyright: basic, reportArgumentType=false
+
 from __future__ import annotations
 
 import random
@@ -21,6 +23,7 @@ from sgstore.temporal import Monitor
 from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 JITTER_NS = 400_000
@@ -28,7 +31,7 @@ JITTER_NS = 400_000
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Store, Store]:
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Store, Store]]:
     """A random world, and the same with clocks that jitter."""
     folder = tmp_path_factory.mktemp("worlds")
     stores: list[Store] = []
@@ -45,7 +48,9 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Store, Store]:
             "UPDATE trace SET start_ns = first, end_ns = last FROM (SELECT trace_id AS id,"
             " min(time_ns) AS first, max(time_ns) AS last FROM frame GROUP BY 1) WHERE id = trace_id"
         )
-    return stores[0], sgstore.open(stores[1].file.path)
+    even, odd = stores[0], sgstore.open(stores[1].file.path)
+    with even.file.snapshot(), odd.file.snapshot():
+        yield even, odd
 
 
 def same(pair: tuple[Store, Store], text: str) -> int:
@@ -163,7 +168,7 @@ TRUNCATED = [n * 0.05 - (1e-9 if n % 3 else 0) for n in range(20)]
 
 
 @pytest.fixture(scope="module")
-def truncated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Store]:
+def truncated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Store]]:
     """A recording with such times, of which frames 10 and 11 are missing, and its store."""
     folder = tmp_path_factory.mktemp("truncated")
     path = folder / "cut.mcap"
@@ -173,7 +178,9 @@ def truncated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Store]:
                 recorder.ground_truth(time, [car(7, 10 * time, v=(10 if n < 9 else 2, 0))], host=7)
     store = folder / "cut.sgstore"
     ingest(store, [path])
-    return path, Store(store)
+    opened = Store(store)
+    with opened.file.snapshot():
+        yield path, opened
 
 
 def test_a_frame_is_found_at_the_time_that_it_should_have(truncated: tuple[Path, Store]) -> None:
