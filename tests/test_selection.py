@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import sgstore
-from sgstore.coverage import ChosenFrames, classed, selection_of
+from sgstore.coverage import ChosenFrames, classed, expected_classes, selection_of
 from sgstore.errors import ConfigError, QueryError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
@@ -39,7 +39,6 @@ from sgstore.selection import (
     within,
 )
 from sgstore.selection._cover import bounded
-from sgstore.selection._curve import expected
 from sgstore.selection._sets import greedy
 from sgstore.store import seq_of, trace_of
 
@@ -432,11 +431,11 @@ def test_the_curve_rises_to_all_and_random_order_is_hypergeometric(store: Store)
     assert kept == sorted(kept)
     assert kept[-1] == held.total
     assert drawn.needed == len(found.picked) <= drawn.at_random
-    mean = expected(often, len(found.units), np.array([n]))[0]
+    mean = expected_classes(often, np.array([n]), len(found.units))[0]
     assert mean == pytest.approx(np.mean(tries), rel=0.02)
-    assert expected(often, len(found.units), np.array([len(found.units)]))[0] == pytest.approx(
-        held.total
-    )
+    assert expected_classes(often, np.array([len(found.units)]), len(found.units))[
+        0
+    ] == pytest.approx(held.total)
 
 
 def test_what_was_chosen_is_listed_with_what_it_brings(store: Store) -> None:

@@ -8,6 +8,7 @@ from ._classes import classed as classed
 from ._classes import shared as shared
 from ._compare import classes as classes
 from ._compare import covered as covered
+from ._compare import expected_classes as expected_classes
 from ._compare import growth as growth
 from ._compare import novel as novel
 from ._compare import novel_clips as novel_clips
@@ -50,6 +51,7 @@ __all__ = [
     "combined",
     "combos",
     "covered",
+    "expected_classes",
     "explain",
     "failures",
     "features",

@@ -99,30 +99,36 @@ def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
     return seen + unseen / width, seen + unseen * width
 
 
-def expected_classes(sizes: Ints, drawn: Ints) -> Floats:
+def expected_classes(
+    sizes: Ints, drawn: Ints, units: int = 0, weight: Ints | None = None
+) -> Floats:
     """Mean number of classes in a random part: rarefaction, exact.
+
+    A class that is in m of N units is missed by n of them in C(N - m, n) of C(N, n) cases (hypergeometric).
 
     Parameters
     ----------
     sizes : (S,) int64
-        How often each class was seen.
+        In how many units each class is.
     drawn : (K,) int64
-        How many units are drawn without putting them back; at most the sum of ``sizes``.
+        How many units are drawn without putting them back; at most all.
+    units : int
+        How many there are. 0: the sum of ``sizes``, each unit being of one class.
+    weight : (S,) int64, optional
+        How many classes each stands for.
     """
-    sizes = sizes[sizes > 0]
-    units = int(sizes.sum())
-    if not units:
+    seen = sizes > 0
+    units = units or int(sizes.sum())
+    if not units or not seen.any():
         return np.zeros(len(drawn))
     logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, units + 1)))])
-    distinct, often = np.unique(sizes, return_counts=True)
-    expected = np.full(len(drawn), float(len(sizes)))
-    for size, many in zip(distinct.tolist(), often.tolist(), strict=True):
+    often = np.bincount(sizes[seen], None if weight is None else weight[seen])
+    expected = np.full(len(drawn), float(often.sum()))
+    for size in np.flatnonzero(often).tolist():
         rest = units - size - drawn
-        possible = rest >= 0
-        left = np.maximum(rest, 0)
         # C(units - size, drawn) / C(units, drawn), in logarithms
-        share = logs[units - size] - logs[left] - logs[units] + logs[units - drawn]
-        expected -= many * np.where(possible, np.exp(share), 0.0)
+        missed = logs[units - size] - logs[np.maximum(rest, 0)] - logs[units] + logs[units - drawn]
+        expected -= often[size] * np.where(rest >= 0, np.exp(missed), 0.0)
     return expected
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import lgamma
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.coverage import ReportTable
+from sgstore.coverage import ReportTable, expected_classes
 from sgstore.errors import ConfigError
 from sgstore.selection._units import Measure, kept
 
@@ -81,7 +80,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
     often = np.bincount(pairs[1], minlength=len(held.weight))
     n = np.unique(np.concatenate([_points(len(so_far), points), _points(total, points)]))
     n = n[n <= total]
-    random = expected(often, total, n, held.weight)
+    random = expected_classes(often, n, total, held.weight)
     rows = [
         (
             many,
@@ -108,32 +107,6 @@ def _points(most: int, points: int) -> Ints:
     if not most:
         return np.zeros(0, np.int64)
     return np.unique(np.linspace(1, most, min(points, most)).round().astype(np.int64))
-
-
-def expected(often: Ints, units: int, drawn: Ints, weight: Ints | None = None) -> Floats:
-    """Mean number of elements that so many units hold, drawn without putting them back.
-
-    An element that m of N units hold is missed by n of them in C(N - m, n) of C(N, n) cases (hypergeometric).
-
-    Parameters
-    ----------
-    often : (E,) int64
-        In how many units each element is.
-    units : int
-        N.
-    drawn : (K,) int64
-        Numbers of units, at most N.
-    weight : (E,) int64, optional
-        How many elements each stands for.
-    """
-    logs = np.array([lgamma(i + 1) for i in range(units + 1)])
-    found = np.zeros(len(drawn))
-    stands_for = np.bincount(often, weight, units + 1)
-    for many in np.flatnonzero(stands_for).tolist():
-        rest = units - many - drawn
-        missed = logs[units - many] - logs[np.maximum(rest, 0)] - logs[units] + logs[units - drawn]
-        found += stands_for[many] * np.where(rest >= 0, 1 - np.exp(np.minimum(missed, 0)), 1.0)
-    return found
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
