@@ -92,18 +92,24 @@ class ClipWriter:
         str
             What is wrong with it; empty: nothing. One that is malformed is not written.
         """
-        record = memoryview(b"".join(pieces))[HEAD.size :]
+        stream = BytesIO(b"".join(pieces))
+        stream.seek(HEAD.size)
         try:
-            one = Attachment.read(ReadDataStream(BytesIO(record)))
+            one = Attachment.read(ReadDataStream(stream))
         except READ_ERRORS:
             return _MALFORMED
-        if len(record) != _FIXED + len(one.data) + len((one.name + one.media_type).encode()):
+        with stream.getbuffer() as whole:
+            record = whole[HEAD.size :]
+            length, crc = len(record), int.from_bytes(record[-4:], "little")
+            damaged = crc and crc != zlib.crc32(record[:-4])
+            record.release()
+        if length != _FIXED + len(one.data) + len((one.name + one.media_type).encode()):
             return _MALFORMED
+        del stream  # one copy of a large attachment less while it is written
         self._writer.add_attachment(
             one.create_time, one.log_time, one.name, one.media_type, one.data
         )
-        crc = int.from_bytes(record[-4:], "little")
-        return _DAMAGED if crc and crc != zlib.crc32(record[:-4]) else ""
+        return _DAMAGED if damaged else ""
 
     def message(
         self,
