@@ -1,22 +1,28 @@
 """Recordings of CARLA's ROS bridge, held against the official decoder and against what CARLASGG was told."""
 
+# pyright: basic
+
 from __future__ import annotations
 
 import gzip
 import json
 import math
 from functools import cache
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from carla_recordings import idents, read, states
+from hypothesis import example, given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from sgstore.config import Config
 from sgstore.opendrive import read_map
 from sgstore.readers import read_message
+from sgstore.readers.carla._trace import _turned
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.vocabulary import KINDS, LIGHT_STATES
 
@@ -254,3 +260,17 @@ def test_a_picture_is_read_back_by_its_place(data: Path) -> None:
     assert len(found) == 10
     assert all(pictures[time] == data for time, data in found.items())
     assert all(b"\xff\xd8\xff" in data for data in found.values())
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
+@example([1.0, 0.0, 1.0, 0.0])
+@example([0.0, 1.0, 0.0, 1.0])
+@example([0.3, -0.7, -0.3, -0.7])
+@example([0.7, 0.3, -0.7, 0.3])
+def test_angles_turn_as_the_quaternion_does_straight_up_and_down_too(given: list[float]) -> None:
+    q = np.array(given) / np.linalg.norm(given)
+    angles, up = _turned(q[None, :])
+
+    expected = matrix_of(SimpleNamespace(x=q[0], y=q[1], z=q[2], w=q[3]))
+    np.testing.assert_allclose(matrix(*angles[0]), expected, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(up[0], expected[:, 2], rtol=0, atol=1e-12)

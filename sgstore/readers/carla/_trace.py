@@ -419,10 +419,15 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
     return values, np.all(near, axis=1, keepdims=True)[:, 0]
 
 
+_UPRIGHT: Final = 1 - 1e-13
+"""Sine of the pitch beyond which rounding leaves no heading and roll of their own."""
+
+
 def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
     """Heading, pitch, roll of quaternions (x, y, z, w), and where their upright axis points; NaN for none.
 
-    A quaternion may be a little longer or shorter than 1.
+    A quaternion may be a little longer or shorter than 1. With the nose straight up or down heading and roll
+    turn about one axis: then the roll is 0.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt((quaternions * quaternions).sum(axis=1))
@@ -430,8 +435,11 @@ def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
         x, y, z, w = (quaternions / norm[:, None]).T
         up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
         heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-        roll = np.arctan2(2 * (w * x + y * z), up[:, 2])
+        sine = np.clip(2 * (w * y - z * x), -1, 1)
+        pitch, roll = np.arcsin(sine), np.arctan2(2 * (w * x + y * z), up[:, 2])
+        upright = np.abs(sine) > _UPRIGHT
+    heading[upright] = np.arctan2(2 * w * z, w * w - z * z)[upright]
+    roll[upright] = 0
     return np.stack([heading, pitch, roll], axis=1), up
 
 
