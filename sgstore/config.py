@@ -15,6 +15,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
+from sgstore import plugins
 from sgstore.errors import ConfigError
 from sgstore.vocabulary import (
     DIRECTIONS,
@@ -38,28 +39,6 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-__all__ = [
-    "ALL_EGOS",
-    "MAX_CONFIG_BYTES",
-    "PRESETS",
-    "Config",
-    "Direction",
-    "LaneSettings",
-    "PairSettings",
-    "Payloads",
-    "Preset",
-    "Proximity",
-    "RangeSettings",
-    "Signs",
-    "as_markdown",
-    "as_toml",
-    "configured",
-    "from_dict",
-    "load",
-    "preset",
-]
-
-
 COMMENT: Final = "comment"
 """Key of a setting's comment among the metadata of its field."""
 
@@ -72,6 +51,10 @@ TIES: Final = ("ahead", "both", "carlasgg")
 JOINS: Final = ("nearest", "latest")
 ORIENTATIONS: Final = ("asam", "carla")
 ALL_EGOS: Final = "all"
+
+OF_LABELS: Final = (
+    "only related pairs of these labels, in either order: [['Ego', 'Vehicle']]; empty: all"
+)
 
 MOST_CORNERS: Final = 64
 MOST_LENGTH: Final = 100_000.0
@@ -167,7 +150,6 @@ class LaneSettings:
         (),
         "types of lanes that are kept, as OpenDRIVE has them ('driving', 'sidewalk', …); empty: all",
     )
-
     sections: bool = setting(
         default=True,
         comment="whether each section of a road has lanes of its own ('12/0/-1'); otherwise the lanes of a "
@@ -204,8 +186,10 @@ class Proximity:
         "(a vehicle's is on the ground); 'footprints': the gap between them, in the plane. "
         "[pairs] has the same distance",
     )
+    kinds: tuple[tuple[str, ...], ...] = setting((), OF_LABELS)
 
     def __post_init__(self) -> None:
+        check_pairs("proximity.kinds", self.kinds)
         check_steps("proximity", self.names, self.upper, PROXIMITY, len(self.names))
         check(self.between in MEASURES, "proximity.between", self.between, one_of(MEASURES))
 
@@ -230,8 +214,14 @@ class Direction:
         "toLeftOf and toRightOf: 'open': what is dead ahead or dead behind is neither; 'closed': it is to the "
         "left (CARLASGG); 'none': no such relations among entities",
     )
+    within: float = setting(
+        0.0, "up to this distance, as [proximity] measures it; m. 0: as far as pairs are related"
+    )
+    kinds: tuple[tuple[str, ...], ...] = setting((), OF_LABELS)
 
     def __post_init__(self) -> None:
+        check_pairs("direction.kinds", self.kinds)
+        _check_length(self.within >= 0, "direction.within", self.within, "a length of 0 or more")
         check_steps("direction", self.names, self.upper, DIRECTIONS, max(len(self.names) - 1, 0))
         within = all(bound < 180 for bound in self.upper)
         check(within, "direction.upper", self.upper, "bounds below 180, in degrees")
@@ -263,9 +253,7 @@ class PairSettings:
         for name in ("within", "ego_within"):
             value = getattr(self, name)
             _check_length(value >= 0, f"pairs.{name}", value, "a length of 0 or more, in metres")
-        for i, pair in enumerate(self.kinds):
-            check(len(pair) == 2, f"pairs.kinds[{i}]", pair, "two labels")
-            check_labels(f"pairs.kinds[{i}]", pair, ego=True)
+        check_pairs("pairs.kinds", self.kinds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,18 +275,12 @@ class Payloads:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """Settings of the reading of a road map's signals.
-
-    Attributes
-    ----------
-    kinds : tuple of (str, str)
-        Type codes of signals, in lower case, and the kinds that the client says they are.
-    orientation : str
-        One of :data:`ORIENTATIONS`: what the orientation of a signal without validity means.
-    """
+    """Settings of the reading of a road map's signals."""
 
     kinds: tuple[tuple[str, str], ...] = ()
+    """Type codes of signals, in lower case, and the kinds that the client says they are."""
     orientation: str = "asam"
+    """One of :data:`ORIENTATIONS`: what the orientation of a signal without validity means."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -339,6 +321,11 @@ class Config:
         "labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map ('Lane'); the "
         "ego always is. What is not kept is as if it were not there. Empty: everything",
     )
+    exclude_ids: tuple[str, ...] = setting(
+        (),
+        "entities that are left out, as if they were not there: the simulator's ids, or roles or names of "
+        "vehicles as for ego; an ego never is",
+    )
     without: tuple[str, ...] = setting(
         (),
         "relations that are not computed, so that nothing is known of them: ['overlaps', 'follows']",
@@ -357,6 +344,10 @@ class Config:
         "what they mean: kind, special kind and subkind, before what sgstore knows of them:\n"
         '"vehicle.acme.patrol" = { kind = "car", special = "emergency" }',
     )
+    relations: Mapping[str, Mapping[str, Any]] = setting(
+        {},
+        "settings of relations of other packages, a table for each:\n[relations.besides]\nreach = 3.0",
+    )
 
     def __post_init__(self) -> None:
         check(not (self.ego and self.egos), "egos", self.egos, "either ego or egos, not both")
@@ -366,6 +357,7 @@ class Config:
         check(alone, "egos", self.egos, f"'{ALL_EGOS}' alone, or a list of egos")
         for kind in self.new_kinds:
             _make_known("new_kinds", add_kind, kind)
+        check(all(self.exclude_ids), "exclude_ids", self.exclude_ids, "ids, roles or names")
         check(0 <= self.rate <= 1e6, "rate", self.rate, "0 or more frames per second")
         check_labels("kinds", self.kinds, ego=False)
         both = set(self.proximity.names) & set(self.direction.names)
@@ -377,6 +369,7 @@ class Config:
         right = one_of(ORIENTATIONS)
         check(self.orientation in ORIENTATIONS, "orientation", self.orientation, right)
         object.__setattr__(self, "types", _checked_types(self.types))
+        object.__setattr__(self, "relations", _checked_relations(self.relations))
 
     def __hash__(self) -> int:
         return hash(repr(self))
@@ -386,6 +379,16 @@ class Config:
         """Settings of the reading of signals of road maps, for :func:`sgstore.opendrive.read_map`."""
         kinds = tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
         return Signs(kinds, self.orientation)
+
+    @property
+    def notes(self) -> list[str]:
+        """Names of the client's own that are all but those of this package: slips, perhaps."""
+        return [
+            f"setting '{table}.names': {name!r} is a relation of your own; did you mean {like!r}?"
+            for table, known in (("proximity", PROXIMITY), ("direction", DIRECTIONS))
+            for name in getattr(self, table).names
+            if name not in known and (like := suggestion(name, known))
+        ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
         """Those of the type names that no mapping knows whose meaning the client does not tell either."""
@@ -405,13 +408,6 @@ class Config:
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as they stand in TOML and JSON."""
         return asdict(self)
-
-
-def default_of(setting_field: Any) -> Any:
-    """The default of a field of a table."""
-    if setting_field.default is not MISSING:
-        return setting_field.default
-    return setting_field.default_factory()
 
 
 def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: FBT001
@@ -464,6 +460,13 @@ def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
         check(meant, name, label, _expected(label, known))
 
 
+def check_pairs(name: str, pairs: tuple[tuple[str, ...], ...]) -> None:
+    """Refuse what is no list of pairs of labels."""
+    for i, pair in enumerate(pairs):
+        check(len(pair) == 2, f"{name}[{i}]", pair, "two labels")
+        check_labels(f"{name}[{i}]", pair, ego=True)
+
+
 def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
     """Refuse what is no simple polygon."""
     pairs = all(len(corner) == 2 and all(map(math.isfinite, corner)) for corner in corners)
@@ -471,41 +474,11 @@ def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
     check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)
     near = all(abs(number) <= MOST_LENGTH for corner in corners for number in corner)
     check(near, name, corners, f"corners up to {MOST_LENGTH:.0f} m away")
-    sides = list(zip(corners, (*corners[1:], corners[0]), strict=True))
-    folded_back = any(
-        _turn(*one, other[1]) == 0 and not _between(*one, other[1], ahead=True)
-        for one, other in zip(sides, (*sides[1:], sides[0]), strict=True)
+    from sgstore.geometry import is_simple  # it comes with numpy, which most configs need not
+
+    check(
+        is_simple(corners), name, corners, "sides that meet at the corners only, one after another"
     )
-    crossing = any(
-        _meet(sides[i], sides[j])
-        for i in range(len(sides))
-        for j in range(i + 2, len(sides) - (i == 0))
-    )
-    simple = not folded_back and not crossing
-    check(simple, name, corners, "sides that meet at the corners only, one after another")
-
-
-Corner = tuple[float, ...]
-
-
-def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
-    """Return whether two sides have a point in common."""
-    ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
-    turns = [_turn(*three) for three in ends]
-    if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
-        return True
-    return any(turn == 0 and _between(*e) for turn, e in zip(turns, ends, strict=True))
-
-
-def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
-    """Return whether c, on the line through a and b, lies between them; or ``ahead``: beyond b, seen from a."""
-    if ahead:
-        return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
-    return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))
-
-
-def _turn(a: Corner, b: Corner, c: Corner) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # noqa: FBT001
@@ -533,6 +506,22 @@ def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
             check(plain, f"{where}.{part}", word, "a word of a-z, 0-9 and _")
         check(name.lower() not in checked, where, name, "each type name once")
         checked[name.lower()] = meaning
+    return checked
+
+
+def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The settings of relations, with the defaults of those that are not given."""
+    checked, others = dict[str, dict[str, Any]](), plugins.RELATIONS.others() if given else {}
+    for name, values in sorted(given.items()):
+        check(name in others, "relations", name, _expected(name, others) if others else "no table")
+        relation = plugins.RELATIONS.load_other(others[name], ConfigError)
+        known: Mapping[str, Any] = getattr(relation, "parameters", {})
+        for key in values:
+            if key not in known:
+                raise _unknown(f"relations.{name}.", key, {*known})
+        where = f"relations.{name}."
+        chosen = {key: _value(type(known[key]), v, where + key) for key, v in values.items()}
+        checked[name] = {**known, **chosen}
     return checked
 
 
@@ -759,6 +748,8 @@ def _value(hint: Any, value: Any, name: str, default: Any = None) -> Any:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         check(number and math.isfinite(value), name, value, "a number")
         return float(value)
+    if hint is Any:
+        return value
     if hint in _PLAIN:
         check(type(value) is hint, name, value, _PLAIN[hint])
         return value
@@ -802,6 +793,13 @@ def as_toml(config: Config) -> str:
             tables += ["", *(f"# {line}" for line in _summary(type(value))), f"[{one.name}]"]
             for inner in fields(value):
                 tables += _setting(inner, getattr(value, inner.name))
+        elif one.name == "relations":
+            tables += ["", *_comment(one), *([] if value else ["[relations]"])]
+            for name, values in value.items():
+                tables += [
+                    f"[relations.{name}]",
+                    *(f"{k} = {_literal(v)}" for k, v in values.items()),
+                ]
         elif isinstance(value, Mapping):
             tables += ["", *_comment(one), f"[{one.name}]"]
             tables += [f"{_text(key)} = {_meaning(asdict(v))}" for key, v in value.items()]
@@ -867,9 +865,10 @@ What a file does not name keeps its default, or the value of the preset that it 
 |---|---|
 | entity classes, special classes, signal classes | `[types]`, before the shipped tables; `kinds` |
 | road granularity: none, lane, waypoints | `lanes.granularity`, `lanes.spacing`, `lanes.types` |
-| distance relationships: none, thresholds | `[proximity]`; none: `names` and `upper` are `[]` |
-| angular relationships: none, thresholds | `[direction]`; none: likewise, and `sides = "none"` |
+| distance relationships: none, thresholds | `[proximity]`, with `kinds`; none: `names` and `upper` are `[]` |
+| angular relationships: none, thresholds | `[direction]`, `kinds`, `within`; none: so, and `sides = "none"` |
 | entity relationships: none, pairs | `[pairs]`; none: `ego = false` and `within = 0` |
+| `exclude_ids` | `exclude_ids` |
 | range: the geometry of what is in the graph | `[range]` |
 
 ## Presets
@@ -893,7 +892,7 @@ def _differences(
     default: Mapping[str, Any], other: Mapping[str, Any], prefix: str
 ) -> Iterator[str]:
     for name, value in other.items():
-        if isinstance(value, Mapping) and name != "types":
+        if isinstance(value, Mapping) and name not in {"types", "relations"}:
             yield from _differences(default[name], value, f"{prefix}{name}.")
         elif value != default[name]:
             yield f"{prefix}{name} = {_literal(value)}"

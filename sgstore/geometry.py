@@ -13,6 +13,8 @@ Conventions
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,3 +77,41 @@ def gap_to_points(boxes: Floats, x: Floats, y: Floats) -> Floats:
     ahead = np.maximum(np.abs(lon) - boxes[:, 3] / 2, 0)
     aside = np.maximum(np.abs(lat) - boxes[:, 4] / 2, 0)
     return np.sqrt(ahead * ahead + aside * aside)
+
+
+Corner = Sequence[float]
+
+
+def is_simple(corners: Sequence[Corner]) -> bool:
+    """Return whether a polygon's sides meet at its corners only, one after another."""
+    sides = list(zip(corners, (*corners[1:], corners[0]), strict=True))
+    folded_back = any(
+        _turn(*one, other[1]) == 0 and not _between(*one, other[1], ahead=True)
+        for one, other in zip(sides, (*sides[1:], sides[0]), strict=True)
+    )
+    crossing = any(
+        _meet(sides[i], sides[j])
+        for i in range(len(sides))
+        for j in range(i + 2, len(sides) - (i == 0))
+    )
+    return not folded_back and not crossing
+
+
+def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
+    """Return whether two sides have a point in common."""
+    ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
+    turns = [_turn(*three) for three in ends]
+    if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
+        return True
+    return any(turn == 0 and _between(*e) for turn, e in zip(turns, ends, strict=True))
+
+
+def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
+    """Return whether c, on the line through a and b, lies between them; or ``ahead``: beyond b, seen from a."""
+    if ahead:
+        return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
+    return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))
+
+
+def _turn(a: Corner, b: Corner, c: Corner) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

@@ -16,7 +16,7 @@ import threading
 import time
 from array import array
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -352,6 +352,7 @@ class SegmentReader:
             mapping=job.config.mapping,
         ) as trace:
             road_map, odd = self._maps.of(trace.info)
+            odd = [*odd, *job.config.notes]
             lost = lost_lanes(trace.info, road_map)
             on_map(trace, road_map)
             wanted = [one for one in self._wanted(trace, views) if self._is_new(one, road_map)]
@@ -392,6 +393,15 @@ class SegmentReader:
             seen.add(found)
             view.outcome.ego = found
             yield _Wanted(view, replace(info, ego=found))
+
+    def _excluded(self, info: TraceInfo) -> tuple[str, ...]:
+        """The ids of what is to be left out; what is no role or name of a vehicle is an id."""
+        found: list[str] = []
+        for name in self._job.config.exclude_ids:
+            with suppress(SgstoreError):
+                found.append(_ident(info, name, self._job.config.mapping))
+            found.append(name)
+        return tuple(dict.fromkeys(found))
 
     def _vehicles(self, trace: MessageTrace) -> list[str]:
         """The ids of all vehicles of a recording."""
@@ -439,7 +449,8 @@ class SegmentReader:
     ) -> None:
         """Build the segments of some views in one pass over the recording."""
         job, size = self._job, self._job.block_frames
-        generator = SceneGraphGenerator(road_map, job.config)
+        config = replace(job.config, exclude_ids=self._excluded(trace.info))
+        generator = SceneGraphGenerator(road_map, config)
         tally = TraceTally()
         blocks = job.part.blocks(map(self._meant, trace.blocks(size)), size)
         first = next(blocks, None)

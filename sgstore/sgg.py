@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
+from sgstore.errors import ConfigError
 from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
     IS_SIGNAL,
@@ -50,7 +51,7 @@ from sgstore.relations import (
     waypoints_of,
 )
 from sgstore.step import Stepper
-from sgstore.vocabulary import RELATIONS
+from sgstore.vocabulary import OWN_RELATIONS, RELATIONS
 from sgstore.world import States
 
 if TYPE_CHECKING:
@@ -108,6 +109,7 @@ class SceneGraphGenerator:
         self._extent = Extent(config.range, road_map)
         self._keeping = Keeping(config, road_map)
         self._kinds: Codes = np.zeros(0, np.int8)
+        self._left_out: Bools = np.zeros(0, np.bool_)
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self._still = StillPairs(config)
         self._parking = Parking()
@@ -143,6 +145,8 @@ class SceneGraphGenerator:
 
         Raises
         ------
+        ConfigError
+            A relation of another package gives edges that it does not declare.
         ValueError
             A state belongs to a node that no block has introduced, or nodes are not introduced one after
             another: a defect of the reader.
@@ -250,16 +254,29 @@ class SceneGraphGenerator:
         pairs = related_pairs(bodies, view.ego, near, self._config)
         if over_touching.any():
             touching = joined_pairs([touching, contacts_of(bodies, view.ego, over_touching)])
-        touching = of_kinds(bodies, view.ego, touching, self._config.pairs)
+        touching = of_kinds(bodies, view.ego, touching, self._config.pairs.kinds)
         scene = BlockScene(self._config, bodies, view.ego, pairs, touching, ground)
+        edges = self._keeping.edges(Edges.chained([edges(scene) for edges in self._functions]))
+        self._refuse_undeclared(edges)
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground and self._keeping.present(ground.present)),
-            edges=self._keeping.edges(Edges.chained([edges(scene) for edges in self._functions])),
+            edges=edges,
             lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
             gaps=self._keeping.gaps(gaps(bodies, ground)),
             crowded=self._crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}),
         )
+
+    def _refuse_undeclared(self, edges: Edges) -> None:
+        """Refuse edges of another package that no relation asked for declares: no store has room for them."""
+        names = [tuple(RELATIONS)[code] for code in np.unique(edges.relation)]
+        strange = sorted({*names} - {*self.answers} - {*OWN_RELATIONS})
+        if strange:
+            raise ConfigError(
+                f"a relation of another package gives edges {', '.join(strange)}, which none that these"
+                " settings ask for declares; expected edges of its own name, or of relations that share"
+                " its function"
+            )
 
     def _crowded(
         self, bodies: Bodies, over: Mapping[str, Bools]
@@ -387,6 +404,8 @@ class SceneGraphGenerator:
             if entities.first != len(self._kinds):
                 raise ValueError(f"new entities begin at {entities.first}, not {len(self._kinds)}")
             self._kinds = np.concatenate([self._kinds, entities.kind])
+            left_out = [ident in self._config.exclude_ids for ident in entities.ident]
+            self._left_out = np.append(self._left_out, np.array(left_out, np.bool_))
             self._parking.learn(entities)
             if self._survey is not None:
                 self._survey.learn(entities, frames.scenery)
@@ -411,7 +430,7 @@ class SceneGraphGenerator:
         kind = self._kinds[scenery.node][row]
         boxes, bottom = _boxes(scenery)[row], _bottom(scenery)[row]
         held = areas.hold(frame, boxes, bottom, static=True, hung=IS_SIGNAL[kind])
-        held &= self._keeping.entities(kind)
+        held &= self._keeping.entities(kind) & ~self._left_out[scenery.node[row]]
         return frame[held], row[held]
 
     def _in_range(
@@ -421,7 +440,7 @@ class SceneGraphGenerator:
         frame, states = frames.frame_of, frames.states
         kind = self._kinds[states.node]
         held = areas.hold(frame, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
-        held &= self._keeping.entities(kind)
+        held &= self._keeping.entities(kind) & ~self._left_out[states.node]
         named = states.node == np.repeat(frames.ego, np.diff(frames.offsets))
         kept = np.flatnonzero(held | named)
         here = np.where(ego < 0, -1, np.searchsorted(kept, ego))

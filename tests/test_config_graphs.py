@@ -1,7 +1,10 @@
 """Whatever the settings are, graphs are whole: every edge ends at nodes that are there, and is there once."""
 
+# pyright: basic, reportReturnType=false
+
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from itertools import islice
@@ -13,13 +16,28 @@ from conftest import REPOSITORY
 from test_online import columns, shown
 
 from sgstore.config import Config, configured
+from sgstore.demo import RECORDING
+from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
+from sgstore.query import Store
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.step import Replay
-from sgstore.vocabulary import RELATION_CODE, RELATIONS, TypeMeaning
+from sgstore.store import StoreFile
+from sgstore.vocabulary import (
+    DIRECTIONS,
+    PROXIMITY,
+    RELATION_CODE,
+    RELATIONS,
+    SIDES,
+    TypeMeaning,
+    kinds_labelled,
+)
+from sgstore.vocabulary import KINDS as ALL_KINDS
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
     from sgstore.world import FrameBlock
@@ -79,6 +97,11 @@ def nodes_of(graph: GraphBlock) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("seed", range(24))
 def test_every_edge_ends_at_nodes_and_is_there_once(seed: int) -> None:
     config, (blocks, road_map) = any_config(seed), sample()
+    config = replace(
+        config,
+        proximity=replace(config.proximity, kinds=(("Vehicle", "Person"),) * (seed % 2)),
+        direction=replace(config.direction, within=12.0 * (seed % 3), kinds=(("Ego", "Entity"),)),
+    )
     generator, shown = SceneGraphGenerator(road_map, config), map_of_graphs(road_map, config)
     assert shown is not None
     for block in blocks:
@@ -131,3 +154,90 @@ def test_steps_give_what_blocks_give_whatever_the_settings(seed: int) -> None:
         assert shown(step) == columns(graph, row, idents)
     kinds = {attributes["kind"] for step in steps for attributes in step.nodes.values()}
     assert "person" not in kinds
+
+
+def rows(graph: GraphBlock, names: tuple[str, ...]) -> set[tuple[int, str, int, int]]:
+    """The edges of some relations, as frame, relation, source and destination."""
+    of = graph.edges
+    columns = (of.frame, of.relation, of.src, of.dst)
+    found = (
+        (f, RELATIONS[r], s, d) for f, r, s, d in zip(*map(np.ndarray.tolist, columns), strict=True)
+    )
+    return {row for row in found if row[1] in names}
+
+
+def test_each_ladder_has_pairs_and_a_reach_of_its_own() -> None:
+    blocks, road_map = sample()
+    block, bearings = blocks[0], (*DIRECTIONS, *SIDES)
+    narrow = configured(
+        proximity={"kinds": [["Person", "Ego"], ["Car", "Car"]]},
+        direction={"kinds": [["Ego", "Vehicle"]], "within": 12},
+    )
+    every, some = (SceneGraphGenerator(road_map, one).block(block) for one in (Config(), narrow))
+    kinds, states, frame = block.entities.kind, block.states, block.frame_of
+    place = {
+        (f, n): (x, y, z)
+        for f, n, x, y, z in zip(
+            frame.tolist(), states.node.tolist(), states.x, states.y, states.z, strict=True
+        )
+    }
+    ego = dict(enumerate(block.ego.tolist()))
+
+    def labelled(f: int, node: int, label: str) -> bool:
+        return (
+            node == ego[f]
+            if label == "Ego"
+            else ALL_KINDS[kinds[node]] in (kinds_labelled(label) or ())
+        )
+
+    def listed(f: int, a: int, b: int, pairs: tuple[tuple[str, ...], ...]) -> bool:
+        return any(
+            (labelled(f, a, one) and labelled(f, b, other))
+            or (labelled(f, b, one) and labelled(f, a, other))
+            for one, other in pairs
+        )
+
+    near = {r for r in rows(every, PROXIMITY) if listed(r[0], r[2], r[3], narrow.proximity.kinds)}
+    seen = {
+        r
+        for r in rows(every, bearings)
+        if listed(r[0], r[2], r[3], narrow.direction.kinds)
+        and {r[:1] + r[2:3], r[:1] + r[3:]} <= place.keys()
+        and math.dist(place[r[0], r[2]], place[r[0], r[3]]) <= 12
+    }
+    assert rows(some, PROXIMITY) == near
+    assert {
+        r for r in rows(some, bearings) if {r[:1] + r[2:3], r[:1] + r[3:]} <= place.keys()
+    } == seen
+    assert 0 < len(near) < len(rows(every, PROXIMITY))
+    assert 0 < len(seen) < len(rows(every, bearings))
+
+
+def test_entities_are_left_out_by_their_ids() -> None:
+    blocks, road_map = sample()
+    block, still = blocks[0], ("leads", "follows", "sees")  # others come in their places
+    idents, ego = block.entities.ident, int(block.ego[0])
+    gone = {n for n in range(len(idents)) if n % 5 == 1 and n != ego}
+    config = Config(exclude_ids=(*(idents[n] for n in gone), idents[ego], "nobody"))
+    every, some = (SceneGraphGenerator(road_map, one).block(block) for one in (Config(), config))
+
+    assert nodes_of(some) == {(f, n) for f, n in nodes_of(every) if n not in gone}
+    others = tuple(name for name in RELATIONS if name not in still)
+    assert rows(some, others) == {r for r in rows(every, others) if not gone & {*r[2:]}}
+    assert len(nodes_of(some)) < len(nodes_of(every))
+
+
+def test_entities_are_left_out_of_a_store_through_ingest(tmp_path: Path) -> None:
+    StoreFile.create(tmp_path / "s.db")
+    (first,) = ingest(tmp_path / "s.db", [RECORDING], until=1.0)
+    store = Store(tmp_path / "s.db")
+    ((ident,),) = store.sql(
+        "SELECT ident FROM entities WHERE kind = 'car' AND node_id <> 0 LIMIT 1"
+    ).values
+    config = Config(exclude_ids=(str(ident),))
+    (second,) = ingest(tmp_path / "s.db", [RECORDING], until=1.0, config=config, force=True)
+
+    assert first.error is None
+    assert second.error is None
+    there = f"SELECT count(*) FROM nodes JOIN entities USING (node_id) WHERE ident = '{ident}'"
+    assert Store(tmp_path / "s.db").sql(there).values == [(0,)]

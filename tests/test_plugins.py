@@ -1,8 +1,13 @@
 # pyright: basic
 """Relations of other packages: by entry point, into stores made before, and where nobody knows them."""
 
+# pyright: basic
+
 from __future__ import annotations
 
+import json
+import re
+import tomllib
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +17,7 @@ import pytest
 
 import sgstore.relations._registry as registry
 from sgstore import plugins, vocabulary
-from sgstore.config import Config, Direction, Proximity
+from sgstore.config import Config, Direction, Proximity, as_toml, from_dict, load
 from sgstore.demo import RECORDING
 from sgstore.errors import ConfigError, QueryNameError, StoreError
 from sgstore.ingest import ingest
@@ -181,3 +186,78 @@ def test_a_package_whose_relation_cannot_be_loaded_is_named(
 
     with pytest.raises(ConfigError, match="the relation 'besides'"):
         registry.relations()
+
+
+def edges_of_pairs_near_enough(scene: BlockScene) -> Edges:
+    rows = np.flatnonzero(scene.pairs.distance < scene.parameters(NEAR_ENOUGH)["reach"])
+    return edges_between(scene, "besides", scene.pairs.b[rows], scene.pairs.a[rows])
+
+
+NEAR_ENOUGH = Relation(
+    name="besides",
+    doc="b → a: b is near a",
+    edges=edges_of_pairs_near_enough,
+    of_pairs=True,
+    parameters={"reach": 5.0, "loud": False},
+)
+
+
+def test_a_relation_of_another_package_has_settings(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(monkeypatch, NEAR_ENOUGH)
+    path, file = tmp_path / "s.db", tmp_path / "c.toml"
+    file.write_text("[relations.besides]\nreach = 3\n", encoding="utf-8")
+    config = load(file)
+    distances = "SELECT max(p.distance) FROM edges e JOIN pairs p USING (frame_id, src, dst)"
+    reached = dict[float, float]()
+    for reach, one in {5.0: Config(), 3.0: config}.items():
+        StoreFile.create(path)
+        ingest(path, [RECORDING], until=4.0, config=one)
+        ((reached[reach],),) = Store(path).sql(f"{distances} WHERE relation = 'besides'").values
+        ((kept,),) = StoreFile(path).rows("SELECT settings FROM config").values
+        assert json.loads(kept)["relations"] == (
+            {} if reach == 5 else {"besides": {"reach": 3.0, "loud": False}}
+        )
+        path.unlink()
+
+    assert 0 < reached[3.0] <= 3 < reached[5.0] <= 5
+    assert "[relations.besides]\nreach = 3.0\nloud = false" in as_toml(config)
+    assert from_dict(tomllib.loads(as_toml(config))) == config
+    assert from_dict(json.loads(json.dumps(config.as_dict()))) == config
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"besides": {"reach": "far"}}, "'relations.besides.reach' is 'far'; expected a number"),
+        ({"besides": {"loud": 1}}, "'relations.besides.loud' is 1; expected true or false"),
+        ({"besides": {"raech": 3}}, "did you mean 'relations.besides.reach'"),
+        ({"beside": {"reach": 3}}, "'relations' is 'beside'; expected 'besides', perhaps"),
+        ({"near": {}}, "'relations' is 'near'"),
+        ({"besides": 3}, "a table"),
+    ],
+)
+def test_settings_of_a_relation_are_checked(
+    names: list[str], monkeypatch: pytest.MonkeyPatch, given: Any, message: str
+) -> None:
+    installed(monkeypatch, NEAR_ENOUGH)
+
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        from_dict({"relations": given})
+
+
+def test_edges_that_no_relation_declares_are_refused(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vocabulary.add_relation("strange")
+
+    def strange(scene: BlockScene) -> Edges:
+        return edges_between(scene, "strange", scene.pairs.b, scene.pairs.a)
+
+    installed(monkeypatch, Relation(name="besides", doc="", edges=strange, of_pairs=True))
+    StoreFile.create(tmp_path / "s.db")
+
+    (outcome,) = ingest(tmp_path / "s.db", [RECORDING], until=1.0)
+
+    assert "a relation of another package gives edges strange" in str(outcome.error)

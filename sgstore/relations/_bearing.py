@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.relations._pairs import are_of_kinds
 from sgstore.relations._scene import BlockScene, Relation, edges_between
 from sgstore.vocabulary import DIRECTIONS, RELATION_CODE, SIDES
 
@@ -33,9 +34,20 @@ BESIDE: Final = 1e-3
 """What is not farther off the axis is neither left nor right; m."""
 
 
+def _seen(scene: BlockScene) -> Bools:
+    """Mask of the pairs that the settings tell directions of, and whose bearing is known."""
+    settings, pairs = scene.config.direction, scene.pairs
+    seen = ~np.isnan(pairs.bearing)
+    if settings.within > 0:
+        seen &= pairs.distance <= settings.within
+    if settings.kinds:
+        seen &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
+    return seen
+
+
 def _direction_edges(scene: BlockScene) -> Edges:
     settings, pairs = scene.config.direction, scene.pairs
-    seen = np.flatnonzero(~np.isnan(pairs.bearing) & bool(settings.names))
+    seen = np.flatnonzero(_seen(scene) & bool(settings.names))
     bounds = np.radians(settings.upper) + NOISE
     bearing = pairs.bearing[seen]
     sector = np.searchsorted(bounds, np.abs(bearing))
@@ -67,9 +79,9 @@ def _side_edges(scene: BlockScene) -> Edges:
     dx, dy = bodies.x[pairs.b] - bodies.x[pairs.a], bodies.y[pairs.b] - bodies.y[pairs.a]
     off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(pairs.bearing))
     if scene.config.direction.sides == "closed":  # to the last bit, as CARLASGG has it
-        aside = np.flatnonzero(~np.isnan(pairs.bearing))
+        aside = np.flatnonzero(_seen(scene))
     else:
-        aside = np.flatnonzero(off_axis > BESIDE)
+        aside = np.flatnonzero(_seen(scene) & (off_axis > BESIDE))
     left, right = (RELATION_CODE[name] for name in SIDES)
     codes = np.where(pairs.bearing[aside] >= 0, left, right).astype(np.int8)
     return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])

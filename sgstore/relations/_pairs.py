@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.config import Config, PairSettings
+    from sgstore.config import Config
     from sgstore.graph import GraphBlock
     from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
 
@@ -82,7 +82,7 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
     """
     settings, between = config.pairs, config.proximity.between
     if not settings.ego:
-        return _with_mirror_images(bodies, *of_kinds(bodies, ego, near, settings), between)
+        return _with_mirror_images(bodies, *of_kinds(bodies, ego, near, settings.kinds), between)
     mine = ego[bodies.frame]
     others = np.flatnonzero((mine >= 0) & (mine != np.arange(len(bodies))))
     a, b = near
@@ -91,24 +91,35 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
     if settings.ego_within > 0:
         close = distances(bodies, *with_ego, between) <= settings.ego_within
         with_ego = with_ego[0][close], with_ego[1][close]
-    halves = of_kinds(bodies, ego, joined_pairs([with_ego, (a[further], b[further])]), settings)
+    halves = joined_pairs([with_ego, (a[further], b[further])])
+    halves = of_kinds(bodies, ego, halves, settings.kinds)
     return _with_mirror_images(bodies, *halves, between)
 
 
-def of_kinds(bodies: Bodies, ego: Rows, pairs: Halves, settings: PairSettings) -> Halves:
-    """The pairs of the kinds that the settings list, in either order."""
-    if not settings.kinds:
+def of_kinds(
+    bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
+) -> Halves:
+    """The pairs of listed labels, in either order; all if none are listed."""
+    if not kinds:
         return pairs
+    a, b = pairs
+    kept = are_of_kinds(bodies, ego, pairs, kinds)
+    return a[kept], b[kept]
+
+
+def are_of_kinds(
+    bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
+) -> Bools:
+    """Mask of the pairs of listed labels, in either order."""
     listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last one: the ego
-    for one, other in settings.kinds:
+    for one, other in kinds:
         listed[np.ix_(_kind_codes(one), _kind_codes(other))] = True
     listed |= listed.T
     a, b = pairs
     of_a, of_b = bodies.kind[a].astype(np.intp), bodies.kind[b].astype(np.intp)
     kept = listed[of_a, of_b]
     kept |= listed[-1, of_b] & (ego[bodies.frame[a]] == a)
-    kept |= listed[of_a, -1] & (ego[bodies.frame[b]] == b)
-    return a[kept], b[kept]
+    return kept | listed[of_a, -1] & (ego[bodies.frame[b]] == b)
 
 
 def _kind_codes(label: str) -> list[int]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sgstore.relations._pairs import are_of_kinds
 from sgstore.relations._scene import BlockScene, Relation, edges_between
 from sgstore.vocabulary import PROXIMITY, RELATION_CODE
 
@@ -22,7 +23,10 @@ def _edges(scene: BlockScene) -> Edges:
     settings, pairs = scene.config.proximity, scene.pairs
     # What is beyond the last rung, or has no distance (NaN sorts last), falls behind all of them.
     rung = np.searchsorted(np.array(settings.upper), pairs.distance)
-    on = np.flatnonzero(rung < len(settings.upper))
+    holds = rung < len(settings.upper)
+    if settings.kinds:
+        holds &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
+    on = np.flatnonzero(holds)
     codes = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
     return edges_between(scene, codes[rung[on]], pairs.a[on], pairs.b[on])
 

@@ -5,8 +5,8 @@ Which intervals of a line meet: how candidates are found without looking at all 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from sgstore.graph import Edges
 from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -242,6 +242,10 @@ class BlockScene:
     contacts: tuple[NDArray[np.intp], NDArray[np.intp]]
     ground: MapContext | None
 
+    def parameters(self, relation: Relation) -> Mapping[str, Any]:
+        """Settings of a relation's own: those of the config, and the defaults of the others."""
+        return {**relation.parameters, **self.config.relations.get(relation.name, {})}
+
 
 def always(config: Config) -> bool:
     """Every config asks for it."""
@@ -274,6 +278,9 @@ class Relation:
         the settings relate none.
     settings : function
         Whether a config asks for it.
+    parameters : mapping
+        Settings of its own, by name with their defaults: what a config may say in ``[relations.NAME]``;
+        numbers, texts, true or false. See :meth:`BlockScene.parameters`.
     legend : str
         A few words for the legend of a picture, seen from the other end; empty: the name says it.
     """
@@ -287,6 +294,7 @@ class Relation:
     of_map: bool = False
     of_pairs: bool = False
     settings: Callable[[Config], bool] = always
+    parameters: Mapping[str, Any] = field(default_factory=dict[str, Any], hash=False)
     legend: str = ""
 
     def asked(self, config: Config) -> bool:
