@@ -146,7 +146,7 @@ def try_wheel(folder: Path) -> None:
         What was tested is not what was installed.
     """
     wheel = build(folder, isolated=True)
-    needs = ("pytest>=8.3", "pytest-xdist>=3.6", "hypothesis>=6.100", "polars>=1")
+    needs = ("pytest>=8.3", "pytest-xdist>=3.8", "hypothesis>=6.100", "polars>=1")
     programs = environment(folder / "env", f"{wheel}[viz,arrow]", *needs)
     where = [str(programs / "python"), "-c", "import sgstore; print(sgstore.__path__[0])"]
     (folder / "copy").mkdir()
