@@ -387,7 +387,7 @@ class Config:
             f"setting '{table}.names': {name!r} is a relation of your own; did you mean {like!r}?"
             for table, known in (("proximity", PROXIMITY), ("direction", DIRECTIONS))
             for name in getattr(self, table).names
-            if name not in known and (like := suggestion(name, known))
+            if name not in known and (like := suggestion(name, known, alike=0.8))
         ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:

@@ -405,10 +405,10 @@ def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
     return keyed, name
 
 
-def suggestion(name: str, known: Iterable[str]) -> str | None:
-    """The known name that is most like ``name``, or ``None`` if none is alike."""
+def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | None:
+    """The known name that is most like ``name``, or ``None`` if none is alike by that much, from 0 to 1."""
     by_folded = {normalize_name(candidate): candidate for candidate in known}
-    close = difflib.get_close_matches(normalize_name(name), by_folded, n=1, cutoff=0.6)
+    close = difflib.get_close_matches(normalize_name(name), by_folded, n=1, cutoff=alike)
     return by_folded[close[0]] if close else None
 
 

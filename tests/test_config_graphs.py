@@ -241,3 +241,15 @@ def test_entities_are_left_out_of_a_store_through_ingest(tmp_path: Path) -> None
     assert second.error is None
     there = f"SELECT count(*) FROM nodes JOIN entities USING (node_id) WHERE ident = '{ident}'"
     assert Store(tmp_path / "s.db").sql(there).values == [(0,)]
+
+
+def test_a_name_that_is_all_but_a_built_in_one_is_noted(tmp_path: Path) -> None:
+    StoreFile.create(tmp_path / "s.db")
+    slip = configured(proximity={"names": ["near_col", "yonder"], "upper": [4, 50]})
+    (outcome,) = ingest(tmp_path / "s.db", [RECORDING], until=1.0, config=slip)
+
+    assert outcome.error is None
+    assert [note for note in outcome.warnings if "proximity" in note] == [
+        "setting 'proximity.names': 'near_col' is a relation of your own; did you mean 'near_coll'?"
+    ]
+    assert Config().notes == []
