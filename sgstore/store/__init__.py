@@ -2,8 +2,9 @@
 
 Reading: ``_file`` is the face, :class:`StoreFile`. ``_locking`` lets readers and writers share the file,
 and ``_schema`` compares it with ``schema.sql`` before anything is read. ``_rows`` runs statements, users'
-too, and writes their rows to files. ``_traces`` finds traces and frames by their names, ``_graphs`` reads
-graphs, ``_catalog`` tells the compiler of queries what there is, ``_joins`` brings users' own tables beside
+too, and makes tables and files of their rows; ``_steps`` lets a signal end them. ``_traces`` finds traces
+and frames by their names, ``_graphs`` reads graphs,
+``_catalog`` tells the compiler of queries what there is, ``_joins`` brings users' own tables beside
 the store, and ``_contents`` makes digests of frames.
 
 Writing: ``_packing`` turns the graphs of a block into columns and masks. ``_write`` builds a trace aside,
