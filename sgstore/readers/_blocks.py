@@ -37,6 +37,9 @@ NAN: Final = float("nan")
 FAR: Final = 1e9
 """Greatest coordinate of anything on earth, in any projection; m. Beyond it a pose is not usable."""
 
+UPRIGHT: Final = 1 - 1e-13
+"""Sine of the pitch beyond which rounding leaves no heading and roll of their own."""
+
 NEAR_REFS: Final = 250_000
 """Messages behind a frame, and before the next one, that are referred to however many there are."""
 

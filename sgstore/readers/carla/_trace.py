@@ -32,7 +32,7 @@ import numpy as np
 from sgstore.errors import MapError, TraceError
 from sgstore.opendrive import read_map
 from sgstore.readers._base import SurveyedTrace
-from sgstore.readers._blocks import FAR, NAN, FrameRows, MessageDecoder
+from sgstore.readers._blocks import FAR, NAN, UPRIGHT, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
 from sgstore.readers.carla._signals import Lights, signals_of
 from sgstore.readers.carla._survey import (
@@ -419,10 +419,6 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
     return values, np.all(near, axis=1, keepdims=True)[:, 0]
 
 
-_UPRIGHT: Final = 1 - 1e-13
-"""Sine of the pitch beyond which rounding leaves no heading and roll of their own."""
-
-
 def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
     """Heading, pitch, roll of quaternions (x, y, z, w), and where their upright axis points; NaN for none.
 
@@ -437,7 +433,7 @@ def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
         heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         sine = np.clip(2 * (w * y - z * x), -1, 1)
         pitch, roll = np.arcsin(sine), np.arctan2(2 * (w * x + y * z), up[:, 2])
-        upright = np.abs(sine) > _UPRIGHT
+        upright = np.abs(sine) > UPRIGHT
     heading[upright] = np.arctan2(2 * w * z, w * w - z * z)[upright]
     roll[upright] = 0
     return np.stack([heading, pitch, roll], axis=1), up

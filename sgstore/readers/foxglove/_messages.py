@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.readers._blocks import FAR
+from sgstore.readers._blocks import FAR, UPRIGHT
 from sgstore.readers.osi._schema import DECODE_ERRORS, check_size, message_class
 
 if TYPE_CHECKING:
@@ -164,10 +164,6 @@ def rotated(turn: Floats, vectors: Floats) -> Floats:
     return vectors @ matrix.T
 
 
-_UPRIGHT: Final = 1 - 1e-13
-"""Sine of the pitch beyond which rounding leaves no heading and roll of their own."""
-
-
 def angles(turn: Floats) -> tuple[float, float, float]:
     """Heading, pitch and roll of a quaternion; rad. Pitch is positive with the nose down, as in OSI.
 
@@ -175,7 +171,7 @@ def angles(turn: Floats) -> tuple[float, float, float]:
     """
     x, y, z, w = turn.tolist()
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    if abs(sine) > _UPRIGHT:
+    if abs(sine) > UPRIGHT:
         return float(np.arctan2(2 * w * z, w * w - z * z)), float(np.arcsin(sine)), 0.0
     return (
         float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
