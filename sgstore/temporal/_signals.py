@@ -426,7 +426,12 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
         case b.Operation(word=word, operands=operands) if word in _TOLERANT and _of_time(part):
             compare = _TOLERANT[word]
             left, right = (column_evaluator(o, partial(_over_time, test=test)) for o in operands)
-            return lambda at: compare(left(at), right(at), at.clock.tolerance / NS)
+
+            def compared(at: SignalValues) -> Column:
+                one, other, by = left(at), right(at), at.clock.tolerance / NS
+                return Column(compare(one.values, other.values, by), all_known((one, other)))
+
+            return compared
         case _:
             return None
 
@@ -459,20 +464,12 @@ def _summed(steps: Array) -> Array:
     return np.concatenate((np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)), axis=1)
 
 
-def _tolerant(function: Callable[[Array, Array, float], Array]) -> Any:
-    """A comparison of times, those that differ by no more than a tolerance being the same."""
-
-    def compare(one: Column, other: Column, by: float) -> Column:
-        return Column(function(one.values, other.values, by), all_known((one, other)))
-
-    return compare
-
-
-_TOLERANT: Final[Mapping[str, Callable[[Column, Column, float], Column]]] = {
-    "=": _tolerant(lambda one, other, by: np.abs(one - other) <= by),
-    "<>": _tolerant(lambda one, other, by: np.abs(one - other) > by),
-    "<": _tolerant(lambda one, other, by: one < other - by),
-    "<=": _tolerant(lambda one, other, by: one <= other + by),
-    ">": _tolerant(lambda one, other, by: one > other + by),
-    ">=": _tolerant(lambda one, other, by: one >= other - by),
+_TOLERANT: Final[Mapping[str, Callable[[Array, Array, float], Array]]] = {
+    "=": lambda one, other, by: np.abs(one - other) <= by,
+    "<>": lambda one, other, by: np.abs(one - other) > by,
+    "<": lambda one, other, by: one < other - by,
+    "<=": lambda one, other, by: one <= other + by,
+    ">": lambda one, other, by: one > other + by,
+    ">=": lambda one, other, by: one >= other - by,
 }
+"""Comparisons of times, those that differ by no more than a tolerance being the same."""
