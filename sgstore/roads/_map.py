@@ -649,7 +649,7 @@ def summary(road_map: RoadMap) -> list[MapCount]:
     A road that is of several types one after another counts under each, with the length that it has of it.
     """
     nodes = road_map.nodes
-    kinds = [KINDS[code] for code in nodes.kind]
+    kinds = [KINDS[int(code)] for code in nodes.kind]
     lanes = [(nodes.lane_type[row], float(nodes.length[row])) for row in _of(kinds, "lane")]
     junctions = [road_map.junction_types.get(nodes.name[r], "") for r in _of(kinds, "junction")]
     signals = Counter(kind for kind in kinds if kind in SIGNALS)
