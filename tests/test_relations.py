@@ -97,13 +97,13 @@ def test_a_family_that_needs_a_map_says_so_where_there_is_none(family: Family) -
 
 
 @family
-@pytest.mark.parametrize("seed", range(10))
-def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(family: Family, seed: int) -> None:
-    of = found(busy(seed), family)
+def test_nothing_is_related_to_itself_and_no_edge_is_given_twice(family: Family) -> None:
+    scenes = [found(busy(seed), family) for seed in range(10)]
 
-    assert of
-    assert all(src != dst for src, _, dst in of)
-    assert len(set(of)) == len(of)
+    assert any(scenes)
+    for of in scenes:
+        assert all(src != dst for src, _, dst in of)
+        assert len(set(of)) == len(of)
 
 
 @family
