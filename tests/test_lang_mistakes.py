@@ -127,7 +127,7 @@ def test_of_a_long_line_what_is_around_the_mistake_is_shown(at: int) -> None:
 def test_what_was_found_is_told_in_short_and_so_that_it_can_be_seen() -> None:
     assert "U+0000" in refused("MATCH (e:Ego)\0").reason
     assert "U+200B" in refused("MATCH (e:Ego)\u200b").reason
-    assert len(refused(f"MATCH (e:Ego) {'x' * 5_000}").reason) < 200
+    assert len(refused(f"MATCH (e:Ego) {'x' * 50_000}").reason) < 200
 
 
 # For people ---------------------------------------------------------------------------------------

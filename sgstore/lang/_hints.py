@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 LOOK_BACK: Final = 400
-"""So many characters before the unexpected part are looked at."""
+"""So many characters before the unexpected part are looked at; a longer part is no mistake that is known."""
 
 MANY: Final = 24
 """So many names are listed in a hint."""
@@ -125,6 +125,8 @@ def slip_hint(
     found = text[start:end]
     if hint := _character(found, at):
         return hint
+    if len(found) > LOOK_BACK:
+        return None
     before = text[max(start - LOOK_BACK, 0) : end]
     if hint := _looked("syntax", before, text, end, at):
         return hint
