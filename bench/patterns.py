@@ -62,7 +62,7 @@ class Question(NamedTuple):
     small: Callable[[], tuple[Graph, Callable[[Graph, dict[int, int]], bool]]] | None = None
 
 
-def wanted(*edges: tuple[str, str, str], **kinds: str) -> Graph:
+def wanted(*edges: tuple[str, str, str], **kinds: str) -> Graph:  # pyright: ignore[reportUnknownParameterType]
     graph = nx.MultiDiGraph()
     graph.add_nodes_from((name, {"kind": kind}) for name, kind in kinds.items())
     for src, relation, dst in edges:
@@ -80,7 +80,7 @@ QUESTIONS = (
         "MATCH (e:Ego)-[:near_coll]->(p:Person) RETURN FRAMES",
         "SELECT count(DISTINCT frame) FROM edge WHERE relation = 'near_coll' AND src_kind = 'ego'"
         " AND dst_kind = 'person'",
-        lambda: (wanted(("e", "near_coll", "p"), e="ego", p="person"), _always),
+        lambda: (wanted(("e", "near_coll", "p"), e="ego", p="person"), _always),  # pyright: ignore[reportUnknownLambdaType]
     ),
     Question("one relation, nearly everywhere", "MATCH (e:Ego)-[:inDFrontOf]->(v:Car) RETURN COUNT(*)"),
     Question(
@@ -91,9 +91,9 @@ QUESTIONS = (
         " JOIN node c ON c.frame = a.frame AND c.node = b.src"
         " WHERE a.relation = 'isIn' AND a.src_kind = 'ego' AND a.dst_kind = 'lane' AND b.relation = 'isIn'"
         " AND b.src_kind = 'car' AND n.relation = 'near' AND c.speed > 10",
-        lambda: (
+        lambda: (  # pyright: ignore[reportUnknownLambdaType]
             wanted(("e", "isIn", "l"), ("c", "isIn", "l"), ("e", "near", "c"), e="ego", c="car", l="lane"),
-            lambda graph, found: graph.nodes[_of(found, "c")]["speed"] > 10,
+            lambda graph, found: graph.nodes[_of(found, "c")]["speed"] > 10,  # pyright: ignore[reportUnknownLambdaType]
         ),
     ),
     Question(
@@ -103,7 +103,7 @@ QUESTIONS = (
         " JOIN edge z ON z.frame = x.frame AND z.src = x.src AND z.dst = y.dst"
         " WHERE x.relation = 'super_near' AND x.src_kind = 'ego' AND x.dst_kind = 'car'"
         " AND y.relation = 'super_near' AND y.dst_kind = 'car' AND z.relation = 'near'",
-        lambda: (
+        lambda: (  # pyright: ignore[reportUnknownLambdaType]
             wanted(
                 *(("e", "super_near", "a"), ("a", "super_near", "b"), ("e", "near", "b")),
                 e="ego",
@@ -256,8 +256,8 @@ def searched(folder: Path, store: Store, frames: int) -> Iterator[tuple[Question
             matcher = MultiDiGraphMatcher(
                 graph,
                 pattern,
-                node_match=lambda a, b: a["kind"] == b["kind"],
-                edge_match=lambda a, b: (
+                node_match=lambda a, b: a["kind"] == b["kind"],  # pyright: ignore[reportUnknownLambdaType]
+                edge_match=lambda a, b: (  # pyright: ignore[reportUnknownLambdaType]
                     {e["relation"] for e in b.values()} <= {e["relation"] for e in a.values()}
                 ),
             )
@@ -316,9 +316,9 @@ def run(quick: bool = False) -> list[Measure]:
 
 
 def _sizes(store: Store, folder: Path, frames: int) -> Iterator[Measure]:
-    nodes = store.sql("SELECT sum(bit_count(mask)) FROM node").values[0][0]
-    nodes += store.sql("SELECT count(*) FROM state").values[0][0]
-    edges = store.sql("SELECT sum(bit_count(mask)) FROM edge").values[0][0]
+    nodes = store.sql("SELECT sum(bit_count(mask)) FROM inside.node").values[0][0]
+    nodes += store.sql("SELECT count(*) FROM inside.state").values[0][0]
+    edges = store.sql("SELECT sum(bit_count(mask)) FROM inside.edge").values[0][0]
     yield Measure(
         "nodes, and edges without the map's",
         nodes / frames,
@@ -357,7 +357,7 @@ def _compared(store: Store, folder: Path, frames: int) -> Iterator[Measure]:
         notes = [f"processor {1e3 * worked:.0f} ms = {worked / base:.2f} of the reference"]
         if question.rows:
             start = time.perf_counter()
-            (other,) = rows.execute(question.rows).fetchone()
+            (other,) = rows.execute(question.rows).fetchone()  # pyright: ignore[reportGeneralTypeIssues]
             notes.append(f"{(time.perf_counter() - start) / spent:.1f} times rows")
             _same(question, answer, other)
         if question.label in slow:

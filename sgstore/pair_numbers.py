@@ -278,7 +278,9 @@ def pairs_view() -> tuple[str, str]:
     columns += ["a.kind AS src_kind", "b.kind AS dst_kind"]
     columns += ["a.is_ego AS src_is_ego", "b.is_ego AS dst_is_ego"]
     columns += [f"{name[0]}.{name[2:]}::DOUBLE AS {name}" for name in inputs]
-    join = "state a JOIN state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
+    join = (
+        "inside.state a JOIN inside.state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
+    )
     text = f"SELECT {', '.join(columns)} FROM {join}"  # noqa: S608
     for stage in range(1, 1 + max(map(stage_of, wanted))):
         layer = [f"{pair_sql(n, str)} AS {n}" for n in sorted(wanted) if stage_of(n) == stage]

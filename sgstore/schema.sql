@@ -1,7 +1,7 @@
 -- sgstore: what is in a store, version 4.
 --
 -- Users' SQL sees the VIEWS at the end of this file: frames, nodes, edges, pairs, lanes, entities, payloads.
--- They are public and keep their columns. The TABLES are inside and may change with the version.
+-- They are public and keep their columns. The TABLES are in the schema "inside" and may change with the version.
 --
 -- Ids. A trace is one recording seen from one ego. Its trace_id is 39 bits of a digest of both, so it is the same
 -- in every store. Its frames are numbered by seq = 0, 1, 2, …; 60 consecutive frames are a bucket:
@@ -14,7 +14,7 @@
 -- state of lights, or can answer a relation, that the type does not have, it is added behind the others, in place.
 --
 -- Changes
---   * Version 4: kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
+--   * Version 4: tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     Columns that are always known are NOT NULL; store_info holds a digest of these statements.
 --   * Version 3: bucket.joined; the states of the ego lie together (state, lane_state).
 --   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; lane_dists, by lane_state.is_own and map_reach. roles, by lane_role.
@@ -34,6 +34,9 @@ CREATE TYPE relation AS ENUM (
   'inDFrontOf', 'inSFrontOf', 'atSRearOf', 'atDRearOf', 'leads', 'follows', 'overlaps', 'sees');
 
 CREATE TYPE light_state AS ENUM ('unknown', 'off', 'red', 'yellow', 'green', 'red_yellow', 'flashing');
+
+CREATE SCHEMA inside; -- of the tables: who opens the file sees nothing but the views
+USE inside;
 
 -- What the store is -----------------------------------------------------------------------------------------------
 
@@ -188,13 +191,13 @@ INSERT INTO bits SELECT range::TINYINT, 1::BIGINT << range FROM range(60);
 -- They are written so that filters on frame_id, relation and kinds reach the scans of the tables, and so that joining
 -- them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).
 
-CREATE VIEW frames AS
+CREATE VIEW main.frames AS
 SELECT f.frame_id, f.trace_id, f.seq, f.time_ns, f.ego, t.name AS trace, (f.time_ns - t.start_ns) / 1e9 AS t, f.log_time_ns, m.name AS map
-FROM frame f JOIN trace t ON t.trace_id = f.trace_id LEFT JOIN map m ON m.map_id = f.map_id;
+FROM inside.frame f JOIN inside.trace t ON t.trace_id = f.trace_id LEFT JOIN inside.map m ON m.map_id = f.map_id;
 
-COMMENT ON VIEW frames IS 'One row a frame. ego: node_id of the ego, NULL where it is absent; trace: name of the recording; t: seconds since the trace began; log_time_ns: of the leading message; map: name of the road map, NULL without one.';
+COMMENT ON VIEW main.frames IS 'One row a frame. ego: node_id of the ego, NULL where it is absent; trace: name of the recording; t: seconds since the trace began; log_time_ns: of the leading message; map: name of the road map, NULL without one.';
 
-CREATE VIEW nodes AS
+CREATE VIEW main.nodes AS
 SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS name, s.special, s.subkind, false AS is_static,
        t.origin_x + s.x AS x, t.origin_y + s.y AS y, t.origin_z + s.z AS z,
        degrees(s.heading) AS heading, degrees(s.pitch) AS pitch, degrees(s.roll) AS roll, s.speed, s.vx, s.vy, s.vz,
@@ -207,131 +210,131 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
        NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit, NULL::DOUBLE AS curvature
-FROM state s JOIN trace t ON t.trace_id = s.frame_id >> 24
+FROM inside.state s JOIN inside.trace t ON t.trace_id = s.frame_id >> 24
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
        NULL, NULL, n.still, n.still, n.still, n.still, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
        n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature
-FROM frame f JOIN (
+FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
          m.length, m.width, NULL::FLOAT AS height,
          CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature
-  FROM bucket b JOIN node k ON k.bucket = b.bucket JOIN map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
+  FROM inside.bucket b JOIN inside.node k ON k.bucket = b.bucket JOIN inside.map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL
   SELECT k.bucket, k.mask, k.node_id, k.kind, k.kind || ' ' || k.node_id, e.special, e.subkind,
          t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, 0::FLOAT, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
-  FROM node k JOIN trace t ON t.trace_id = k.bucket >> 18 JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
+  FROM inside.node k JOIN inside.trace t ON t.trace_id = k.bucket >> 18 JOIN inside.entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
 
-CREATE VIEW edges AS
+CREATE VIEW main.edges AS
 SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego
-FROM frame f JOIN (
-  SELECT bucket, mask, src, relation, dst, src_kind, dst_kind, src_is_ego, dst_is_ego FROM edge
+FROM inside.frame f JOIN (
+  SELECT bucket, mask, src, relation, dst, src_kind, dst_kind, src_is_ego, dst_is_ego FROM inside.edge
   UNION ALL
   SELECT b.bucket, s.mask & d.mask, m.src, m.relation, m.dst, m.src_kind, m.dst_kind, false, false
-  FROM bucket b JOIN node s ON s.bucket = b.bucket JOIN map_edge m ON m.map_id = b.map_id AND m.src = s.node_id
-       JOIN node d ON d.bucket = b.bucket AND d.node_id = m.dst
+  FROM inside.bucket b JOIN inside.node s ON s.bucket = b.bucket JOIN inside.map_edge m ON m.map_id = b.map_id AND m.src = s.node_id
+       JOIN inside.node d ON d.bucket = b.bucket AND d.node_id = m.dst
   WHERE (s.mask & d.mask) <> 0
 ) e ON e.bucket = f.bucket AND (e.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
+COMMENT ON VIEW main.edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
 
-CREATE VIEW lane_states AS
+CREATE VIEW main.lane_states AS
 SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary, along, is_own
-FROM lane_state;
+FROM inside.lane_state;
 
-COMMENT ON VIEW lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which lane_dists are told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
+COMMENT ON VIEW main.lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which lane_dists are told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
 
-CREATE VIEW lane_gaps AS
-SELECT frame_id, src, dst, gap FROM lane_gap;
+CREATE VIEW main.lane_gaps AS
+SELECT frame_id, src, dst, gap FROM inside.lane_gap;
 
-COMMENT ON VIEW lane_gaps IS 'How far it is along the lanes: one row for each edge src follows dst (and dst leads src). gap: from bumper to bumper along the centre lines, m; 0 where they overlap, NULL where a length is not known.';
+COMMENT ON VIEW main.lane_gaps IS 'How far it is along the lanes: one row for each edge src follows dst (and dst leads src). gap: from bumper to bumper along the centre lines, m; 0 where they overlap, NULL where a length is not known.';
 
 -- Pairs are not stored: they are functions of two states. Their numbers are declared in sgstore/pair_numbers.py, which also
 -- writes the SELECT of this view, with a column for each of them, and what its comment says of them.
-CREATE VIEW pairs AS {{pairs}};
+CREATE VIEW main.pairs AS {{pairs}};
 
-COMMENT ON VIEW pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart; a is src, b is dst. {{numbers}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart; a is src, b is dst. {{numbers}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
 
 -- A view of its own, and no column of pairs: who asks for other numbers should not pay for these joins.
-CREATE VIEW lane_dists AS
+CREATE VIEW main.lane_dists AS
 SELECT frame_id, src, dst, CASE WHEN behind IS NULL OR ahead <= -behind THEN ahead ELSE behind END AS lane_dist, src_kind, dst_kind, src_is_ego, dst_is_ego
 FROM (
   SELECT frame_id, src, dst, src_kind, dst_kind, src_is_ego, dst_is_ego, min(CASE WHEN way >= 0 THEN way END) AS ahead, max(CASE WHEN way < 0 THEN way END) AS behind
   FROM (
     SELECT a.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
         r.start + (b.along::DOUBLE - a.along::DOUBLE) AS way
-    FROM lane_state a JOIN lane_state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id JOIN frame f ON f.frame_id = a.frame_id
-         JOIN map_reach r ON r.map_id = f.map_id AND r.src = a.lane AND r.dst = b.lane
+    FROM inside.lane_state a JOIN inside.lane_state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id JOIN inside.frame f ON f.frame_id = a.frame_id
+         JOIN inside.map_reach r ON r.map_id = f.map_id AND r.src = a.lane AND r.dst = b.lane
     WHERE a.is_own AND b.is_own)
   WHERE way BETWEEN -200 AND 200
   GROUP BY ALL);
 
-COMMENT ON VIEW lane_dists IS 'How far it is along the lanes: one row for each ordered pair of entities that a way of at most 200 m joins (lane changes are none). lane_dist: from centre to centre, positive where one drives from src to dst, negative where one drives from dst to src; the shorter one counts, m.';
+COMMENT ON VIEW main.lane_dists IS 'How far it is along the lanes: one row for each ordered pair of entities that a way of at most 200 m joins (lane changes are none). lane_dist: from centre to centre, positive where one drives from src to dst, negative where one drives from dst to src; the shorter one counts, m.';
 
-CREATE VIEW classes AS
+CREATE VIEW main.classes AS
 SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class
-FROM frame f JOIN (SELECT * FROM frame_class UNION ALL SELECT * FROM later_class) c
+FROM inside.frame f JOIN (SELECT * FROM inside.frame_class UNION ALL SELECT * FROM inside.later_class) c
      ON c.bucket = f.bucket AND (c.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW classes IS 'One row a frame and abstraction (E, EL, ER, RSV, junction; others once they were asked for). class: equal exactly where the labelled graphs are the same but for which node is which (isomorphic), in every store; 32 hexadecimal digits, NULL where a graph is so symmetric that it was given up.';
+COMMENT ON VIEW main.classes IS 'One row a frame and abstraction (E, EL, ER, RSV, junction; others once they were asked for). class: equal exactly where the labelled graphs are the same but for which node is which (isomorphic), in every store; 32 hexadecimal digits, NULL where a graph is so symmetric that it was given up.';
 
-CREATE VIEW roles AS
+CREATE VIEW main.roles AS
 SELECT f.frame_id, r.node_id, r.role
-FROM frame f JOIN lane_role r ON r.bucket = f.bucket AND (r.mask & (1::BIGINT << f.bit)) <> 0;
+FROM inside.frame f JOIN inside.lane_role r ON r.bucket = f.bucket AND (r.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW roles IS 'What lanes are to the ego: one row a frame and lane that is in range or that traffic is in, as far as it can be said. role: Ego Lane; Left 1 of Ego Lane, Right 2 of Ego Lane … for lanes beside it that run the same way; Opposing Lane 0, 1 … for any other that traffic is in, the nearest first. Lanes one behind the other are one and have the same role (as in the abstraction RSV).';
+COMMENT ON VIEW main.roles IS 'What lanes are to the ego: one row a frame and lane that is in range or that traffic is in, as far as it can be said. role: Ego Lane; Left 1 of Ego Lane, Right 2 of Ego Lane … for lanes beside it that run the same way; Opposing Lane 0, 1 … for any other that traffic is in, the nearest first. Lanes one behind the other are one and have the same role (as in the abstraction RSV).';
 
-CREATE VIEW lanes AS
+CREATE VIEW main.lanes AS
 SELECT m.name AS map, n.node_id, n.name, n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.x, n.y, n.z, degrees(n.heading) AS heading,
        n.length, n.width, n.speed_limit
-FROM map_node n JOIN map m ON m.map_id = n.map_id
+FROM inside.map_node n JOIN inside.map m ON m.map_id = n.map_id
 WHERE n.kind = 'lane';
 
-COMMENT ON VIEW lanes IS 'One row a lane of a road map. name: road/section/lane; x, y, z, heading: a point of its centre line and the direction of travel there, m and degrees; width: mean, m; speed_limit: m/s; turn: where a lane in a junction leads. node_id is unique in its map.';
+COMMENT ON VIEW main.lanes IS 'One row a lane of a road map. name: road/section/lane; x, y, z, heading: a point of its centre line and the direction of travel there, m and degrees; width: mean, m; speed_limit: m/s; turn: where a lane in a junction leads. node_id is unique in its map.';
 
-CREATE VIEW entities AS
+CREATE VIEW main.entities AS
 SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.ident, e.special, e.subkind, e.type_name, e.is_static, e.map_ref,
        t.origin_x + e.x AS x, t.origin_y + e.y AS y, t.origin_z + e.z AS z, degrees(e.heading) AS heading, e.length, e.width, e.height,
        e.parked
-FROM entity e JOIN trace t ON t.trace_id = e.trace_id;
+FROM inside.entity e JOIN inside.trace t ON t.trace_id = e.trace_id;
 
-COMMENT ON VIEW entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
+COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
 
-CREATE VIEW payloads AS
+CREATE VIEW main.payloads AS
 SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, t.uri AS file,
        p.chunk_offset, p."offset" AS message_offset, p.length
-FROM frame f JOIN payload p ON p.bucket = f.bucket AND p.bit = f.bit
-     JOIN channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN trace t ON t.trace_id = f.trace_id;
+FROM inside.frame f JOIN inside.payload p ON p.bucket = f.bucket AND p.bit = f.bit
+     JOIN inside.channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN inside.trace t ON t.trace_id = f.trace_id;
 
-COMMENT ON VIEW payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';
+COMMENT ON VIEW main.payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';
 
-CREATE VIEW events AS
+CREATE VIEW main.events AS
 SELECT v.frame_id, v.trace_id, t.name AS trace, v.kind, v.time_ns, (v.time_ns - t.start_ns) / 1e9 AS t, v.log_time_ns,
        e.node_id, o.node_id AS other, v.value, v.detail, v.ident, v.other AS other_ident
-FROM event v JOIN trace t ON t.trace_id = v.trace_id
-     LEFT JOIN entity e ON e.trace_id = v.trace_id AND e.ident = v.ident
-     LEFT JOIN entity o ON o.trace_id = v.trace_id AND o.ident = v.other;
+FROM inside.event v JOIN inside.trace t ON t.trace_id = v.trace_id
+     LEFT JOIN inside.entity e ON e.trace_id = v.trace_id AND e.ident = v.ident
+     LEFT JOIN inside.entity o ON o.trace_id = v.trace_id AND o.ident = v.other;
 
-COMMENT ON VIEW events IS 'What the simulator says has happened. frame_id: of the frame that is nearest in time; kind: collision, lane_invasion, environment; t: seconds since the trace began; node_id, ident: the vehicle, as an entity and as the simulator calls it; other, other_ident: what it collided with, NULL where that is no entity of the trace or nothing; value: length of the impulse of a collision, N·s; detail: markings that were crossed (broken, solid, other), or weather and light from then on. What is not known is NULL.';
+COMMENT ON VIEW main.events IS 'What the simulator says has happened. frame_id: of the frame that is nearest in time; kind: collision, lane_invasion, environment; t: seconds since the trace began; node_id, ident: the vehicle, as an entity and as the simulator calls it; other, other_ident: what it collided with, NULL where that is no entity of the trace or nothing; value: length of the impulse of a collision, N·s; detail: markings that were crossed (broken, solid, other), or weather and light from then on. What is not known is NULL.';
 
-CREATE VIEW attributes AS
+CREATE VIEW main.attributes AS
 SELECT frame_id, node_id, attribute AS name, json_extract_string(value, '$') AS text, value
-FROM attribute WHERE relation IS NULL;
+FROM inside.attribute WHERE relation IS NULL;
 
-COMMENT ON VIEW attributes IS 'Attributes of a client''s own: one row for each of a node in a frame that was imported as a graph and for which nodes has no column. name: as in the file; text: its value as text; value: as JSON.';
+COMMENT ON VIEW main.attributes IS 'Attributes of a client''s own: one row for each of a node in a frame that was imported as a graph and for which nodes has no column. name: as in the file; text: its value as text; value: as JSON.';
 
-CREATE VIEW edge_attributes AS
+CREATE VIEW main.edge_attributes AS
 SELECT frame_id, node_id AS src, relation, dst, attribute AS name, json_extract_string(value, '$') AS text, value
-FROM attribute WHERE relation IS NOT NULL;
+FROM inside.attribute WHERE relation IS NOT NULL;
 
-COMMENT ON VIEW edge_attributes IS 'The same of edges (src relation dst): one row for each attribute for which no view has a column.';
+COMMENT ON VIEW main.edge_attributes IS 'The same of edges (src relation dst): one row for each attribute for which no view has a column.';
 
-CREATE VIEW imports AS
+CREATE VIEW main.imports AS
 SELECT f.frame_id, i.graph, i.place, i.images
-FROM frame f JOIN imported i ON i.bucket = f.bucket AND i.bit = f.bit;
+FROM inside.frame f JOIN inside.imported i ON i.bucket = f.bucket AND i.bit = f.bit;
 
-COMMENT ON VIEW imports IS 'One row a frame that was imported as a graph. graph: what its file calls it; place: row or line of the file where it begins; images: how many frames of the source it stands for (S3C keeps one for each class), else 1.';
+COMMENT ON VIEW main.imports IS 'One row a frame that was imported as a graph. graph: what its file calls it; place: row or line of the file where it begins; images: how many frames of the source it stands for (S3C keeps one for each class), else 1.';

@@ -85,7 +85,7 @@ class Drive:
         if not path.exists():
             ingest(path, [recording])
         store = Store(path)
-        ((name,),) = store.sql("SELECT name FROM trace").values
+        ((name,),) = store.sql("SELECT name FROM inside.trace").values
         with opened(str(recording), Config()) as source:
             generator = SceneGraphGenerator(source.road_map, Config())
             graphs = [generator.step(frame) for frame in source.frames]
@@ -170,7 +170,7 @@ class Drive:
                     for event in events
                     if event.name == f"pattern {number}"
                 )
-                assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)
+                assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)  # pyright: ignore[reportOperatorIssue]
                 runs += len(begun)
         return runs
 

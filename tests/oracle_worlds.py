@@ -403,6 +403,7 @@ def random_state(rng: random.Random, entity: dict[str, Any]) -> dict[str, Any]:
 def store_all(
     connection: duckdb.DuckDBPyConnection, traces: list[Trace], rng: random.Random
 ) -> None:
+    connection.execute("USE inside")
     connection.execute("INSERT INTO config VALUES (1, 'c', '{}')")
     columns = (
         "lane_type",

@@ -50,10 +50,12 @@ import sgstore
 from sgstore.store import StoreFile
 store, seconds = sys.argv[1:]
 WHOLE = '''
-SELECT (SELECT coalesce(sum(frames), 0) FROM trace) = (SELECT count(*) FROM frame),
-       (SELECT coalesce(sum(rows), 0) FROM manifest WHERE "table" = 'state') = (SELECT count(*) FROM state),
-       (SELECT coalesce(sum(rows), 0) FROM manifest WHERE "table" = 'edge') = (SELECT count(*) FROM edge),
-       (SELECT count(*) FROM edge WHERE bucket NOT IN (SELECT bucket FROM bucket)) = 0
+SELECT (SELECT coalesce(sum(frames), 0) FROM inside.trace) = (SELECT count(*) FROM inside.frame),
+       (SELECT coalesce(sum(rows), 0) FROM inside.manifest WHERE "table" = 'state')
+       = (SELECT count(*) FROM inside.state),
+       (SELECT coalesce(sum(rows), 0) FROM inside.manifest WHERE "table" = 'edge')
+       = (SELECT count(*) FROM inside.edge),
+       (SELECT count(*) FROM inside.edge WHERE bucket NOT IN (SELECT bucket FROM inside.bucket)) = 0
 '''
 file = StoreFile(store)
 end, reads, slowest = time.monotonic() + float(seconds), 0, 0.0

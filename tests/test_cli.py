@@ -11,6 +11,7 @@ import sys
 from contextlib import suppress
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -63,7 +64,7 @@ def test_the_demo_leaves_a_store_pictures_and_a_clip(folder: Path) -> None:
     ]
 
 
-def test_the_demo_says_where_its_recording_is_to_be_had(tmp_path: Path, sgstore) -> None:
+def test_the_demo_says_where_its_recording_is_to_be_had(tmp_path: Path, sgstore: Any) -> None:
     code, _, err = sgstore("demo", tmp_path / "demo", "--recording", tmp_path / "town.mcap")
 
     assert code == 1
@@ -71,7 +72,7 @@ def test_the_demo_says_where_its_recording_is_to_be_had(tmp_path: Path, sgstore)
     assert not (tmp_path / "demo").exists()
 
 
-def test_an_interval_is_shown_by_its_first_frame(store: str, sgstore) -> None:
+def test_an_interval_is_shown_by_its_first_frame(store: str, sgstore: Any) -> None:
     query = "MATCH (e:Ego)-[:near_coll]->(v:Bus) RETURN v.name, INTERVALS"
     code, out, _ = sgstore("find", store, query)
 
@@ -84,7 +85,7 @@ def test_an_interval_is_shown_by_its_first_frame(store: str, sgstore) -> None:
 
 
 def test_the_demo_can_be_run_again_but_not_in_a_folder_of_others(
-    folder: Path, tmp_path: Path, sgstore
+    folder: Path, tmp_path: Path, sgstore: Any
 ) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
 
@@ -96,7 +97,7 @@ def test_the_demo_can_be_run_again_but_not_in_a_folder_of_others(
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_find_prints_what_each_variable_is_bound_to(store: str, sgstore) -> None:
+def test_find_prints_what_each_variable_is_bound_to(store: str, sgstore: Any) -> None:
     code, out, _ = sgstore("find", store, CROSSING)
     head, _, first, *_ = out.splitlines()
 
@@ -105,7 +106,7 @@ def test_find_prints_what_each_variable_is_bound_to(store: str, sgstore) -> None
     assert first.split()[0] == "town#251"
 
 
-def test_count_is_the_number_of_distinct_frames_and_nothing_else(store: str, sgstore) -> None:
+def test_count_is_the_number_of_distinct_frames_and_nothing_else(store: str, sgstore: Any) -> None:
     rows = json.loads(sgstore("find", store, CROSSING, "--json")[1])
 
     code, out, err = sgstore("find", store, CROSSING, "--count")
@@ -114,7 +115,7 @@ def test_count_is_the_number_of_distinct_frames_and_nothing_else(store: str, sgs
     assert out == f"{len({row['frame_id'] for row in rows})}\n"
 
 
-def test_ids_are_texts_in_json_because_readers_round_them(store: str, sgstore) -> None:
+def test_ids_are_texts_in_json_because_readers_round_them(store: str, sgstore: Any) -> None:
     row = json.loads(sgstore("find", store, CROSSING, "--json")[1])[0]
 
     assert isinstance(row["frame_id"], str)
@@ -122,7 +123,7 @@ def test_ids_are_texts_in_json_because_readers_round_them(store: str, sgstore) -
     assert isinstance(row["seq"], int)
 
 
-def test_all_formats_hold_the_same_rows(store: str, sgstore, tmp_path: Path) -> None:
+def test_all_formats_hold_the_same_rows(store: str, sgstore: Any, tmp_path: Path) -> None:
     statement = "SELECT seq, t, trace FROM frames ORDER BY seq LIMIT 300"
     file = tmp_path / "rows.parquet"
 
@@ -142,7 +143,7 @@ def test_all_formats_hold_the_same_rows(store: str, sgstore, tmp_path: Path) -> 
     assert pyarrow.parquet.read_table(file).to_pylist() == whole
 
 
-def test_nothing_found_is_no_error_unless_it_is_required(store: str, sgstore) -> None:
+def test_nothing_found_is_no_error_unless_it_is_required(store: str, sgstore: Any) -> None:
     nothing = "MATCH (a:Animal)"
 
     assert sgstore("find", store, nothing)[0] == 0
@@ -151,7 +152,7 @@ def test_nothing_found_is_no_error_unless_it_is_required(store: str, sgstore) ->
 
 
 def test_a_query_comes_from_a_file_or_stdin_with_parameters(
-    store: str, sgstore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: str, sgstore: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = "MATCH (e:Ego), (v:Vehicle) WHERE gap(e, v) < $near"
     (tmp_path / "near.sgql").write_text(text)
@@ -164,7 +165,7 @@ def test_a_query_comes_from_a_file_or_stdin_with_parameters(
     assert int(nearer[1]) < int(near[1])
 
 
-def test_explain_shows_the_stages_and_searches_nothing(store: str, sgstore) -> None:
+def test_explain_shows_the_stages_and_searches_nothing(store: str, sgstore: Any) -> None:
     code, out, _ = sgstore("find", store, CROSSING, "--explain")
 
     assert code == 0
@@ -172,7 +173,7 @@ def test_explain_shows_the_stages_and_searches_nothing(store: str, sgstore) -> N
     assert stages == ["---- parse", "---- bind", "---- rewrite", "---- emit"]
 
 
-def test_show_marks_what_a_query_matches(store: str, sgstore, tmp_path: Path) -> None:
+def test_show_marks_what_a_query_matches(store: str, sgstore: Any, tmp_path: Path) -> None:
     plain, marked = tmp_path / "plain.svg", tmp_path / "marked.svg"
 
     assert sgstore("show", store, "town@26s", "-o", plain)[0] == 0
@@ -182,14 +183,14 @@ def test_show_marks_what_a_query_matches(store: str, sgstore, tmp_path: Path) ->
     assert 'id="halo-' in marked.read_text()
 
 
-def test_show_says_when_nothing_is_marked(store: str, sgstore, tmp_path: Path) -> None:
+def test_show_says_when_nothing_is_marked(store: str, sgstore: Any, tmp_path: Path) -> None:
     code, _, err = sgstore("show", store, "town#0", CROSSING, "-o", tmp_path / "f.png")
 
     assert code == 0
     assert "does not match in town#0" in err
 
 
-def test_export_takes_frames_as_lines(store: str, sgstore, tmp_path: Path) -> None:
+def test_export_takes_frames_as_lines(store: str, sgstore: Any, tmp_path: Path) -> None:
     (tmp_path / "frames.txt").write_text("town#100\ntown@10.5s\ntown#700\n")
 
     code, out, _ = sgstore(
@@ -200,7 +201,7 @@ def test_export_takes_frames_as_lines(store: str, sgstore, tmp_path: Path) -> No
     assert [row["seconds"] for row in json.loads(out)] == [4.5, 4.0]
 
 
-def test_an_exported_clip_has_the_same_graphs(store: str, folder: Path, sgstore) -> None:
+def test_an_exported_clip_has_the_same_graphs(store: str, folder: Path, sgstore: Any) -> None:
     clip, again = folder / "clips" / "town_001.mcap", folder / "again.sgstore"
     assert sgstore("ingest", again, clip)[0] == 0
     # Node ids count entities as they appear; the simulator's own ids are the same.
@@ -241,7 +242,7 @@ BAD: list[tuple[str, list[str], int, str]] = [
         "NAME=VALUE",
     ),
     ("wrong SQL", ["sql", "{store}", "SELECT speeed FROM nodes"], 2, "speed"),
-    ("SQL that writes", ["sql", "{store}", "DROP TABLE edge"], 2, "read only"),
+    ("SQL that writes", ["sql", "{store}", "DROP TABLE inside.edge"], 2, "read only"),
     (
         "SQL that reads files",
         ["sql", "{store}", "SELECT * FROM read_text('{text}')"],
@@ -260,7 +261,7 @@ BAD: list[tuple[str, list[str], int, str]] = [
     ("arguments", "code", "says"), [b[1:] for b in BAD], ids=[b[0] for b in BAD]
 )
 def test_bad_input_gets_one_clear_message_and_changes_nothing(
-    arguments: list[str], code: int, says: str, store: str, sgstore, tmp_path: Path
+    arguments: list[str], code: int, says: str, store: str, sgstore: Any, tmp_path: Path
 ) -> None:
     text = tmp_path / "notes.txt"
     text.write_text("These are notes, and nothing else.\n" * 20)
@@ -284,7 +285,7 @@ def test_bad_input_gets_one_clear_message_and_changes_nothing(
 
 
 def test_a_recording_without_ground_truth_says_which_channels_it_has(
-    sgstore, tmp_path: Path
+    sgstore: Any, tmp_path: Path
 ) -> None:
     from mcap.writer import Writer
 
@@ -305,7 +306,7 @@ def test_a_recording_without_ground_truth_says_which_channels_it_has(
 
 
 def test_a_recording_that_lost_something_is_kept_and_the_exit_code_says_so(
-    sgstore, tmp_path: Path
+    sgstore: Any, tmp_path: Path
 ) -> None:
     cut = tmp_path / "cut.mcap"
     content = SAMPLE.read_bytes()
@@ -321,7 +322,7 @@ def test_a_recording_that_lost_something_is_kept_and_the_exit_code_says_so(
 
 
 def test_a_folder_stands_for_the_recordings_in_it_and_twice_is_once(
-    sgstore, tmp_path: Path
+    sgstore: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "drives" / "may").mkdir(parents=True)
     shutil.copy(SAMPLE, tmp_path / "drives" / "may" / "a.mcap")
@@ -333,7 +334,7 @@ def test_a_folder_stands_for_the_recordings_in_it_and_twice_is_once(
     assert len(json.loads(sgstore("info", tmp_path / "new.sgstore", "--json")[1])) == 1
 
 
-def test_info_of_a_trace_says_how_it_was_made(store: str, sgstore) -> None:
+def test_info_of_a_trace_says_how_it_was_made(store: str, sgstore: Any) -> None:
     known = json.loads(sgstore("info", store, "--trace", "town", "--json")[1])
 
     assert known["name"] == "town"
@@ -384,7 +385,7 @@ def test_a_command_line_knows_its_verb_alone_and_without_one_all_of_them() -> No
 
 
 @pytest.mark.parametrize("verb", [verb for verbs in VERBS.values() for verb in verbs])
-def test_every_verb_is_on_the_page_of_commands_and_explains_itself(verb: str, sgstore) -> None:
+def test_every_verb_is_on_the_page_of_commands_and_explains_itself(verb: str, sgstore: Any) -> None:
     page = (REPOSITORY / "docs" / "commands.md").read_text()
     code, out, _ = sgstore(verb, "--help")
 
@@ -393,7 +394,7 @@ def test_every_verb_is_on_the_page_of_commands_and_explains_itself(verb: str, sg
     assert "Usage" in out
 
 
-def test_a_question_can_be_asked_in_a_bounded_process(store: str, sgstore) -> None:
+def test_a_question_can_be_asked_in_a_bounded_process(store: str, sgstore: Any) -> None:
     frames = sgstore("sql", store, "SELECT seq FROM frames", "--safe", "--max-rows", 3, "--json")
     found = sgstore("find", store, "MATCH (e:Ego) WHERE e.speed > 1e6", "--safe", "--require")
     late = sgstore("sql", store, "SELECT sleep_ms(60000)", "--safe", "--timeout", "300ms")
@@ -405,7 +406,7 @@ def test_a_question_can_be_asked_in_a_bounded_process(store: str, sgstore) -> No
     assert "stopped after 0.3 s" in late[2]
 
 
-def test_what_fails_in_a_frame_is_told(store: str, sgstore) -> None:
+def test_what_fails_in_a_frame_is_told(store: str, sgstore: Any) -> None:
     query = "MATCH (e:Ego) WHERE e.speed > 20"
     told, data = (
         sgstore("why-not", store, "town@20s", query),
@@ -422,7 +423,7 @@ def test_what_fails_in_a_frame_is_told(store: str, sgstore) -> None:
     assert (told[0], data[0]) == (0, 0)
 
 
-def test_properties_of_sgsm_are_translated(tmp_path: Path, sgstore) -> None:
+def test_properties_of_sgsm_are_translated(tmp_path: Path, sgstore: Any) -> None:
     (tmp_path / "p.py").write_text('x = P.gt(P.size(P.relSet("Ego", "near")), 0)')
 
     told = sgstore("translate", tmp_path / "p.py")
@@ -432,7 +433,9 @@ def test_properties_of_sgsm_are_translated(tmp_path: Path, sgstore) -> None:
     assert (written[1], (tmp_path / "p.sgql").read_text()) == ("", told[1])
 
 
-def test_a_pattern_of_the_library_is_asked_by_its_name(store: str, sgstore, tmp_path: Path) -> None:
+def test_a_pattern_of_the_library_is_asked_by_its_name(
+    store: str, sgstore: Any, tmp_path: Path
+) -> None:
     intervals = json.loads(sgstore("patterns", "run", store, "jaywalking", "--json")[1])
     code, out, _ = sgstore("find", store, "-p", "jaywalking", "--json")
     found = json.loads(out)
@@ -448,7 +451,9 @@ def test_a_pattern_of_the_library_is_asked_by_its_name(store: str, sgstore, tmp_
 
 
 @pytest.mark.parametrize("verb", [["find"], ["why-not", "town@20s"], ["export"]])
-def test_a_query_and_a_name_are_not_asked_at_once(store: str, sgstore, verb: list[str]) -> None:
+def test_a_query_and_a_name_are_not_asked_at_once(
+    store: str, sgstore: Any, verb: list[str]
+) -> None:
     code, _, err = sgstore(verb[0], store, *verb[1:], "MATCH (e:Ego)", "-p", "jaywalking")
 
     assert code == 2

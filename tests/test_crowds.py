@@ -107,7 +107,7 @@ def test_four_egos_of_a_frame_with_as_many_pairs_as_there_may_be_share_their_mem
 
     assert done.returncode == 0, done.stderr
     assert int(peak.read_text()) < 500 << 10
-    edges = sgstore.open(store).sql("SELECT count(*) FROM edge GROUP BY bucket >> 18").values
+    edges = sgstore.open(store).sql("SELECT count(*) FROM inside.edge GROUP BY bucket >> 18").values
     assert [count > 1_500_000 for (count,) in edges] == [True] * 4
 
 
@@ -194,7 +194,10 @@ def test_edges_that_are_kept_in_pieces_are_the_same_edges(
     ingest(tmp_path / "pieces.sgstore", [path], config=config)
 
     whole, pieces = (sgstore.open(tmp_path / f"{name}.sgstore") for name in ("whole", "pieces"))
-    assert whole.sql("FROM edge ORDER BY ALL").values == pieces.sql("FROM edge ORDER BY ALL").values
+    assert (
+        whole.sql("FROM inside.edge ORDER BY ALL").values
+        == pieces.sql("FROM inside.edge ORDER BY ALL").values
+    )
 
 
 # What is left out ---------------------------------------------------------------------------------------
@@ -227,7 +230,7 @@ def test_a_crowded_frame_has_what_bodies_are_to_the_ego_and_other_frames_have_al
     of_ego = "SELECT f.seq, e.src, e.relation, e.dst FROM edges e JOIN frames f USING (frame_id)"
     of_ego += " WHERE e.src_is_ego OR e.dst_is_ego ORDER BY ALL"
     assert store.sql(of_ego).values == ego_only.sql(of_ego).values
-    report = store.sql("SELECT report FROM trace").values[0][0]
+    report = store.sql("SELECT report FROM inside.trace").values[0][0]
     assert json.loads(report)["losses"][0]["reason"] == outcome.losses[0].reason
     assert expected.losses == []
 

@@ -31,8 +31,8 @@ def path(town_store: Path) -> Path:
     with duckdb.connect(str(town_store)) as connection:
         for seq, detail in DETAILS:
             connection.execute(
-                "INSERT INTO event BY NAME SELECT trace_id, frame_id, time_ns, log_time_ns,"
-                " 'environment' AS kind, ? AS detail FROM frame WHERE seq = ?",
+                "INSERT INTO inside.event BY NAME SELECT trace_id, frame_id, time_ns, log_time_ns,"
+                " 'environment' AS kind, ? AS detail FROM inside.frame WHERE seq = ?",
                 [detail, seq],
             )
     return town_store
@@ -85,8 +85,8 @@ def test_the_time_of_day_goes_on(store: Store) -> None:
 def test_the_weather_of_a_frame_can_be_explained(store: Store) -> None:
     answer = store.why_not("town#120", f"{WHO} WHERE env.precipitation = 'heavy'")
 
-    assert answer.failed == "env.precipitation = 'heavy'"
-    assert answer.found == "env.precipitation = 'light'"
+    assert answer.failed == "env.precipitation = 'heavy'"  # pyright: ignore[reportAttributeAccessIssue]
+    assert answer.found == "env.precipitation = 'light'"  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_classes_that_were_not_seen_in_a_dataset_are_novel(path: Path, tmp_path:
     failed = store.why_not(
         next(novel.frames()), "MATCH (e:Ego) WHERE frame.class('EL') IN dataset_classes('train')"
     )
-    assert failed.failed == "frame.class('EL') IN dataset_classes('train')"
+    assert failed.failed == "frame.class('EL') IN dataset_classes('train')"  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize(

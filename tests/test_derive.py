@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -11,6 +12,9 @@ from sgstore.config import configured
 from sgstore.derive import derive
 from sgstore.errors import AbstractionError, ConfigError
 from sgstore.ingest import ingest
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"
 
@@ -29,31 +33,32 @@ OTHERS = {
 }
 
 EDGES = """
-SELECT (e.bucket << 6) + b.bit, e.src, e.relation::VARCHAR, e.dst FROM edge e JOIN bits b ON (e.mask & b.m) <> 0
+SELECT (e.bucket << 6) + b.bit, e.src, e.relation::VARCHAR, e.dst FROM inside.edge e
+JOIN inside.bits b ON (e.mask & b.m) <> 0
 """
 DERIVED = """
-SELECT (e.bucket << 6) + b.bit, e.src, e.relation::VARCHAR, e.dst FROM derived_edge e
-JOIN bits b ON (e.mask & b.m) <> 0 WHERE e.set_name = '{0}'
+SELECT (e.bucket << 6) + b.bit, e.src, e.relation::VARCHAR, e.dst FROM inside.derived_edge e
+JOIN inside.bits b ON (e.mask & b.m) <> 0 WHERE e.set_name = '{0}'
 """
 NODES = "SELECT frame_id, node_id, kind::VARCHAR FROM nodes"
 DERIVED_NODES = """
-SELECT (n.bucket << 6) + b.bit, n.node_id, n.kind::VARCHAR FROM derived_node n
-JOIN bits b ON (n.mask & b.m) <> 0 WHERE n.set_name = '{0}'
+SELECT (n.bucket << 6) + b.bit, n.node_id, n.kind::VARCHAR FROM inside.derived_node n
+JOIN inside.bits b ON (n.mask & b.m) <> 0 WHERE n.set_name = '{0}'
 """
 
 
-def stored(path, trace, config=None):
+def stored(path: Any, trace: Any, config: Any = None):
     (outcome,) = ingest(path, [str(trace)], config=config, until=15.0)
     assert outcome.error is None
     return sgstore.open(path)
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory):
+def town(tmp_path_factory: pytest.TempPathFactory):
     return stored(tmp_path_factory.mktemp("derive") / "town.sgstore", SAMPLE)
 
 
-def same(derived, name, ingested) -> None:
+def same(derived: Any, name: Any, ingested: Any) -> None:
     """Whether a set has the nodes and edges of a store that was made with its settings."""
     made = set(derived.sql(DERIVED.format(name)).values)
     assert made == set(ingested.sql(EDGES).values)
@@ -67,7 +72,9 @@ def same(derived, name, ingested) -> None:
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_a_derived_set_is_what_ingesting_with_its_settings_gives(town, name, tmp_path) -> None:
+def test_a_derived_set_is_what_ingesting_with_its_settings_gives(
+    town: Any, name: Any, tmp_path: Path
+) -> None:
     (result,) = derive(town.file.path, OTHERS[name], name)
     ingested = stored(tmp_path / "other.sgstore", SAMPLE, OTHERS[name])
 
@@ -84,7 +91,7 @@ def test_a_derived_set_is_what_ingesting_with_its_settings_gives(town, name, tmp
         "osi_converter",
     ],
 )
-def test_real_traces_derive_to_what_ingesting_gives(data, tmp_path, path) -> None:
+def test_real_traces_derive_to_what_ingesting_gives(data: Any, tmp_path: Path, path: Any) -> None:
     found = data / "traces" / path
     trace = found if found.is_file() else min(found.glob("*.mcap"))
     config = OTHERS["thresholds"]
@@ -94,7 +101,9 @@ def test_real_traces_derive_to_what_ingesting_gives(data, tmp_path, path) -> Non
     same(store, "other", stored(tmp_path / "b.sgstore", trace, config))
 
 
-def test_who_follows_farther_off_under_other_settings_has_a_gap_too(data, tmp_path) -> None:
+def test_who_follows_farther_off_under_other_settings_has_a_gap_too(
+    data: Any, tmp_path: Path
+) -> None:
     trace = data / "traces/esmini/highway_merge.mcap"
     near, far = ({"lanes": {"ahead": ahead}} for ahead in (15.0, 90.0))
     store = stored(tmp_path / "near.sgstore", trace, configured(**near))
@@ -111,7 +120,7 @@ def test_who_follows_farther_off_under_other_settings_has_a_gap_too(data, tmp_pa
     assert gap in {about.get("gap") for *_, about in graph.edges(data=True)}
 
 
-def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path) -> None:
+def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path: Path) -> None:
     copy, store = tmp_path / "drive.mcap", tmp_path / "s.sgstore"
     copy.write_bytes(SAMPLE.read_bytes())
     ingest(store, [str(copy)], until=15.0)
@@ -123,16 +132,18 @@ def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path) -> None:
     assert [r.status for r in first + again] == ["derived", "present"]
 
 
-def test_a_name_that_is_taken_is_replaced_on_demand_only(town) -> None:
+def test_a_name_that_is_taken_is_replaced_on_demand_only(town: Any) -> None:
     derive(town.file.path, OTHERS["smaller"], "once")
     with pytest.raises(AbstractionError, match="already, with other settings; say --force"):
         derive(town.file.path, OTHERS["vehicles"], "once")
     derive(town.file.path, OTHERS["vehicles"], "once", replace_old=True)
-    relations = town.sql("SELECT DISTINCT relation FROM derived_edge WHERE set_name = 'once'")
+    relations = town.sql(
+        "SELECT DISTINCT relation FROM inside.derived_edge WHERE set_name = 'once'"
+    )
 
     assert ("sees",) not in relations.values
     assert town.file.deriving.remove("once") == ("town",)
-    assert not town.sql("SELECT 1 FROM derived_edge WHERE set_name = 'once'").values
+    assert not town.sql("SELECT 1 FROM inside.derived_edge WHERE set_name = 'once'").values
     assert not town.file.verify().faults
     with pytest.raises(AbstractionError, match="no derived set"):
         town.file.deriving.remove("once")
@@ -150,19 +161,19 @@ def test_a_name_that_is_taken_is_replaced_on_demand_only(town) -> None:
     ],
 )
 def test_what_the_states_do_not_suffice_for_is_refused_with_its_setting(
-    town, settings, named
+    town: Any, settings: Any, named: Any
 ) -> None:
     with pytest.raises(ConfigError, match=f"'{named}' is .* was ingested with"):
         derive(town.file.path, configured(**settings), "larger")
 
 
 @pytest.mark.parametrize("name", ["RSV", "junction", "a b", "", "'; DROP"])
-def test_names_of_abstractions_and_no_names_are_refused(town, name) -> None:
+def test_names_of_abstractions_and_no_names_are_refused(town: Any, name: Any) -> None:
     with pytest.raises(AbstractionError):
         derive(town.file.path, OTHERS["smaller"], name)
 
 
-def test_a_graph_of_a_set_has_its_nodes_and_edges_and_what_is_known_of_them(town) -> None:
+def test_a_graph_of_a_set_has_its_nodes_and_edges_and_what_is_known_of_them(town: Any) -> None:
     derive(town.file.path, OTHERS["smaller"], "smaller")
     whole, part = town.graph("town#100"), town.graph("town#100", abstraction="smaller")
 
@@ -178,7 +189,7 @@ def test_a_graph_of_a_set_has_its_nodes_and_edges_and_what_is_known_of_them(town
     assert "mayAffect" not in {k for _, k, _ in of_map}
 
 
-def test_a_trace_that_is_removed_takes_its_sets_with_it(tmp_path) -> None:
+def test_a_trace_that_is_removed_takes_its_sets_with_it(tmp_path: Path) -> None:
     store = stored(tmp_path / "s.sgstore", SAMPLE)
     derive(store.file.path, OTHERS["smaller"], "gone")
     store.file.remove("town")

@@ -12,7 +12,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
@@ -47,7 +47,7 @@ with Sandbox(store) as box:
 
 
 @pytest.fixture
-def hostile(tmp_path) -> Path:
+def hostile(tmp_path: Path) -> Path:
     """A folder with modules that leave a trace if anybody runs them."""
     folder = tmp_path / "hostile"
     names = (
@@ -73,7 +73,7 @@ def hostile(tmp_path) -> Path:
     ids=["its own", "a notebook's"],
 )
 def test_no_child_runs_what_lies_in_the_current_folder_or_on_pythonpath(
-    hostile, tmp_path, before
+    hostile: Any, tmp_path: Path, before: Any
 ) -> None:
     paths = [drive(tmp_path / f"{frames}.mcap", frames=frames) for frames in (4, 5)]
     given = json.dumps([str(tmp_path / "s.sgstore"), *map(str, paths)])
@@ -95,7 +95,7 @@ def test_no_child_runs_what_lies_in_the_current_folder_or_on_pythonpath(
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory) -> tuple[bytes, Path]:
+def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, Path]:
     """A store of two traces, and the folder of their recordings."""
     folder = tmp_path_factory.mktemp("drives")
     paths = [drive(folder / f"drive{frames}.mcap", frames=frames) for frames in (12, 14)]
@@ -105,7 +105,7 @@ def drives(tmp_path_factory) -> tuple[bytes, Path]:
 
 
 @pytest.fixture
-def store(drives, tmp_path) -> Path:
+def store(drives: Any, tmp_path: Path) -> Path:
     (tmp_path / "s.sgstore").write_bytes(drives[0])
     return tmp_path / "s.sgstore"
 
@@ -128,13 +128,13 @@ class Result:
 
 
 @pytest.fixture
-def run(capsys) -> Callable[..., Result]:
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Result]:
     """Runs a command line; what leaves it is an exit code, or a fault of ours."""
 
     def call(*arguments: object) -> Result:
         capsys.readouterr()
         code = command_line([str(one) for one in arguments])
-        return Result(code, *capsys.readouterr())
+        return Result(code, *capsys.readouterr())  # pyright: ignore[reportArgumentType]
 
     return call
 
@@ -147,7 +147,7 @@ def made() -> duckdb.DuckDBPyConnection:
 
 
 def names(what: str) -> list[str]:
-    return re.findall(rf"^CREATE {what} (\w+)", schema_sql(), re.MULTILINE)
+    return re.findall(rf"^CREATE {what} (?:main\.)?(\w+)", schema_sql(), re.MULTILINE)
 
 
 ALTERED = {
@@ -160,44 +160,48 @@ ALTERED = {
     },
     **{
         f"view {view} says something else": (
-            f"CREATE OR REPLACE VIEW {view} AS SELECT * FROM frame",
+            f"CREATE OR REPLACE VIEW main.{view} AS SELECT * FROM inside.frame",
         )
         for view in names("VIEW")
     },
     **{f"view {view} is gone": (f"DROP VIEW {view}",) for view in names("VIEW")},
     "a view whose text differs in a number": (
-        "CREATE OR REPLACE VIEW lane_gaps AS SELECT frame_id, src, dst, gap + 1 AS gap FROM lane_gap",
+        "CREATE OR REPLACE VIEW main.lane_gaps AS"
+        " SELECT frame_id, src, dst, gap + 1 AS gap FROM inside.lane_gap",
     ),
     "a table in the place of a view": (
-        "CREATE TABLE copy AS FROM lanes",
+        "CREATE TABLE main.copy AS FROM lanes",
         "DROP VIEW lanes",
-        "ALTER TABLE copy RENAME TO lanes",
+        "ALTER TABLE main.copy RENAME TO lanes",
     ),
-    "a column of another type": ("ALTER TABLE frame ALTER seq TYPE VARCHAR",),
-    "a column more": ("ALTER TABLE trace ADD COLUMN x INTEGER",),
-    "a column less": ("ALTER TABLE event DROP COLUMN detail",),
-    "a column of another name": ("ALTER TABLE event RENAME COLUMN detail TO other_detail",),
-    "a column that may be missing": ("ALTER TABLE config ALTER settings DROP NOT NULL",),
-    "a column that may not": ("ALTER TABLE event ALTER detail SET NOT NULL",),
-    "a default": ("ALTER TABLE event ALTER detail SET DEFAULT 'x'",),
+    "a column of another type": ("ALTER TABLE inside.frame ALTER seq TYPE VARCHAR",),
+    "a column more": ("ALTER TABLE inside.trace ADD COLUMN x INTEGER",),
+    "a column less": ("ALTER TABLE inside.event DROP COLUMN detail",),
+    "a column of another name": ("ALTER TABLE inside.event RENAME COLUMN detail TO other_detail",),
+    "a column that may be missing": ("ALTER TABLE inside.config ALTER settings DROP NOT NULL",),
+    "a column that may not": ("ALTER TABLE inside.event ALTER detail SET NOT NULL",),
+    "a default": ("ALTER TABLE inside.event ALTER detail SET DEFAULT 'x'",),
     "a generated column": (
-        "DROP TABLE imported",
-        "CREATE TABLE imported (bucket BIGINT, bit TINYINT, trace_id BIGINT, graph VARCHAR,"
+        "DROP TABLE inside.imported",
+        "CREATE TABLE inside.imported (bucket BIGINT, bit TINYINT, trace_id BIGINT, graph VARCHAR,"
         " place BIGINT, images BIGINT GENERATED ALWAYS AS (place + 1))",
     ),
-    "a kind more": ("ALTER TABLE map_edge ALTER src_kind TYPE ENUM ('car', 'hovercraft')",),
+    "a kind more": ("ALTER TABLE inside.map_edge ALTER src_kind TYPE ENUM ('car', 'hovercraft')",),
     "a type": ("DROP TYPE light_state", "CREATE TYPE light_state AS ENUM ('red', 'blue')"),
     "a macro like a function": ("CREATE MACRO degrees(x) AS 42",),
     "a macro like an operator": ("CREATE MACRO \"||\"(a, b) AS 'mine'",),
     "a macro like a table function": ("CREATE MACRO range(n) AS TABLE SELECT 1 AS range",),
     "a macro in other letters": ("CREATE MACRO SQRT(x) AS x",),
     "an index": ("CREATE UNIQUE INDEX once ON frame (trace_id)",),
-    "a table is gone": ("DROP TABLE payload",),
+    "a table among the views": ("CREATE TABLE main.trace AS FROM inside.trace",),
+    "a type among the tables": ("CREATE TYPE inside.kind AS ENUM ('car')",),
+    "a view among the tables": ("CREATE VIEW inside.frames AS SELECT 1 AS frame_id",),
+    "a table is gone": ("DROP TABLE inside.payload",),
 }
 
 
 @pytest.mark.parametrize("how", ALTERED)
-def test_every_object_that_is_not_as_sgstore_makes_it_is_told(made, how) -> None:
+def test_every_object_that_is_not_as_sgstore_makes_it_is_told(made: Any, how: Any) -> None:
     assert shape.altered(made, "memory") == []
     made.execute("BEGIN")
     try:
@@ -209,13 +213,14 @@ def test_every_object_that_is_not_as_sgstore_makes_it_is_told(made, how) -> None
 
 
 @pytest.mark.skipif(duckdb.__version__ < "2", reason="DuckDB 1.5 has no triggers")
-def test_a_trigger_is_told(tmp_path) -> None:
+def test_a_trigger_is_told(tmp_path: Path) -> None:
     connection = duckdb.connect()
     connection.execute(f"ATTACH '{tmp_path / 't'}' AS t (STORAGE_VERSION 'v2.0.0')")
     connection.execute("USE t")
     connection.execute(schema_sql())
     connection.execute(
-        "CREATE TRIGGER mine AFTER INSERT ON frame FOR EACH STATEMENT INSERT INTO bits VALUES (1, 1)"
+        "CREATE TRIGGER mine AFTER INSERT ON inside.frame"
+        " FOR EACH STATEMENT INSERT INTO inside.bits VALUES (1, 1)"
     )
 
     assert shape.altered(connection, "t") == ["table 'frame' has the trigger 'mine'"]
@@ -225,7 +230,7 @@ VERBS = (
     ("find", "{store}", "MATCH (e:Ego) RETURN e.speed"),
     ("check", "{store}", "-e", "CHECK c: ALWAYS ego.speed < 20"),
     ("info", "{store}"),
-    ("sql", "{store}", "SELECT * FROM config"),
+    ("sql", "{store}", "SELECT * FROM inside.config"),
     ("show", "{store}", "drive12#3"),
     ("payload", "{store}", "drive12#3", "/camera", "-o", "{out}"),
     ("like", "{store}", "drive12#3"),
@@ -242,14 +247,14 @@ VERBS = (
 
 @pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb[0])
 def test_a_view_in_the_place_of_a_table_reads_nobodys_files(
-    run, verb, store, drives, tmp_path
+    run: Any, verb: Any, store: Any, drives: Any, tmp_path: Path
 ) -> None:
     secret = tmp_path / "secret.json"
     secret.write_text('{"password": "1234567"}')
     change(
         store,
-        "DROP TABLE config",
-        f"CREATE VIEW config AS SELECT 1 AS config_id, content AS digest, content AS settings"
+        "DROP TABLE inside.config",
+        f"CREATE VIEW inside.config AS SELECT 1 AS config_id, content AS digest, content AS settings"
         f" FROM read_text('{secret}')",
     )
     before = store.read_bytes()
@@ -263,7 +268,7 @@ def test_a_view_in_the_place_of_a_table_reads_nobodys_files(
     assert b"1234567" not in before
 
 
-def test_a_store_that_was_good_is_looked_at_again_once_it_has_changed(store) -> None:
+def test_a_store_that_was_good_is_looked_at_again_once_it_has_changed(store: Any) -> None:
     file = StoreFile(store)
     assert len(file.traces()) == 2
     change(store, "CREATE OR REPLACE VIEW lanes AS SELECT 1 AS x")
@@ -274,11 +279,11 @@ def test_a_store_that_was_good_is_looked_at_again_once_it_has_changed(store) -> 
                 ask()
 
 
-def test_verify_says_every_object_that_was_altered(run, store) -> None:
+def test_verify_says_every_object_that_was_altered(run: Any, store: Any) -> None:
     change(
         store,
         "CREATE OR REPLACE VIEW lanes AS SELECT * FROM read_csv('/etc/passwd')",
-        "ALTER TABLE event ADD COLUMN more INTEGER",
+        "ALTER TABLE inside.event ADD COLUMN more INTEGER",
         "CREATE MACRO abs(x) AS 1",
     )
     result = run("verify", store, "--format", "ndjson")
@@ -295,15 +300,15 @@ def test_verify_says_every_object_that_was_altered(run, store) -> None:
 
 @pytest.mark.parametrize("digest", ["0" * 64, None])
 def test_a_store_that_other_statements_made_is_of_another_version_and_not_altered(
-    run, store, digest
+    run: Any, store: Any, digest: Any
 ) -> None:
     keyed = "WHERE key = 'schema_digest'"
     change(
         store,
-        f"UPDATE store_info SET value = '{digest}' {keyed}"
+        f"UPDATE inside.store_info SET value = '{digest}' {keyed}"
         if digest
-        else f"DELETE FROM store_info {keyed}",
-        "ALTER TABLE event ADD COLUMN more INTEGER",
+        else f"DELETE FROM inside.store_info {keyed}",
+        "ALTER TABLE inside.event ADD COLUMN more INTEGER",
     )
     result = run("info", store)
 
@@ -312,12 +317,14 @@ def test_a_store_that_other_statements_made_is_of_another_version_and_not_altere
     assert "not as sgstore made it" not in result.output
 
 
-def test_tables_of_somebody_else_are_left_alone_and_told(run, store, drives, tmp_path) -> None:
+def test_tables_of_somebody_else_are_left_alone_and_told(
+    run: Any, store: Any, drives: Any, tmp_path: Path
+) -> None:
     secret = tmp_path / "secret.csv"
     secret.write_text("password\n1234567\n")
     change(
         store,
-        "CREATE TABLE labels AS SELECT frame_id, 1 AS label FROM frame",
+        "CREATE TABLE labels AS SELECT frame_id, 1 AS label FROM inside.frame",
         f"CREATE VIEW broken AS SELECT * FROM read_csv('{secret}')",
         "CREATE SCHEMA mine",
         "CREATE TABLE mine.trace (trace_id BIGINT)",
@@ -345,7 +352,7 @@ def test_tables_of_somebody_else_are_left_alone_and_told(run, store, drives, tmp
 
 
 def test_a_connection_that_writes_sees_no_other_files_and_keeps_its_settings(
-    store, tmp_path
+    store: Any, tmp_path: Path
 ) -> None:
     secret = tmp_path / "secret.csv"
     secret.write_text("password\n1234567\n")
@@ -375,7 +382,7 @@ def test_a_connection_that_writes_sees_no_other_files_and_keeps_its_settings(
 
 
 @pytest.fixture
-def special(tmp_path) -> dict[str, Path]:
+def special(tmp_path: Path) -> dict[str, Path]:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     listening = socket.socket(socket.AF_UNIX)
@@ -388,7 +395,7 @@ def special(tmp_path) -> dict[str, Path]:
 @pytest.mark.parametrize("what", ["a named pipe", "a folder", "a socket", "a device"])
 @pytest.mark.parametrize("verb", [VERBS[0], VERBS[2], VERBS[11], ("verify", "{store}")], ids=str)
 def test_what_is_no_file_is_refused_as_a_store_at_once(
-    run, special, what, verb, drives, tmp_path
+    run: Any, special: Any, what: Any, verb: Any, drives: Any, tmp_path: Path
 ) -> None:
     given = {
         "store": special[what],
@@ -404,7 +411,9 @@ def test_what_is_no_file_is_refused_as_a_store_at_once(
 
 
 @pytest.mark.parametrize("ending", [".wal", ".gate", ".segment-1-ab"])
-def test_a_pipe_beside_a_store_makes_nobody_wait(run, store, drives, ending) -> None:
+def test_a_pipe_beside_a_store_makes_nobody_wait(
+    run: Any, store: Any, drives: Any, ending: Any
+) -> None:
     os.mkfifo(store.with_name(f"{store.name}{ending}"))
     start = time.perf_counter()
     found = run("find", store, "MATCH (e:Ego)", "--count")
@@ -422,7 +431,7 @@ def test_a_pipe_beside_a_store_makes_nobody_wait(run, store, drives, ending) -> 
 @pytest.mark.parametrize("read_only", [True, False])
 @pytest.mark.parametrize("write", [True, False])
 def test_a_store_that_this_process_has_open_by_duckdb_is_said_to_be_at_once(
-    store, drives, read_only, write
+    store: Any, drives: Any, read_only: Any, write: Any
 ) -> None:
     opened = sgstore.open(store)
 
@@ -437,7 +446,7 @@ def test_a_store_that_this_process_has_open_by_duckdb_is_said_to_be_at_once(
         with pytest.raises(StoreError, match="open in this process already, by a connection of"):
             ask()
         assert time.perf_counter() - start < 3
-        assert connection.execute("SELECT count(*) FROM trace").fetchall() == [(2,)]
+        assert connection.execute("SELECT count(*) FROM inside.trace").fetchall() == [(2,)]
 
     assert len(sgstore.open(store).info()) == 2
     (outcome,) = ingest(store, [drives[1] / "drive12.mcap"], force=True)
@@ -482,7 +491,7 @@ ASKED = (
 def hurts(connection: duckdb.DuckDBPyConnection) -> list[str]:
     """Every column of every table with every odd value, and tables with rows too few or too many."""
     found: list[str] = []
-    for table in names("TABLE"):
+    for table in (f"inside.{name}" for name in names("TABLE")):
         for name, kind, *_ in connection.execute(f"DESCRIBE {table}").fetchall():
             values = [*ODD.get(kind, ()), "NULL"]
             values += [f"enum_last(NULL::{name})"] if name in names("TYPE") else []
@@ -493,19 +502,19 @@ def hurts(connection: duckdb.DuckDBPyConnection) -> list[str]:
 
 
 KNOWN = (
-    ("UPDATE config SET settings = '[]'", 5),
-    ("UPDATE config SET settings = '7'", 0),
-    ("UPDATE config SET config_id = 2147483647", 5),
-    ("UPDATE trace SET report = '[]'", 0),
-    ("UPDATE trace SET uri = '/dev/zero'", 7),
-    ("UPDATE trace SET uri = '/dev/zero'", 1),
-    ("DELETE FROM bits", 2),
+    ("UPDATE inside.config SET settings = '[]'", 5),
+    ("UPDATE inside.config SET settings = '7'", 0),
+    ("UPDATE inside.config SET config_id = 2147483647", 5),
+    ("UPDATE inside.trace SET report = '[]'", 0),
+    ("UPDATE inside.trace SET uri = '/dev/zero'", 7),
+    ("UPDATE inside.trace SET uri = '/dev/zero'", 1),
+    ("DELETE FROM inside.bits", 2),
 )
 
 
 @pytest.mark.parametrize("number", range(40))
 def test_rows_that_were_changed_give_an_answer_or_a_reason_and_no_traceback(
-    run, made, store, tmp_path, number
+    run: Any, made: Any, store: Any, tmp_path: Path, number: Any
 ) -> None:
     chance = random.Random(number)
     hurt, verb = chance.choice(hurts(made)), chance.choice(ASKED)
@@ -524,8 +533,10 @@ def test_rows_that_were_changed_give_an_answer_or_a_reason_and_no_traceback(
 
 
 @pytest.mark.parametrize("what", ["a named pipe", "a folder", "a socket", "a device"])
-def test_a_recording_that_has_become_no_file_is_refused_at_once(run, store, special, what) -> None:
-    change(store, f"UPDATE trace SET uri = '{special[what]}', size = 0")
+def test_a_recording_that_has_become_no_file_is_refused_at_once(
+    run: Any, store: Any, special: Any, what: Any
+) -> None:
+    change(store, f"UPDATE inside.trace SET uri = '{special[what]}', size = 0")
     start = time.perf_counter()
 
     verified = run("verify", store, "--payloads")
@@ -543,7 +554,7 @@ def test_a_recording_that_has_become_no_file_is_refused_at_once(run, store, spec
     ids=["a long name", "below a file"],
 )
 def test_a_place_that_cannot_be_looked_at_is_refused_with_the_reason(
-    run, tmp_path, name, reason
+    run: Any, tmp_path: Path, name: Any, reason: Any
 ) -> None:
     (tmp_path / "file").touch()
     place = tmp_path / name

@@ -47,7 +47,7 @@ def recorded(path: Path, text: str = STREET, frames: int = 12) -> Path:
     return path
 
 
-def test_a_recording_comes_in_with_its_graphs(tmp_path) -> None:
+def test_a_recording_comes_in_with_its_graphs(tmp_path: Path) -> None:
     (outcome,) = ingest(tmp_path / "s.db", [recorded(tmp_path / "drive.mcap")])
 
     assert (outcome.status, outcome.name, outcome.frames) == ("added", "drive", 12)
@@ -58,7 +58,7 @@ def test_a_recording_comes_in_with_its_graphs(tmp_path) -> None:
     assert rows(tmp_path / "s.db", sql) == [(12,)]
 
 
-def test_the_store_holds_what_reader_and_generator_say(tmp_path) -> None:
+def test_the_store_holds_what_reader_and_generator_say(tmp_path: Path) -> None:
     path = recorded(tmp_path / "drive.mcap")
     ingest(tmp_path / "s.db", [path])
     expected: Counter[tuple[Any, ...]] = Counter()
@@ -76,18 +76,18 @@ def test_the_store_holds_what_reader_and_generator_say(tmp_path) -> None:
     assert found == Counter({(q, s, RELATIONS[r], d): n for (q, s, r, d), n in expected.items()})
 
 
-def test_many_blocks_are_as_good_as_one(tmp_path, monkeypatch) -> None:
+def test_many_blocks_are_as_good_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = drive(tmp_path / "drive.mcap", frames=130)
     found = []
     for name, size in (("one.db", 240), ("many.db", 60), ("odd.db", 17)):
         monkeypatch.setattr(running, "BLOCK_FRAMES", size)
         ingest(tmp_path / name, [path])
-        found.append(rows(tmp_path / name, "SELECT * FROM edge ORDER BY ALL"))
+        found.append(rows(tmp_path / name, "SELECT * FROM inside.edge ORDER BY ALL"))
 
     assert found[0] == found[1] == found[2]
 
 
-def test_the_same_recording_again_is_present(tmp_path) -> None:
+def test_the_same_recording_again_is_present(tmp_path: Path) -> None:
     path = recorded(tmp_path / "drive.mcap")
     copy = tmp_path / "copy.mcap"
     copy.write_bytes(path.read_bytes())
@@ -100,7 +100,7 @@ def test_the_same_recording_again_is_present(tmp_path) -> None:
     assert (tmp_path / "s.db").read_bytes() == before
 
 
-def test_the_same_recording_with_other_settings_is_refused(tmp_path) -> None:
+def test_the_same_recording_with_other_settings_is_refused(tmp_path: Path) -> None:
     path = recorded(tmp_path / "drive.mcap")
     ingest(tmp_path / "s.db", [path])
     before = (tmp_path / "s.db").read_bytes()
@@ -112,7 +112,7 @@ def test_the_same_recording_with_other_settings_is_refused(tmp_path) -> None:
     assert (tmp_path / "s.db").read_bytes() == before
 
 
-def test_one_that_fails_does_not_stop_the_others(tmp_path) -> None:
+def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     good = [recorded(tmp_path / f"{name}.mcap", frames=n) for name, n in (("a", 3), ("b", 4))]
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"no recording")
@@ -121,13 +121,16 @@ def test_one_that_fails_does_not_stop_the_others(tmp_path) -> None:
 
     assert [o.status for o in outcomes] == ["added", "failed", "failed", "added"]
     assert all(isinstance(o.error, TraceError) for o in outcomes[1:3])
-    assert [name for (name,) in rows(tmp_path / "s.db", "SELECT name FROM trace")] == ["a", "b"]
+    assert [name for (name,) in rows(tmp_path / "s.db", "SELECT name FROM inside.trace")] == [
+        "a",
+        "b",
+    ]
 
 
 # Maps
 
 
-def test_the_map_that_is_given_serves_recordings_without_their_own(tmp_path) -> None:
+def test_the_map_that_is_given_serves_recordings_without_their_own(tmp_path: Path) -> None:
     (tmp_path / "street.xodr").write_text(STREET)
     paths = [recorded(tmp_path / "bare.mcap", text=""), recorded(tmp_path / "own.mcap")]
 
@@ -137,10 +140,10 @@ def test_the_map_that_is_given_serves_recordings_without_their_own(tmp_path) -> 
     sql = "SELECT DISTINCT trace, map FROM frames ORDER BY trace"
     # The text is the same, and so is the map: it is in the store once, under its first name.
     assert rows(tmp_path / "s.db", sql) == [("bare", "street.xodr"), ("own", "street.xodr")]
-    assert rows(tmp_path / "s.db", "SELECT count(*) FROM map") == [(1,)]
+    assert rows(tmp_path / "s.db", "SELECT count(*) FROM inside.map") == [(1,)]
 
 
-def test_a_recording_without_a_map_comes_in_without_roads_and_it_is_said(tmp_path) -> None:
+def test_a_recording_without_a_map_comes_in_without_roads_and_it_is_said(tmp_path: Path) -> None:
     (outcome,) = ingest(tmp_path / "s.db", [recorded(tmp_path / "bare.mcap", text="")])
 
     assert outcome.status == "added"
@@ -153,7 +156,7 @@ def test_a_recording_without_a_map_comes_in_without_roads_and_it_is_said(tmp_pat
     assert trace.report["warnings"] == outcome.warnings
 
 
-def test_a_map_in_a_recording_that_cannot_be_read_is_a_warning(tmp_path) -> None:
+def test_a_map_in_a_recording_that_cannot_be_read_is_a_warning(tmp_path: Path) -> None:
     path = recorded(tmp_path / "drive.mcap", text="<OpenDRIVE/>")
 
     (outcome,) = ingest(tmp_path / "s.db", [path])
@@ -162,9 +165,9 @@ def test_a_map_in_a_recording_that_cannot_be_read_is_a_warning(tmp_path) -> None
     assert outcome.warnings[0].startswith("its road map cannot be read: ")
 
 
-def test_a_map_is_read_once_a_run(tmp_path, monkeypatch) -> None:
+def test_a_map_is_read_once_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
-    monkeypatch.setattr(maps, "read_map", lambda *map_: (read.append(map_), read_map(*map_))[1])
+    monkeypatch.setattr(maps, "read_map", lambda *map_: (read.append(map_), read_map(*map_))[1])  # pyright: ignore[reportUnknownLambdaType]
     paths = [recorded(tmp_path / f"{n}.mcap", frames=n) for n in (2, 3, 4)]
 
     ingest(tmp_path / "s.db", paths)
@@ -183,7 +186,7 @@ def test_a_map_is_read_once_a_run(tmp_path, monkeypatch) -> None:
     ],
 )
 def test_a_map_that_is_given_and_is_none_stops_before_anything_is_done(
-    tmp_path, content, reason
+    tmp_path: Path, content: Any, reason: Any
 ) -> None:
     path = recorded(tmp_path / "drive.mcap")
     if content is not None:
@@ -196,7 +199,7 @@ def test_a_map_that_is_given_and_is_none_stops_before_anything_is_done(
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "iso-8859-1"])
-def test_a_map_is_read_in_the_encoding_that_it_names(tmp_path, encoding) -> None:
+def test_a_map_is_read_in_the_encoding_that_it_names(tmp_path: Path, encoding: Any) -> None:
     named = f"<?xml version='1.0' encoding='{encoding.removesuffix('-sig')}'?>"
     text = named + STREET.replace('name="test"', 'name="Größe"')
     (tmp_path / "street.xodr").write_bytes(text.encode(encoding))
@@ -225,7 +228,7 @@ def bad_inputs(folder: Path) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", ["none", "empty", "text", "other", "folder"])
-def test_bad_input_makes_no_store(tmp_path, name) -> None:
+def test_bad_input_makes_no_store(tmp_path: Path, name: Any) -> None:
     (tmp_path / "in").mkdir()
     path = bad_inputs(tmp_path / "in")[name]
 
@@ -237,7 +240,7 @@ def test_bad_input_makes_no_store(tmp_path, name) -> None:
 
 
 @pytest.mark.parametrize("name", ["none", "empty", "text", "other", "folder"])
-def test_bad_input_leaves_a_store_byte_for_byte(tmp_path, name) -> None:
+def test_bad_input_leaves_a_store_byte_for_byte(tmp_path: Path, name: Any) -> None:
     (tmp_path / "in").mkdir()
     ingest(tmp_path / "s.db", [recorded(tmp_path / "in" / "drive.mcap", frames=3)])
     before = (tmp_path / "s.db").read_bytes()
@@ -248,7 +251,7 @@ def test_bad_input_leaves_a_store_byte_for_byte(tmp_path, name) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "s.db"]
 
 
-def test_what_is_no_store_is_not_written_to(tmp_path) -> None:
+def test_what_is_no_store_is_not_written_to(tmp_path: Path) -> None:
     (tmp_path / "s.db").write_text("my diary")
 
     with pytest.raises(StoreError, match="not a store"):
@@ -260,7 +263,7 @@ def test_what_is_no_store_is_not_written_to(tmp_path) -> None:
 # Long runs
 
 
-def test_progress_is_told_block_by_block(tmp_path, monkeypatch) -> None:
+def test_progress_is_told_block_by_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "BLOCK_FRAMES", 60)
     path = drive(tmp_path / "drive.mcap", frames=130, chunk_size=2000)
     seen: list[Progress] = []
@@ -274,7 +277,7 @@ def test_progress_is_told_block_by_block(tmp_path, monkeypatch) -> None:
 
 
 def test_an_interrupted_run_leaves_a_whole_store_and_nothing_beside_it(
-    tmp_path, monkeypatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(running, "BLOCK_FRAMES", 60)
     paths = [recorded(tmp_path / "a.mcap"), drive(tmp_path / "b.mcap", frames=130)]
@@ -291,7 +294,7 @@ def test_an_interrupted_run_leaves_a_whole_store_and_nothing_beside_it(
     assert [o.status for o in ingest(tmp_path / "s.db", paths)] == ["present", "added"]
 
 
-def test_ctrl_c_in_the_middle_is_an_interruption_too(tmp_path) -> None:
+def test_ctrl_c_in_the_middle_is_an_interruption_too(tmp_path: Path) -> None:
     path = drive(tmp_path / "long.mcap", frames=1500)
     code = (
         "import sys; from sgstore import ingest as m; m.BLOCK_FRAMES = 60\n"
@@ -323,7 +326,7 @@ print(re.search("VmHWM: *([0-9]+)", Path("/proc/self/status").read_text().replac
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peaks are told by Linux")
-def test_memory_does_not_grow_with_the_length_of_a_trace(tmp_path) -> None:
+def test_memory_does_not_grow_with_the_length_of_a_trace(tmp_path: Path) -> None:
     peaks = []
     for frames in (600, 20_000):
         code = PEAK.format(

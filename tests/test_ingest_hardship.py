@@ -124,7 +124,7 @@ LOGGED = (
     "import duckdb, os, sys\n"
     "c = duckdb.connect(sys.argv[1], config={'wal_autocheckpoint': '1TB'})\n"
     "c.execute('PRAGMA disable_checkpoint_on_shutdown')\n"
-    "c.execute(\"INSERT INTO store_info VALUES ('test', 'kept')\")\n"
+    "c.execute(\"INSERT INTO inside.store_info VALUES ('test', 'kept')\")\n"
     "os.kill(os.getpid(), 9)\n"
 )
 """A writer that is killed before its log is worked into the store."""
@@ -140,7 +140,7 @@ def test_a_log_is_never_left_beside_a_store_that_was_written_anew(tmp_path: Path
 
     assert not (tmp_path / "s.db.wal").exists()
     assert StoreFile(store).verify().faults == []
-    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values
+    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM inside.store_info").values
 
 
 @pytest.mark.parametrize("verb", ["derive", "import"])
@@ -162,7 +162,7 @@ def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(
     assert sgstore(list(map(str, line))) == 0
 
     assert sorted(path.name for path in tmp_path.glob("s.db*")) == ["s.db"]
-    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values
+    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM inside.store_info").values
 
 
 def test_readers_and_a_writer_meet_no_lock_and_no_half_trace(tmp_path: Path) -> None:
@@ -281,4 +281,4 @@ def test_what_a_killed_writer_left_is_worked_in_by_the_next_run(tmp_path: Path) 
     assert ingest(store, [recording])[0].status == "present"
 
     assert sorted(path.name for path in tmp_path.glob("s.db*")) == ["s.db"]
-    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM store_info").values
+    assert ("test", "kept") in StoreFile(store).rows("SELECT * FROM inside.store_info").values

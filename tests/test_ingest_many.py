@@ -34,7 +34,7 @@ def rows(store: Path, sql: str) -> list[tuple[Any, ...]]:
 
 
 @pytest.fixture(scope="module")
-def mixed(tmp_path_factory) -> list[Path]:
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Recordings of one name, a copy of another, one that is not there, and one that is none."""
     folder = tmp_path_factory.mktemp("mixed")
     paths = made(folder, frames=70)
@@ -44,13 +44,13 @@ def mixed(tmp_path_factory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def one_by_one(mixed, tmp_path_factory) -> tuple[Path, list[Any]]:
+def one_by_one(mixed: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any]]:
     store = tmp_path_factory.mktemp("one") / "s.db"
     return store, ingest(store, mixed)
 
 
 def test_the_store_is_the_same_whatever_the_number_of_processes(
-    mixed, one_by_one, tmp_path
+    mixed: Any, one_by_one: Any, tmp_path: Path
 ) -> None:
     outcomes = ingest(tmp_path / "s.db", mixed, jobs=3)
 
@@ -64,7 +64,7 @@ def test_the_store_is_the_same_whatever_the_number_of_processes(
     assert [p.name for p in tmp_path.iterdir()] == ["s.db"]
 
 
-def test_names_are_given_in_the_order_of_the_recordings(one_by_one) -> None:
+def test_names_are_given_in_the_order_of_the_recordings(one_by_one: Any) -> None:
     names = [(o.path.parent.name == "other", o.name, o.status) for o in one_by_one[1]]
 
     assert names == [
@@ -77,7 +77,7 @@ def test_names_are_given_in_the_order_of_the_recordings(one_by_one) -> None:
     ]
 
 
-def test_progress_of_all_is_told_from_all_processes(mixed, tmp_path) -> None:
+def test_progress_of_all_is_told_from_all_processes(mixed: Any, tmp_path: Path) -> None:
     seen: list[Progress] = []
 
     ingest(tmp_path / "s.db", mixed, jobs=2, on_progress=seen.append)
@@ -91,7 +91,9 @@ def test_progress_of_all_is_told_from_all_processes(mixed, tmp_path) -> None:
     assert all(p.all_bytes <= total for p in seen)
 
 
-def test_a_process_that_dies_costs_the_recording_that_it_read(tmp_path, monkeypatch) -> None:
+def test_a_process_that_dies_costs_the_recording_that_it_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     paths = [drive(tmp_path / f"d{i}.mcap", frames=200 + i) for i in range(5)]
     hired: list[Any] = []
     real = workers.subprocess.Popen
@@ -119,7 +121,9 @@ def test_a_process_that_dies_costs_the_recording_that_it_read(tmp_path, monkeypa
     assert [o.status for o in ingest(tmp_path / "s.db", paths)].count("present") == 4
 
 
-def test_a_map_that_is_none_stops_before_a_process_is_begun(mixed, tmp_path, monkeypatch) -> None:
+def test_a_map_that_is_none_stops_before_a_process_is_begun(
+    mixed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(workers.subprocess, "Popen", None)
 
     with pytest.raises(MapError):
@@ -129,7 +133,9 @@ def test_a_map_that_is_none_stops_before_a_process_is_begun(mixed, tmp_path, mon
 # Again, anew, and only in thought
 
 
-def test_what_looks_the_same_is_not_hashed_again(tmp_path, monkeypatch) -> None:
+def test_what_looks_the_same_is_not_hashed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = drive(tmp_path / "d.mcap", frames=5)
     ingest(tmp_path / "s.db", [path])
 
@@ -142,7 +148,7 @@ def test_what_looks_the_same_is_not_hashed_again(tmp_path, monkeypatch) -> None:
     assert outcome.status == "present"
 
 
-def test_what_was_touched_is_known_by_its_content(tmp_path) -> None:
+def test_what_was_touched_is_known_by_its_content(tmp_path: Path) -> None:
     path = drive(tmp_path / "d.mcap", frames=5)
     ingest(tmp_path / "s.db", [path])
     os.utime(path, ns=(1, 1))
@@ -150,7 +156,7 @@ def test_what_was_touched_is_known_by_its_content(tmp_path) -> None:
     assert [o.status for o in ingest(tmp_path / "s.db", [path])] == ["present"]
 
 
-def test_what_is_there_is_read_anew_and_replaced_by_force(tmp_path) -> None:
+def test_what_is_there_is_read_anew_and_replaced_by_force(tmp_path: Path) -> None:
     paths = made(tmp_path, frames=30)
     ingest(tmp_path / "s.db", paths)
     before = content(tmp_path / "s.db")
@@ -170,13 +176,13 @@ def test_what_is_there_is_read_anew_and_replaced_by_force(tmp_path) -> None:
     }
 
 
-def test_force_reads_what_is_not_there(tmp_path) -> None:
+def test_force_reads_what_is_not_there(tmp_path: Path) -> None:
     (outcome,) = ingest(tmp_path / "s.db", [drive(tmp_path / "d.mcap", frames=5)], force=True)
 
     assert outcome.status == "added"
 
 
-def test_a_trial_says_what_would_be_done_and_does_nothing(tmp_path) -> None:
+def test_a_trial_says_what_would_be_done_and_does_nothing(tmp_path: Path) -> None:
     paths = made(tmp_path, frames=10)
     ingest(tmp_path / "s.db", paths[:1])
     before = (tmp_path / "s.db").read_bytes()
@@ -194,7 +200,7 @@ def test_a_trial_says_what_would_be_done_and_does_nothing(tmp_path) -> None:
 
 
 @pytest.fixture(scope="module")
-def long(tmp_path_factory) -> Path:
+def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """260 frames, ten a second; beside it a store of all of them."""
     path = drive(tmp_path_factory.mktemp("long") / "d.mcap", frames=260)
     ingest(path.with_name("all.db"), [path])
@@ -215,7 +221,9 @@ def edges(store: Path) -> set[tuple[Any, ...]]:
         ({"since": 12.0, "until": 25.0, "rate": 1}, range(120, 251, 10)),
     ],
 )
-def test_a_part_is_the_same_frames_with_the_same_edges(long, tmp_path, part, times) -> None:
+def test_a_part_is_the_same_frames_with_the_same_edges(
+    long: Any, tmp_path: Path, part: Any, times: Any
+) -> None:
     everything = long.with_name("all.db")
     (outcome,) = ingest(tmp_path / "part.db", [long], **part)
 
@@ -233,7 +241,7 @@ def test_a_part_is_the_same_frames_with_the_same_edges(long, tmp_path, part, tim
     assert StoreFile(tmp_path / "part.db").verify().faults == []
 
 
-def test_a_part_is_another_reading_of_the_trace(long, tmp_path) -> None:
+def test_a_part_is_another_reading_of_the_trace(long: Any, tmp_path: Path) -> None:
     ingest(tmp_path / "s.db", [long], until=3.0)
 
     (same,) = ingest(tmp_path / "s.db", [long], until=3.0)
@@ -246,7 +254,7 @@ def test_a_part_is_another_reading_of_the_trace(long, tmp_path) -> None:
     assert StoreFile(tmp_path / "s.db").trace("d").until == 4.0
 
 
-def test_a_part_without_frames_is_told(long, tmp_path) -> None:
+def test_a_part_without_frames_is_told(long: Any, tmp_path: Path) -> None:
     (outcome,) = ingest(tmp_path / "s.db", [long], since=99)
 
     assert isinstance(outcome.error, TraceError)
@@ -257,7 +265,7 @@ def test_a_part_without_frames_is_told(long, tmp_path) -> None:
 
 
 @pytest.fixture(scope="module")
-def crowd(tmp_path_factory) -> Path:
+def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six cars and a person; car 5 comes late and car 6 goes early."""
     path = tmp_path_factory.mktemp("crowd") / "crowd.mcap"
     with Recorder(path) as recorder:
@@ -286,7 +294,9 @@ def of_trace(store: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
     }
 
 
-def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(crowd, tmp_path) -> None:
+def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(
+    crowd: Any, tmp_path: Path
+) -> None:
     small = Config(range=RangeSettings(25.0))
 
     outcomes = ingest(tmp_path / "s.db", [crowd], config=small, egos=["5", "1", "6"])
@@ -304,24 +314,24 @@ def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(crowd, tmp_
     assert [(o.ego, o.status) for o in again] == [("1", "present"), ("2", "added")]
 
 
-def test_every_vehicle_can_be_an_ego(crowd, tmp_path) -> None:
+def test_every_vehicle_can_be_an_ego(crowd: Any, tmp_path: Path) -> None:
     outcomes = ingest(tmp_path / "s.db", [crowd], egos=["all"], jobs=2)
 
     assert sorted(o.ego for o in outcomes) == ["1", "2", "3", "4", "5", "6"]
     assert {o.status for o in outcomes} == {"added"}
-    egos = rows(tmp_path / "s.db", "SELECT DISTINCT name FROM trace ORDER BY ALL")
+    egos = rows(tmp_path / "s.db", "SELECT DISTINCT name FROM inside.trace ORDER BY ALL")
     assert len(egos) == 6
     assert StoreFile(tmp_path / "s.db").verify().faults == []
 
 
-def test_an_ego_that_is_not_in_the_recording_costs_no_other(crowd, tmp_path) -> None:
+def test_an_ego_that_is_not_in_the_recording_costs_no_other(crowd: Any, tmp_path: Path) -> None:
     outcomes = ingest(tmp_path / "s.db", [crowd], egos=["1", "nobody", "2"])
 
     assert [o.status for o in outcomes] == ["added", "failed", "added"]
     assert "nobody" in str(outcomes[1].error)
 
 
-def test_an_ego_that_comes_only_after_the_part_is_told(crowd, tmp_path) -> None:
+def test_an_ego_that_comes_only_after_the_part_is_told(crowd: Any, tmp_path: Path) -> None:
     outcomes = ingest(tmp_path / "s.db", [crowd], egos=["1", "5"], until=2.0)
 
     assert [(o.status, o.frames) for o in outcomes] == [("added", 21), ("failed", 0)]
@@ -331,7 +341,7 @@ def test_an_ego_that_comes_only_after_the_part_is_told(crowd, tmp_path) -> None:
 # Which files
 
 
-def test_files_folders_and_patterns_are_meant_each_once(tmp_path) -> None:
+def test_files_folders_and_patterns_are_meant_each_once(tmp_path: Path) -> None:
     (tmp_path / "day1" / "deep").mkdir(parents=True)
     (tmp_path / "day[2]").mkdir()
     names = [
@@ -359,7 +369,7 @@ def test_files_folders_and_patterns_are_meant_each_once(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("name", ["empty", "*.mcap"])
-def test_a_folder_or_pattern_that_means_nothing_is_told(tmp_path, name) -> None:
+def test_a_folder_or_pattern_that_means_nothing_is_told(tmp_path: Path, name: Any) -> None:
     (tmp_path / "empty").mkdir()
 
     with pytest.raises(StoreError, match=r"no recording \(\.mcap|no file fits this pattern"):

@@ -55,18 +55,20 @@ def states_of(columns: dict[str, Any], origin: dict[str, float]) -> States:
 
 def read_back(store: StoreFile) -> list[FrameBlock]:
     """The frames of the only trace of a store, as blocks of a bucket each."""
-    (place,) = store.rows("SELECT origin_x AS x, origin_y AS y, origin_z AS z FROM trace").dicts()
+    (place,) = store.rows(
+        "SELECT origin_x AS x, origin_y AS y, origin_z AS z FROM inside.trace"
+    ).dicts()
     frames = store.arrays(
-        "SELECT seq, time_ns, log_time_ns, coalesce(ego, -1) AS ego FROM frame ORDER BY seq"
+        "SELECT seq, time_ns, log_time_ns, coalesce(ego, -1) AS ego FROM inside.frame ORDER BY seq"
     )
     state = store.arrays(
-        "SELECT * EXCLUDE (kind, light_state) FROM state ORDER BY frame_id, node_id"
+        "SELECT * EXCLUDE (kind, light_state) FROM inside.state ORDER BY frame_id, node_id"
     )
     entity = store.arrays(
         "SELECT * REPLACE (kind::VARCHAR AS kind, coalesce(map_ref, '') AS map_ref)"
-        " FROM entity ORDER BY node_id"
+        " FROM inside.entity ORDER BY node_id"
     )
-    seq = (state["frame_id"] >> 6) % (1 << 18) * BUCKET_FRAMES + state["frame_id"] % 64
+    seq = (state["frame_id"] >> 6) % (1 << 18) * BUCKET_FRAMES + state["frame_id"] % 64  # pyright: ignore[reportOperatorIssue]
     rows = states_of(state, place)
     blocks = []
     for first in range(0, len(frames["seq"]), BUCKET_FRAMES):
@@ -81,7 +83,7 @@ def read_back(store: StoreFile) -> list[FrameBlock]:
         )
         blocks.append(
             FrameBlock(
-                **{k: v[here].astype(np.int64) for k, v in frames.items()},
+                **{k: v[here].astype(np.int64) for k, v in frames.items()},  # pyright: ignore[reportArgumentType]
                 offsets=(at - at[0]).astype(np.int64),
                 states=rows.take(np.arange(at[0], at[-1])),
                 entities=new,
@@ -109,7 +111,7 @@ def _entities(columns: dict[str, Any], first: int = 0) -> Entities:
 def edges_of(block: FrameBlock, graph: GraphBlock) -> set[tuple[int, str, int, int]]:
     edges = graph.edges
     columns = (block.seq[edges.frame], edges.relation, edges.src, edges.dst)
-    return {
+    return {  # pyright: ignore[reportReturnType]
         (q, RELATIONS[r], s, d) for q, r, s, d in zip(*(c.tolist() for c in columns), strict=True)
     }
 
@@ -117,7 +119,7 @@ def edges_of(block: FrameBlock, graph: GraphBlock) -> set[tuple[int, str, int, i
 def stored_edges(store: StoreFile) -> set[tuple[int, str, int, int]]:
     sql = """
       SELECT f.seq, e.relation::VARCHAR, e.src, e.dst
-      FROM edge e JOIN frame f ON f.bucket = e.bucket AND e.mask & (1::BIGINT << f.bit) <> 0
+      FROM inside.edge e JOIN inside.frame f ON f.bucket = e.bucket AND e.mask & (1::BIGINT << f.bit) <> 0
     """
     return set(store.rows(sql).values)
 
@@ -152,20 +154,22 @@ def same_again(store: StoreFile) -> None:
     edges, lanes = remade(store)
     sql = """
       SELECT f.seq, l.node_id, l.lane, l.overlap, l.lane_offset, l.heading_error, l.is_primary
-      FROM lane_state l JOIN frame f ON f.frame_id = l.frame_id
+      FROM inside.lane_state l JOIN inside.frame f ON f.frame_id = l.frame_id
     """
 
     assert edges == stored_edges(store)
     assert lanes == set(store.rows(sql).values)
 
 
-def test_relations_of_the_sample_are_made_again_from_its_store(town_store) -> None:
+def test_relations_of_the_sample_are_made_again_from_its_store(town_store: Any) -> None:
     same_again(StoreFile(town_store))
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", MORE_DATA)
-def test_relations_of_recordings_are_made_again_from_their_stores(tmp_path, data, name) -> None:
+def test_relations_of_recordings_are_made_again_from_their_stores(
+    tmp_path: Path, data: Any, name: Any
+) -> None:
     ingest(tmp_path / "s.db", [data / "traces" / name])
 
     same_again(StoreFile(tmp_path / "s.db"))
@@ -179,7 +183,7 @@ NEAR = st.one_of(
 
 @given(st.lists(NEAR, min_size=1, max_size=20), FAR_ORIGINS)
 @settings(max_examples=200, deadline=None)
-def test_what_is_kept_is_what_comes_back(offsets, zero) -> None:
+def test_what_is_kept_is_what_comes_back(offsets: Any, zero: Any) -> None:
     block = RandomTrace(frames=1).blocks[0].frames
     x = zero + np.array(offsets)
     states = States.of(node=np.arange(len(x)), x=x, y=-x, z=x / 2, heading=np.array(offsets), vx=x)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from importlib import resources
 from itertools import islice
+from typing import Any
 
 import pytest
 from matching import Matcher
@@ -23,11 +24,11 @@ BESIDE = "MATCH (x:Vehicle)-[:isIn]->(l:Lane {role: 'Right 1 of Ego Lane'})"
 
 
 @pytest.fixture(scope="module")
-def store(open_town):
+def store(open_town: Any):
     return open_town
 
 
-def test_lanes_have_the_roles_that_rsv_calls_them_by(store) -> None:
+def test_lanes_have_the_roles_that_rsv_calls_them_by(store: Any) -> None:
     found: dict[int, set[tuple[int, str]]] = {}
     asked = f"{INSIDE} RETURN frame.id, x.id, x.is_ego, l.role"
     for frame, node, is_ego, role in store.find(asked):
@@ -45,7 +46,7 @@ def test_lanes_have_the_roles_that_rsv_calls_them_by(store) -> None:
         assert {(node, role) for node, role in got if node in traffic} == wanted
 
 
-def test_a_role_is_asked_by_property_by_condition_and_by_return_alike(store) -> None:
+def test_a_role_is_asked_by_property_by_condition_and_by_return_alike(store: Any) -> None:
     by_property = store.find(BESIDE).rows()
     by_condition = store.find(
         "MATCH (x:Vehicle)-[:isIn]->(l:Lane) WHERE l.role = 'Right 1 of Ego Lane'"
@@ -61,7 +62,7 @@ def test_a_role_is_asked_by_property_by_condition_and_by_return_alike(store) -> 
     assert len(by_property) == in_sql > 0
 
 
-def test_a_role_counts_in_blocks_and_under_the_abstraction(store) -> None:
+def test_a_role_counts_in_blocks_and_under_the_abstraction(store: Any) -> None:
     block = "EXISTS {(x:Vehicle)-[:isIn]->(l:Lane {role: 'Right 1 of Ego Lane'})}"
     frames = {frame.frame_id for frame in store.find(BESIDE).frames()}
 
@@ -70,7 +71,7 @@ def test_a_role_counts_in_blocks_and_under_the_abstraction(store) -> None:
     assert {frame.frame_id for frame in seen} == frames
 
 
-def test_roles_in_memory_and_online_are_those_of_the_store(store) -> None:
+def test_roles_in_memory_and_online_are_those_of_the_store(store: Any) -> None:
     matcher = Matcher(compile_query(BESIDE, store.catalog(), {}).bound)
     replay, compared, held = Replay(), 0, 0
     with open_trace(RECORDING) as recording:
@@ -90,7 +91,9 @@ def test_roles_in_memory_and_online_are_those_of_the_store(store) -> None:
     assert held == len({seq for seq in frames if seq < compared * 10})
 
 
-def test_roles_are_verified_with_the_rest(store) -> None:
+def test_roles_are_verified_with_the_rest(store: Any) -> None:
     assert not store.file.verify().faults
-    (named,) = store.sql("SELECT count(*) FROM manifest WHERE \"table\" = 'lane_role'").values
+    (named,) = store.sql(
+        "SELECT count(*) FROM inside.manifest WHERE \"table\" = 'lane_role'"
+    ).values
     assert named == (1,)

@@ -43,6 +43,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("many") / "many.sgstore"
     StoreFile.create(path)
     with duckdb.connect(str(path)) as connection:
+        connection.execute("USE inside")
         for table, columns in TABLES.items():
             into = ", ".join(f'"{name}"' for name in columns)
             source = f"range({BUCKETS}) AS b(n)" + FROM.get(table, "")

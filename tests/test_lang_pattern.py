@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 import pytest
@@ -83,13 +83,13 @@ def test_a_frame_of_the_store_is_a_pattern_that_finds_it(store: Store) -> None:
         lambda: str(Pattern()),
     ],
 )
-def test_what_cannot_stand_in_a_pattern_is_refused(build) -> None:
+def test_what_cannot_stand_in_a_pattern_is_refused(build: Any) -> None:
     with pytest.raises(QueryError):
         build()
 
 
 def test_values_are_bound_and_never_written_into_the_text() -> None:
-    pattern = Pattern().node("v", "Vehicle", special="x'; DROP TABLE trace --")
+    pattern = Pattern().node("v", "Vehicle", special="x'; DROP TABLE inside.trace --")
 
     assert str(pattern) == "MATCH (v:Vehicle {special: $v_special})"
-    assert pattern.parameters == {"v_special": "x'; DROP TABLE trace --"}
+    assert pattern.parameters == {"v_special": "x'; DROP TABLE inside.trace --"}

@@ -188,7 +188,7 @@ def test_static_edges_of_the_view_are_those_of_the_pattern(world: World) -> None
 
 
 def test_values_of_the_user_are_bound_and_never_written(world: World) -> None:
-    evil = "x'; DROP TABLE edge; --"
+    evil = "x'; DROP TABLE inside.edge; --"
 
     statement = compile_query(
         "MATCH (a) WHERE a.name = $name", world.catalog, {"name": evil}
@@ -312,7 +312,9 @@ QUERIES = [
 @pytest.mark.parametrize("text", QUERIES)
 def test_windows_together_give_the_whole(text: str, world: World) -> None:
     compiled = compile_query(text, world.catalog)
-    buckets = world.connection.execute("SELECT DISTINCT bucket FROM bucket ORDER BY 1").fetchall()
+    buckets = world.connection.execute(
+        "SELECT DISTINCT bucket FROM inside.bucket ORDER BY 1"
+    ).fetchall()
     cuts = [bucket for (bucket,) in buckets] + [1 << 40]
 
     parts = [compiled.rows(Window(a, b)) for a, b in pairwise(cuts)]

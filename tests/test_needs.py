@@ -55,8 +55,8 @@ def silent(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         for table, some in (("state", columns), ("entity", ["parked", "heading", *columns[11:14]])):
             trace = "frame_id >> 24" if table == "state" else "trace_id"
             cleared = ", ".join(f"{column} = NULL" for column in some)
-            connection.execute(f"UPDATE {table} SET {cleared} WHERE {trace} = 2")
-        connection.execute("UPDATE map_node SET speed_limit = 10, curvature = 0")
+            connection.execute(f"UPDATE inside.{table} SET {cleared} WHERE {trace} = 2")
+        connection.execute("UPDATE inside.map_node SET speed_limit = 10, curvature = 0")
     store = Store(store.file.path)
     with store.file.snapshot():
         yield store
@@ -252,7 +252,11 @@ def test_traces_come_as_people_count() -> None:
     ],
 )
 def test_whatever_tells_verdicts_says_why_they_are_unknown(
-    text: str, unknown: dict[str, str], drives: Store, tmp_path: Path, capsys
+    text: str,
+    unknown: dict[str, str],
+    drives: Store,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     store, picture = str(drives.file.path), tmp_path / "when.svg"
 
@@ -283,7 +287,7 @@ def test_whatever_tells_verdicts_says_why_they_are_unknown(
 
 
 def test_swim_lanes_tell_what_a_trace_cannot_answer_from_what_is_not_found(
-    drives: Store, capsys
+    drives: Store, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = str(drives.file.path)
 

@@ -335,7 +335,8 @@ def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
 
     with duckdb.connect() as db:
         db.execute(
-            f"CREATE TABLE state AS SELECT frame_id, node_id, 'car' AS kind, FALSE AS is_ego, {read} FROM state"
+            "CREATE SCHEMA inside; CREATE TABLE inside.state AS"
+            f" SELECT frame_id, node_id, 'car' AS kind, FALSE AS is_ego, {read} FROM state"
         )
         view, _ = pairs_view()
         column = PAIR_FUNCTIONS[name].column or name

@@ -79,7 +79,7 @@ def test_the_public_names_are_few_and_all_there() -> None:
     for name in sgstore.__all__:
         assert getattr(sgstore, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        sgstore.nothing  # noqa: B018
+        sgstore.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 
 
 # Finding
@@ -435,7 +435,7 @@ def test_sql_reads_the_views(store: Store, world: World) -> None:
 
     assert rows.values == [(len(world.frames),)]
     with pytest.raises(SqlError):
-        store.sql("DROP TABLE edge")
+        store.sql("DROP TABLE inside.edge")
 
 
 def test_info_lists_the_traces(store: Store, world: World) -> None:
@@ -457,16 +457,18 @@ def test_a_store_that_has_grown_is_asked_as_it_is_now(tmp_path: Path) -> None:
     path = tmp_path / "growing.sgstore"
     StoreFile.create(path)
     first = random_world(20, traces=1, frames=12, path=path)
-    first.connection.execute("UPDATE edge SET src_kind = 'car'")
+    first.connection.execute("UPDATE inside.edge SET src_kind = 'car'")
     first.connection.close()
     matches = sgstore.open(path).find("MATCH (v:Car)-[d]->(x) RETURN COUNT(*)")
     before = matches.rows()
 
     bus = "REPLACE ('bus' AS {0}, 99 AS {1})"
     with duckdb.connect(str(path)) as connection:
-        connection.execute(f"INSERT INTO edge SELECT * {bus.format('src_kind', 'src')} FROM edge")
         connection.execute(
-            f"INSERT INTO entity SELECT * {bus.format('kind', 'node_id')} FROM entity LIMIT 1"
+            f"INSERT INTO inside.edge SELECT * {bus.format('src_kind', 'src')} FROM inside.edge"
+        )
+        connection.execute(
+            f"INSERT INTO inside.entity SELECT * {bus.format('kind', 'node_id')} FROM inside.entity LIMIT 1"
         )
 
     # Buses are no cars, although there were none when the query was compiled.

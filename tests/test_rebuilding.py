@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest
 from sgstore.rebuild import rebuild
 from sgstore.store import StoreFile
+from sgstore.store._schema import schema_sql
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,7 +46,7 @@ def held(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = dict(content(path))
     store = StoreFile(path)
     found["derived"] = store.rows(
-        "SELECT * EXCLUDE (derived_at) FROM derived ORDER BY name, trace_id"
+        "SELECT * EXCLUDE (derived_at) FROM inside.derived ORDER BY name, trace_id"
     ).values
     found["manifest"] = [row for row in found["manifest"] if row[2] != "derived"]  # holds a time
     found["order"] = [one.name for one in store.traces()]
@@ -115,9 +117,19 @@ def change(store: Path, *statements: str) -> None:
             connection.execute(statement)
 
 
+TABLES = re.findall(r"^CREATE TABLE (\w+)", schema_sql(), re.MULTILINE)
+AMONG_THE_VIEWS = (
+    *(f"CREATE TABLE main.{table} AS FROM inside.{table}" for table in TABLES),
+    "DROP SCHEMA inside CASCADE",
+    "UPDATE store_info SET value = 'before' WHERE key = 'schema_digest'",
+)
+"""So stores were made before their tables had a schema of their own."""
+
 HOW = {
     "as it is": (),
+    "of tables among the views": AMONG_THE_VIEWS,
     "of an older version": (
+        *AMONG_THE_VIEWS,
         "DELETE FROM store_info WHERE key = 'schema_digest'",
         "UPDATE store_info SET value = '2' WHERE key = 'schema_version'",
         *(f"DROP VIEW {view}" for view in ("events", "pairs", "lane_dists", "roles")),
@@ -127,10 +139,10 @@ HOW = {
     ),
     "altered": (
         "CREATE MACRO abs(x) AS 1",
-        "DROP TABLE frame",
-        "CREATE VIEW frame AS SELECT * FROM read_csv('/etc/passwd')",
-        "DELETE FROM entity",
-        "UPDATE state SET x = 7",
+        "DROP TABLE inside.frame",
+        "CREATE VIEW inside.frame AS SELECT * FROM read_csv('/etc/passwd')",
+        "DELETE FROM inside.entity",
+        "UPDATE inside.state SET x = 7",
         "CREATE OR REPLACE VIEW lanes AS SELECT 1 AS x",
     ),
 }
@@ -275,14 +287,14 @@ def test_tables_of_others_are_not_lost(store: Path) -> None:
 @pytest.mark.parametrize(
     ("statement", "reason"),
     [
-        ("DROP TABLE trace", "has no table 'trace'"),
-        ("UPDATE config SET settings = '[1]'", "cannot be read"),
-        ('UPDATE config SET settings = \'{"range": {"odd": 1}}\'', "odd"),
-        ("DELETE FROM config", "cannot be read"),
-        ("UPDATE trace SET name = 'same'", "two traces have the same name or id"),
-        ("UPDATE trace SET report = '7'", "cannot be read"),
-        ("UPDATE trace SET uri = '/dev/zero', size = 0, mtime_ns = 0", "/dev/zero"),
-        ("UPDATE trace SET since = 'nan'", "cannot be read"),
+        ("DROP TABLE inside.trace", "has no table 'trace'"),
+        ("UPDATE inside.config SET settings = '[1]'", "cannot be read"),
+        ('UPDATE inside.config SET settings = \'{"range": {"odd": 1}}\'', "odd"),
+        ("DELETE FROM inside.config", "cannot be read"),
+        ("UPDATE inside.trace SET name = 'same'", "two traces have the same name or id"),
+        ("UPDATE inside.trace SET report = '7'", "cannot be read"),
+        ("UPDATE inside.trace SET uri = '/dev/zero', size = 0, mtime_ns = 0", "/dev/zero"),
+        ("UPDATE inside.trace SET since = 'nan'", "cannot be read"),
     ],
 )
 def test_a_store_whose_traces_are_not_known_is_left_as_it_is(

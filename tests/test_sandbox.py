@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -98,8 +98,8 @@ def test_a_mistake_in_a_pattern_is_shown_with_carets(box: Sandbox, path: Path) -
         ("CREATE TABLE x AS SELECT 1", "CREATE is not allowed"),
         ("CREATE MACRO f() AS 1", "CREATE is not allowed"),
         ("DROP VIEW frames", "DROP is not allowed"),
-        ("INSERT INTO trace SELECT * FROM trace", "INSERT is not allowed"),
-        ("UPDATE trace SET name = 'x'", "UPDATE is not allowed"),
+        ("INSERT INTO inside.trace SELECT * FROM inside.trace", "INSERT is not allowed"),
+        ("UPDATE inside.trace SET name = 'x'", "UPDATE is not allowed"),
         ("SELECT 1; SELECT 2", "expected one statement"),
         ("BEGIN", "TRANSACTION is not allowed"),
         ("SELECT * FROM read_text('{secret}')", "disabled by configuration"),
@@ -123,7 +123,9 @@ def test_a_mistake_in_a_pattern_is_shown_with_carets(box: Sandbox, path: Path) -
         ("DROP VIEW labels", "DROP is not allowed"),
     ],
 )
-def test_nothing_but_the_store_is_reached(box: Sandbox, path: Path, tmp_path, sql, reason) -> None:
+def test_nothing_but_the_store_is_reached(
+    box: Sandbox, path: Path, tmp_path: Path, sql: Any, reason: Any
+) -> None:
     secret, out = tmp_path / "secret.csv", tmp_path / "out"
     secret.write_text("a,b\n1,2\n")
     before = path.read_bytes()

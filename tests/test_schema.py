@@ -87,9 +87,11 @@ def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty: duckdb.DuckDBPy
     loose = duckdb.connect()  # where nothing has to be known
     loose.execute(tables_sql())
     loose.execute("--" + schema_sql().partition("-- The public views")[2])
-    loose.execute("INSERT INTO trace BY NAME SELECT 0 AS trace_id")
+    loose.execute("INSERT INTO inside.trace BY NAME SELECT 0 AS trace_id")
     for bit in range(len(VEHICLE_LIGHTS)):
-        loose.execute(f"INSERT INTO state BY NAME SELECT {bit} AS frame_id, {1 << bit} AS lights")
+        loose.execute(
+            f"INSERT INTO inside.state BY NAME SELECT {bit} AS frame_id, {1 << bit} AS lights"
+        )
     lights = ", ".join(c for c in columns if c.startswith("light_") and c != "light_state")
     rows = loose.execute(f"SELECT {lights} FROM nodes ORDER BY frame_id").fetchall()
 
@@ -99,7 +101,7 @@ def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty: duckdb.DuckDBPy
 
 
 def test_bits_are_those_of_the_frames_of_a_bucket(empty: duckdb.DuckDBPyConnection) -> None:
-    assert empty.execute("SELECT bit, m FROM bits ORDER BY bit").fetchall() == [
+    assert empty.execute("SELECT bit, m FROM inside.bits ORDER BY bit").fetchall() == [
         (bit, 1 << bit) for bit in range(BUCKET_FRAMES)
     ]
 
@@ -116,7 +118,7 @@ def test_the_head_says_the_version_that_a_store_is_made_with(tmp_path: Path) -> 
         r"^-- sgstore: what is in a store, version (\d+)\.$", schema_sql(), re.MULTILINE
     )
 
-    sql = "SELECT value FROM store_info WHERE key = 'schema_version'"
+    sql = "SELECT value FROM inside.store_info WHERE key = 'schema_version'"
     assert store.rows(sql).values == [(version,)]
     assert f"--   * Version {version}: " in schema_sql()
 

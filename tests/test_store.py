@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Iterator[StoreFile]:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreFile]:
     store = StoreFile.create(tmp_path_factory.mktemp("store") / "s.db")
     roads = map_stub(seed=1)
     for seed, name in enumerate(("drive_1", "drive_2", "night#3", "1234")):
@@ -34,9 +34,10 @@ def store(tmp_path_factory) -> Iterator[StoreFile]:
 def content(path: Path) -> list[tuple[str, int]]:
     """Tables of a database and how many rows each has."""
     with duckdb.connect(str(path), read_only=True) as connection:
-        names = connection.execute("SELECT table_name FROM duckdb_tables() ORDER BY 1").fetchall()
+        sql = "SELECT schema_name || '.' || table_name FROM duckdb_tables() ORDER BY 1"
+        names = connection.execute(sql).fetchall()
         return [
-            (name, *connection.execute(f"SELECT count(*) FROM {name}").fetchone())
+            (name, *connection.execute(f"SELECT count(*) FROM {name}").fetchone())  # pyright: ignore[reportOptionalIterable]
             for (name,) in names
         ]
 
@@ -44,7 +45,7 @@ def content(path: Path) -> list[tuple[str, int]]:
 # Opening
 
 
-def test_an_empty_store_has_no_traces(tmp_path) -> None:
+def test_an_empty_store_has_no_traces(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
 
     assert store.traces() == ()
@@ -52,13 +53,13 @@ def test_an_empty_store_has_no_traces(tmp_path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "s.db"]
 
 
-def test_create_opens_what_is_a_store_already(tmp_path) -> None:
+def test_create_opens_what_is_a_store_already(tmp_path: Path) -> None:
     publish(StoreFile.create(tmp_path / "s.db"), RandomTrace(frames=3))
 
     assert len(StoreFile.create(tmp_path / "s.db").traces()) == 1
 
 
-def test_what_is_not_there_is_not_opened_nor_made(tmp_path) -> None:
+def test_what_is_not_there_is_not_opened_nor_made(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such store; 'sgstore ingest' makes one"):
         StoreFile(tmp_path / "none.db")
 
@@ -74,7 +75,9 @@ def test_what_is_not_there_is_not_opened_nor_made(tmp_path) -> None:
         (b"\x89MCAP0\r\n" + bytes(5000), "not a store"),
     ],
 )
-def test_other_files_are_refused_and_left_alone(tmp_path, make, content, reason) -> None:
+def test_other_files_are_refused_and_left_alone(
+    tmp_path: Path, make: Any, content: Any, reason: Any
+) -> None:
     path = tmp_path / "file"
     path.write_bytes(content)
 
@@ -86,12 +89,12 @@ def test_other_files_are_refused_and_left_alone(tmp_path, make, content, reason)
 
 
 @pytest.mark.parametrize("make", [StoreFile, StoreFile.create])
-def test_a_folder_is_no_store(tmp_path, make) -> None:
+def test_a_folder_is_no_store(tmp_path: Path, make: Any) -> None:
     with pytest.raises(StoreError, match="not a store"):
         make(tmp_path)
 
 
-def test_a_database_of_someone_else_s_is_refused(tmp_path) -> None:
+def test_a_database_of_someone_else_s_is_refused(tmp_path: Path) -> None:
     with duckdb.connect(str(tmp_path / "other.db")) as connection:
         connection.execute("CREATE TABLE trace AS SELECT 1 AS a")
 
@@ -99,32 +102,32 @@ def test_a_database_of_someone_else_s_is_refused(tmp_path) -> None:
         StoreFile.create(tmp_path / "other.db")
 
 
-def test_a_store_of_another_version_is_refused(tmp_path) -> None:
+def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
     StoreFile.create(tmp_path / "s.db")
     with duckdb.connect(str(tmp_path / "s.db")) as connection:
-        connection.execute("UPDATE store_info SET value = '99' WHERE key = 'schema_version'")
+        connection.execute("UPDATE inside.store_info SET value = '99' WHERE key = 'schema_version'")
 
     with pytest.raises(StoreError, match=r"version 99, expected \d+ .*'sgstore rebuild'"):
         StoreFile(tmp_path / "s.db")
 
 
-def test_a_folder_that_is_not_there_cannot_hold_a_store(tmp_path) -> None:
+def test_a_folder_that_is_not_there_cannot_hold_a_store(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="there is no folder"):
         StoreFile.create(tmp_path / "x" / "s.db")
 
 
-def test_the_file_can_be_read_by_the_oldest_database_that_is_supported(tmp_path) -> None:
+def test_the_file_can_be_read_by_the_oldest_database_that_is_supported(tmp_path: Path) -> None:
     StoreFile.create(tmp_path / "s.db")
 
     with duckdb.connect(str(tmp_path / "s.db"), read_only=True) as connection:
         sql = "SELECT tags['storage_version'] FROM duckdb_databases() WHERE NOT internal"
-        (version,) = connection.execute(sql).fetchone()
+        (version,) = connection.execute(sql).fetchone()  # pyright: ignore[reportGeneralTypeIssues]
 
     assert version.startswith("v1.5")
 
 
 @pytest.mark.parametrize("name", ["it's a store.db", "größe.db", "s [1].db", "a;DROP TABLE.db"])
-def test_a_store_may_have_any_name(tmp_path, name) -> None:
+def test_a_store_may_have_any_name(tmp_path: Path, name: Any) -> None:
     store = StoreFile.create(tmp_path / name)
     publish(store, RandomTrace(frames=3))
 
@@ -135,7 +138,7 @@ def test_a_store_may_have_any_name(tmp_path, name) -> None:
 # Asking
 
 
-def test_rows_have_columns_types_and_values(store) -> None:
+def test_rows_have_columns_types_and_values(store: Any) -> None:
     rows = store.rows("SELECT 1 AS a, 'x' AS b, NULL::kind AS k WHERE $yes", {"yes": True})
 
     assert rows.columns == ("a", "b", "k")
@@ -145,14 +148,14 @@ def test_rows_have_columns_types_and_values(store) -> None:
     assert rows.dicts() == [{"a": 1, "b": "x", "k": None}]
 
 
-def test_columns_come_as_arrays(store) -> None:
+def test_columns_come_as_arrays(store: Any) -> None:
     columns = store.arrays("SELECT range AS i, nullif(range, 2) AS n FROM range(?)", [4])
 
     assert columns["i"].tolist() == [0, 1, 2, 3]
     assert np.ma.getmaskarray(columns["n"]).tolist() == [False, False, True, False]
 
 
-def test_batches_are_all_rows_a_few_at_a_time(store) -> None:
+def test_batches_are_all_rows_a_few_at_a_time(store: Any) -> None:
     with store.batches("SELECT range FROM range(25)", size=10) as batches:
         sizes = [len(batch) for batch in batches]
 
@@ -160,19 +163,19 @@ def test_batches_are_all_rows_a_few_at_a_time(store) -> None:
     assert sizes == [10, 10, 5]
 
 
-def test_questions_may_be_asked_while_a_stream_is_open(store) -> None:
-    with store.batches("SELECT trace_id FROM trace ORDER BY name", size=1) as batches:
+def test_questions_may_be_asked_while_a_stream_is_open(store: Any) -> None:
+    with store.batches("SELECT trace_id FROM inside.trace ORDER BY name", size=1) as batches:
         names = [store.trace(trace_id).name for batch in batches for (trace_id,) in batch]
 
     assert names == ["1234", "drive_1", "drive_2", "night#3"]
 
 
-def test_a_statement_of_ours_that_fails_is_an_error_of_the_store(store) -> None:
+def test_a_statement_of_ours_that_fails_is_an_error_of_the_store(store: Any) -> None:
     with pytest.raises(StoreError, match="nonesuch"):
         store.rows("SELECT * FROM nonesuch")
 
 
-def test_traces_tell_what_they_are(store) -> None:
+def test_traces_tell_what_they_are(store: Any) -> None:
     traces = {trace.name: trace for trace in store.traces()}
 
     trace = traces["drive_1"]
@@ -185,14 +188,14 @@ def test_traces_tell_what_they_are(store) -> None:
     assert trace.path == Path("drive_1").resolve()
 
 
-def test_the_catalog_is_what_occurs(store) -> None:
+def test_the_catalog_is_what_occurs(store: Any) -> None:
     catalog = store.catalog()
 
     sql = "SELECT relation, src_kind, dst_kind, count(*) FROM {} GROUP BY ALL"
     assert catalog.edges == {row[:3]: row[3] for row in store.rows(sql.format("edge")).values}
     assert catalog.map_edges == {row[:3]: row[3] for row in store.rows(sql.format("map_edge"))}
     assert catalog.mapped == {"off_road", "lane", "road", "junction"}
-    seen = {row[0] for row in store.rows("SELECT DISTINCT kind FROM state")}
+    seen = {row[0] for row in store.rows("SELECT DISTINCT kind FROM inside.state")}
     assert seen <= catalog.moving
     assert catalog.moving | catalog.fixed == {
         row[0] for row in store.rows("SELECT DISTINCT kind FROM entities")
@@ -201,12 +204,12 @@ def test_the_catalog_is_what_occurs(store) -> None:
     assert catalog.traces[1].answers == {"isIn", "near", "toLeftOf"}
 
 
-def test_the_map_of_a_trace_is_its_text(store) -> None:
+def test_the_map_of_a_trace_is_its_text(store: Any) -> None:
     assert store.road_map_text("drive_1") == ("stub", "<OpenDRIVE seed='1'/>")
     assert store.road_map_text("drive_2") is None
 
 
-def test_channels_and_context_are_those_of_the_recording(store) -> None:
+def test_channels_and_context_are_those_of_the_recording(store: Any) -> None:
     assert store.channels("drive_1") == CHANNELS
     context = store.context("drive_1")
     assert context.channel.tolist() == [MAP]
@@ -217,11 +220,11 @@ def test_channels_and_context_are_those_of_the_recording(store) -> None:
 
 
 @pytest.mark.parametrize("ref", ["drive_1", "night#3", "night", "1234"])
-def test_a_trace_is_named_by_name_or_unique_beginning(store, ref) -> None:
+def test_a_trace_is_named_by_name_or_unique_beginning(store: Any, ref: Any) -> None:
     assert store.trace(ref).name.startswith(ref)
 
 
-def test_a_trace_is_named_by_its_id(store) -> None:
+def test_a_trace_is_named_by_its_id(store: Any) -> None:
     trace = store.trace("drive_2")
 
     assert store.trace(trace.trace_id) == store.trace(str(trace.trace_id)) == trace
@@ -236,12 +239,14 @@ def test_a_trace_is_named_by_its_id(store) -> None:
         ("", "no trace ''; there are"),
     ],
 )
-def test_a_trace_that_is_not_there_is_told_from_those_that_are(store, ref, reason) -> None:
+def test_a_trace_that_is_not_there_is_told_from_those_that_are(
+    store: Any, ref: Any, reason: Any
+) -> None:
     with pytest.raises(StoreError, match=reason):
         store.trace(ref)
 
 
-def test_a_frame_is_named_by_its_id(store) -> None:
+def test_a_frame_is_named_by_its_id(store: Any) -> None:
     frame = store.frame("drive_1#77")
 
     assert store.frame(frame.frame_id) == store.frame(str(frame.frame_id)) == frame
@@ -263,7 +268,9 @@ def test_a_frame_is_named_by_its_id(store) -> None:
         ("drive_1@12.9 s", "drive_1", 129),
     ],
 )
-def test_a_frame_is_named_by_its_place_or_time_in_its_trace(store, ref, trace, seq) -> None:
+def test_a_frame_is_named_by_its_place_or_time_in_its_trace(
+    store: Any, ref: Any, trace: Any, seq: Any
+) -> None:
     frame = store.frame(ref)
 
     assert (frame.trace, frame.seq) == (trace, seq)
@@ -287,12 +294,14 @@ def test_a_frame_is_named_by_its_place_or_time_in_its_trace(store, ref, trace, s
         ("9223372036854775808", "no frame 9223372036854775808"),
     ],
 )
-def test_a_frame_that_is_not_there_is_told_from_those_that_are(store, ref, reason) -> None:
+def test_a_frame_that_is_not_there_is_told_from_those_that_are(
+    store: Any, ref: Any, reason: Any
+) -> None:
     with pytest.raises(StoreError, match=reason):
         store.frame(ref)
 
 
-def test_a_time_that_jumps_back_still_names_the_last_frame_at_or_before(tmp_path) -> None:
+def test_a_time_that_jumps_back_still_names_the_last_frame_at_or_before(tmp_path: Path) -> None:
     trace = RandomTrace(frames=6)
     trace.blocks[0].frames.time_ns[:] = np.array([0, 1, 2, 1, 2, 3]) * 1_000_000_000
     store = StoreFile.create(tmp_path / "s.db")
@@ -304,7 +313,7 @@ def test_a_time_that_jumps_back_still_names_the_last_frame_at_or_before(tmp_path
 # Removing
 
 
-def test_a_removed_trace_leaves_nothing_behind(tmp_path) -> None:
+def test_a_removed_trace_leaves_nothing_behind(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     roads = map_stub()
     publish(store, RandomTrace(1, road_map=roads, path="one"))
@@ -320,7 +329,7 @@ def test_a_removed_trace_leaves_nothing_behind(tmp_path) -> None:
     assert [trace.name for trace in store.traces()] == ["one"]
 
 
-def test_a_map_stays_while_a_trace_lies_on_it(tmp_path) -> None:
+def test_a_map_stays_while_a_trace_lies_on_it(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     roads = map_stub()
     for seed, name in enumerate(("one", "two")):
@@ -331,7 +340,7 @@ def test_a_map_stays_while_a_trace_lies_on_it(tmp_path) -> None:
     assert store.road_map_text("two") == (roads.name, roads.text)
 
 
-def test_a_removed_trace_can_come_again(tmp_path) -> None:
+def test_a_removed_trace_can_come_again(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     trace = RandomTrace(1, road_map=map_stub())
     name = publish(store, trace)
@@ -343,12 +352,12 @@ def test_a_removed_trace_can_come_again(tmp_path) -> None:
     assert store.rows("SELECT * FROM edges ORDER BY ALL").values == before
 
 
-def test_what_is_not_there_cannot_be_removed(store) -> None:
+def test_what_is_not_there_cannot_be_removed(store: Any) -> None:
     with pytest.raises(StoreError, match="no trace 'nonesuch'"):
         store.remove("nonesuch")
 
 
-def test_a_compacted_store_gives_the_same_answers(tmp_path) -> None:
+def test_a_compacted_store_gives_the_same_answers(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     roads = map_stub()
     for seed in range(3):
@@ -362,6 +371,6 @@ def test_a_compacted_store_gives_the_same_answers(tmp_path) -> None:
     store.compact()
 
     assert everything() == before
-    relations = [row[0] for row in store.rows("SELECT relation FROM edge ORDER BY rowid")]
+    relations = [row[0] for row in store.rows("SELECT relation FROM inside.edge ORDER BY rowid")]
     assert relations == sorted(relations, key=RELATIONS.index)
     assert content(tmp_path / "s.db")

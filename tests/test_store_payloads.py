@@ -57,14 +57,14 @@ def joined(
     periods = payloads.Periods()
     periods.see(payloads.FRAMES, np.array(frames))
     for i, time in enumerate(frames):
-        sql = "INSERT INTO frame BY NAME SELECT ? AS frame_id, 0 AS bucket, ? AS bit, ? AS log_time_ns"
+        sql = "INSERT INTO inside.frame BY NAME SELECT ? AS frame_id, 0 AS bucket, ? AS bit, ? AS log_time_ns"
         connection.execute(sql, [i, i, time])
         connection.execute("INSERT INTO message VALUES (1, ?, 0, ?, 1)", [time, i])
     for offset, (channel, time) in enumerate(said):
         connection.execute("INSERT INTO message VALUES (?, ?, 0, ?, 1)", [channel, time, offset])
         periods.see(channel, np.array([time]))
     payloads.join(connection, "SELECT * FROM message", CHANNELS, periods, how)
-    found = connection.execute('SELECT bit, channel_id, log_time_ns, "offset" FROM payload')
+    found = connection.execute('SELECT bit, channel_id, log_time_ns, "offset" FROM inside.payload')
     return set(found.fetchall())
 
 
@@ -100,14 +100,14 @@ def period(mine: list[Any], frames: list[int]) -> float:
 @given(frames=TIMES, said=SAID)
 @settings(max_examples=25, deadline=None)
 def test_a_message_belongs_to_a_frame_as_trying_them_all_says(
-    segment, join, tolerance_ns, frames, said
+    segment: Any, join: Any, tolerance_ns: Any, frames: Any, said: Any
 ) -> None:
     how = Payloads(join=join, tolerance=tolerance_ns / 1e9)
 
     assert joined(segment, frames, said, how) == tried(frames, said, how)
 
 
-def test_of_frames_of_one_time_each_is_its_own_message(segment) -> None:
+def test_of_frames_of_one_time_each_is_its_own_message(segment: Any) -> None:
     assert {row for row in joined(segment, [5, 5, 5], [], Payloads()) if row[1] == 1} == {
         (0, 1, 5, 0),
         (1, 1, 5, 1),
@@ -128,7 +128,7 @@ def test_the_period_of_a_channel_is_told_from_its_beginning_in_bounded_memory() 
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Iterator[tuple[StoreFile, Path]]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[StoreFile, Path]]:
     folder = tmp_path_factory.mktemp("recorded")
     path = drive(folder / "drive.mcap", frames=20)
     (outcome,) = ingest(folder / "s.db", [path])
@@ -147,7 +147,7 @@ def messages(path: Path, topic: str) -> dict[int, bytes]:
         }
 
 
-def test_a_payload_read_back_is_the_message_in_the_file(recorded) -> None:
+def test_a_payload_read_back_is_the_message_in_the_file(recorded: Any) -> None:
     store, path = recorded
     pictures, truth = messages(path, "camera"), messages(path, "truth")
 
@@ -157,7 +157,7 @@ def test_a_payload_read_back_is_the_message_in_the_file(recorded) -> None:
         assert store.payload(frame, channel) == expected[time]
 
 
-def test_every_frame_has_its_own_ground_truth(recorded) -> None:
+def test_every_frame_has_its_own_ground_truth(recorded: Any) -> None:
     store, _ = recorded
     sql = "SELECT f.log_time_ns - p.log_time_ns, offset_s FROM payloads p JOIN frames f USING (frame_id)"
 
@@ -165,7 +165,7 @@ def test_every_frame_has_its_own_ground_truth(recorded) -> None:
     assert store.rows("SELECT count(*) FROM payloads WHERE channel = 'truth'").values == [(20,)]
 
 
-def test_pictures_every_other_frame_belong_to_the_frames_that_are_near(recorded) -> None:
+def test_pictures_every_other_frame_belong_to_the_frames_that_are_near(recorded: Any) -> None:
     store, _ = recorded
     sql = "SELECT seq, offset_s FROM payloads JOIN frames USING (frame_id) WHERE channel = 'camera'"
 
@@ -175,7 +175,7 @@ def test_pictures_every_other_frame_belong_to_the_frames_that_are_near(recorded)
     assert found == {seq: pytest.approx(0.025 if seq % 2 == 0 else -0.075) for seq in range(20)}
 
 
-def test_views_say_where_a_message_stands(recorded) -> None:
+def test_views_say_where_a_message_stands(recorded: Any) -> None:
     store, path = recorded
     row = store.rows("SELECT * FROM payloads WHERE channel = 'camera' LIMIT 1").dicts()[0]
 
@@ -190,14 +190,14 @@ def test_views_say_where_a_message_stands(recorded) -> None:
         ("map", "it holds the map, which belongs to all frames"),
     ],
 )
-def test_a_channel_that_gives_nothing_is_told(recorded, channel, reason) -> None:
+def test_a_channel_that_gives_nothing_is_told(recorded: Any, channel: Any, reason: Any) -> None:
     store, _ = recorded
 
     with pytest.raises(StoreError, match=reason):
         store.payload("drive#3", channel)
 
 
-def test_a_frame_without_a_message_is_told(tmp_path) -> None:
+def test_a_frame_without_a_message_is_told(tmp_path: Path) -> None:
     with Recorder(tmp_path / "d.mcap") as recorder:
         for i in range(5):
             recorder.ground_truth(i / 10, [car(1)], host=1)
@@ -210,7 +210,7 @@ def test_a_frame_without_a_message_is_told(tmp_path) -> None:
         store.payload("d#4", "camera")
 
 
-def test_the_latest_message_is_joined_where_that_is_asked_for(tmp_path) -> None:
+def test_the_latest_message_is_joined_where_that_is_asked_for(tmp_path: Path) -> None:
     path = drive(tmp_path / "d.mcap", frames=6)
     config = Config(payloads=Payloads(join="latest", tolerance=10))
     ingest(tmp_path / "s.db", [path], config=config)
@@ -221,7 +221,7 @@ def test_the_latest_message_is_joined_where_that_is_asked_for(tmp_path) -> None:
     assert offsets == pytest.approx([-0.075, -0.175, -0.075, -0.175, -0.075])
 
 
-def test_a_recording_that_is_gone_or_another_is_told(tmp_path) -> None:
+def test_a_recording_that_is_gone_or_another_is_told(tmp_path: Path) -> None:
     path = drive(tmp_path / "d.mcap", frames=6)
     ingest(tmp_path / "s.db", [path])
     store = StoreFile(tmp_path / "s.db")
@@ -236,7 +236,7 @@ def test_a_recording_that_is_gone_or_another_is_told(tmp_path) -> None:
         store.payload("d#5", "truth")
 
 
-def test_a_recording_that_was_only_touched_is_the_same(tmp_path) -> None:
+def test_a_recording_that_was_only_touched_is_the_same(tmp_path: Path) -> None:
     path = drive(tmp_path / "d.mcap", frames=6)
     ingest(tmp_path / "s.db", [path])
 

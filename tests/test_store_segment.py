@@ -21,7 +21,7 @@ from sgstore.store import StoreFile, trace_id_of
 from sgstore.world import TraceReport
 
 TABLES = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
-TABLES += ("event", "lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "config")
+TABLES += ("event", "lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "config")  # pyright: ignore[reportConstantRedefinition]
 
 
 def content(store: StoreFile) -> dict[str, list[tuple[Any, ...]]]:
@@ -35,7 +35,7 @@ def content(store: StoreFile) -> dict[str, list[tuple[Any, ...]]]:
 
 
 @pytest.fixture
-def store(tmp_path) -> StoreFile:
+def store(tmp_path: Path) -> StoreFile:
     return StoreFile.create(tmp_path / "s.db")
 
 
@@ -43,7 +43,7 @@ def beside(store: StoreFile) -> list[str]:
     return sorted(p.name for p in store.path.parent.iterdir() if p != store.path)
 
 
-def test_a_trace_is_not_in_the_store_before_it_is_published(store) -> None:
+def test_a_trace_is_not_in_the_store_before_it_is_published(store: Any) -> None:
     trace = RandomTrace(frames=130)
     with store.segment(trace.info, Config()) as segment:
         for graph in trace.blocks:
@@ -55,7 +55,7 @@ def test_a_trace_is_not_in_the_store_before_it_is_published(store) -> None:
     assert beside(store) == []
 
 
-def test_what_is_not_published_is_forgotten(store) -> None:
+def test_what_is_not_published_is_forgotten(store: Any) -> None:
     trace = RandomTrace(frames=130)
     with store.segment(trace.info, Config()) as segment:
         segment.append(trace.blocks[0])
@@ -66,7 +66,7 @@ def test_what_is_not_published_is_forgotten(store) -> None:
 
 
 @pytest.mark.parametrize("size", [1, 61])
-def test_blocks_of_any_size_give_the_same_store(tmp_path, size) -> None:
+def test_blocks_of_any_size_give_the_same_store(tmp_path: Path, size: Any) -> None:
     stores = [StoreFile.create(tmp_path / name) for name in ("whole.db", "cut.db")]
     roads = map_stub()
     whole = RandomTrace(5, frames=75, size=75, road_map=roads)
@@ -80,7 +80,7 @@ def test_blocks_of_any_size_give_the_same_store(tmp_path, size) -> None:
 
 @pytest.mark.parametrize("name", ["s.db", "it's [1]*.db"])
 def test_parts_that_wait_in_files_are_published_like_those_in_memory(
-    tmp_path, monkeypatch, name
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: Any
 ) -> None:
     found = []
     for rows, place in ((10**9, "memory.db"), (1, name)):
@@ -94,7 +94,7 @@ def test_parts_that_wait_in_files_are_published_like_those_in_memory(
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["memory.db", name])
 
 
-def test_a_trace_with_more_entities_than_are_sampled_comes_in(store) -> None:
+def test_a_trace_with_more_entities_than_are_sampled_comes_in(store: Any) -> None:
     publish(store, RandomTrace(frames=2, moving=2500))
 
     sql = "SELECT count(*), count(special), count(map_ref) FROM entities"
@@ -147,7 +147,7 @@ def _cut(part: Any, first: int, end: int) -> Any:
     return type(part)(**columns | {"frame": columns["frame"] - first})
 
 
-def test_the_same_trace_is_told_to_be_there(store) -> None:
+def test_the_same_trace_is_told_to_be_there(store: Any) -> None:
     trace = RandomTrace(frames=3, path="drive")
     assert store.stored(trace.info, Config(), None) is None
 
@@ -156,7 +156,7 @@ def test_the_same_trace_is_told_to_be_there(store) -> None:
     assert store.stored(trace.info, Config(), None) == "drive"
 
 
-def test_a_trace_that_comes_twice_at_once_comes_once(store) -> None:
+def test_a_trace_that_comes_twice_at_once_comes_once(store: Any) -> None:
     first, second = RandomTrace(frames=3, path="drive"), RandomTrace(frames=3, path="drive")
     with store.segment(second.info, Config()) as late:
         late.append(second.blocks[0])
@@ -176,7 +176,9 @@ def test_a_trace_that_comes_twice_at_once_comes_once(store) -> None:
         (Config(), map_stub(seed=9), "with another road map"),
     ],
 )
-def test_the_same_trace_read_otherwise_is_refused(store, config, roads, what) -> None:
+def test_the_same_trace_read_otherwise_is_refused(
+    store: Any, config: Any, roads: Any, what: Any
+) -> None:
     trace = RandomTrace(frames=3, path="drive")
     publish(store, trace)
 
@@ -186,28 +188,30 @@ def test_the_same_trace_read_otherwise_is_refused(store, config, roads, what) ->
         store.stored(trace.info, config, roads)
 
 
-def test_another_ego_is_another_trace(store) -> None:
+def test_another_ego_is_another_trace(store: Any) -> None:
     publish(store, RandomTrace(frames=3, path="drive"))
     publish(store, RandomTrace(frames=3, path="drive", ego="17"))
 
     assert [(t.name, t.ego) for t in store.traces()] == [("drive", "0"), ("drive~2", "17")]
 
 
-def test_traces_of_one_name_are_numbered(store) -> None:
+def test_traces_of_one_name_are_numbered(store: Any) -> None:
     names = [publish(store, RandomTrace(seed, frames=3, path="drive")) for seed in range(3)]
 
     assert names == ["drive", "drive~2", "drive~3"]
 
 
-def test_maps_of_one_name_are_numbered_and_equal_maps_are_one(store) -> None:
+def test_maps_of_one_name_are_numbered_and_equal_maps_are_one(store: Any) -> None:
     for seed, roads in enumerate((map_stub(1), map_stub(2), map_stub(1))):
         publish(store, RandomTrace(seed, frames=3, road_map=roads, path=f"d{seed}"))
 
     assert [t.map for t in store.traces()] == ["stub", "stub~2", "stub"]
-    assert store.rows("SELECT count(*) FROM map_node").values == [(2 * len(map_stub(1).nodes),)]
+    assert store.rows("SELECT count(*) FROM inside.map_node").values == [
+        (2 * len(map_stub(1).nodes),)
+    ]
 
 
-def test_two_traces_with_one_id_are_not_mixed(store) -> None:
+def test_two_traces_with_one_id_are_not_mixed(store: Any) -> None:
     trace = RandomTrace(frames=3, path="drive")
     publish(store, trace)
     writer = store  # an id is 39 bits of a digest: one that collides is made up
@@ -216,7 +220,7 @@ def test_two_traces_with_one_id_are_not_mixed(store) -> None:
 
     with duckdb.connect(str(store.path)) as connection:
         taken = trace_id_of(other.digest, other.ego)
-        connection.execute(f"UPDATE trace SET trace_id = {taken}")
+        connection.execute(f"UPDATE inside.trace SET trace_id = {taken}")
 
     with pytest.raises(StoreError, match="is taken by another trace, 'drive', by chance"):
         writer.stored(other, Config(), None)
@@ -230,7 +234,7 @@ def test_the_id_of_a_trace_is_39_bits_of_a_digest_of_recording_and_ego() -> None
     assert trace_id_of("abc", "42") == number >> (256 - 39)
 
 
-def test_frames_out_of_order_are_a_defect_of_the_caller(store) -> None:
+def test_frames_out_of_order_are_a_defect_of_the_caller(store: Any) -> None:
     trace = RandomTrace(frames=130)
     with (
         store.segment(trace.info, Config()) as segment,
@@ -239,7 +243,7 @@ def test_frames_out_of_order_are_a_defect_of_the_caller(store) -> None:
         segment.append(trace.blocks[1])
 
 
-def test_a_trace_without_frames_is_a_defect_of_the_caller(store) -> None:
+def test_a_trace_without_frames_is_a_defect_of_the_caller(store: Any) -> None:
     with (
         store.segment(trace_info(), Config()) as segment,
         pytest.raises(ValueError, match="a trace without frames"),
@@ -247,10 +251,10 @@ def test_a_trace_without_frames_is_a_defect_of_the_caller(store) -> None:
         segment.publish(TraceReport())
 
 
-def test_texts_that_are_no_unicode_are_kept_as_far_as_they_are(store) -> None:
+def test_texts_that_are_no_unicode_are_kept_as_far_as_they_are(store: Any) -> None:
     trace = RandomTrace(frames=3, path="/r/drive\udcff.mcap", ego="\udcff")
     entities = trace.blocks[0].frames.entities
-    odd = ("\ud800", "nul\0", "'; DROP TABLE trace; --", *entities.ident[3:])
+    odd = ("\ud800", "nul\0", "'; DROP TABLE inside.trace; --", *entities.ident[3:])
     trace.blocks[0] = replace(
         trace.blocks[0],
         frames=replace(
@@ -269,7 +273,7 @@ def test_texts_that_are_no_unicode_are_kept_as_far_as_they_are(store) -> None:
     assert stored.report["warnings"] == ["odd: ?"]
 
 
-def test_a_trace_without_anything_in_it_is_still_its_frames(store) -> None:
+def test_a_trace_without_anything_in_it_is_still_its_frames(store: Any) -> None:
     trace = RandomTrace(frames=70)
     for graph in trace.blocks:
         for column in (graph.frames.states.x, graph.frames.states.y, graph.frames.scenery.x):
@@ -280,10 +284,10 @@ def test_a_trace_without_anything_in_it_is_still_its_frames(store) -> None:
     assert store.rows("SELECT count(*) FROM frames").values == [(70,)]
 
 
-def test_bits_of_a_bucket_are_its_frames(store) -> None:
+def test_bits_of_a_bucket_are_its_frames(store: Any) -> None:
     publish(store, RandomTrace(frames=65))
 
-    assert store.rows("SELECT valid FROM bucket ORDER BY bucket").values == [
+    assert store.rows("SELECT valid FROM inside.bucket ORDER BY bucket").values == [
         ((1 << 60) - 1,),
         (0b11111,),
     ]
@@ -325,7 +329,7 @@ def killed_at(store: StoreFile, at: int) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
-def test_a_killed_run_leaves_a_whole_store(tmp_path) -> None:
+def test_a_killed_run_leaves_a_whole_store(tmp_path: Path) -> None:
     whole = StoreFile.create(tmp_path / "whole.db")
     lines = int(killed_at(whole, 10**9).stdout)
     after = content(whole)
@@ -348,7 +352,7 @@ def test_a_killed_run_leaves_a_whole_store(tmp_path) -> None:
     assert seen == {True, False}
 
 
-def test_what_a_dead_process_left_is_removed_and_what_a_living_one_has_is_not(store) -> None:
+def test_what_a_dead_process_left_is_removed_and_what_a_living_one_has_is_not(store: Any) -> None:
     dead = store.path.with_name(f"{store.path.name}.segment-1-dead")
     (dead / "spill").mkdir(parents=True)
     trace = RandomTrace(frames=3, path="a")
@@ -383,7 +387,7 @@ except StoreError as error:
 """
 
 
-def test_a_store_that_is_compacted_is_replaced_in_one_step(store) -> None:
+def test_a_store_that_is_compacted_is_replaced_in_one_step(store: Any) -> None:
     publish(store, RandomTrace(1, frames=70, path="a"))
     publish(store, RandomTrace(2, frames=70, path="b"))
     store.remove("a")
@@ -403,7 +407,7 @@ def test_a_store_that_is_compacted_is_replaced_in_one_step(store) -> None:
         pytest.param(100_000, True, id="full when it is in and should be moved to its place"),
     ],
 )
-def test_a_disk_that_is_full_leaves_a_whole_store(store, room, is_in) -> None:
+def test_a_disk_that_is_full_leaves_a_whole_store(store: Any, room: Any, is_in: Any) -> None:
     publish(store, RandomTrace(1, frames=130, path="first"))
     before = content(store)
     most = max(store.path.stat().st_size + room, 20_000)

@@ -10,7 +10,7 @@ import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 TORN = """
-  SELECT (SELECT coalesce(sum(frames), 0) FROM trace) = (SELECT count(*) FROM frame)
-     AND (SELECT count(*) FROM trace) = (SELECT count(DISTINCT trace_id) FROM bucket)
+  SELECT (SELECT coalesce(sum(frames), 0) FROM inside.trace) = (SELECT count(*) FROM inside.frame)
+     AND (SELECT count(*) FROM inside.trace) = (SELECT count(DISTINCT trace_id) FROM inside.bucket)
 """
 """True of a store that holds whole traces only."""
 
 
 @pytest.fixture
-def store(tmp_path) -> StoreFile:
+def store(tmp_path: Path) -> StoreFile:
     store = StoreFile.create(tmp_path / "s.db")
     publish(store, RandomTrace(1, frames=5, path="first"))
     return store
 
 
-@contextmanager
+@contextmanager  # pyright: ignore[reportDeprecated]
 def process(code: str, **values: object) -> Iterator[subprocess.Popen[str]]:
     """A process that has begun: it has printed a line. It goes on until its stdin ends, and is waited for."""
     code = textwrap.dedent(code).format(path=[str(Path(__file__).parent)], **values)
@@ -54,7 +54,7 @@ def process(code: str, **values: object) -> Iterator[subprocess.Popen[str]]:
         assert child.returncode == 0, errors
 
 
-@contextmanager
+@contextmanager  # pyright: ignore[reportDeprecated]
 def let_go_later(child: subprocess.Popen[str]) -> Iterator[threading.Event]:
     """Lets a process go on after a while; the event is set before."""
     going = threading.Event()
@@ -91,7 +91,7 @@ connection.close()
 """
 
 
-def test_a_writer_waits_until_a_reader_is_done(store) -> None:
+def test_a_writer_waits_until_a_reader_is_done(store: Any) -> None:
     with process(READS, store=str(store.path)) as reader, let_go_later(reader) as going:
         publish(store, RandomTrace(2, frames=5, path="second"))
         assert going.is_set()
@@ -99,13 +99,13 @@ def test_a_writer_waits_until_a_reader_is_done(store) -> None:
     assert len(store.traces()) == 2
 
 
-def test_a_reader_waits_until_a_writer_is_done(store) -> None:
+def test_a_reader_waits_until_a_writer_is_done(store: Any) -> None:
     with process(WRITES, store=str(store.path)) as writer, let_go_later(writer) as going:
         assert len(store.traces()) == 1
         assert going.is_set()
 
 
-def test_a_reader_does_not_wait_for_ever(store) -> None:
+def test_a_reader_does_not_wait_for_ever(store: Any) -> None:
     with process(WRITES, store=str(store.path)):
         start = time.perf_counter()
         with pytest.raises(StoreError, match="in use by another process for too long"):
@@ -113,7 +113,7 @@ def test_a_reader_does_not_wait_for_ever(store) -> None:
         assert time.perf_counter() - start > 0.25
 
 
-def test_a_writer_does_not_wait_for_ever_and_changes_nothing(store) -> None:
+def test_a_writer_does_not_wait_for_ever_and_changes_nothing(store: Any) -> None:
     hasty = StoreFile(store.path, wait_s=0.3)
     with (
         process(READS, store=str(store.path)),
@@ -125,7 +125,7 @@ def test_a_writer_does_not_wait_for_ever_and_changes_nothing(store) -> None:
     assert [p.name for p in store.path.parent.iterdir()] == [store.path.name]
 
 
-def test_readers_of_many_processes_read_at_once(store) -> None:
+def test_readers_of_many_processes_read_at_once(store: Any) -> None:
     with process(READS, store=str(store.path)):
         assert len(StoreFile(store.path, wait_s=0.3).traces()) == 1
 
@@ -145,7 +145,7 @@ while told.is_alive():
 """
 
 
-def test_a_stream_of_readers_does_not_keep_a_writer_out(store) -> None:
+def test_a_stream_of_readers_does_not_keep_a_writer_out(store: Any) -> None:
     about = {"store": str(store.path), "torn": TORN}
     with process(READS_ON, **about), process(READS_ON, **about), process(READS_ON, **about):
         for seed in range(2, 5):
@@ -165,7 +165,7 @@ assert len(traces) == 2, "it came before the writer who waited longer"
 """
 
 
-def test_who_comes_while_a_writer_waits_comes_after_it(store) -> None:
+def test_who_comes_while_a_writer_waits_comes_after_it(store: Any) -> None:
     about = {"store": str(store.path)}
     writer = threading.Thread(target=publish, args=(store, RandomTrace(2, frames=5, path="b")))
     with process(READS, **about) as reader:
@@ -182,10 +182,12 @@ def test_who_comes_while_a_writer_waits_comes_after_it(store) -> None:
             writer.join()
 
 
-def test_an_interrupt_just_after_the_gate_was_made_leaves_no_gate(store, monkeypatch) -> None:
+def test_an_interrupt_just_after_the_gate_was_made_leaves_no_gate(
+    store: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opened, gate = os.open, f"{store.path}.gate"
 
-    def interrupted(path, *more, **named) -> int:
+    def interrupted(path: Any, *more: Any, **named: Any) -> int:
         number = opened(path, *more, **named)
         if str(path) == gate:
             monkeypatch.undo()
@@ -201,7 +203,7 @@ def test_an_interrupt_just_after_the_gate_was_made_leaves_no_gate(store, monkeyp
     assert len(store.traces()) == 2
 
 
-def test_threads_read_while_one_writes_and_see_whole_traces(store) -> None:
+def test_threads_read_while_one_writes_and_see_whole_traces(store: Any) -> None:
     stop, failures, reads = threading.Event(), [], []
 
     def read() -> None:
@@ -226,7 +228,7 @@ def test_threads_read_while_one_writes_and_see_whole_traces(store) -> None:
     assert len(store.traces()) == 5
 
 
-def test_a_snapshot_stays_as_it_is_while_others_publish(store) -> None:
+def test_a_snapshot_stays_as_it_is_while_others_publish(store: Any) -> None:
     with store.snapshot():
         writer = threading.Thread(target=publish, args=(store, RandomTrace(2, frames=5, path="b")))
         writer.start()
@@ -238,7 +240,7 @@ def test_a_snapshot_stays_as_it_is_while_others_publish(store) -> None:
     assert len(store.traces()) == 2
 
 
-def test_who_reads_cannot_write_at_once_and_is_told(store) -> None:
+def test_who_reads_cannot_write_at_once_and_is_told(store: Any) -> None:
     with (
         store.snapshot(),
         pytest.raises(StoreError, match="cannot be written while the same thread reads it"),
@@ -246,7 +248,7 @@ def test_who_reads_cannot_write_at_once_and_is_told(store) -> None:
         publish(store, RandomTrace(2, frames=5, path="b"))
 
 
-def test_two_writers_take_turns(store) -> None:
+def test_two_writers_take_turns(store: Any) -> None:
     threads = [
         threading.Thread(target=publish, args=(store, RandomTrace(seed, frames=5, path=f"t{seed}")))
         for seed in range(2, 6)
@@ -260,7 +262,9 @@ def test_two_writers_take_turns(store) -> None:
     assert store.rows(TORN).values == [(True,)]
 
 
-def test_the_lock_of_a_writer_holds_while_its_process_looks_elsewhere(store, tmp_path) -> None:
+def test_the_lock_of_a_writer_holds_while_its_process_looks_elsewhere(
+    store: Any, tmp_path: Path
+) -> None:
     other = StoreFile.create(tmp_path / "other.db")
     connection = duckdb.connect()
     with Access(store.path, memory=1 << 28, wait_s=5).writing(connection):
@@ -273,17 +277,17 @@ def test_the_lock_of_a_writer_holds_while_its_process_looks_elsewhere(store, tmp
     assert "Could not set lock" in run.stderr
 
 
-def test_no_write_ahead_log_is_left_at_rest(store) -> None:
+def test_no_write_ahead_log_is_left_at_rest(store: Any) -> None:
     publish(store, RandomTrace(2, frames=5, path="b"))
 
     assert [p.name for p in store.path.parent.iterdir()] == [store.path.name]
 
 
-def test_the_file_is_free_between_questions(store) -> None:
+def test_the_file_is_free_between_questions(store: Any) -> None:
     store.traces()
     publish(store, RandomTrace(2, frames=5, path="b"))
-    code = f"import duckdb; duckdb.connect({str(store.path)!r}).execute('DELETE FROM bits')"
+    code = f"import duckdb; duckdb.connect({str(store.path)!r}).execute('DELETE FROM inside.bits')"
 
     subprocess.run([sys.executable, "-c", code], check=True)
 
-    assert store.rows("SELECT * FROM bits").values == []
+    assert store.rows("SELECT * FROM inside.bits").values == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
@@ -22,7 +22,7 @@ RUNAWAY = "SELECT count(*) FROM range(1000000) a, range(1000000) b WHERE a.range
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Iterator[StoreFile]:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreFile]:
     store = StoreFile.create(tmp_path_factory.mktemp("store") / "s.db")
     publish(store, RandomTrace(frames=130))
     with store.snapshot():
@@ -41,7 +41,7 @@ def store(tmp_path_factory) -> Iterator[StoreFile]:
         "(SELECT count(*) FROM frames)",
     ],
 )
-def test_one_statement_that_reads_is_answered(store, sql) -> None:
+def test_one_statement_that_reads_is_answered(store: Any, sql: Any) -> None:
     assert store.user_sql(sql).values == [(130,)]
 
 
@@ -49,11 +49,11 @@ def test_one_statement_that_reads_is_answered(store, sql) -> None:
     "sql",
     ["DESCRIBE nodes", "SHOW TABLES", "SUMMARIZE frames", "EXPLAIN FROM edges", "TABLE frames"],
 )
-def test_what_describes_is_answered(store, sql) -> None:
+def test_what_describes_is_answered(store: Any, sql: Any) -> None:
     assert len(store.user_sql(sql)) > 0
 
 
-def test_types_of_the_result_are_told(store) -> None:
+def test_types_of_the_result_are_told(store: Any) -> None:
     rows = store.user_sql("SELECT frame_id, kind FROM nodes LIMIT 1")
 
     assert rows.columns == ("frame_id", "kind")
@@ -61,7 +61,7 @@ def test_types_of_the_result_are_told(store) -> None:
     assert isinstance(rows.values[0][1], str)
 
 
-def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store) -> None:
+def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store: Any) -> None:
     some = store.user_sql("SELECT seq FROM frames ORDER BY seq", max_rows=7)
     every = store.user_sql("SELECT seq FROM frames", max_rows=130)
     none = store.user_sql("SELECT seq FROM frames", max_rows=0)
@@ -74,11 +74,11 @@ def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store) -> None:
 @pytest.mark.parametrize(
     ("sql", "reason"),
     [
-        ("INSERT INTO frame VALUES (1)", "INSERT is not allowed; expected SELECT"),
-        ("UPDATE trace SET name = 'x'", "UPDATE is not allowed"),
-        ("DELETE FROM trace", "DELETE is not allowed"),
-        ("DROP TABLE trace", "DROP is not allowed"),
-        ("ALTER TABLE trace ADD COLUMN x INT", "ALTER is not allowed"),
+        ("INSERT INTO inside.frame VALUES (1)", "INSERT is not allowed; expected SELECT"),
+        ("UPDATE inside.trace SET name = 'x'", "UPDATE is not allowed"),
+        ("DELETE FROM inside.trace", "DELETE is not allowed"),
+        ("DROP TABLE inside.trace", "DROP is not allowed"),
+        ("ALTER TABLE inside.trace ADD COLUMN x INT", "ALTER is not allowed"),
         ("CREATE TABLE x AS SELECT 1", "CREATE is not allowed"),
         ("CREATE TEMP TABLE x AS SELECT 1", "CREATE is not allowed"),
         ("COPY frames TO '{out}'", "COPY is not allowed"),
@@ -98,7 +98,7 @@ def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store) -> None:
         ("VACUUM", "VACUUM is not allowed"),
         ("PREPARE p AS SELECT 1", "PREPARE is not allowed"),
         ("USE memory", "is not allowed"),
-        ("SELECT 1; DROP TABLE trace", "expected one statement, found 2"),
+        ("SELECT 1; DROP TABLE inside.trace", "expected one statement, found 2"),
         ("SELECT 1; SELECT 2", "expected one statement, found 2"),
         ("", "expected one statement, found 0"),
         ("-- nothing", "expected one statement, found 0"),
@@ -110,14 +110,19 @@ def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store) -> None:
         ("SELECT * FROM glob('{secret}*')", "disabled by configuration"),
         ("SELECT * FROM sniff_csv('{secret}')", "disabled by configuration"),
         ("EXPLAIN ANALYZE COPY frames TO '{out}'", "disabled by configuration"),
-        ("EXPLAIN ANALYZE INSERT INTO bits VALUES (1, 1)", "read-only"),
+        ("EXPLAIN ANALYZE INSERT INTO inside.bits VALUES (1, 1)", "read-only"),
         ("EXPLAIN ANALYZE CREATE TABLE x AS SELECT 1", "read-only"),
         ("SELECT * FROM store_in_python", "store_in_python does not exist"),
         ("SELECT getenv('HOME')", "getenv does not exist"),
-        ("WITH x AS (INSERT INTO bits VALUES (1, 1) RETURNING bit) FROM x", "read-only|SELECT"),
+        (
+            "WITH x AS (INSERT INTO inside.bits VALUES (1, 1) RETURNING bit) FROM x",
+            "read-only|SELECT",
+        ),
     ],
 )
-def test_nothing_but_reading_the_store_is_done(store, tmp_path, sql, reason) -> None:
+def test_nothing_but_reading_the_store_is_done(
+    store: Any, tmp_path: Path, sql: Any, reason: Any
+) -> None:
     store_in_python = {"a": [1]}  # what DuckDB would read if it were let
     secret, out = tmp_path / "secret.csv", tmp_path / "out"
     secret.write_text("a,b\n1,2\n")
@@ -131,7 +136,7 @@ def test_nothing_but_reading_the_store_is_done(store, tmp_path, sql, reason) -> 
     assert store_in_python
 
 
-def test_settings_are_the_same_for_the_next_statement(store) -> None:
+def test_settings_are_the_same_for_the_next_statement(store: Any) -> None:
     sql = "SELECT value FROM duckdb_settings() WHERE name IN ('enable_external_access', 'lock_configuration')"
 
     for _ in range(2):
@@ -146,21 +151,21 @@ def test_settings_are_the_same_for_the_next_statement(store) -> None:
         ("SELECT 1 FROM", ["syntax error"]),
     ],
 )
-def test_a_mistake_is_told_as_the_database_tells_it(store, sql, parts) -> None:
+def test_a_mistake_is_told_as_the_database_tells_it(store: Any, sql: Any, parts: Any) -> None:
     with pytest.raises(SqlError) as caught:
         store.user_sql(sql)
 
     assert all(part.lower() in str(caught.value).lower() for part in parts), caught.value
 
 
-def test_a_time_with_a_zone_is_told_how_to_be_shown(store) -> None:
+def test_a_time_with_a_zone_is_told_how_to_be_shown(store: Any) -> None:
     with pytest.raises(SqlError, match=r"cast them: now\(\)::TIMESTAMP"):
         store.user_sql("SELECT now()")
 
     assert len(store.user_sql("SELECT now()::TIMESTAMP")) == 1
 
 
-def test_a_runaway_statement_is_stopped_in_time(store) -> None:
+def test_a_runaway_statement_is_stopped_in_time(store: Any) -> None:
     start = time.perf_counter()
 
     with pytest.raises(SqlError, match=r"stopped after 0.2 s: SELECT count"):
@@ -169,7 +174,7 @@ def test_a_runaway_statement_is_stopped_in_time(store) -> None:
     assert 0.2 <= time.perf_counter() - start < 1.0
 
 
-def test_a_stream_is_stopped_in_time_too(store) -> None:
+def test_a_stream_is_stopped_in_time_too(store: Any) -> None:
     sql = "SELECT a.range + b.range FROM range(1000000) a, range(1000000) b"
 
     with (
@@ -180,7 +185,7 @@ def test_a_stream_is_stopped_in_time_too(store) -> None:
             pass
 
 
-def test_the_store_goes_on_after_a_statement_was_stopped(store) -> None:
+def test_the_store_goes_on_after_a_statement_was_stopped(store: Any) -> None:
     with pytest.raises(SqlError):
         store.user_sql(RUNAWAY, timeout_s=0.05)
 
@@ -197,12 +202,12 @@ def test_too_much_memory_is_refused_not_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("deep", ["(" * 100_000, "SELECT " + "-" * 100_000 + "1", "[" * 50_000])
-def test_deep_nonsense_is_an_error_not_a_crash(store, deep) -> None:
+def test_deep_nonsense_is_an_error_not_a_crash(store: Any, deep: Any) -> None:
     with pytest.raises(SqlError):
         store.user_sql(deep)
 
 
-def test_a_statement_that_is_too_long_is_refused(store) -> None:
+def test_a_statement_that_is_too_long_is_refused(store: Any) -> None:
     with pytest.raises(SqlError, match="1048576 are allowed"):
         store.user_sql("SELECT 1" + " " * (1 << 20))
 
@@ -215,7 +220,7 @@ def test_an_error_of_sql_is_an_error_of_the_store() -> None:
 
 
 @pytest.fixture
-def alone(tmp_path) -> StoreFile:
+def alone(tmp_path: Path) -> StoreFile:
     store = StoreFile.create(tmp_path / "alone.db")
     publish(store, RandomTrace(frames=5))
     return store
@@ -224,11 +229,11 @@ def alone(tmp_path) -> StoreFile:
 class _Faulty:
     """Stands for what runs a statement: the database fails the first times, and then answers."""
 
-    def __init__(self, monkeypatch, times: int) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, times: int) -> None:
         self.left, self._run = times, rows.run
         monkeypatch.setattr(rows, "run", self)
 
-    def __call__(self, connection, sql, parameters=None):
+    def __call__(self, connection: Any, sql: Any, parameters: Any = None):
         if self.left:
             self.left -= 1
             raise duckdb.InternalException(
@@ -238,14 +243,14 @@ class _Faulty:
 
 
 @pytest.mark.skipif(duckdb.__version__.startswith("1."), reason="DuckDB 1 has no such setting")
-def test_small_chunks_are_not_gathered_because_their_dictionaries_are_mixed_up(store) -> None:
+def test_small_chunks_are_not_gathered_because_their_dictionaries_are_mixed_up(store: Any) -> None:
     setting = "SELECT current_setting('enable_caching_operators')"
     assert store.user_sql(setting).values == [(False,)]
 
 
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_question_that_meets_a_fault_of_the_database_is_asked_again(
-    alone, monkeypatch, nested
+    alone: Any, monkeypatch: pytest.MonkeyPatch, nested: Any
 ) -> None:
     _Faulty(monkeypatch, times=1)
     with alone.snapshot() if nested else nullcontext():
@@ -253,7 +258,9 @@ def test_a_question_that_meets_a_fault_of_the_database_is_asked_again(
         assert alone.rows("SELECT 1").values == [(1,)]
 
 
-def test_a_fault_that_stays_is_one_line_and_the_store_goes_on(alone, monkeypatch) -> None:
+def test_a_fault_that_stays_is_one_line_and_the_store_goes_on(
+    alone: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _Faulty(monkeypatch, times=9)
     with pytest.raises(StoreError, match=r"fault of DuckDB \S+ itself.*global dictionary$"):
         alone.rows("SELECT 1")
@@ -261,7 +268,9 @@ def test_a_fault_that_stays_is_one_line_and_the_store_goes_on(alone, monkeypatch
     assert alone.rows("SELECT 1").values == [(1,)]
 
 
-def test_what_a_question_was_given_is_given_again(alone, monkeypatch) -> None:
+def test_what_a_question_was_given_is_given_again(
+    alone: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _Faulty(monkeypatch, times=1)
     given = GivenTable("mine", {"n": "INTEGER"}, lambda: iter([[[1, 2]], [[3]]]))
     assert alone.rows("SELECT sum(n) FROM mine", given=[given]).values == [(6,)]

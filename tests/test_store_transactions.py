@@ -187,7 +187,7 @@ def test_frames_go_on_over_equal_times_and_not_over_gaps_nor_back(
     trace.blocks[0].frames.time_ns[:] = times.astype(np.int64) + 1_000
     store = StoreFile.create(tmp_path / "s.db")
     publish(store, trace)
-    ((_, joined),) = store.rows("SELECT valid, joined FROM bucket").values
+    ((_, joined),) = store.rows("SELECT valid, joined FROM inside.bucket").values
 
     starts = {first for first, _ in runs}
     assert {bit for bit in range(6) if not joined >> bit & 1} == starts

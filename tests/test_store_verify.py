@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import numpy as np
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory) -> bytes:
+def published(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     store = StoreFile.create(tmp_path_factory.mktemp("published") / "s.db")
     roads = map_stub()
     publish(store, RandomTrace(1, frames=130, road_map=roads, path="one"))
@@ -32,7 +32,7 @@ def published(tmp_path_factory) -> bytes:
 
 
 @pytest.fixture
-def store(published, tmp_path) -> StoreFile:
+def store(published: Any, tmp_path: Path) -> StoreFile:
     (tmp_path / "s.db").write_bytes(published)
     return StoreFile(tmp_path / "s.db")
 
@@ -47,7 +47,7 @@ def change(store: StoreFile, *statements: str) -> None:
             connection.execute(statement)
 
 
-def test_what_was_published_is_without_fault(store) -> None:
+def test_what_was_published_is_without_fault(store: Any) -> None:
     found = store.verify()
 
     assert found.faults == []
@@ -59,7 +59,7 @@ def test_what_was_published_is_without_fault(store) -> None:
     assert found.rows == count
 
 
-def test_what_was_compacted_is_without_fault(store) -> None:
+def test_what_was_compacted_is_without_fault(store: Any) -> None:
     store.remove("two")
     publish(store, RandomTrace(3, frames=70, road_map=map_stub(5), path="three"))
     store.compact()
@@ -69,60 +69,69 @@ def test_what_was_compacted_is_without_fault(store) -> None:
 
 CHANGES = {
     "a value": (
-        "UPDATE state SET x = x + 0.001 WHERE frame_id = (SELECT max(frame_id) FROM state)",
+        "UPDATE inside.state SET x = x + 0.001 WHERE frame_id = (SELECT max(frame_id) FROM inside.state)",
         "rows",
     ),
     "a value that goes missing": (
-        "UPDATE state SET vy = NULL WHERE frame_id = (SELECT min(frame_id) FROM state)",
+        "UPDATE inside.state SET vy = NULL WHERE frame_id = (SELECT min(frame_id) FROM inside.state)",
         "rows",
     ),
-    "a text": ("UPDATE entity SET ident = 'other' WHERE node_id = 0", "rows"),
-    "a row too few": ("DELETE FROM edge WHERE src = (SELECT max(src) FROM edge)", "rows"),
+    "a text": ("UPDATE inside.entity SET ident = 'other' WHERE node_id = 0", "rows"),
+    "a row too few": (
+        "DELETE FROM inside.edge WHERE src = (SELECT max(src) FROM inside.edge)",
+        "rows",
+    ),
     "a row too many": (
-        "INSERT INTO frame SELECT * REPLACE (frame_id + 1 AS frame_id) FROM frame"
-        " WHERE frame_id = (SELECT max(frame_id) FROM frame)",
+        "INSERT INTO inside.frame SELECT * REPLACE (frame_id + 1 AS frame_id) FROM inside.frame"
+        " WHERE frame_id = (SELECT max(frame_id) FROM inside.frame)",
         "frames",
     ),
     "states behind the last frame": (
-        "INSERT INTO state SELECT * REPLACE (frame_id + 640 AS frame_id) FROM state"
-        " WHERE frame_id = (SELECT max(frame_id) FROM state)",
+        "INSERT INTO inside.state SELECT * REPLACE (frame_id + 640 AS frame_id) FROM inside.state"
+        " WHERE frame_id = (SELECT max(frame_id) FROM inside.state)",
         "references",
     ),
-    "a frame twice": ("INSERT INTO frame SELECT * FROM frame WHERE seq = 3", "frames"),
-    "an empty mask": ("UPDATE edge SET mask = 0 WHERE src = (SELECT min(src) FROM edge)", "masks"),
-    "a mask beyond the frames": ("UPDATE edge SET mask = mask | (1::BIGINT << 59)", "masks"),
-    "a mask of nodes beyond the frames": (
-        "UPDATE node SET mask = mask | (1::BIGINT << 59)",
+    "a frame twice": (
+        "INSERT INTO inside.frame SELECT * FROM inside.frame WHERE seq = 3",
+        "frames",
+    ),
+    "an empty mask": (
+        "UPDATE inside.edge SET mask = 0 WHERE src = (SELECT min(src) FROM inside.edge)",
         "masks",
     ),
-    "a bucket": ("UPDATE bucket SET valid = 1", "masks"),
-    "an edge from nobody": ("UPDATE edge SET src = 9999 WHERE src >= 0", "references"),
-    "an edge to another kind": ("UPDATE edge SET dst_kind = 'animal'", "references"),
-    "a lane that is not in the map": ("UPDATE lane_state SET lane = -9999", "references"),
-    "an ego that is nobody": ("UPDATE frame SET ego = 9999", "references"),
-    "settings that are gone": ("DELETE FROM config", None),
+    "a mask beyond the frames": ("UPDATE inside.edge SET mask = mask | (1::BIGINT << 59)", "masks"),
+    "a mask of nodes beyond the frames": (
+        "UPDATE inside.node SET mask = mask | (1::BIGINT << 59)",
+        "masks",
+    ),
+    "a bucket": ("UPDATE inside.bucket SET valid = 1", "masks"),
+    "an edge from nobody": ("UPDATE inside.edge SET src = 9999 WHERE src >= 0", "references"),
+    "an edge to another kind": ("UPDATE inside.edge SET dst_kind = 'animal'", "references"),
+    "a lane that is not in the map": ("UPDATE inside.lane_state SET lane = -9999", "references"),
+    "an ego that is nobody": ("UPDATE inside.frame SET ego = 9999", "references"),
+    "settings that are gone": ("DELETE FROM inside.config", None),
     "a channel that is gone": (
-        "INSERT INTO payload SELECT bucket, bit, trace_id, 99, 0, 0, 0, 1 FROM frame",
+        "INSERT INTO inside.payload SELECT bucket, bit, trace_id, 99, 0, 0, 0, 1 FROM inside.frame",
         "references",
     ),
-    "a map that is changed": ("UPDATE map SET text = text || ' '", "map"),
-    "a lane of a map": ("UPDATE map_node SET x = x + 1 WHERE node_id = -2", "map"),
-    "an edge of a map to nowhere": ("UPDATE map_edge SET dst = -9999", "map"),
-    "a way along lanes to nowhere": ("UPDATE map_reach SET dst = -9999", "map"),
-    "a manifest that is gone": ("DELETE FROM manifest WHERE trace_id IS NOT NULL", "rows"),
-    "a trace that says otherwise": ("UPDATE trace SET frames = 7", "frames"),
+    "a map that is changed": ("UPDATE inside.map SET text = text || ' '", "map"),
+    "a lane of a map": ("UPDATE inside.map_node SET x = x + 1 WHERE node_id = -2", "map"),
+    "an edge of a map to nowhere": ("UPDATE inside.map_edge SET dst = -9999", "map"),
+    "a way along lanes to nowhere": ("UPDATE inside.map_reach SET dst = -9999", "map"),
+    "a manifest that is gone": ("DELETE FROM inside.manifest WHERE trace_id IS NOT NULL", "rows"),
+    "a trace that says otherwise": ("UPDATE inside.trace SET frames = 7", "frames"),
 }
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_a_change_is_found_and_named(store, what) -> None:
+def test_a_change_is_found_and_named(store: Any, what: Any) -> None:
     statement, check = CHANGES[what]
-    before = store.rows("SELECT count(*) FROM trace").values
+    before = store.rows("SELECT count(*) FROM inside.trace").values
 
     change(store, statement)
 
     found = faults(store)
-    assert store.rows("SELECT count(*) FROM trace").values == before
+    assert store.rows("SELECT count(*) FROM inside.trace").values == before
     if check is None:  # without its settings no trace is listed any more
         assert {fault.check for fault in found} == {"references"}
     else:
@@ -130,9 +139,9 @@ def test_a_change_is_found_and_named(store, what) -> None:
     assert all(fault.detail for fault in found)
 
 
-def test_a_fault_is_told_of_the_trace_that_has_it(store) -> None:
+def test_a_fault_is_told_of_the_trace_that_has_it(store: Any) -> None:
     trace_id = store.trace("two").trace_id
-    change(store, f"UPDATE state SET speed = 99 WHERE frame_id >> 24 = {trace_id}")
+    change(store, f"UPDATE inside.state SET speed = 99 WHERE frame_id >> 24 = {trace_id}")
 
     assert [(f.trace, f.check, f.detail) for f in faults(store)] == [
         ("two", "rows", "table state holds other values than were published")
@@ -140,13 +149,15 @@ def test_a_fault_is_told_of_the_trace_that_has_it(store) -> None:
 
 
 @pytest.mark.parametrize("step", [1, 2])
-def test_it_does_not_matter_in_what_pieces_a_store_is_read(store, monkeypatch, step) -> None:
+def test_it_does_not_matter_in_what_pieces_a_store_is_read(
+    store: Any, monkeypatch: pytest.MonkeyPatch, step: Any
+) -> None:
     monkeypatch.setattr(publishing, "STEP", step)
 
     assert faults(store) == []
 
 
-def test_a_file_that_is_damaged_is_told(tmp_path) -> None:
+def test_a_file_that_is_damaged_is_told(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     publish(store, RandomTrace(1, frames=600, path="one", moving=20))
     content = bytearray(store.path.read_bytes())
@@ -164,7 +175,7 @@ def test_a_file_that_is_damaged_is_told(tmp_path) -> None:
     assert told >= 6
 
 
-def test_recordings_are_hashed_again_where_that_is_asked_for(tmp_path) -> None:
+def test_recordings_are_hashed_again_where_that_is_asked_for(tmp_path: Path) -> None:
     paths = [
         drive(tmp_path / f"{name}.mcap", frames=n) for name, n in (("a", 4), ("b", 5), ("c", 6))
     ]
@@ -219,7 +230,7 @@ def test_values_that_differ_have_other_checksums() -> None:
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_there_is_one_zero_since_not_every_database_keeps_its_sign(kind) -> None:
+def test_there_is_one_zero_since_not_every_database_keeps_its_sign(kind: Any) -> None:
     zeros, other = np.array([0.0, -0.0], kind), np.array([-0.0, 0.0], kind)
 
     assert checksum(a=zeros, b=[1, 2]) == checksum(a=other, b=[1, 2])
@@ -247,14 +258,14 @@ def test_checksums_are_those_of_the_text_book() -> None:
     assert checksum(a=a, b=b) == Checksum(2, total & ((1 << 63) - 1))
 
 
-def test_removing_takes_everything_of_a_trace_and_its_checksums(store, tmp_path) -> None:
+def test_removing_takes_everything_of_a_trace_and_its_checksums(store: Any, tmp_path: Path) -> None:
     (gone,) = store.remove("one")
 
     low, high = gone.trace_id << 24, (gone.trace_id + 1) << 24
     for table in ("state", "lane_state"):
         sql = f"SELECT count(*) FROM {table} WHERE frame_id BETWEEN {low} AND {high}"
         assert store.rows(sql).values == [(0,)]
-    assert store.rows("SELECT DISTINCT trace_id FROM manifest").values == [
+    assert store.rows("SELECT DISTINCT trace_id FROM inside.manifest").values == [
         (store.trace("two").trace_id,)
     ]
     assert faults(store) == []

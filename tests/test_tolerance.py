@@ -42,11 +42,11 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Store, Stor
     with duckdb.connect(str(stores[1].file.path)) as connection:
         off = f"CAST(hash(frame_id) % {2 * JITTER_NS} AS BIGINT) - {JITTER_NS}"
         connection.execute(
-            f"UPDATE frame SET time_ns = time_ns + {off}, log_time_ns = log_time_ns + {off}"
+            f"UPDATE inside.frame SET time_ns = time_ns + {off}, log_time_ns = log_time_ns + {off}"
         )
         connection.execute(
-            "UPDATE trace SET start_ns = first, end_ns = last FROM (SELECT trace_id AS id,"
-            " min(time_ns) AS first, max(time_ns) AS last FROM frame GROUP BY 1) WHERE id = trace_id"
+            "UPDATE inside.trace SET start_ns = first, end_ns = last FROM (SELECT trace_id AS id,"
+            " min(time_ns) AS first, max(time_ns) AS last FROM inside.frame GROUP BY 1) WHERE id = trace_id"
         )
     even, odd = stores[0], sgstore.open(stores[1].file.path)
     with even.file.snapshot(), odd.file.snapshot():
@@ -153,7 +153,7 @@ def watched(speeds: list[float], times: list[int]) -> list[tuple[Any, ...]]:
     for speed, time_ns in zip(speeds, times, strict=True):
         frame = Frame(time_ns=time_ns, ego="ego")
         size = {"heading": 0.0, "length": 4.0, "width": 2.0}
-        frame.add("ego", "car", 0.0, 0.0, 0.0, **size, vx=speed, vy=0.0)
+        frame.add("ego", "car", 0.0, 0.0, 0.0, **size, vx=speed, vy=0.0)  # pyright: ignore[reportArgumentType]
         told += monitor.step(frame)
     verdicts = monitor.finish()
     events = [(e.kind, e.name, e.told.seq, e.start.seq, e.end.seq) for e in told]

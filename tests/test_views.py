@@ -19,6 +19,7 @@ from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 ROADS = map_stub(seed=1)
 TRACES = {
@@ -32,7 +33,7 @@ Edge = tuple[int, int, str, int]
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Iterator[StoreFile]:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreFile]:
     store = StoreFile.create(tmp_path_factory.mktemp("store") / "s.db")
     for name, trace in TRACES.items():
         assert publish(store, trace) == name
@@ -60,7 +61,7 @@ def all_frames(store: StoreFile) -> Iterator[tuple[int, RandomTrace, Any, int]]:
                 yield start + seq // BUCKET_FRAMES * 64 + seq % BUCKET_FRAMES, trace, graph, i
 
 
-def test_frames_are_those_that_were_appended(store) -> None:
+def test_frames_are_those_that_were_appended(store: Any) -> None:
     expected = [
         (frame, trace.info.path.stem, seq, time_ns, log_ns, None if ego < 0 else ego)
         for frame, trace, graph, i in all_frames(store)
@@ -78,13 +79,13 @@ def test_frames_are_those_that_were_appended(store) -> None:
     assert store.rows(sql).values == sorted(expected)
 
 
-def test_seconds_count_from_the_first_frame(store) -> None:
+def test_seconds_count_from_the_first_frame(store: Any) -> None:
     rows = store.rows("SELECT seq, t FROM frames WHERE trace = 'town' ORDER BY seq").values
 
     assert [t for _, t in rows] == pytest.approx([seq / 10 for seq, _ in rows])
 
 
-def test_frames_name_their_map(store) -> None:
+def test_frames_name_their_map(store: Any) -> None:
     rows = store.rows("SELECT DISTINCT trace, map FROM frames ORDER BY trace").values
 
     assert rows == [("again", "stub"), ("field", None), ("town", "stub")]
@@ -94,7 +95,7 @@ def kind_of(trace: RandomTrace, node: int) -> str:
     return KINDS[trace.kinds[node] if node >= 0 else trace.road_map.nodes.kind[-1 - node]]
 
 
-def test_nodes_are_states_and_what_is_present(store) -> None:
+def test_nodes_are_states_and_what_is_present(store: Any) -> None:
     sql = "SELECT frame_id, node_id, kind, is_ego, is_static FROM nodes"
     found = rows_by_frame(store, sql)
 
@@ -108,7 +109,7 @@ def test_nodes_are_states_and_what_is_present(store) -> None:
         assert found[frame] == Counter(expected)
 
 
-def test_states_are_kept_to_the_last_bit_of_a_short_float(store) -> None:
+def test_states_are_kept_to_the_last_bit_of_a_short_float(store: Any) -> None:
     names = ("vx", "vy", "ax", "ay", "length", "width", "height")
     sql = f"SELECT {', '.join(names)} FROM nodes WHERE frame_id = ? AND NOT is_static ORDER BY node_id"
 
@@ -126,7 +127,7 @@ def near(value: float) -> Any:
     return None if np.isnan(value) else pytest.approx(value, abs=1e-4, rel=1e-5)
 
 
-def test_attributes_come_out_in_the_units_of_people(store) -> None:
+def test_attributes_come_out_in_the_units_of_people(store: Any) -> None:
     sql = "SELECT * FROM nodes WHERE frame_id = ? AND NOT is_static ORDER BY node_id"
     for frame, trace, graph, i in list(all_frames(store))[::23]:
         states = graph.frames.states
@@ -174,14 +175,16 @@ def edges_of(trace: RandomTrace, graph: Any, i: int) -> set[tuple[int, str, int]
     return found | set(static_edges(trace, present))
 
 
-def test_edges_are_those_of_the_blocks_and_of_the_map_where_both_ends_are_present(store) -> None:
+def test_edges_are_those_of_the_blocks_and_of_the_map_where_both_ends_are_present(
+    store: Any,
+) -> None:
     found = rows_by_frame(store, "SELECT frame_id, src, relation, dst FROM edges")
 
     for frame, trace, graph, i in all_frames(store):
         assert found[frame] == Counter(edges_of(trace, graph, i))
 
 
-def test_edges_know_the_kinds_of_their_ends_and_whether_they_are_the_ego(store) -> None:
+def test_edges_know_the_kinds_of_their_ends_and_whether_they_are_the_ego(store: Any) -> None:
     sql = "SELECT frame_id, src, dst, src_kind, dst_kind, src_is_ego, dst_is_ego FROM edges"
     found = rows_by_frame(store, sql)
 
@@ -192,7 +195,7 @@ def test_edges_know_the_kinds_of_their_ends_and_whether_they_are_the_ego(store) 
             assert (src_is_ego, dst_is_ego) == (0 <= ego == src, 0 <= ego == dst)
 
 
-def test_lane_states_are_those_of_the_blocks_in_degrees(store) -> None:
+def test_lane_states_are_those_of_the_blocks_in_degrees(store: Any) -> None:
     found = rows_by_frame(store, "SELECT frame_id, src, dst, overlap, is_primary FROM lane_states")
     angles = store.rows("SELECT heading_error FROM lane_states").values
 
@@ -204,13 +207,13 @@ def test_lane_states_are_those_of_the_blocks_in_degrees(store) -> None:
     assert 30 < max(abs(angle) for (angle,) in angles) <= np.degrees(1)
 
 
-def test_each_lane_state_belongs_to_an_edge(store) -> None:
+def test_each_lane_state_belongs_to_an_edge(store: Any) -> None:
     sql = "SELECT count(*) FROM lane_states JOIN edges USING (frame_id, src, dst) WHERE relation = 'isIn'"
 
     assert store.rows(sql).values == store.rows("SELECT count(*) FROM lane_states").values
 
 
-def test_two_edges_joined_in_plain_sql_are_two_edges_of_one_frame(store) -> None:
+def test_two_edges_joined_in_plain_sql_are_two_edges_of_one_frame(store: Any) -> None:
     sql = """
       SELECT a.frame_id, a.src, a.dst, b.dst
       FROM edges a JOIN edges b ON b.frame_id = a.frame_id AND b.src = a.dst
@@ -236,14 +239,14 @@ def boxes(store: StoreFile, frame: int) -> tuple[list[int], Any]:
     sql = """
       SELECT node_id, x::DOUBLE, y::DOUBLE, z::DOUBLE, heading::DOUBLE, length::DOUBLE, width::DOUBLE,
              vx::DOUBLE, vy::DOUBLE
-      FROM state WHERE frame_id = ? ORDER BY node_id
+      FROM inside.state WHERE frame_id = ? ORDER BY node_id
     """
     rows = store.rows(sql, [frame]).values
     return [row[0] for row in rows], np.array([row[1:] for row in rows], float).reshape(-1, 8)
 
 
 @pytest.mark.parametrize("name", TRACES)
-def test_numbers_of_pairs_are_those_of_the_geometry(store, name) -> None:
+def test_numbers_of_pairs_are_those_of_the_geometry(store: Any, name: Any) -> None:
     for seq in range(0, TRACES[name].frames, 11):
         frame = frame_id(store, name, seq)
         nodes, states = boxes(store, frame)
@@ -278,7 +281,7 @@ def test_numbers_of_pairs_are_those_of_the_geometry(store, name) -> None:
     ],
 )
 def test_bearings_are_to_the_left_and_the_half_turn_is_positive(
-    tmp_path, other, bearing, rel_heading
+    tmp_path: Path, other: Any, bearing: Any, rel_heading: Any
 ) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     trace = RandomTrace(seed=11, frames=1)
@@ -293,7 +296,7 @@ def test_bearings_are_to_the_left_and_the_half_turn_is_positive(
     assert store.rows(sql).values[0] == pytest.approx((bearing, rel_heading), abs=1e-4)
 
 
-def test_lanes_are_those_of_the_map_once(store) -> None:
+def test_lanes_are_those_of_the_map_once(store: Any) -> None:
     rows = store.rows("SELECT map, node_id, name, road, lane, length FROM lanes").values
 
     is_lane = [i for i, kind in enumerate(ROADS.nodes.kind.tolist()) if KINDS[kind] == "lane"]
@@ -302,7 +305,7 @@ def test_lanes_are_those_of_the_map_once(store) -> None:
     )
 
 
-def test_entities_are_what_the_readers_said_once_a_trace(store) -> None:
+def test_entities_are_what_the_readers_said_once_a_trace(store: Any) -> None:
     rows = store.rows("SELECT node_id, ident, kind, subkind, is_static FROM entities").values
 
     assert Counter(rows) == Counter(
@@ -312,7 +315,7 @@ def test_entities_are_what_the_readers_said_once_a_trace(store) -> None:
     )
 
 
-def test_static_entities_have_their_pose_in_every_frame_that_they_are_in(store) -> None:
+def test_static_entities_have_their_pose_in_every_frame_that_they_are_in(store: Any) -> None:
     for name, trace in TRACES.items():
         scenery = trace.blocks[0].frames.scenery
         sql = """
@@ -326,7 +329,7 @@ def test_static_entities_have_their_pose_in_every_frame_that_they_are_in(store) 
 
 
 @pytest.mark.parametrize("name", TRACES)
-def test_a_graph_is_all_that_the_views_show_of_its_frame(store, name) -> None:
+def test_a_graph_is_all_that_the_views_show_of_its_frame(store: Any, name: Any) -> None:
     for seq in range(0, TRACES[name].frames, 13):
         frame = frame_id(store, name, seq)
         graph = store.graph(frame)
@@ -354,7 +357,7 @@ def test_a_graph_is_all_that_the_views_show_of_its_frame(store, name) -> None:
         assert graph.ego == (None if ego[seq % len(TRACES[name].blocks[0])] < 0 else 0)
 
 
-def test_a_mask_is_one_row_even_where_blocks_split_buckets(store) -> None:
+def test_a_mask_is_one_row_even_where_blocks_split_buckets(store: Any) -> None:
     for table, key in (
         ("edge", "relation, src, dst, src_is_ego, dst_is_ego, bucket"),
         ("node", "node_id, bucket"),
@@ -393,7 +396,7 @@ def scans(store: StoreFile, sql: str) -> list[tuple[str, str]]:
         ("SELECT * FROM payloads WHERE frame_id = {frame}", "frame", "{frame}"),
     ],
 )  # fmt: skip
-def test_filters_on_views_reach_the_scans(store, sql, table, filtered) -> None:
+def test_filters_on_views_reach_the_scans(store: Any, sql: Any, table: Any, filtered: Any) -> None:
     about = {"frame": frame_id(store, "town", 71), "kind": KINDS[TRACES["town"].kinds[1]]}
 
     found = scans(store, sql.format(**about))
@@ -402,7 +405,9 @@ def test_filters_on_views_reach_the_scans(store, sql, table, filtered) -> None:
 
 
 @pytest.mark.parametrize(("view", "table"), [("pairs", "state"), ("lane_dists", "lane_state")])
-def test_the_filter_on_the_frame_of_a_pair_reaches_both_sides(store, view, table) -> None:
+def test_the_filter_on_the_frame_of_a_pair_reaches_both_sides(
+    store: Any, view: Any, table: Any
+) -> None:
     frame = frame_id(store, "town", 71)
 
     found = scans(store, f"SELECT * FROM {view} WHERE frame_id = {frame}")
@@ -410,13 +415,13 @@ def test_the_filter_on_the_frame_of_a_pair_reaches_both_sides(store, view, table
     assert [str(frame) in filters for t, filters in found if t == table] == [True, True]
 
 
-def test_ways_of_the_ego_look_at_the_lanes_of_the_ego_only(store) -> None:
+def test_ways_of_the_ego_look_at_the_lanes_of_the_ego_only(store: Any) -> None:
     found = scans(store, "SELECT src, dst, lane_dist FROM lane_dists WHERE src_is_ego")
 
     assert sum("is_ego" in filters for table, filters in found if table == "lane_state") == 1
 
 
-def test_numbers_of_pairs_look_at_no_lanes(store) -> None:
+def test_numbers_of_pairs_look_at_no_lanes(store: Any) -> None:
     found = scans(store, "SELECT * FROM pairs WHERE src_is_ego")
 
     assert [table for table, _ in found] == ["state", "state"]

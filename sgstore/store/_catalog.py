@@ -79,11 +79,14 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
     among = _words(kinds)
     ends = f"src_kind IN ({among}) AND dst_kind IN ({among})"
     shadows = [
-        (table, f'SELECT * FROM main."{table}" WHERE relation IN ({_words(relations)}) AND {ends}')
+        (
+            table,
+            f'SELECT * FROM inside."{table}" WHERE relation IN ({_words(relations)}) AND {ends}',
+        )
         for table, relations in (("edge", of.moving), ("map_edge", of.lasting))
     ]
     shadows += [
-        (table, f'SELECT * FROM main."{table}" WHERE kind IN ({among})')
+        (table, f'SELECT * FROM inside."{table}" WHERE kind IN ({among})')
         for table in ("node", "state")
     ]
 
@@ -113,7 +116,7 @@ def _derived(
     reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
     word = literal(name)
     shadows = {
-        table: f'SELECT * FROM main."{table}" WHERE trace_id IN'
+        table: f'SELECT * FROM inside."{table}" WHERE trace_id IN'
         f" (SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
         for table in ("frame", "bucket")
     }
@@ -126,7 +129,7 @@ def _derived(
         f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = {word} AND NOT moves"
     )
     shadows["state"] = (
-        'SELECT s.* FROM main."state" AS s JOIN derived_node AS d'
+        'SELECT s.* FROM inside."state" AS s JOIN derived_node AS d'
         f" ON d.set_name = {word} AND d.moves AND d.bucket = s.frame_id >> 6 AND d.node_id = s.node_id"
         " AND (d.mask & (CAST(1 AS BIGINT) << CAST(s.frame_id & 63 AS INTEGER))) <> 0"
     )

@@ -160,7 +160,7 @@ class Abstracted:
             files, _ = staging.seal()
             with writing(self._access, staging.folder) as connection:
                 # Another process may have been faster, or have removed the trace.
-                if trace_id in _missing(connection, name, "store."):
+                if trace_id in _missing(connection, name, "store.inside."):
                     add_files(connection, staging, files)
                     note(connection, trace_id, [_LATER])
         finally:

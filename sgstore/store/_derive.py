@@ -342,7 +342,7 @@ class Building:
         files, _ = self._staging.seal()
         with writing(self._access, self._staging.folder) as connection:
             there = connection.execute(
-                "SELECT 1 FROM store.trace WHERE trace_id = ?", [self._trace_id]
+                "SELECT 1 FROM store.inside.trace WHERE trace_id = ?", [self._trace_id]
             ).fetchone()
             if there is None:
                 raise StoreError("the trace was removed from the store meanwhile")
@@ -350,7 +350,7 @@ class Building:
             shape.widen(connection, "store", self._staging.words(answers))
             add_files(connection, self._staging, files)
             connection.execute(
-                "INSERT INTO store.derived BY NAME SELECT $name AS name, $trace AS trace_id,"
+                "INSERT INTO store.inside.derived BY NAME SELECT $name AS name, $trace AS trace_id,"
                 " $settings AS settings, $digest AS digest, $answers AS answers,"
                 " $now AS derived_at, $version AS version",
                 {
@@ -368,7 +368,7 @@ class Building:
 
 def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
     connection.execute(
-        "DELETE FROM store.derived WHERE name = ? AND trace_id = ?", [name, trace_id]
+        "DELETE FROM store.inside.derived WHERE name = ? AND trace_id = ?", [name, trace_id]
     )
     for table, trace in (
         ("derived_node", "bucket >> 18"),
@@ -376,7 +376,7 @@ def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
         ("derived_gap", "frame_id >> 24"),
     ):
         connection.execute(
-            f"DELETE FROM store.{table} WHERE set_name = ? AND {trace} = ?", [name, trace_id]
+            f"DELETE FROM store.inside.{table} WHERE set_name = ? AND {trace} = ?", [name, trace_id]
         )
 
 

@@ -68,12 +68,12 @@ SELECT f.frame_id, u.* FROM {0} u LEFT JOIN frames f ON f.trace = CAST(u.trace A
 _BY_TIME: Final = """
 SELECT CASE WHEN u.":ns" <= f.until THEN f.frame_id END AS frame_id, u.* EXCLUDE (":ns")
 FROM (
-  SELECT u.*, {1} AS ":ns" FROM {0} u LEFT JOIN trace t ON t.name = CAST(u.trace AS VARCHAR)
+  SELECT u.*, {1} AS ":ns" FROM {0} u LEFT JOIN inside.trace t ON t.name = CAST(u.trace AS VARCHAR)
 ) u ASOF LEFT JOIN (
   SELECT t.name AS trace, f.frame_id, f.time_ns + coalesce(t.period_ns, 0) // 2 + {2} AS until,
          greatest(f.time_ns - coalesce(t.period_ns, 0) // 2 - {2},
                   (f.time_ns + lag(f.time_ns) OVER (PARTITION BY f.trace_id ORDER BY f.seq) + 1) // 2) AS since
-  FROM frame f JOIN trace t ON t.trace_id = f.trace_id
+  FROM inside.frame f JOIN trace t ON t.trace_id = f.trace_id
 ) f ON f.trace = CAST(u.trace AS VARCHAR) AND u.":ns" >= f.since
 """
 _NANOSECONDS: Final = {
@@ -232,7 +232,7 @@ class UserTables:
             if table.key:
                 sql = (
                     "SELECT count(*), count(f.frame_id), count(DISTINCT f.frame_id)"
-                    f' FROM "{table.name}" u LEFT JOIN frame f ON f.frame_id = u.frame_id'
+                    f' FROM "{table.name}" u LEFT JOIN inside.frame f ON f.frame_id = u.frame_id'
                 )
                 found[table.name] = JoinedTable(*connection.execute(sql).fetchall()[0])
         return found

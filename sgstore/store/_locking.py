@@ -423,6 +423,8 @@ class Access:
                     self._check(door.instance)
                     door.checked = True
                 connection = door.instance.cursor()
+                if self._checked:
+                    connection.execute(f"USE {shape.INSIDE}")  # a cursor does not inherit it
             except BaseException:
                 self._close_unused()
                 raise

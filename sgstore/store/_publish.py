@@ -93,11 +93,11 @@ def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
 def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -> str:
     """Copy the files of a trace into the attached store; the name of the trace there."""
     identity = sealed.identity
-    taken = connection.execute("SELECT name FROM store.trace").fetchall()
-    if not replace and already_stored(connection, identity, catalog="store."):
-        name = stored_name(connection, identity, catalog="store.")
+    taken = connection.execute("SELECT name FROM store.inside.trace").fetchall()
+    if not replace and already_stored(connection, identity, catalog="store.inside."):
+        name = stored_name(connection, identity, catalog="store.inside.")
         raise StoreError(f"{sealed.path}: came into the store meanwhile, as {name!r}")
-    name = stored_name(connection, identity, catalog="store.")
+    name = stored_name(connection, identity, catalog="store.inside.")
     if name is None:
         name = free_name(plain(sealed.path.stem), {name for (name,) in taken})
     else:
@@ -126,7 +126,7 @@ def _insert(
         # Reading takes a pattern, and a folder may be called anything.
         file = literal(escape(str(sealed.folder / name)))
         connection.execute(
-            f"INSERT INTO store.{table} BY NAME {select} FROM read_parquet({file})", values
+            f"INSERT INTO store.inside.{table} BY NAME {select} FROM read_parquet({file})", values
         )
 
 
@@ -140,20 +140,20 @@ def _note(
     """Take down the checksums of what was inserted."""
     for table, checksum in checksums.items():
         connection.execute(
-            "INSERT INTO store.manifest VALUES (?, ?, ?, ?, ?)",
+            "INSERT INTO store.inside.manifest VALUES (?, ?, ?, ?, ?)",
             [trace_id, map_id, table, checksum.rows, checksum.value],
         )
 
 
 def _config_id(connection: DuckDBPyConnection, identity: Identity) -> int:
     """The number of the settings in the store, where they are now if they were not before."""
-    rows = connection.execute("SELECT config_id, digest FROM store.config").fetchall()
+    rows = connection.execute("SELECT config_id, digest FROM store.inside.config").fetchall()
     for number, digest in rows:
         if digest == identity.settings_digest:
             return number
     new = max((number for number, _ in rows), default=0) + 1
     connection.execute(
-        "INSERT INTO store.config VALUES (?, ?, ?)",
+        "INSERT INTO store.inside.config VALUES (?, ?, ?)",
         [new, identity.settings_digest, identity.settings],
     )
     return new
@@ -164,7 +164,7 @@ def _map_id(connection: DuckDBPyConnection, sealed: Sealed) -> int | None:
     digest = sealed.identity.map_digest
     if not digest:
         return None
-    rows = connection.execute("SELECT map_id, digest, name FROM store.map").fetchall()
+    rows = connection.execute("SELECT map_id, digest, name FROM store.inside.map").fetchall()
     for number, known, _ in rows:
         if known == digest:
             return number
@@ -186,12 +186,14 @@ _OWNED: Final = {
 """Column → condition on the rows of a trace; of a table that has several, the first counts."""
 
 _ORPHANS: Final = """
-DELETE FROM store.config WHERE config_id NOT IN (SELECT config_id FROM store.trace);
-DELETE FROM store.map WHERE map_id NOT IN (SELECT map_id FROM store.trace WHERE map_id IS NOT NULL);
-DELETE FROM store.map_node WHERE map_id NOT IN (SELECT map_id FROM store.map);
-DELETE FROM store.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.map);
-DELETE FROM store.map_reach WHERE map_id NOT IN (SELECT map_id FROM store.map);
-DELETE FROM store.manifest WHERE map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM store.map);
+DELETE FROM store.inside.config WHERE config_id NOT IN (SELECT config_id FROM store.inside.trace);
+DELETE FROM store.inside.map
+WHERE map_id NOT IN (SELECT map_id FROM store.inside.trace WHERE map_id IS NOT NULL);
+DELETE FROM store.inside.map_node WHERE map_id NOT IN (SELECT map_id FROM store.inside.map);
+DELETE FROM store.inside.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.inside.map);
+DELETE FROM store.inside.map_reach WHERE map_id NOT IN (SELECT map_id FROM store.inside.map);
+DELETE FROM store.inside.manifest
+WHERE map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM store.inside.map);
 """
 
 
@@ -200,7 +202,7 @@ def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, 
     rows = connection.execute(
         """
         SELECT table_name, list(column_name) FROM duckdb_columns()
-        WHERE database_name = $1 AND schema_name = 'main' AND list_contains($2, table_name)
+        WHERE database_name = $1 AND schema_name = 'inside' AND list_contains($2, table_name)
         GROUP BY table_name ORDER BY table_name
         """,
         [database, [*shape.expected().tables]],  # others may have tables of their own there
@@ -219,24 +221,27 @@ def remove(connection: DuckDBPyConnection, trace_id: int) -> None:
 
 def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
     for table, condition in list(owned(connection, "store")):
-        connection.execute(f"DELETE FROM store.{table} WHERE {condition}", {"trace_id": trace_id})
+        connection.execute(
+            f"DELETE FROM store.inside.{table} WHERE {condition}", {"trace_id": trace_id}
+        )
 
 
 _SORTED: Final = {
-    "state": "SELECT * FROM store.state ORDER BY is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
-    "lane_state": "SELECT * FROM store.lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
-    "lane_gap": "SELECT * FROM store.lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
-    "node": "SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM store.node GROUP BY ALL ORDER BY ALL",
+    "state": "SELECT * FROM store.inside.state ORDER BY is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
+    "lane_state": "SELECT * FROM store.inside.lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
+    "lane_gap": "SELECT * FROM store.inside.lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
+    "node": """
+SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM store.inside.node GROUP BY ALL ORDER BY ALL""",
     "edge": """
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
-FROM store.edge GROUP BY ALL ORDER BY ALL""",
-    "frame": "SELECT * FROM store.frame ORDER BY frame_id",
-    "frame_class": "SELECT * FROM store.frame_class ORDER BY ALL",
-    "lane_role": "SELECT * FROM store.lane_role ORDER BY ALL",
-    "later_class": "SELECT * FROM store.later_class ORDER BY ALL",
-    "derived_node": "SELECT * FROM store.derived_node ORDER BY ALL",
-    "derived_edge": "SELECT * FROM store.derived_edge ORDER BY ALL",
-    "derived_gap": "SELECT * FROM store.derived_gap ORDER BY ALL",
+FROM store.inside.edge GROUP BY ALL ORDER BY ALL""",
+    "frame": "SELECT * FROM store.inside.frame ORDER BY frame_id",
+    "frame_class": "SELECT * FROM store.inside.frame_class ORDER BY ALL",
+    "lane_role": "SELECT * FROM store.inside.lane_role ORDER BY ALL",
+    "later_class": "SELECT * FROM store.inside.later_class ORDER BY ALL",
+    "derived_node": "SELECT * FROM store.inside.derived_node ORDER BY ALL",
+    "derived_edge": "SELECT * FROM store.inside.derived_edge ORDER BY ALL",
+    "derived_gap": "SELECT * FROM store.inside.derived_gap ORDER BY ALL",
 }
 """The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
 
@@ -249,9 +254,9 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
     words = {enum: shape.labels_of(connection, "store", enum) for enum in NAMES}
     shape.widen(connection, "fresh", words)
     for (table,) in tables:
-        select = _SORTED.get(table, f"SELECT * FROM store.{table}")
-        connection.execute(f"DELETE FROM fresh.{table}")
-        connection.execute(f"INSERT INTO fresh.{table} BY NAME {select}")
+        select = _SORTED.get(table, f"SELECT * FROM store.inside.{table}")
+        connection.execute(f"DELETE FROM fresh.inside.{table}")
+        connection.execute(f"INSERT INTO fresh.inside.{table} BY NAME {select}")
 
 
 # What is added to traces that are in a store already: built aside, brought in by one transaction, noted ----
@@ -275,22 +280,23 @@ def add_files(
         for name in names:
             file = literal(escape(str(staging.folder / name)))
             connection.execute(
-                f"INSERT INTO store.{table} BY NAME SELECT * FROM read_parquet({file})"
+                f"INSERT INTO store.inside.{table} BY NAME SELECT * FROM read_parquet({file})"
             )
 
 
 def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -> None:
     """Take down what a trace has now in tables that change after it was published."""
-    sql = "SELECT frames FROM store.trace WHERE trace_id = ?"
+    sql = "SELECT frames FROM store.inside.trace WHERE trace_id = ?"
     frames = sum(n for (n,) in connection.execute(sql, [trace_id]).fetchall())
     for table in tables:
         checksum = checksum_of(connection, "store", table, trace_id, frames)
         connection.execute(
-            'DELETE FROM store.manifest WHERE trace_id = ? AND "table" = ?', [trace_id, table]
+            'DELETE FROM store.inside.manifest WHERE trace_id = ? AND "table" = ?',
+            [trace_id, table],
         )
         if checksum.rows:
             connection.execute(
-                "INSERT INTO store.manifest VALUES (?, NULL, ?, ?, ?)",
+                "INSERT INTO store.inside.manifest VALUES (?, NULL, ?, ?, ?)",
                 [trace_id, table, checksum.rows, checksum.value],
             )
 
@@ -303,7 +309,7 @@ def checksum_of(
     select = expressions(connection, table, database)
     for condition, values in _ranges(connection, database, table, trace_id, frames):
         rows = connection.execute(
-            f"SELECT {select} FROM {quoted(database)}.main.{table} WHERE {condition}", values
+            f"SELECT {select} FROM {quoted(database)}.inside.{table} WHERE {condition}", values
         )
         checksum.add(rows.fetchnumpy())
     return checksum

@@ -156,11 +156,12 @@ class _TableReader:
         self._connection = connection
         self._database = database
         self._path = path
+        self._schema = shape.schema_of(connection, database)
         self._tables = set(
             connection.execute(
                 "SELECT table_name FROM system.main.duckdb_tables()"
-                " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
-                [database],
+                " WHERE database_name = ? AND schema_name = ? AND internal = false",
+                [database, self._schema],
             ).fetchall()
         )
 
@@ -183,7 +184,7 @@ class _TableReader:
         names = columns.split()
         listed = ", ".join(map(quoted, names))
         found = self._connection.execute(
-            f"{how} {listed} FROM {quoted(self._database)}.main.{quoted(table)}"
+            f"{how} {listed} FROM {quoted(self._database)}.{self._schema}.{quoted(table)}"
         )
         return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
@@ -368,16 +369,20 @@ def named_as(path: Path, old: Remains) -> None:
     with scratch(spill_folder()) as connection, access.writing(connection):
         for trace in old.traces:
             connection.execute(
-                "UPDATE store.trace SET name = ? WHERE trace_id = ?", [trace.name, trace.trace_id]
+                "UPDATE store.inside.trace SET name = ? WHERE trace_id = ?",
+                [trace.name, trace.trace_id],
             )
         named = {one.digest: one.name for one in old.maps.values()}
         if len(set(named.values())) == len(named):
-            held = connection.execute("SELECT map_id, digest, name FROM store.map").fetchall()
+            held = connection.execute(
+                "SELECT map_id, digest, name FROM store.inside.map"
+            ).fetchall()
             others = {name for _, digest, name in held if digest not in named}
             for map_id, digest, _ in held:
                 if digest in named and named[digest] not in others:
                     connection.execute(
-                        "UPDATE store.map SET name = ? WHERE map_id = ?", [named[digest], map_id]
+                        "UPDATE store.inside.map SET name = ? WHERE map_id = ?",
+                        [named[digest], map_id],
                     )
 
 

@@ -363,6 +363,7 @@ def user_statement(
     SqlError
         It is not one statement that only reads, the database refuses it, or it runs for too long.
     """
+    connection.execute("USE main")  # the views alone
     with _refused(sql, timeout_s):
         _check(connection, sql)
     with _interrupted_after(connection, timeout_s), _refused(sql, timeout_s):

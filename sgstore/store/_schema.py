@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     Tokens = tuple[str, ...]
 
 
+INSIDE: Final = "inside"
+"""Schema of the tables of a store; the public views, and the types of their columns, are in ``main``."""
+
 _VIEWS: Final = "-- The public views "
 """Where the views begin in ``schema.sql``."""
 
@@ -114,7 +117,7 @@ def expected(*wider: tuple[str, Tokens]) -> Shape:
         elif words[:2] == ("CREATE", "TABLE"):
             tables[words[2]] = words
         elif words[:2] == ("CREATE", "VIEW"):
-            views[words[2]] = " ".join(words[4:])
+            views[words[4]] = " ".join(words[6:])
     types |= dict(wider)
     written = {name: tuple(_with_types(words, types)) for name, words in tables.items()}
     return Shape(written, types, views)
@@ -198,13 +201,20 @@ def _about(connection: DuckDBPyConnection, database: str, path: Path) -> dict[st
 
 def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str] | None:
     """Read version and digest of a store's schema from it; ``None`` if it is no store."""
-    made = _made(connection, "tables", database).get("store_info")
+    schema = schema_of(connection, database)
+    made = _made(connection, "tables", database, schema).get("store_info")
     if made is None:
         return None
     if _bare(made) != _bare(expected().tables["store_info"]):
         return {}  # whatever it is, it is not read
-    rows = connection.execute(f"SELECT key, value FROM {quoted(database)}.main.store_info")
+    rows = connection.execute(f"SELECT key, value FROM {quoted(database)}.{schema}.store_info")
     return {str(key): str(value) for key, value in rows.fetchall()}
+
+
+def schema_of(connection: DuckDBPyConnection, database: str) -> str:
+    """Return the schema in which a store has its tables: stores of before have them among the views."""
+    there = _made(connection, "tables", database, INSIDE)
+    return INSIDE if "store_info" in there else "main"
 
 
 def other_version(about: dict[str, str]) -> str:
@@ -236,12 +246,14 @@ def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
         if some[: len(own_labels(enum))] == own_labels(enum)
     ]
     shape = expected(*wider)
-    tables, views, types = (
-        _made(connection, what, database) for what in ("tables", "views", "types")
-    )
-    found = [*_differing("table", shape.tables, tables, views)]
-    found += _differing("view", _expected_views(connection), views, tables)
+    tables = _made(connection, "tables", database, INSIDE)
+    views, types = (_made(connection, what, database, "main") for what in ("views", "types"))
+    instead = _made(connection, "views", database, INSIDE)
+    found = [*_differing("table", shape.tables, tables, instead)]
+    instead = _made(connection, "tables", database, "main")
+    found += _differing("view", _expected_views(connection), views, instead)
     found += _differing("type", shape.types, types, {})
+    found += _misplaced(connection, database, shape)
     found += _shadowing(connection, database)
     found += _attached(connection, database, shape)
     return found or [*_strange(labels)]
@@ -260,8 +272,8 @@ def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple
     """Return the values of an enumeration of a store, by their codes there; none if there is no such type."""
     rows = connection.execute(
         "SELECT labels FROM system.main.duckdb_types() WHERE database_name = ?"
-        " AND schema_name = 'main' AND type_name = ? AND internal = false",
-        [database, enum],
+        " AND schema_name = ? AND type_name = ? AND internal = false",
+        [database, "main", enum],
     ).fetchall()
     return tuple(rows[0][0] or ()) if rows else ()
 
@@ -276,7 +288,7 @@ def widen(
     connection: DuckDBPyConnection, database: str, names: Mapping[str, Iterable[str]]
 ) -> None:
     """Let the enumerations of a database that is attached hold these values, too."""
-    main = f"{quoted(database)}.main"
+    inside = f"{quoted(database)}.{INSIDE}"
     for enum, wanted in names.items():
         labels = labels_of(connection, database, enum)
         new = [name for name in dict.fromkeys(wanted) if name not in labels]
@@ -285,9 +297,9 @@ def widen(
         wider = _enum((*labels, *new))
         for table in expected().tables:
             for column in (name for name, what in enums_of(table).items() if what == enum):
-                connection.execute(f"ALTER TABLE {main}.{table} ALTER {column} TYPE {wider}")
-        connection.execute(f"DROP TYPE {main}.{enum}")
-        connection.execute(f"CREATE TYPE {main}.{enum} AS {wider}")
+                connection.execute(f"ALTER TABLE {inside}.{table} ALTER {column} TYPE {wider}")
+        connection.execute(f"DROP TYPE {quoted(database)}.main.{enum}")
+        connection.execute(f"CREATE TYPE {quoted(database)}.main.{enum} AS {wider}")
 
 
 @cache
@@ -324,8 +336,18 @@ def _strange(labels: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
 
 def others(connection: DuckDBPyConnection, database: str) -> list[str]:
     """Tables and views in a store that are none of ours, sorted."""
-    shape = expected()
-    ours = {("main", name) for name in (*shape.tables, *shape.views)}
+    schema = schema_of(connection, database)
+    ours = {(schema, name) for name in expected().tables}
+    ours |= {("main", name) for name in expected().views}
+    return sorted(
+        name if schema == "main" else f"{schema}.{name}"
+        for schema, name in _all(connection, database)
+        if (schema, name.lower()) not in ours
+    )
+
+
+def _all(connection: DuckDBPyConnection, database: str) -> list[tuple[str, str]]:
+    """The schemas and names of all tables and views."""
     rows: list[tuple[str, str]] = []
     for what, column in (("tables", "table_name"), ("views", "view_name")):
         rows += connection.execute(
@@ -333,11 +355,7 @@ def others(connection: DuckDBPyConnection, database: str) -> list[str]:
             " WHERE database_name = ? AND internal = false",
             [database],
         ).fetchall()
-    return sorted(
-        name if schema == "main" else f"{schema}.{name}"
-        for schema, name in rows
-        if (schema, name.lower()) not in ours
-    )
+    return rows
 
 
 # Words ------------------------------------------------------------------------------------------------------
@@ -377,8 +395,9 @@ def _words(sql: str) -> list[str]:
 
 @lru_cache(maxsize=256)
 def _statement(sql: str) -> Tokens:
-    """A statement as words; those of one store are mostly those of the next."""
-    return tuple(_words(sql))
+    """A statement as words, without the schema; those of one store are mostly those of the next."""
+    words = _words(sql)
+    return tuple(words[:2] + words[4:] if words[3:4] == ["."] else words)
 
 
 def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
@@ -399,20 +418,22 @@ def _bare(words: Tokens) -> Tokens:
 # What is there ----------------------------------------------------------------------------------------------
 
 
-def _made(connection: DuckDBPyConnection, what: str, database: str) -> dict[str, Tokens]:
-    """The tables, views or types of the main schema, by their names in small letters."""
+def _made(
+    connection: DuckDBPyConnection, what: str, database: str, schema: str
+) -> dict[str, Tokens]:
+    """The tables, views or types of a schema, by their names in small letters."""
     if what == "types":
         rows = connection.execute(
             "SELECT type_name, labels FROM system.main.duckdb_types()"
-            " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
-            [database],
+            " WHERE database_name = ? AND schema_name = ? AND internal = false",
+            [database, schema],
         ).fetchall()
         return {name: tuple(_words(_enum(labels or ()))) for name, labels in rows}
     one = what[:-1]
     rows = connection.execute(
         f"SELECT {one}_name, sql FROM system.main.duckdb_{what}()"
-        " WHERE database_name = ? AND schema_name = 'main' AND internal = false",
-        [database],
+        " WHERE database_name = ? AND schema_name = ? AND internal = false",
+        [database, schema],
     ).fetchall()
     return {name.lower(): _statement((sql or "").rstrip().removesuffix(";")) for name, sql in rows}
 
@@ -440,6 +461,16 @@ def _differing(
             yield f"{what} {name!r} is {gone}"
         elif found != words:
             yield f"{what} {name!r} is not the one that sgstore makes"
+
+
+def _misplaced(connection: DuckDBPyConnection, database: str, shape: Shape) -> Iterator[str]:
+    """Tables and views of somebody else's that are called like ours and would be found in their place."""
+    for schema, name in sorted(_all(connection, database)):
+        ours = {"main": shape.tables, INSIDE: shape.views}.get(schema, {})
+        if name.lower() in ours:
+            yield f"{schema}.{name} takes the place of {'a table' if schema == 'main' else 'a view'}"
+    for name in sorted(_made(connection, "types", database, INSIDE)):
+        yield f"{INSIDE}.{name} takes the place of a type"
 
 
 def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
@@ -478,7 +509,7 @@ def _attached(connection: DuckDBPyConnection, database: str, shape: Shape) -> It
         except duckdb.CatalogException:  # DuckDB 1.5 has no triggers, and reads no store that has
             continue
         for schema, table, name in rows:
-            if schema == "main" and table.lower() in (*shape.tables, *shape.views):
+            if schema in {"main", INSIDE} and table.lower() in (*shape.tables, *shape.views):
                 yield f"table {table!r} has the {what} {name!r}"
 
 

@@ -23,6 +23,7 @@ from sgstore.quoting import literal, quoted
 from sgstore.store._locking import Folder, memory_setting, translated
 from sgstore.store._packing import MISSING
 from sgstore.store._schema import (
+    INSIDE,
     code_sql,
     database_of,
     enums_of,
@@ -103,7 +104,7 @@ def columns_of(
     connection: DuckDBPyConnection, table: str, catalog: str = ""
 ) -> list[tuple[str, str]]:
     """Names and types of the columns of a table of the schema; ``duckdb_columns()`` would bind every view."""
-    place = f"{quoted(catalog)}.main" if catalog else "main"
+    place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
     rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
     return [(name, kind) for name, kind, *_ in rows]
 
