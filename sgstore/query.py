@@ -44,6 +44,7 @@ def open(
     memory: int = 0,
     tables: Mapping[str, object] | None = None,
     max_spill: int = 0,
+    root: str | Path | None = None,
 ) -> Store:
     """Open a store; parameters and errors are those of :class:`Store`.
 
@@ -52,7 +53,7 @@ def open(
         with sgstore.open("drives.sgstore", create=True) as store:
             store.ingest("recordings/")
     """
-    return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill)
+    return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root)
 
 
 class Store:
@@ -73,6 +74,9 @@ class Store:
         or data frames of pandas, polars, pyarrow.
     max_spill : int
         Most that a question may put on disk where memory does not suffice; bytes. 0: 10 GB.
+    root : str or Path, optional
+        Folder to which the data set was moved: recordings are looked for in it by the ends of their paths. By
+        default the variable ``SGSTORE_ROOT`` of the environment.
 
     Raises
     ------
@@ -92,6 +96,7 @@ class Store:
         memory: int = 0,
         tables: Mapping[str, object] | UserTables | None = None,
         max_spill: int = 0,
+        root: str | Path | None = None,
     ) -> None:
         if create and not Path(path).exists():
             StoreFile.create(path)
@@ -100,6 +105,7 @@ class Store:
             memory=memory,
             spill=max_spill,
             tables=tables if isinstance(tables, UserTables) else UserTables(tables or {}),
+            root=root,
         )
         self._held: tuple[tuple[int, ...], Catalog] | None = None
 

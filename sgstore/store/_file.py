@@ -35,6 +35,7 @@ from sgstore.store._traces import (
     StoredTrace,
     already_stored,
     frame_named,
+    located,
     stored_name,
     stored_traces,
     trace_named,
@@ -86,6 +87,8 @@ class StoreFile:
         Most that the temporary files of a question take; bytes. 0: 10 GB.
     tables : UserTables, optional
         Tables of users' own that are seen beside its views.
+    root : str or Path, optional
+        Where the recordings of the data set are now; see :func:`sgstore.store._traces.located`.
 
     Raises
     ------
@@ -102,6 +105,7 @@ class StoreFile:
         wait_s: float = WAIT_S,
         tables: UserTables | None = None,
         spill: int = 0,
+        root: str | Path | None = None,
     ) -> None:
         self.path = Path(path)
         self.tables = tables
@@ -109,6 +113,7 @@ class StoreFile:
         self.access = Access(
             self.path, memory=most, wait_s=wait_s, tables=tables, spill=spill, diagnose=_damage
         )
+        self.access.root = root
         self._graphs = Graphs()
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
@@ -298,7 +303,7 @@ class StoreFile:
     def traces(self) -> tuple[StoredTrace, ...]:
         """All traces, in the order in which they came."""
         with self._reading() as connection:
-            return stored_traces(connection)
+            return stored_traces(connection, self.access.root)
 
     def trace(self, ref: int | str) -> StoredTrace:
         """A trace by its name, its id, or a unique beginning of its name.
@@ -310,7 +315,9 @@ class StoreFile:
         """
         with self._reading() as connection:
             trace_id, _ = trace_named(connection, str(ref))
-            found = [t for t in stored_traces(connection) if t.trace_id == trace_id]
+            found = [
+                t for t in stored_traces(connection, self.access.root) if t.trace_id == trace_id
+            ]
             if not found:
                 raise StoreError(
                     f"{self.path}: the settings of {ref!r} are gone; see 'sgstore verify'"
@@ -446,12 +453,12 @@ class StoreFile:
         """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
         from sgstore.mcap import digest_of, mark_of
 
-        path = Path(uri)
+        path = located(uri, size, self.access.root)
         try:
-            mark = (uri, *mark_of(path))
+            mark = (str(path), *mark_of(path))
         except OSError as error:
             raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
-        if mark != (uri, size, mtime_ns) and mark not in self._seen:
+        if mark[1:] != (size, mtime_ns) and mark not in self._seen:
             if mark[1] != size or digest_of(path) != digest:
                 raise TraceError("not the file that was ingested; ingest it anew", path=path)
             self._seen.add(mark)

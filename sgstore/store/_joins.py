@@ -73,7 +73,7 @@ FROM (
   SELECT t.name AS trace, f.frame_id, f.time_ns + coalesce(t.period_ns, 0) // 2 + {2} AS until,
          greatest(f.time_ns - coalesce(t.period_ns, 0) // 2 - {2},
                   (f.time_ns + lag(f.time_ns) OVER (PARTITION BY f.trace_id ORDER BY f.seq) + 1) // 2) AS since
-  FROM inside.frame f JOIN trace t ON t.trace_id = f.trace_id
+  FROM inside.frame f JOIN inside.trace t ON t.trace_id = f.trace_id
 ) f ON f.trace = CAST(u.trace AS VARCHAR) AND u.":ns" >= f.since
 """
 _NANOSECONDS: Final = {

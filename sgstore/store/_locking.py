@@ -317,6 +317,11 @@ class Access:
     diagnose : callable, optional
         Returns what is wrong with the store, empty if nothing is. It is asked where our own code could make
         nothing of what it read.
+
+    Attributes
+    ----------
+    root : str, Path or None
+        Where the recordings of the data set are now; see :func:`sgstore.store._traces.located`.
     """
 
     def __init__(
@@ -331,6 +336,7 @@ class Access:
         diagnose: Callable[[DuckDBPyConnection, Path], str] | None = None,
     ) -> None:
         self.path = path
+        self.root: str | Path | None = None
         self._checked = checked
         self._diagnose = diagnose
         self._tables = tables

@@ -14,7 +14,6 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
@@ -34,8 +33,11 @@ from sgstore.store._locking import (
 from sgstore.store._publish import copy_sorted
 from sgstore.store._schema import SCHEMA_VERSION, schema_digest, schema_sql
 from sgstore.store._staging import scratch
+from sgstore.store._traces import located
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from duckdb import DuckDBPyConnection
 
 
@@ -216,7 +218,7 @@ def _trace(row: dict[str, Any], settings: dict[int, dict[str, Any]]) -> OldTrace
     return OldTrace(
         trace_id=int(row["trace_id"]),
         name=_text(row["name"]),
-        path=Path(_text(row["uri"])),
+        path=located(_text(row["uri"]), int(row["size"])),
         size=int(row["size"]),
         mtime_ns=int(row["mtime_ns"]),
         digest=_text(row["digest"]),

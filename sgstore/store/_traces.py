@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.errors import StoreError
+from sgstore.errors import SgstoreError, StoreError
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store._rows import run
 from sgstore.vocabulary import natural, suggestion
@@ -109,7 +111,7 @@ class StoredTrace:
     name : str
         Unique in its store.
     path : Path
-        The recording, when it was ingested.
+        The recording: where it was ingested, or beneath the root of the data set.
     size, mtime_ns : int
         Of the recording then.
     digest, flavour, ego : str
@@ -200,14 +202,46 @@ FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map
 """
 
 
-def stored_traces(connection: DuckDBPyConnection) -> tuple[StoredTrace, ...]:
-    """All traces of a store, by name in natural order."""
+ROOT: Final = "SGSTORE_ROOT"
+"""Variable of the environment: a folder in which recordings are looked for first."""
+
+
+def located(uri: str, size: int, root: str | Path | None = None) -> Path:
+    """The place of a recording now: beneath the root if it is found there, else where it was ingested.
+
+    Parameters
+    ----------
+    uri : str
+        Where it was ingested: ``/data/town/a.mcap``.
+    size : int
+        Of the recording; another one of the same name is passed over.
+    root : str or Path, optional
+        Where the data set is now; by default what :data:`ROOT` says. It may stand for any of the folders on the
+        way: ``ROOT/data/town/a.mcap``, ``ROOT/town/a.mcap`` and ``ROOT/a.mcap`` are looked at, in this order.
+    """
+    from sgstore.mcap import mark_of
+
+    path, root = Path(uri), root or os.environ.get(ROOT)
+    parts = path.parts[1:] if path.is_absolute() else path.parts
+    if root and ".." not in parts:
+        for first in range(len(parts)):
+            with suppress(OSError, SgstoreError):
+                found = Path(root, *parts[first:]).resolve()
+                if mark_of(found)[0] == size:
+                    return found
+    return path
+
+
+def stored_traces(
+    connection: DuckDBPyConnection, root: str | Path | None = None
+) -> tuple[StoredTrace, ...]:
+    """All traces of a store, by name in natural order; ``root`` as :func:`located` takes it."""
     found = run(connection, _TRACES).dicts()
     texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
     try:
         settings = {config_id: _object(text) for config_id, text in texts}
         for row in found:
-            row["path"] = Path(row["path"])
+            row["path"] = located(row["path"], row["size"], root)
             row["answers"] = tuple(map(str, row["answers"]))
             row["report"] = _object(row["report"])
             row["settings"] = settings[row.pop("config_id")]

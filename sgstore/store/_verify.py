@@ -248,7 +248,7 @@ def verify_store(access: Access, *, recordings: bool = False) -> Verification:
     with access.reading() as connection:
         found = verify(connection, access.path)
         if recordings:
-            again = verify_recordings(connection, digest_of)
+            again = verify_recordings(connection, digest_of, access.root)
             found.recordings = again.recordings
             found.faults += again.faults
     return found
@@ -317,12 +317,15 @@ def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
 
 
 def verify_recordings(
-    connection: DuckDBPyConnection, digest_of: Callable[[Path], str]
+    connection: DuckDBPyConnection,
+    digest_of: Callable[[Path], str],
+    root: str | Path | None = None,
 ) -> Verification:
     """Hash the recordings of all traces again."""
     found = Verification()
     known: dict[Path, str | SgstoreError] = {}
-    for trace in stored_traces(connection):
+    traces = stored_traces(connection, root)
+    for trace in traces:
         if trace.path not in known:
             try:
                 known[trace.path] = digest_of(trace.path)
@@ -334,7 +337,7 @@ def verify_recordings(
         elif digest != trace.digest:
             reason = f"{trace.path}: not the file that was ingested; ingest it anew"
             found.faults.append(Fault(trace.name, "payloads", reason))
-    found.traces, found.recordings = len(stored_traces(connection)), len(known)
+    found.traces, found.recordings = len(traces), len(known)
     return found
 
 
