@@ -64,9 +64,9 @@ def same(derived: Any, name: Any, ingested: Any) -> None:
     assert made == set(ingested.sql(EDGES).values)
     assert made
     assert set(derived.sql(DERIVED_NODES.format(name)).values) == set(ingested.sql(NODES).values)
-    gaps = "SELECT frame_id, src, dst, gap FROM "
-    kept = derived.sql(f"{gaps} derived_gap WHERE set_name = '{name}'").values
-    assert set(kept) == set(ingested.sql(f"{gaps} lane_gap").values)
+    gaps = "SELECT frame_id, src, dst, gap FROM inside."
+    kept = derived.sql(f"{gaps}derived_gap WHERE set_name = '{name}'").values
+    assert set(kept) == set(ingested.sql(f"{gaps}lane_gap").values)
     (one,) = [s for s in derived.file.deriving.sets() if s.name == name]
     assert one.answers == ingested.info()[0].answers
 

@@ -131,7 +131,7 @@ def test_an_interrupt_inside_ingest_is_told_and_the_store_stays_whole(
 
 
 def fail_after_a_write(connection: duckdb.DuckDBPyConnection, error: type[BaseException]) -> None:
-    connection.execute("DELETE FROM store.trace")
+    connection.execute("DELETE FROM store.inside.trace")
     raise error
 
 
