@@ -357,7 +357,7 @@ def test_a_recording_that_is_read_in_pieces_gives_the_same_store(
 
     assert run(["verify", str(tmp_path / "pieces.sgstore")]) == 0
     whole, pieces = (sgstore.open(tmp_path / f"{name}.sgstore") for name in ("whole", "pieces"))
-    for view in (*VIEWS, "derived_edge", "derived_node", "frame_class"):
+    for view in (*VIEWS, "inside.derived_edge", "inside.derived_node", "inside.frame_class"):
         assert (
             pieces.sql(f"FROM {view} ORDER BY ALL").values
             == whole.sql(f"FROM {view} ORDER BY ALL").values
