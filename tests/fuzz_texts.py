@@ -320,7 +320,7 @@ def _use_map(path: Path) -> None:
         frame = Frame(at * 100_000_000, ego="v0")
         for i in range(6):
             place = {"x": x + 6.0 * i, "y": y + 2.0 * i, "z": 0.0, "heading": 30.0 * i}
-            frame.add(f"v{i}", "car", **place, length=4.5, width=1.9, height=1.5, vx=3.0)  # pyright: ignore[reportArgumentType]
+            frame.add(f"v{i}", "car", **place, length=4.5, width=1.9, height=1.5, vx=3.0)
         graph = generator.step(frame)
         generator.class_of("RSV")
         generator.roles_of()

@@ -170,7 +170,7 @@ class Drive:
                     for event in events
                     if event.name == f"pattern {number}"
                 )
-                assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)  # pyright: ignore[reportOperatorIssue]
+                assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)
                 runs += len(begun)
         return runs
 

@@ -1,7 +1,5 @@
 """Recordings of CARLA's ROS bridge, held against the official decoder and against what CARLASGG was told."""
 
-# pyright: basic
-
 from __future__ import annotations
 
 import gzip

@@ -1,7 +1,5 @@
 """What ends a run before it is done, and what is left of it then: nothing."""
 
-# pyright: basic, reportArgumentType=false, reportFunctionMemberAccess=false
-
 from __future__ import annotations
 
 import json

@@ -1,7 +1,5 @@
 """Settings: what a config file can say, and what it is told when it says something else."""
 
-# pyright: basic, reportArgumentType=false, reportReturnType=false
-
 from __future__ import annotations
 
 import json

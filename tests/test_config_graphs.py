@@ -1,7 +1,5 @@
 """Whatever the settings are, graphs are whole: every edge ends at nodes that are there, and is there once."""
 
-# pyright: basic, reportReturnType=false
-
 from __future__ import annotations
 
 import math

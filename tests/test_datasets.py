@@ -85,8 +85,8 @@ def test_the_time_of_day_goes_on(store: Store) -> None:
 def test_the_weather_of_a_frame_can_be_explained(store: Store) -> None:
     answer = store.why_not("town#120", f"{WHO} WHERE env.precipitation = 'heavy'")
 
-    assert answer.failed == "env.precipitation = 'heavy'"  # pyright: ignore[reportAttributeAccessIssue]
-    assert answer.found == "env.precipitation = 'light'"  # pyright: ignore[reportAttributeAccessIssue]
+    assert answer.failed == "env.precipitation = 'heavy'"
+    assert answer.found == "env.precipitation = 'light'"
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_classes_that_were_not_seen_in_a_dataset_are_novel(path: Path, tmp_path:
     failed = store.why_not(
         next(novel.frames()), "MATCH (e:Ego) WHERE frame.class('EL') IN dataset_classes('train')"
     )
-    assert failed.failed == "frame.class('EL') IN dataset_classes('train')"  # pyright: ignore[reportAttributeAccessIssue]
+    assert failed.failed == "frame.class('EL') IN dataset_classes('train')"
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Result]:
     def call(*arguments: object) -> Result:
         capsys.readouterr()
         code = command_line([str(one) for one in arguments])
-        return Result(code, *capsys.readouterr())  # pyright: ignore[reportArgumentType]
+        return Result(code, *capsys.readouterr())
 
     return call
 

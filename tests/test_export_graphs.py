@@ -1,7 +1,5 @@
 """Scene graphs and labels in clips, against the store and Foxglove's own definitions; and MCAP's rules."""
 
-# pyright: basic, reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
-
 from __future__ import annotations
 
 import json

@@ -1,7 +1,5 @@
 """Exports of clips of a store: the laws of every format, and what each holds, against the store itself."""
 
-# pyright: basic, reportArgumentType=false, reportCallIssue=false
-
 from __future__ import annotations
 
 import csv
@@ -183,7 +181,7 @@ def test_an_export_that_is_interrupted_leaves_nothing(
 def test_the_progress_goes_up_to_the_end(export: Export, tmp_path: Path, form: str) -> None:
     told: list[tuple[int, int]] = []
 
-    write_export(replace(export, progress=lambda *of: told.append(of)), tmp_path / "out", form)  # pyright: ignore[reportUnknownLambdaType]
+    write_export(replace(export, progress=lambda *of: told.append(of)), tmp_path / "out", form)
 
     assert told[-1] == (2, 2)
     assert {of for _, of in told} == {2}
@@ -295,13 +293,13 @@ def test_a_format_of_another_package_is_found(
         def load(self) -> Exporter:
             raise ImportError("no module named elsewhere")
 
-    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])  # pyright: ignore[reportUnknownLambdaType]
+    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
     (file,) = write_export(export, tmp_path / "out", "lines")
     assert isinstance(file, WrittenFile)
     assert file.file.read_text().split() == [str(i) for _, i in frames_in(export)]
     assert list(exporters()) == [*(one.name for one in EXPORTERS), "lines"]
 
-    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Broken()])  # pyright: ignore[reportUnknownLambdaType]
+    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Broken()])
     with pytest.raises(ExportError, match=r"'broken' .* cannot be loaded: ImportError"):
         exporter_named("nothing")
 
@@ -464,7 +462,7 @@ def test_a_table_of_parquet_is_the_view_of_the_store(
     ids = ", ".join(str(frame_id) for clip, frame_id in clips if clip == 1)
     view = export.store.sql(f"SELECT * FROM {table} WHERE frame_id IN ({ids})").dicts()
     names = [name for name in view[0] if name != "gap"]
-    key = lambda row: [str(row[name]) for name in names]  # noqa: E731  # pyright: ignore[reportUnknownLambdaType]
+    key = lambda row: [str(row[name]) for name in names]  # noqa: E731
     assert sorted(map(key, first)) == sorted(map(key, view))
 
 
@@ -583,7 +581,7 @@ def test_graphs_to_learn_from_are_those_of_the_abstraction(
     for number in range(0, len(data), 5):
         arrays = data.arrays(number)
         graph = export.store.graph(int(arrays["frame_id"]), "roadscene2vec")
-        kinds = [lanes.get(kind, kind) for _, kind in graph.nodes.data("base_class")]  # pyright: ignore[reportArgumentType, reportCallIssue]
+        kinds = [lanes.get(kind, kind) for _, kind in graph.nodes.data("base_class")]
         assert sorted(ACTORS[kind] for kind in arrays["node_type"]) == sorted(kinds)
         named = {
             (_of_node(arrays, a), RELATIONS[kind], _of_node(arrays, b))
@@ -600,7 +598,7 @@ def _of_node(arrays: dict[str, Any], row: int) -> tuple[str, int]:
     return kind, node if node >= 0 and kind != "ego_car" else -1
 
 
-def _of_name(graph: nx.MultiDiGraph, name: str) -> tuple[str, int]:  # pyright: ignore[reportMissingTypeArgument, reportUnknownParameterType]
+def _of_name(graph: nx.MultiDiGraph, name: str) -> tuple[str, int]:
     kind = graph.nodes[name]["base_class"]
     if kind in {"Left Lane", "Middle Lane", "Right Lane"}:
         return "lane", -1
@@ -666,29 +664,27 @@ def test_any_abstraction_can_be_learned_from(
 
     assert types == sorted(types)
     assert sorted(types[kind] for kind in arrays["node_type"]) == sorted(
-        kind
-        for _, kind in graph.nodes.data("base_class")  # pyright: ignore[reportArgumentType]
+        kind for _, kind in graph.nodes.data("base_class")
     )
     mine = [
         (types[arrays["node_type"][a]], relations[kind], types[arrays["node_type"][b]])
         for (a, b), kind in zip(arrays["edge_index"].T, arrays["edge_type"], strict=True)
     ]
-    kinds = dict(graph.nodes.data("base_class"))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    kinds = dict(graph.nodes.data("base_class"))
     assert sorted(mine) == sorted(
-        (kinds[a], of, kinds[b])  # pyright: ignore[reportArgumentType]
-        for a, b, of in graph.edges.data("label")  # pyright: ignore[reportArgumentType]
+        (kinds[a], of, kinds[b]) for a, b, of in graph.edges.data("label")
     )
 
 
 def test_graphs_that_were_hurt_are_refused(written: Callable[..., Path], tmp_path: Path) -> None:
     for number, (name, hurt) in enumerate(
         [
-            ("graphs.json", lambda file: file.write_text("{}")),  # pyright: ignore[reportUnknownLambdaType]
-            ("graphs.json", lambda file: file.write_text("[1]")),  # pyright: ignore[reportUnknownLambdaType]
+            ("graphs.json", lambda file: file.write_text("{}")),
+            ("graphs.json", lambda file: file.write_text("[1]")),
             ("graphs.json", Path.unlink),
-            ("graphs/node_type.npy", lambda file: file.write_bytes(b"\x80\x04.")),  # pyright: ignore[reportUnknownLambdaType]
-            ("graphs/edge_index.npy", lambda file: np.save(file, np.full((9, 2), 77, np.int32))),  # pyright: ignore[reportUnknownLambdaType]
-            ("graphs/node_ptr.npy", lambda file: np.save(file, np.arange(15)[::-1])),  # pyright: ignore[reportUnknownLambdaType]
+            ("graphs/node_type.npy", lambda file: file.write_bytes(b"\x80\x04.")),
+            ("graphs/edge_index.npy", lambda file: np.save(file, np.full((9, 2), 77, np.int32))),
+            ("graphs/node_ptr.npy", lambda file: np.save(file, np.arange(15)[::-1])),
             ("graphs/edge_type.npy", Path.unlink),
         ]
     ):

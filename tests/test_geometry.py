@@ -1,7 +1,5 @@
 """Plane geometry against shapely and against plain definitions."""
 
-# pyright: basic, reportArgumentType=false, reportIndexIssue=false, reportCallIssue=false
-
 from __future__ import annotations
 
 import math

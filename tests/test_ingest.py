@@ -167,7 +167,7 @@ def test_a_map_in_a_recording_that_cannot_be_read_is_a_warning(tmp_path: Path) -
 
 def test_a_map_is_read_once_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
-    monkeypatch.setattr(maps, "read_map", lambda *map_: (read.append(map_), read_map(*map_))[1])  # pyright: ignore[reportUnknownLambdaType]
+    monkeypatch.setattr(maps, "read_map", lambda *map_: (read.append(map_), read_map(*map_))[1])
     paths = [recorded(tmp_path / f"{n}.mcap", frames=n) for n in (2, 3, 4)]
 
     ingest(tmp_path / "s.db", paths)

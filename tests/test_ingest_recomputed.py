@@ -68,7 +68,7 @@ def read_back(store: StoreFile) -> list[FrameBlock]:
         "SELECT * REPLACE (kind::VARCHAR AS kind, coalesce(map_ref, '') AS map_ref)"
         " FROM inside.entity ORDER BY node_id"
     )
-    seq = (state["frame_id"] >> 6) % (1 << 18) * BUCKET_FRAMES + state["frame_id"] % 64  # pyright: ignore[reportOperatorIssue]
+    seq = (state["frame_id"] >> 6) % (1 << 18) * BUCKET_FRAMES + state["frame_id"] % 64
     rows = states_of(state, place)
     blocks = []
     for first in range(0, len(frames["seq"]), BUCKET_FRAMES):
@@ -83,7 +83,7 @@ def read_back(store: StoreFile) -> list[FrameBlock]:
         )
         blocks.append(
             FrameBlock(
-                **{k: v[here].astype(np.int64) for k, v in frames.items()},  # pyright: ignore[reportArgumentType]
+                **{k: v[here].astype(np.int64) for k, v in frames.items()},
                 offsets=(at - at[0]).astype(np.int64),
                 states=rows.take(np.arange(at[0], at[-1])),
                 entities=new,
@@ -111,7 +111,7 @@ def _entities(columns: dict[str, Any], first: int = 0) -> Entities:
 def edges_of(block: FrameBlock, graph: GraphBlock) -> set[tuple[int, str, int, int]]:
     edges = graph.edges
     columns = (block.seq[edges.frame], edges.relation, edges.src, edges.dst)
-    return {  # pyright: ignore[reportReturnType]
+    return {
         (q, RELATIONS[r], s, d) for q, r, s, d in zip(*(c.tolist() for c in columns), strict=True)
     }
 

@@ -1,7 +1,5 @@
 """What lanes are to the ego: in queries, in memory and online as in the abstraction RSV."""
 
-# pyright: basic
-
 from __future__ import annotations
 
 from importlib import resources

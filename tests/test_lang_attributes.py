@@ -1,7 +1,5 @@
 """Each attribute of nodes, frames and traces is the same in SQL and in memory."""
 
-# pyright: basic
-
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any

@@ -1,7 +1,5 @@
 """Which nodes of several traces are the same: an entity is a trace and a number, a lane a map and a number."""
 
-# pyright: basic, reportReturnType=false
-
 from __future__ import annotations
 
 import json

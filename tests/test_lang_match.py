@@ -1,7 +1,5 @@
 """Patterns over one graph in memory, against exhaustive search and against SQL."""
 
-# pyright: basic, reportPossiblyUnboundVariable=false, reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from collections import Counter

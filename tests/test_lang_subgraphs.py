@@ -1,7 +1,5 @@
 """Matches as small graphs: from SQL, in memory, and against exhaustive search."""
 
-# pyright: basic, reportPossiblyUnboundVariable=false, reportArgumentType=false, reportCallIssue=false
-
 from __future__ import annotations
 
 import json

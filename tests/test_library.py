@@ -1,7 +1,5 @@
 """The library of named patterns: each finds the scene that is drawn beside it, and not its counter-example."""
 
-# pyright: basic, reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import re

@@ -1,7 +1,5 @@
 """Monitors: what is told frame by frame is what a store answers of the whole recording."""
 
-# pyright: basic
-
 from __future__ import annotations
 
 import gc

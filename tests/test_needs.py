@@ -1,7 +1,5 @@
 """A trace that knows nothing of what a question speaks of cannot answer it, and says why."""
 
-# pyright: basic, reportArgumentType=false
-
 from __future__ import annotations
 
 import json

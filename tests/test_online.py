@@ -1,7 +1,5 @@
 """Online: a client that owns the loop gets, step by step, the graphs that a store would hold."""
 
-# pyright: basic, reportArgumentType=false, reportReturnType=false, reportPossiblyUnboundVariable=false
-
 from __future__ import annotations
 
 import gc

@@ -270,7 +270,7 @@ class Box:
 def apart(a: Box, b: Box) -> float:
     """Between the footprints, by shapely."""
     boxes = [[o.place.real, o.place.imag, o.heading, o.length, o.width] for o in (a, b)]
-    one, other = shapely.polygons(corners(np.array(boxes)))  # pyright: ignore[reportGeneralTypeIssues]
+    one, other = shapely.polygons(corners(np.array(boxes)))
     return shapely.distance(one, other)
 
 

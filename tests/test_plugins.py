@@ -1,7 +1,4 @@
-# pyright: basic
 """Relations of other packages: by entry point, into stores made before, and where nobody knows them."""
-
-# pyright: basic
 
 from __future__ import annotations
 

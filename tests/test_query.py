@@ -79,7 +79,7 @@ def test_the_public_names_are_few_and_all_there() -> None:
     for name in sgstore.__all__:
         assert getattr(sgstore, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        sgstore.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+        sgstore.nothing  # noqa: B018
 
 
 # Finding

@@ -1,7 +1,5 @@
 """Patterns on a real recording, against networkx over the graph of every frame."""
 
-# pyright: basic
-
 from __future__ import annotations
 
 from typing import TYPE_CHECKING

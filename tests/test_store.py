@@ -37,7 +37,7 @@ def content(path: Path) -> list[tuple[str, int]]:
         sql = "SELECT schema_name || '.' || table_name FROM duckdb_tables() ORDER BY 1"
         names = connection.execute(sql).fetchall()
         return [
-            (name, *connection.execute(f"SELECT count(*) FROM {name}").fetchone())  # pyright: ignore[reportOptionalIterable]
+            (name, *connection.execute(f"SELECT count(*) FROM {name}").fetchone())
             for (name,) in names
         ]
 
@@ -121,7 +121,7 @@ def test_the_file_can_be_read_by_the_oldest_database_that_is_supported(tmp_path:
 
     with duckdb.connect(str(tmp_path / "s.db"), read_only=True) as connection:
         sql = "SELECT tags['storage_version'] FROM duckdb_databases() WHERE NOT internal"
-        (version,) = connection.execute(sql).fetchone()  # pyright: ignore[reportGeneralTypeIssues]
+        (version,) = connection.execute(sql).fetchone()
 
     assert version.startswith("v1.5")
 

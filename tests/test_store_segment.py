@@ -21,7 +21,7 @@ from sgstore.store import StoreFile, trace_id_of
 from sgstore.world import TraceReport
 
 TABLES = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
-TABLES += ("event", "lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "config")  # pyright: ignore[reportConstantRedefinition]
+TABLES += ("event", "lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "config")
 
 
 def content(store: StoreFile) -> dict[str, list[tuple[Any, ...]]]:

@@ -37,7 +37,7 @@ def store(tmp_path: Path) -> StoreFile:
     return store
 
 
-@contextmanager  # pyright: ignore[reportDeprecated]
+@contextmanager
 def process(code: str, **values: object) -> Iterator[subprocess.Popen[str]]:
     """A process that has begun: it has printed a line. It goes on until its stdin ends, and is waited for."""
     code = textwrap.dedent(code).format(path=[str(Path(__file__).parent)], **values)
@@ -54,7 +54,7 @@ def process(code: str, **values: object) -> Iterator[subprocess.Popen[str]]:
         assert child.returncode == 0, errors
 
 
-@contextmanager  # pyright: ignore[reportDeprecated]
+@contextmanager
 def let_go_later(child: subprocess.Popen[str]) -> Iterator[threading.Event]:
     """Lets a process go on after a while; the event is set before."""
     going = threading.Event()

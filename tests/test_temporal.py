@@ -1,7 +1,5 @@
 """Temporal formulas: both engines against the textbook, and against the published verdicts of SGSM."""
 
-# pyright: basic
-
 from __future__ import annotations
 
 import csv

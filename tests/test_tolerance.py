@@ -1,7 +1,5 @@
 """Clocks jitter: times that miss a bound by a hundredth of a period, or by a microsecond, keep it."""
 
-# pyright: basic, reportArgumentType=false
-
 from __future__ import annotations
 
 import random
@@ -153,7 +151,7 @@ def watched(speeds: list[float], times: list[int]) -> list[tuple[Any, ...]]:
     for speed, time_ns in zip(speeds, times, strict=True):
         frame = Frame(time_ns=time_ns, ego="ego")
         size = {"heading": 0.0, "length": 4.0, "width": 2.0}
-        frame.add("ego", "car", 0.0, 0.0, 0.0, **size, vx=speed, vy=0.0)  # pyright: ignore[reportArgumentType]
+        frame.add("ego", "car", 0.0, 0.0, 0.0, **size, vx=speed, vy=0.0)
         told += monitor.step(frame)
     verdicts = monitor.finish()
     events = [(e.kind, e.name, e.told.seq, e.start.seq, e.end.seq) for e in told]

@@ -1,7 +1,5 @@
 """The public views against the blocks that were stored, and against one another."""
 
-# pyright: basic, reportReturnType=false
-
 from __future__ import annotations
 
 import json

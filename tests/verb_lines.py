@@ -4,8 +4,6 @@ As a program it reads a list of ``[arguments, condition]`` as JSON and answers f
 code, length of stdout, and stderr. Each runs in a process of its own, forked from one that imported all.
 """
 
-# pyright: basic, reportPossiblyUnboundVariable=false
-
 from __future__ import annotations
 
 import atexit
