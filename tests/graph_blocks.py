@@ -18,7 +18,7 @@ import numpy as np
 from sgstore.config import Config
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
 from sgstore.roads import MapEdges, MapNodes
-from sgstore.vocabulary import ENTITY_KINDS, KIND_CODE, RELATION_CODE, RELATIONS
+from sgstore.vocabulary import KIND_CODE, OWN_ENTITY_KINDS, OWN_RELATIONS, RELATION_CODE
 from sgstore.world import (
     Channel,
     Entities,
@@ -144,7 +144,7 @@ class RandomTrace:
         self.info = trace_info(**({"digest": f"{seed:064x}"} | info))
         self.moving = moving or int(self.rng.integers(2, 9))
         self.standing = int(self.rng.integers(0, 4))
-        self.kinds = self.rng.integers(0, len(ENTITY_KINDS), self.moving + self.standing)
+        self.kinds = self.rng.integers(0, len(OWN_ENTITY_KINDS), self.moving + self.standing)
         self.blocks = [
             self.block(first, min(first + size, frames)) for first in range(0, frames, size)
         ]
@@ -229,7 +229,7 @@ class RandomTrace:
         if self.road_map is not None:
             dst = np.where(rng.random(count) < 0.3, -1 - rng.integers(0, 5, count), dst)
         kept = here[frame, src] & (src != dst)
-        relation = rng.integers(0, len(RELATIONS), count).astype(np.int8)
+        relation = rng.integers(0, len(OWN_RELATIONS), count).astype(np.int8)
         return Edges(frame[kept], relation[kept], src[kept], dst[kept])
 
     def _lanes(self, frame: Any, node: Any) -> LaneStates:

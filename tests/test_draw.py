@@ -356,7 +356,7 @@ def test_a_missing_package_is_told_with_how_to_install_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
 
-    with pytest.raises(MissingExtraError, match=r"drawing needs .*sgstore\[viz\]"):
+    with pytest.raises(MissingExtraError, match=r"is needed for drawing: .*sgstore\[viz\]"):
         draw_frame(two(), None, tmp_path / "a.png")
 
 
