@@ -440,6 +440,9 @@ def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, i
 
 def _run(solver: Any) -> None:
     """Solve in a thread, so that whatever a handler of signals raises meanwhile ends it."""
+    # All solvers of a process share one lock; one that was interrupted holds it until it has stopped.
+    while not solver.wait(_LOOK_S)[0]:
+        pass
     solver.HandleUserInterrupt = True
     solver.startSolve()
     try:
