@@ -111,3 +111,21 @@ def open_town(town_store: Path) -> Iterator[Store]:
     store = Store(town_store)
     with store.file.snapshot():
         yield store
+
+
+@pytest.fixture
+def own_names() -> Iterator[None]:
+    """Names of kinds, relations and states of lights that a test makes known are forgotten behind it."""
+    from sgstore import vocabulary
+
+    growing = (
+        *("_entity_kinds", "_kinds", "_kind_code", "_KINDS_FOLDED", "_LABELS_FOLDED"),
+        *("_light_states", "_light_state_code"),
+        *("_relations", "_relation_code", "_RELATIONS_FOLDED"),
+    )
+    held: list[Any] = [getattr(vocabulary, name) for name in growing]
+    before = [one.copy() for one in held]
+    yield
+    for one, was in zip(held, before, strict=True):
+        one.clear()
+        one.extend(was) if isinstance(one, list) else one.update(was)

@@ -241,6 +241,7 @@ def test_entities_are_left_out_of_a_store_through_ingest(tmp_path: Path) -> None
     assert Store(tmp_path / "s.db").sql(there).values == [(0,)]
 
 
+@pytest.mark.usefixtures("own_names")
 def test_a_name_that_is_all_but_a_built_in_one_is_noted(tmp_path: Path) -> None:
     StoreFile.create(tmp_path / "s.db")
     slip = configured(proximity={"names": ["near_col", "yonder"], "upper": [4, 50]})

@@ -19,27 +19,11 @@ from sgstore.ingest import ingest
 from sgstore.store import StoreFile, verify_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.query import Store
 
-GROWING = (
-    *("_entity_kinds", "_kinds", "_kind_code", "_KINDS_FOLDED", "_LABELS_FOLDED"),
-    *("_light_states", "_light_state_code"),
-    *("_relations", "_relation_code", "_RELATIONS_FOLDED"),
-)
-
-
-@pytest.fixture(autouse=True)
-def names() -> Iterator[None]:
-    """Names that a test adds are forgotten behind it."""
-    held: list[Any] = [getattr(vocabulary, name) for name in GROWING]
-    before = [one.copy() for one in held]
-    yield
-    for one, was in zip(held, before, strict=True):
-        one.clear()
-        one.extend(was) if isinstance(one, list) else one.update(was)
+pytestmark = pytest.mark.usefixtures("own_names")
 
 
 def scene(name: str) -> nx.MultiDiGraph[str]:
