@@ -5,7 +5,7 @@ What is in a graph. The range of an ego is a disc about its centre, or another a
 as a point, and what has no position is in no range; the ego always is. *Frames without an ego*, or with one
 whose position is missing, have no range: their graphs hold all entities and the whole map, and no relations of
 an ego. Parts of the map are present as :meth:`sgstore.relations._map_context.LaneContact.ground` says; the
-static edges among them are the map's own. What the client does not want (:mod:`sgstore.relations._filters`)
+static edges among them are the map's own. What the client does not want (:mod:`sgstore.relations._registry`)
 is as if it were not there.
 
 A relation that cannot be computed, because a heading or a position is missing, is absent; what a trace cannot

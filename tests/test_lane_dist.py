@@ -16,7 +16,7 @@ from sgstore.graph import LaneDistances
 from sgstore.lang import FrameView
 from sgstore.opendrive import read_map
 from sgstore.query import Store
-from sgstore.roads._lane_graph import FARTHEST
+from sgstore.roads._map import FARTHEST
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 from sgstore.vocabulary import RELATION_CODE

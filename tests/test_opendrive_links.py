@@ -9,7 +9,7 @@ import pytest
 from opendrive_maps import a_map, a_road, arc, element, lane, line, link, mark, section
 
 from sgstore.opendrive import read_map
-from sgstore.opendrive._nodes import permitted
+from sgstore.opendrive._network import permitted
 from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:

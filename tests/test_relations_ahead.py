@@ -13,7 +13,7 @@ from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of,
 from test_sgg_traces import graphs, opened, recording, recordings
 
 from sgstore.config import Config, LaneSettings, RangeSettings
-from sgstore.relations._lane_net import Centrelines, LaneNet
+from sgstore.relations._following import Centrelines, LaneNet
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:

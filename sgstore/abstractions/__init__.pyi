@@ -9,7 +9,7 @@ from ._columns import found as found
 from ._features import GraphFeatures as GraphFeatures
 from ._features import of_frames as of_frames
 from ._features import without as without
-from ._lanes import lane_roles as lane_roles
+from ._columns import lane_roles as lane_roles
 from ._literature import SUBSETS as SUBSETS
 from ._literature import Subset as Subset
 from ._registry import ABSTRACTIONS as ABSTRACTIONS

@@ -33,13 +33,15 @@ import numpy as np
 from sgstore.abstractions._columns import (
     BETWEEN_ENTITIES,
     EGO,
+    NAMELESS,
+    OFF_ROAD,
     SCENERY,
     UNNAMED,
     Labelled,
+    ego_lanes,
     repeated,
     role_name,
 )
-from sgstore.abstractions._lanes import NAMELESS, OFF_ROAD, ego_lanes
 from sgstore.vocabulary import (
     KIND_CODE,
     KINDS,

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore import plugins
 from sgstore.abstractions._classes import Classes, classes_of
-from sgstore.abstractions._columns import GraphColumns, Labelled, MapColumns
-from sgstore.abstractions._lanes import lane_roles
+from sgstore.abstractions._columns import GraphColumns, Labelled, MapColumns, lane_roles
 from sgstore.errors import AbstractionError
 from sgstore.vocabulary import normalize_name, suggestion
 

@@ -1,7 +1,7 @@
 """Text of a road map → RoadMap: OpenDRIVE, and the plain lanes of recordings that carry none.
 
-``document`` reads the text into tables · ``planview`` evaluates reference lines · ``lanes`` stacks lanes on
-them · ``links`` finds where traffic flows on · ``nodes`` and its kin make nodes and relations of it all.
+``document`` reads the text into tables · ``lanes`` evaluates reference lines and stacks lanes on them ·
+``network`` finds where traffic flows on, and makes nodes and relations; ``objects`` and ``signals`` theirs.
 A road with a defect is left out and named in the map's warnings: the text is then read once more
 without it, so that no later step has to know. Of a width, a border, a height or a lane offset that is no
 number only that record is left out. Only a map without any usable road is an error.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sgstore.opendrive._document import Document
-    from sgstore.opendrive._reference_lines import PlanView
+    from sgstore.opendrive._lanes import PlanView
     from sgstore.world import Floats, Ints
 
 

@@ -26,12 +26,13 @@ import shapely
 from sgstore.config import Signs
 from sgstore.errors import MapError
 from sgstore.opendrive._document import Document, Record, Spoiled, read_document
-from sgstore.opendrive._lanes import odd_sections, read_lanes, surface
-from sgstore.opendrive._links import Network, flows
-from sgstore.opendrive._nodes import (
+from sgstore.opendrive._lanes import odd_sections, read_lanes, read_plan_view, surface
+from sgstore.opendrive._network import (
     FIRST_LANE,
+    Network,
     containment,
     flow_edges,
+    flows,
     junction_types,
     lane_nodes,
     neighbours,
@@ -40,7 +41,6 @@ from sgstore.opendrive._nodes import (
     road_types,
 )
 from sgstore.opendrive._objects import read_objects
-from sgstore.opendrive._reference_lines import read_plan_view
 from sgstore.opendrive._signals import read_controllers, read_signals
 from sgstore.roads import (
     MapNodes,

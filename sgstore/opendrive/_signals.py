@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.opendrive._document import coefficients_of, cubic, last_before
-from sgstore.opendrive._links import END, START
-from sgstore.opendrive._nodes import FIRST_LANE, junction_of, speed
-from sgstore.opendrive._reference_lines import PlanView, poses
+from sgstore.opendrive._lanes import PlanView, poses
+from sgstore.opendrive._network import END, FIRST_LANE, START, junction_of, speed
 from sgstore.roads import MapNodes
 from sgstore.vocabulary import DRIVING
 
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     from sgstore.config import Signs
     from sgstore.opendrive._document import Document
-    from sgstore.opendrive._links import Network
+    from sgstore.opendrive._network import Network
     from sgstore.roads import Edge
     from sgstore.world import Floats, Ints
 

@@ -7,8 +7,8 @@ from ._blocks import NAN as NAN
 from ._blocks import POSE as POSE
 from ._blocks import EntityTable as EntityTable
 from ._blocks import FrameRows as FrameRows
-from ._frames import FramesTrace as FramesTrace
-from ._frames import TraceMessage as TraceMessage
+from ._base import FramesTrace as FramesTrace
+from ._base import TraceMessage as TraceMessage
 from ._media import Media as Media
 from ._media import picture_form as picture_form
 from ._media import png as png

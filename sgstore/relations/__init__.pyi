@@ -5,8 +5,8 @@ from ._contact import contacts_of as contacts_of
 from ._extent import Areas as Areas
 from ._extent import EgoPoses as EgoPoses
 from ._extent import Extent as Extent
-from ._filters import Keeping as Keeping
-from ._filters import renamed as renamed
+from ._registry import Keeping as Keeping
+from ._registry import renamed as renamed
 from ._following import Parking as Parking
 from ._following import gaps as gaps
 from ._map_context import LaneContact as LaneContact
@@ -32,7 +32,7 @@ from ._scene import Relation as Relation
 from ._scene import Standing as Standing
 from ._scene import edges_between as edges_between
 from ._scene import edges_to_map as edges_to_map
-from ._waypoints import waypoints_of as waypoints_of
+from ._map_context import waypoints_of as waypoints_of
 
 __all__ = [
     "Areas",

@@ -1,8 +1,8 @@
 # The face of this package: what others may import from it.
 
-from ._cross_sections import Sections as Sections
-from ._cross_sections import run_of as run_of
-from ._lane_graph import LaneGraph as LaneGraph
+from ._lanes import Sections as Sections
+from ._lanes import run_of as run_of
+from ._map import LaneGraph as LaneGraph
 from ._lane_lines import END as END
 from ._lane_lines import MAX_POINTS as MAX_POINTS
 from ._lane_lines import START as START

@@ -18,9 +18,10 @@ import numpy as np
 import shapely
 
 from sgstore.errors import MapError
-from sgstore.roads._cross_sections import (
+from sgstore.roads._lanes import (
     APART,
     WIDE,
+    PlainLane,
     Sections,
     along_line,
     cross_sections,
@@ -30,7 +31,6 @@ from sgstore.roads._cross_sections import (
     thinned,
     way_between,
 )
-from sgstore.roads._lanes import PlainLane
 from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:

@@ -1,11 +1,17 @@
-"""Lanes, roads and junctions as nodes with relations, and lane changes from road marks.
+"""Lanes, roads and junctions as nodes: where traffic flows on, and where it may change lanes.
 
-Lanes, roads and junctions as nodes, and the relations that hold among them.
+A lane ends at one end of its section, or at both if traffic runs both ways. What lies beyond is found
+from that *end*: the next section of the road; a linked road at its contact point (or, from a virtual
+junction, in its middle); or, through a junction, the connecting roads that take this road in. A pair
+counts only if the lane beyond is entered where its own traffic enters: maps also link lanes tail to tail.
+(ASAM OpenDRIVE 1.8, 10.3, 11.5 and 12.)
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -14,12 +20,294 @@ from sgstore.roads import STOREY, LaneChanges, MapNodes, conflicts, mean_widths,
 from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
-    from sgstore.opendrive._document import Document
+    from collections.abc import Iterator
+
+    from sgstore.opendrive._document import Document, ElementTable
     from sgstore.opendrive._lanes import LaneTable
-    from sgstore.opendrive._links import Flow
     from sgstore.roads import Edge, Ribbons
     from sgstore.world import Bools, Floats, Ints
 
+
+START: Final = "start"
+END: Final = "end"
+
+_OTHER: Final = {START: END, END: START}
+
+
+class Target(NamedTuple):
+    """One end of a section that traffic comes to: at its start, at its end, or somewhere within."""
+
+    section: int
+    contact: str
+    """``start``, ``end``, ``+`` or ``-`` (within, along or against s), or empty: within, either way."""
+
+
+class _Connection(NamedTuple):
+    """A way through a junction: where it starts, and which lanes it joins to which."""
+
+    target: Target
+    lanes: tuple[tuple[int, int], ...]
+
+
+@dataclass(slots=True)
+class Network:
+    """The lanes of all roads, to be found by what the map calls them.
+
+    Attributes
+    ----------
+    roads : dict
+        Id of a road → its row.
+    lane : dict
+        (Section, lane id) → lane.
+    first, last : list of int
+        First and last section of each road; -1: it has none.
+    """
+
+    lanes: LaneTable
+    roads: dict[str, int]
+    lane: dict[tuple[int, int], int]
+    first: list[int]
+    last: list[int]
+    warnings: list[str]
+
+    @classmethod
+    def of(cls, document: Document, lanes: LaneTable) -> Network:
+        """The network of a document's lanes."""
+        roads: dict[str, int] = {}
+        warnings: list[str] = []
+        for row, name in enumerate(document.road_ids):
+            if roads.setdefault(name, row) != row:
+                warnings.append(f"road {name!r}: there are two of this id; links lead to the first")
+        section_road = lanes.sections.road
+        every = np.arange(len(document.road_ids))
+        first = np.searchsorted(section_road, every, side="left")
+        last = np.searchsorted(section_road, every, side="right") - 1
+        keys = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
+        lane = {key: row for row, key in enumerate(keys)}
+        return cls(lanes, roads, lane, first.tolist(), last.tolist(), warnings)
+
+    def section_at(self, road: int, s: float) -> int:
+        """The section of a road that holds at ``s``."""
+        starts = self.lanes.sections.start[self.first[road] : self.last[road] + 1]
+        within = int(np.searchsorted(starts, s, side="right")) - 1
+        return self.first[road] + max(within, 0)
+
+    def target(self, attributes: dict[str, str]) -> Target | None:
+        """Section that a link of a road to a road leads to; ``None`` if there is no such road."""
+        road = self.roads.get(attributes.get("elementId", ""))
+        if road is None:
+            return None
+        if "elementS" in attributes:
+            s = _number(attributes["elementS"])
+            return Target(self.section_at(road, s), attributes.get("elementDir", ""))
+        contact = attributes.get("contactPoint", START)
+        return Target(self.first[road] if contact == START else self.last[road], contact)
+
+    def enters(self, lane: int, contact: str) -> bool:
+        """Return whether traffic that comes to a section at ``contact`` may enter this lane of it."""
+        if self.lanes.both[lane] or not contact:
+            return True
+        return bool(self.lanes.forward[lane]) == (contact in {START, "+"})
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """Pairs of lanes between which traffic flows, shape (n,): from ``src`` on to ``dst``."""
+
+    src: Ints
+    dst: Ints
+
+
+def flows(document: Document, network: Network) -> Flow:
+    """All pairs of lanes between which traffic can flow, each once."""
+    joints = _Joints(document, network)
+    pairs = {
+        (lane, beyond)
+        for lane, contact in _exits(network.lanes)
+        for beyond in joints.beyond(lane, contact)
+    }
+    pairs |= set(_branches(document, network))
+    both = np.array(sorted(pairs), np.int64).reshape(-1, 2)
+    return Flow(both[:, 0], both[:, 1])
+
+
+def _exits(lanes: LaneTable) -> Iterator[tuple[int, str]]:
+    for lane, (forward, both) in enumerate(zip(lanes.forward, lanes.both, strict=True)):
+        if forward or both:
+            yield lane, END
+        if both or not forward:
+            yield lane, START
+
+
+class _Joints:
+    """Lanes beyond the ends of lanes."""
+
+    def __init__(self, document: Document, network: Network) -> None:
+        self._network = network
+        self._lane_links = {
+            START: _lane_links(document["road/laneSection/lane/predecessor"], network.lanes),
+            END: _lane_links(document["road/laneSection/lane/successor"], network.lanes),
+        }
+        self._road_links = {
+            START: _road_links(document["road/predecessor"]),
+            END: _road_links(document["road/successor"]),
+        }
+        self._junctions = _junctions(document, network)
+        self._road_names = document.road_ids
+        self._missed: set[str] = set()
+
+    def beyond(self, lane: int, contact: str) -> list[int]:
+        """The lanes beyond one end of a lane that traffic may enter."""
+        network, lanes = self._network, self._network.lanes
+        road, section, ident = (int(c[lane]) for c in (lanes.road, lanes.section, lanes.ident))
+        linked = self._lane_links[contact].get(lane, [])
+        if contact == END and section < network.last[road]:
+            found = [(Target(section + 1, START), to) for to in linked]
+        elif contact == START and section > network.first[road]:
+            found = [(Target(section - 1, END), to) for to in linked]
+        else:
+            link = self._road_links[contact].get(road, {})
+            found = self._across(road, ident, link, linked)
+        onward: list[int] = []
+        for target, to in found:
+            other = network.lane.get((target.section, to))
+            if other is None:
+                self._miss(road, f"lane {ident} leads to a missing lane {to}")
+            elif network.enters(other, target.contact):
+                onward.append(other)
+        return onward
+
+    def _across(
+        self, road: int, ident: int, link: dict[str, str], linked: list[int]
+    ) -> list[tuple[Target, int]]:
+        if link.get("elementType") == "junction":
+            key = (link.get("elementId", ""), self._road_names[road])
+            return [
+                (way.target, to)
+                for way in self._junctions.get(key, [])
+                for source, to in way.lanes
+                if source == ident
+            ]
+        target = self._network.target(link)
+        if target is None and link:
+            self._miss(road, f"leads to a missing road {link.get('elementId', '')!r}")
+        return [(target, to) for to in linked] if target else []
+
+    def _miss(self, road: int, what: str) -> None:
+        warning = f"road {self._road_names[road]!r}: {what}"
+        if warning not in self._missed:
+            self._missed.add(warning)
+            self._network.warnings.append(warning)
+
+
+def _lane_links(table: ElementTable, lanes: LaneTable) -> dict[int, list[int]]:
+    links: dict[int, list[int]] = defaultdict(list)
+    for raw, attributes in zip(table.parent, table.attributes, strict=True):
+        links[int(lanes.row[raw])].append(_whole(attributes.get("id", "")))
+    return links
+
+
+def _road_links(table: ElementTable) -> dict[int, dict[str, str]]:
+    return dict(zip(table.parent, table.attributes, strict=True))
+
+
+def _junctions(document: Document, network: Network) -> dict[tuple[str, str], list[_Connection]]:
+    """(Junction, road that comes in) → its ways through. A direct junction joins both roads both ways."""
+    ways: dict[tuple[str, str], list[_Connection]] = defaultdict(list)
+    junctions = document["junction"]
+    links = _lane_pairs(document)
+    road_ends = _junction_ends(document)
+    table = document["junction/connection"]
+    for row, (parent, attributes) in enumerate(zip(table.parent, table.attributes, strict=True)):
+        junction = junctions.attributes[parent].get("id", "")
+        incoming = attributes.get("incomingRoad", "")
+        direct = "linkedRoad" in attributes
+        onward = attributes.get("linkedRoad" if direct else "connectingRoad", "")
+        link = {"elementId": onward, "contactPoint": attributes.get("contactPoint", START)}
+        target = network.target(link)
+        if target is None:
+            if onward:
+                network.warnings.append(f"junction {junction!r} leads to a missing road {onward!r}")
+            continue
+        ways[junction, incoming].append(_Connection(target, links[row]))
+        if direct and incoming in network.roads:
+            for contact in road_ends.get((junction, incoming), []):
+                back = network.target({"elementId": incoming, "contactPoint": contact})
+                if back is not None:
+                    turned = tuple((to, source) for source, to in links[row])
+                    ways[junction, onward].append(_Connection(back, turned))
+    return ways
+
+
+def _lane_pairs(document: Document) -> dict[int, tuple[tuple[int, int], ...]]:
+    pairs: dict[int, tuple[tuple[int, int], ...]] = defaultdict(tuple)
+    table = document["junction/connection/laneLink"]
+    for row, attributes in zip(table.parent, table.attributes, strict=True):
+        pairs[row] += ((_whole(attributes.get("from", "")), _whole(attributes.get("to", ""))),)
+    return pairs
+
+
+def _junction_ends(document: Document) -> dict[tuple[str, str], list[str]]:
+    """(Junction, road) → the ends of the road that lie at it."""
+    ends: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for kind, contact in (("road/predecessor", START), ("road/successor", END)):
+        for row, attributes in _road_links(document[kind]).items():
+            if attributes.get("elementType") == "junction":
+                key = (attributes.get("elementId", ""), document.road_ids[row])
+                ends[key].append(contact)
+    return ends
+
+
+def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]:
+    """Lanes of main roads and the lanes that branch off them in virtual junctions, midway."""
+    links = _lane_pairs(document)
+    table = document["junction/connection"]
+    junctions = document["junction"].attributes
+    for row, (parent, attributes) in enumerate(zip(table.parent, table.attributes, strict=True)):
+        if junctions[parent].get("type") != "virtual":
+            continue
+        main = network.roads.get(attributes.get("incomingRoad", ""))
+        onward = network.target(
+            {
+                "elementId": attributes.get("connectingRoad", ""),
+                "contactPoint": attributes.get("contactPoint", START),
+            }
+        )
+        if main is None or onward is None:
+            continue
+        place = _place_of_branch(document, onward, network, junctions[parent])
+        section = network.section_at(main, place)
+        for source, to in links[row]:
+            src, dst = network.lane.get((section, source)), network.lane.get((onward.section, to))
+            if src is not None and dst is not None and network.enters(dst, onward.contact):
+                yield src, dst
+
+
+def _place_of_branch(
+    document: Document, onward: Target, network: Network, junction: dict[str, str]
+) -> float:
+    kind = "road/predecessor" if onward.contact == START else "road/successor"
+    road = int(network.lanes.sections.road[onward.section])
+    link = _road_links(document[kind]).get(road, {})
+    return _number(link.get("elementS", junction.get("sStart", "0")))
+
+
+def _whole(text: str) -> int:
+    """A lane id; 0, which is no lane with traffic, where there is none."""
+    try:
+        return int(text)
+    except ValueError:
+        return 0
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return 0.0
+
+
+# Lanes, roads and junctions as nodes with relations, and lane changes from road marks -----------
 
 NARROW: Final = 1e-2
 """A lane that is nowhere wider has no neighbours: those on both sides of it are neighbours; m."""
