@@ -53,6 +53,7 @@ ROOMS: Final[dict[str, tuple[str, ...]]] = {
             "test_schema*.py",
             "test_user_tables.py",
             "test_like.py",
+            "test_rows.py",
         ),
         *(
             "test_doors.py",
