@@ -104,10 +104,11 @@ class Store:
             path,
             memory=memory,
             spill=max_spill,
-            tables=tables if isinstance(tables, UserTables) else UserTables(tables or {}),
+            tables=(tables if isinstance(tables, UserTables) else UserTables(tables))
+            if tables
+            else None,
             root=root,
         )
-        self._held: tuple[tuple[int, ...], Catalog] | None = None
 
     def __repr__(self) -> str:
         return f"Store({str(self.file.path)!r})"
@@ -116,7 +117,7 @@ class Store:
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        self._held = None
+        pass
 
     def ingest(
         self, traces: str | Path | Sequence[str | Path], /, **options: Any
@@ -150,11 +151,7 @@ class Store:
 
     def catalog(self) -> Catalog:
         """The catalog of the store for queries; remembered while the file stays as it is."""
-        if self._held is not None and self._held[0] == _stamp(self.file.path):
-            return self._held[1]  # to open the store costs more than to compile a query
-        with self.file.snapshot():
-            self._held = _stamp(self.file.path), self.file.catalog()
-            return self._held[1]
+        return self.file.catalog()
 
     def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> Matches:
         """Return the matches of a pattern; nothing is searched before it is asked for.
@@ -172,18 +169,14 @@ class Store:
         QueryError
             The text is no query, or names what the store does not know; it says where, and what would be right.
         """
-        if isinstance(query, str):
-            return self._matches(query, parameters)
-        from sgstore.lang import Pattern
-
-        pattern = query if isinstance(query, Pattern) else Pattern.of(query)
-        given = {**pattern.parameters, **parameters}
-        return self._matches(str(pattern), given)
-
-    def _matches(self, text: str, parameters: Mapping[str, object]) -> Matches:
         from sgstore.temporal import TemporalMatches
 
-        return TemporalMatches(self.file, self.catalog, text, parameters)
+        if not isinstance(query, str):
+            from sgstore.lang import Pattern
+
+            pattern = query if isinstance(query, Pattern) else Pattern.of(query)
+            query, parameters = str(pattern), {**pattern.parameters, **parameters}
+        return TemporalMatches(self.file, self.file.catalog, query, parameters)
 
     def check(
         self,
@@ -215,7 +208,7 @@ class Store:
         from sgstore.temporal import CheckRun  # with numpy: only for who asks
 
         return CheckRun(
-            self.file, self.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
+            self.file, self.file.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
         )
 
     def sql(
@@ -527,13 +520,6 @@ class Store:
             if node in graph.nodes:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
         return FrameView(graph, about, whole, classes, roles)
-
-
-def _stamp(path: Path) -> tuple[int, ...]:
-    """Return a stamp that changes with the database: size and time of its file and of its log."""
-    files = (path, path.with_name(f"{path.name}.wal"))
-    found = [file.stat() for file in files if file.exists()]
-    return tuple(number for stat in found for number in (stat.st_mtime_ns, stat.st_size))
 
 
 def _ref(frame: int | str | FrameRef) -> int | str:

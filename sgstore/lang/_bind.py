@@ -210,10 +210,9 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
         elif name == "dataset":
             asked(value, setting.span, session)
         elif name == "abstraction":
-            if normalize_name(value) not in catalog.sets:
-                known = [one.name for one in catalog.sets.values()]
-                hint = None if known else "the store has none yet: sgstore derive makes them"
-                session.unknown("abstraction", value, setting.span, known, hint)
+            if catalog.under(value) is None:
+                hint = None if catalog.sets else "the store has none yet: sgstore derive makes them"
+                session.unknown("abstraction", value, setting.span, [*catalog.sets], hint)
         else:
             session.unknown("setting", setting.name, setting.span, SETTINGS)
     return found

@@ -31,7 +31,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from typing import Self
 
 
@@ -641,8 +641,8 @@ class Catalog:
         The traces that are asked; ``None``: all.
     tables : mapping of str to TableFacts
         Tables of users' own that are joined.
-    sets : mapping of str to Catalog
-        The catalogs of the abstractions that a query can name, by folded name.
+    sets : mapping of str to function
+        The abstractions that a query can name: what makes the catalog of each from this one.
     unknowing : frozenset of int
         Traces that do not know what a query needs (:mod:`sgstore.lang._needs`): it leaves them out.
     lacks : dict
@@ -661,8 +661,16 @@ class Catalog:
     shadows: tuple[tuple[str, str], ...] = ()
     only: frozenset[int] | None = None
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, TableFacts])
-    sets: Mapping[str, Catalog] = field(default_factory=dict[str, "Catalog"])
+    sets: Mapping[str, Callable[[Catalog], Catalog]] = field(
+        default_factory=dict[str, "Callable[[Catalog], Catalog]"]
+    )
     unknowing: frozenset[int] = frozenset()
     lacks: dict[Any, frozenset[int]] = field(
         default_factory=dict[Any, frozenset[int]], compare=False, repr=False
     )
+
+    def under(self, abstraction: str) -> Catalog | None:
+        """Return the catalog under an abstraction, in any spelling; ``None`` if there is none of that name."""
+        wanted = normalize_name(abstraction)
+        found = [made for name, made in self.sets.items() if normalize_name(name) == wanted]
+        return found[-1](self) if found else None

@@ -729,8 +729,7 @@ def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[st
             value = setting.value
             name = value if isinstance(value, str) else str(parameters.get(value.name, ""))
             if normalize_name(setting.name) == "abstraction":
-                chosen = catalog.sets.get(normalize_name(name), catalog)
-                seen = replace(chosen, sets=catalog.sets, only=seen.only)
+                seen = replace(catalog.under(name) or catalog, only=seen.only)
             elif normalize_name(setting.name) == "dataset":
                 seen = replace(seen, only=traces_in(name, catalog.traces, catalog.tables))
     return seen

@@ -7,17 +7,18 @@ statement.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from sgstore.abstractions import SUBSETS
 from sgstore.lang import Catalog, RelationScope, TraceFacts
 from sgstore.quoting import literal
 from sgstore.store._derive import sets_of
 from sgstore.store._traces import stored_traces
-from sgstore.vocabulary import RELATIONS, normalize_name
+from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from duckdb import DuckDBPyConnection
 
@@ -55,14 +56,15 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         ),
         classed=tuple(sorted(name for (name,) in classed)),
     )
-    sets = {normalize_name(name): _narrowed(whole, name, of) for name, of in SUBSETS.items()}
+    sets: dict[str, Callable[[Catalog], Catalog]] = {
+        name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()
+    }
     derived: dict[str, list[DerivedSet]] = {}
     for one in sets_of(connection):
         derived.setdefault(one.name, []).append(one)
     for name, of in derived.items():
-        sets[normalize_name(name)] = replace(
-            _derived(connection, whole, name, of), relations=_relations(connection, whole, of)
-        )
+        changes = _derived(connection, whole, name, of)
+        sets[name] = lambda catalog, changes=changes: replace(catalog, **changes)
     return replace(whole, sets=sets)
 
 
@@ -110,8 +112,8 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
 
 def _derived(
     connection: DuckDBPyConnection, whole: Catalog, name: str, of: list[DerivedSet]
-) -> Catalog:
-    """The catalog under a derived set: of the traces that have it."""
+) -> dict[str, Any]:
+    """Fields in which the catalog under a derived set, of the traces that have it, differs from the store's."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
     reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
     word = literal(name)
@@ -133,17 +135,17 @@ def _derived(
         f" ON d.set_name = {word} AND d.moves AND d.bucket = s.frame_id >> 6 AND d.node_id = s.node_id"
         " AND (d.mask & (CAST(1 AS BIGINT) << CAST(s.frame_id & 63 AS INTEGER))) <> 0"
     )
-    return replace(
-        whole,
-        name=name,
-        shadows=tuple(shadows.items()),
-        edges=_counted(connection, f"({shadows['edge']})"),
-        traces=tuple(
+    return {
+        "name": name,
+        "relations": _relations(connection, whole, of),
+        "shadows": tuple(shadows.items()),
+        "edges": _counted(connection, f"({shadows['edge']})"),
+        "traces": tuple(
             replace(trace, answers=answers[trace.trace_id], reach=reaches[trace.trace_id])
             for trace in whole.traces
             if trace.trace_id in answers
         ),
-    )
+    }
 
 
 def _relations(

@@ -22,6 +22,7 @@ from sgstore.store._locking import (
     EngineError,
     default_memory,
     spill_folder,
+    stamp_of,
     translated,
 )
 from sgstore.store._packing import plain
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from sgstore.readers import Media
     from sgstore.roads import RoadMap
     from sgstore.store._joins import JoinedTable, UserTables
+    from sgstore.store._locking import Stamp
     from sgstore.store._rows import Parameters
     from sgstore.store._similarity import SimilarFrames
     from sgstore.store._staging import Sealed
@@ -109,15 +111,21 @@ class StoreFile:
     ) -> None:
         self.path = Path(path)
         self.tables = tables
-        self._memory = most = memory or default_memory()
+        self._memory = memory or default_memory()
         self.access = Access(
-            self.path, memory=most, wait_s=wait_s, tables=tables, spill=spill, diagnose=_damage
+            self.path,
+            memory=self._memory,
+            wait_s=wait_s,
+            tables=tables,
+            spill=spill,
+            diagnose=_damage,
         )
         self.access.root = root
         self._graphs = Graphs()
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
-        with self._reading():  # what is no store of ours is refused there
+        self._known: tuple[Stamp, Catalog] | None = None
+        with self.access.reading():  # what is no store of ours is refused there
             pass
 
     @classmethod
@@ -134,11 +142,9 @@ class StoreFile:
             anew.create(path)
         return cls(path, memory=memory, wait_s=wait_s)
 
-    @contextmanager
-    def snapshot(self) -> Generator[None]:
+    def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several questions: they see the same state, and cost less."""
-        with self._reading():
-            yield
+        return self.access.reading()
 
     def rows(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
@@ -186,11 +192,7 @@ class StoreFile:
         given: Iterable[GivenTable] = (),
     ) -> Generator[Batches]:
         """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
-
-        def ask(connection: DuckDBPyConnection, _: ExitStack) -> Batches:
-            return Batches(connection, sql, parameters, size)
-
-        with self._answered(ask, given) as found:
+        with self._answered(lambda at, _: Batches(at, sql, parameters, size), given) as found:
             yield found
 
     def user_sql(
@@ -289,20 +291,25 @@ class StoreFile:
 
     def joined(self) -> dict[str, JoinedTable]:
         """Joins of users' own tables with frames, by the names of the tables."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             return {} if self.tables is None else self.tables.joined(connection)
 
     def catalog(self) -> Catalog:
-        """The catalog of the store, as the compiler of queries needs it."""
+        """The catalog of the store for the compiler of queries; remembered while its file stays as it is."""
+        if self._known is not None and self._known[0] == stamp_of(self.path):
+            return self._known[1]  # to open the store costs more than to compile a query
         from sgstore.store._catalog import catalog_of
 
-        with self._reading() as connection:
-            catalog = catalog_of(connection)
-            return catalog if self.tables is None else self.tables.known(connection, catalog)
+        with self.access.reading() as connection:
+            stamp, catalog = stamp_of(self.path), catalog_of(connection)
+            if self.tables is not None:
+                catalog = self.tables.known(connection, catalog)
+            self._known = stamp, catalog
+            return catalog
 
     def traces(self) -> tuple[StoredTrace, ...]:
         """All traces, in the order in which they came."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             return stored_traces(connection, self.access.root)
 
     def trace(self, ref: int | str) -> StoredTrace:
@@ -313,7 +320,7 @@ class StoreFile:
         StoreError
             None or several are meant; it says which there are.
         """
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(ref))
             found = [
                 t for t in stored_traces(connection, self.access.root) if t.trace_id == trace_id
@@ -337,7 +344,7 @@ class StoreFile:
         StoreError
             There is no such frame; it says which there are.
         """
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             return frame_named(connection, ref)
 
     def graph(self, ref: int | str) -> SceneGraph:
@@ -348,18 +355,18 @@ class StoreFile:
         StoreError
             There is no such frame.
         """
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             frame = frame_named(connection, ref)
             return next(self._graphs.scenes(connection, np.array([frame.frame_id])))
 
     def graphs(self, frame_id: NDArray[np.int64]) -> Iterator[SceneGraph]:
         """Scene graphs of some frames of one trace, whose ids ascend; their columns are in memory together."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             yield from self._graphs.scenes(connection, frame_id)
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
         """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
                 "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
@@ -369,7 +376,7 @@ class StoreFile:
 
     def channels(self, trace: int | str) -> tuple[Channel, ...]:
         """Channels of the recording of a trace; ``messages`` is -1."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
                 "SELECT channel_id, coalesce(topic, ''), coalesce(schema, ''), coalesce(schema_encoding, ''),"
@@ -379,7 +386,7 @@ class StoreFile:
 
     def context(self, trace: int | str) -> MessageRefs:
         """Places of the messages that later ones of a trace depend on; ``channel`` counts :meth:`channels`."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
                 "WITH number AS (SELECT channel_id, row_number() OVER (ORDER BY channel_id) - 1 AS channel"
@@ -440,7 +447,7 @@ class StoreFile:
 
     def _payload_place(self, ref: int | str, channel: str) -> tuple[Path, int, dict[str, int]]:
         """Recording, channel's id and place of the message that belongs to a frame."""
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             frame = frame_named(connection, ref)
             found = payload_place(connection, frame, channel)
             sql = "SELECT uri, size, mtime_ns, digest FROM trace WHERE trace_id = ?"
@@ -485,7 +492,7 @@ class StoreFile:
         StoreError
             It has another part of it, or with another config or map; or another trace has its id.
         """
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             return already_stored(connection, Identity.of(info, config, road_map, part))
 
     def segment(
@@ -547,7 +554,7 @@ class StoreFile:
             As :meth:`stored`.
         """
         found = already_stored if as_it_is else stored_name
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             return found(connection, sealed.identity)
 
     def known_digest(self, path: Path) -> str:
@@ -559,7 +566,7 @@ class StoreFile:
         except (OSError, TraceError):
             return ""
         sql = "SELECT any_value(digest) FROM trace WHERE uri = ? AND size = ? AND mtime_ns = ?"
-        with self._reading() as connection:
+        with self.access.reading() as connection:
             found = connection.execute(sql, [plain(str(path.resolve())), *mark]).fetchone()
         return str(found[0]) if found and found[0] else ""
 
@@ -571,7 +578,7 @@ class StoreFile:
         StoreError
             One of them is not there, or others keep the store for too long.
         """
-        with self._reading():
+        with self.access.reading():
             gone = {trace.trace_id: trace for trace in map(self.trace, traces)}
         with scratch(spill_folder()) as connection, self.access.writing(connection):
             for trace_id in gone:
@@ -648,21 +655,15 @@ class StoreFile:
         is left with the store.
         """
         with ExitStack() as stack:
-
-            def asked() -> T:
-                connection = stack.enter_context(self._reading())
-                with translated(self.path):
-                    give(connection, given)
-                    return ask(connection, stack)
-
-            try:
-                found = asked()
-            except EngineError:
-                stack.close()
-                if not self.access.restart():
-                    raise
-                found = asked()
+            while True:
+                try:
+                    connection = stack.enter_context(self.access.reading())
+                    with translated(self.path):
+                        give(connection, given)
+                        found = ask(connection, stack)
+                    break
+                except EngineError:
+                    stack.close()
+                    if not self.access.restart():
+                        raise
             yield found
-
-    def _reading(self) -> AbstractContextManager[DuckDBPyConnection]:
-        return self.access.reading()

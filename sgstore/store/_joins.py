@@ -215,8 +215,7 @@ class UserTables:
             )
             for table in self.tables
         }
-        sets = {name: replace(one, tables=found) for name, one in catalog.sets.items()}
-        return replace(catalog, tables=found, sets=sets)
+        return replace(catalog, tables=found)
 
     def _traces(self, connection: DuckDBPyConnection, table: UserTable) -> frozenset[int] | None:
         """Ids of the traces of a table whose rows are of traces."""
