@@ -458,7 +458,8 @@ class Killing:
         names = {Path(name).name for name in verb.starts_with} | {verb.gives} | {*more}
         beside = [path.name for path in place.iterdir() if path.name not in names]
         if verb.gives and (place / verb.gives).is_dir():
-            beside += [p.name for p in (place / verb.gives).iterdir() if p.name.startswith(".")]
+            hidden = {p.name for p in (place / verb.gives).iterdir() if p.name.startswith(".")}
+            beside += hidden - {*more}
         beside += [p.name for p in self._server.temporary.iterdir() if not tried_by_python(p)]
         assert beside == [], f"{what}: {sorted(beside)} is left"
 
