@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -23,7 +24,7 @@ import numpy as np
 
 from sgstore.errors import StoreError
 from sgstore.pair_numbers import pairs_view
-from sgstore.quoting import quoted
+from sgstore.quoting import literal, quoted
 from sgstore.vocabulary import ADD, NAMES
 
 if TYPE_CHECKING:
@@ -202,10 +203,11 @@ def _about(connection: DuckDBPyConnection, database: str, path: Path) -> dict[st
 def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str] | None:
     """Read version and digest of a store's schema from it; ``None`` if it is no store."""
     schema = schema_of(connection, database)
-    made = _made(connection, "tables", database, schema).get("store_info")
+    made = _made(connection, database)["table", schema].get("store_info")
     if made is None:
         return None
-    if _bare(made) != _bare(expected().tables["store_info"]):
+    own, added = expected().tables["store_info"], {"NOT", "NULL"}  # to its columns, since
+    if [word for word in made if word not in added] != [word for word in own if word not in added]:
         return {}  # whatever it is, it is not read
     rows = connection.execute(f"SELECT key, value FROM {quoted(database)}.{schema}.store_info")
     return {str(key): str(value) for key, value in rows.fetchall()}
@@ -213,8 +215,7 @@ def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str]
 
 def schema_of(connection: DuckDBPyConnection, database: str) -> str:
     """Return the schema in which a store has its tables: stores of before have them among the views."""
-    there = _made(connection, "tables", database, INSIDE)
-    return INSIDE if "store_info" in there else "main"
+    return INSIDE if "store_info" in _made(connection, database)["table", INSIDE] else "main"
 
 
 def other_version(about: dict[str, str]) -> str:
@@ -223,8 +224,8 @@ def other_version(about: dict[str, str]) -> str:
         about.get("schema_version", "unknown"),
         about.get("created_by", "an unknown version"),
     )
-    if held != schema_version():
-        reason = f"a store of version {held}, expected {schema_version()}"
+    if held != SCHEMA_VERSION:
+        reason = f"a store of version {held}, expected {SCHEMA_VERSION}"
     elif about.get("schema_digest") != schema_digest():
         reason = (
             f"a store of version {held}, but with other tables or views than those of this sgstore"
@@ -239,21 +240,22 @@ def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
 
     Kinds, relations and states of lights may have come to those of ``schema.sql``; they are made known here.
     """
-    labels = {enum: labels_of(connection, database, enum) for enum in NAMES}
+    made = _made(connection, database)
+    types = made["type", "main"]
+    labels = {enum: _labels(types.get(enum, ())) for enum in NAMES}
     wider = [
-        (enum, tuple(_words(_enum(some))))
+        (enum, types[enum])
         for enum, some in labels.items()
         if some[: len(own_labels(enum))] == own_labels(enum)
     ]
     shape = expected(*wider)
-    tables = _made(connection, "tables", database, INSIDE)
-    views, types = (_made(connection, what, database, "main") for what in ("views", "types"))
-    instead = _made(connection, "views", database, INSIDE)
-    found = [*_differing("table", shape.tables, tables, instead)]
-    instead = _made(connection, "tables", database, "main")
-    found += _differing("view", _expected_views(connection), views, instead)
+    found = [*_differing("table", shape.tables, made["table", INSIDE], made["view", INSIDE])]
+    found += _differing(
+        "view", _expected_views(connection), made["view", "main"], made["table", "main"]
+    )
     found += _differing("type", shape.types, types, {})
     found += _misplaced(connection, database, shape)
+    found += (f"{INSIDE}.{name} takes the place of a type" for name in sorted(made["type", INSIDE]))
     found += _shadowing(connection, database)
     found += _attached(connection, database, shape)
     return found or [*_strange(labels)]
@@ -265,7 +267,12 @@ def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
 @cache
 def own_labels(enum: str) -> tuple[str, ...]:
     """Return the values of an enumeration of ``schema.sql``."""
-    return tuple(_label(word) for word in expected().types[enum] if word.startswith("'"))
+    return _labels(expected().types[enum])
+
+
+def _labels(words: Tokens) -> tuple[str, ...]:
+    """The values of an enumeration, given its words."""
+    return tuple(word[1:-1].replace("''", "'") for word in words if word.startswith("'"))
 
 
 def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple[str, ...]:
@@ -410,44 +417,31 @@ def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
         before = word
 
 
-def _bare(words: Tokens) -> Tokens:
-    """The words of a table without what was added to its columns since."""
-    return tuple(word for word in words if word not in {"NOT", "NULL"})
-
-
 # What is there ----------------------------------------------------------------------------------------------
 
 
 def _made(
-    connection: DuckDBPyConnection, what: str, database: str, schema: str
-) -> dict[str, Tokens]:
-    """The tables, views or types of a schema, by their names in small letters."""
-    if what == "types":
+    connection: DuckDBPyConnection, database: str
+) -> Mapping[tuple[str, str], dict[str, Tokens]]:
+    """The tables, views and types of our schemas, by what they are and the schema: statements by name."""
+    found: dict[tuple[str, str], dict[str, Tokens]] = defaultdict(dict)
+    for what, told in (("table", "sql"), ("view", "sql"), ("type", "labels")):
         rows = connection.execute(
-            "SELECT type_name, labels FROM system.main.duckdb_types()"
-            " WHERE database_name = ? AND schema_name = ? AND internal = false",
-            [database, schema],
+            f"SELECT schema_name, {what}_name, {told} FROM system.main.duckdb_{what}s()"
+            " WHERE database_name = ? AND internal = false",
+            [database],
         ).fetchall()
-        return {name: tuple(_words(_enum(labels or ()))) for name, labels in rows}
-    one = what[:-1]
-    rows = connection.execute(
-        f"SELECT {one}_name, sql FROM system.main.duckdb_{what}()"
-        " WHERE database_name = ? AND schema_name = ? AND internal = false",
-        [database, schema],
-    ).fetchall()
-    return {name.lower(): _statement((sql or "").rstrip().removesuffix(";")) for name, sql in rows}
+        for schema, name, made in rows:
+            if schema in {"main", INSIDE} and what == "type":
+                found[what, schema][name] = tuple(_words(_enum(made or ())))
+            elif schema in {"main", INSIDE}:
+                written = (made or "").rstrip().removesuffix(";")
+                found[what, schema][name.lower()] = _statement(written)
+    return found
 
 
 def _enum(labels: Iterable[str]) -> str:
-    return f"ENUM({', '.join(_literal(label) for label in labels)})"
-
-
-def _literal(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"
-
-
-def _label(word: str) -> str:
-    return word[1:-1].replace("''", "'")
+    return f"ENUM({', '.join(map(literal, labels))})"
 
 
 def _differing(
@@ -469,8 +463,6 @@ def _misplaced(connection: DuckDBPyConnection, database: str, shape: Shape) -> I
         ours = {"main": shape.tables, INSIDE: shape.views}.get(schema, {})
         if name.lower() in ours:
             yield f"{schema}.{name} takes the place of {'a table' if schema == 'main' else 'a view'}"
-    for name in sorted(_made(connection, "types", database, INSIDE)):
-        yield f"{INSIDE}.{name} takes the place of a type"
 
 
 def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
