@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from carla_recordings import COMPRESSIONS, drive, idents, kinds, read, reasons, states
+from clipping import Source, write_clips
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import sgstore
 from sgstore.cli import run
 from sgstore.errors import TraceError
-from sgstore.exporters import ClipSource
-from sgstore.exporters._mcap import write_clips
 from sgstore.ingest import ingest, recordings
 from sgstore.mcap import McapFile, digest_of
 from sgstore.mcap._fetch import read_metadata
@@ -171,7 +170,7 @@ def test_a_clip_of_a_bag_is_the_clip_of_the_whole(tmp_path: Path, path: Path) ->
         with open_trace(source) as trace:
             info = trace.info
         cut = Clip("drive", 1_000_000_000, 1_500_000_000)
-        given = {"drive": ClipSource(source, info.digest, info.context)}
+        given = {"drive": Source(source, info.digest, info.context)}
         (clip,) = write_clips([cut], given, tmp_path / f"clips{len(clips)}")
         with clip.file.open("rb") as stream:
             clips.append(

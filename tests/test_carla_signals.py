@@ -20,11 +20,10 @@ from carla_recordings import (
     states,
     vehicle,
 )
+from clipping import Source, write_clips
 from opendrive_maps import a_map, a_road, element, lane, line, link, section
 
 from sgstore.doctor import examine
-from sgstore.exporters import ClipSource
-from sgstore.exporters._mcap import write_clips
 from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
 from sgstore.readers import open_trace
@@ -410,7 +409,7 @@ def test_a_clip_keeps_what_lasts_and_only_its_own_frames(tmp_path: Path, path: P
     with open_trace(drive(path)) as trace:
         info, whole = trace.info, list(trace.blocks())
     start, end = (int(whole[0].log_time_ns[i]) for i in (8, 12))
-    source = ClipSource(path, info.digest, info.context)
+    source = Source(path, info.digest, info.context)
     (clip,) = write_clips([Clip("drive", start, end)], {"drive": source}, tmp_path / "clips")
 
     ours, blocks, report = read(clip.file)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from carla_recordings import drive as carla_drive
+from clipping import Source, write_clips
 from foxglove_scenes import SceneRecorder, cube
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.data_stream import RecordBuilder
@@ -333,13 +334,10 @@ def test_clips_keep_to_the_rules_of_the_doctor(store: Store, clip: Path, tmp_pat
 def test_clips_of_recordings_of_all_producers_keep_to_the_rules(
     data: Path, tmp_path: Path, name: str
 ) -> None:
-    from sgstore.exporters import ClipSource
-    from sgstore.exporters._mcap import write_clips
-
     path = data / "traces" / name
     with open_trace(path) as trace:
         first = next(iter(trace.blocks())).log_time_ns
-        source = ClipSource(path, trace.info.digest, trace.info.context)
+        source = Source(path, trace.info.digest, trace.info.context)
     span = Clip("t", int(first[0]), int(first[-1]))
     (written,) = write_clips([span], {"t": source}, tmp_path)
 
@@ -486,7 +484,7 @@ def test_a_file_without_fault_has_none(tmp_path: Path) -> None:
 def test_a_clip_that_the_official_reader_reads_otherwise_is_not_handed_out(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sgstore.exporters._mcap_writer as writer
+    import sgstore.exporters._mcap as writer
 
     def forgets(self: Writer, *_message: Any) -> None:
         pass

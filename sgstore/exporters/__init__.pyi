@@ -1,6 +1,5 @@
 # The face of this package: what others may import from it.
 
-from ._clips import ClipSource as ClipSource
 from ._clips import WrittenClip as WrittenClip
 from ._clips import WrittenFile as WrittenFile
 from ._labels import FEW as FEW
@@ -24,7 +23,6 @@ from ._registry import write_stored as write_stored
 
 __all__ = [
     "ClipFrames",
-    "ClipSource",
     "EXPORTERS",
     "Export",
     "Exporter",

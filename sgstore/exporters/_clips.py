@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.mcap import Loss
-    from sgstore.world import MessageRefs
 
 
 MANIFEST: Final = "manifest.json"
@@ -39,27 +38,6 @@ _MOVING: Final = "moving.json"
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
 _RESERVED: Final = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 _LONGEST_NAME: Final = 80
-
-
-@dataclass(frozen=True, slots=True)
-class ClipSource:
-    """A recording that clips are cut from.
-
-    Attributes
-    ----------
-    path : Path
-    digest : str
-        SHA-256 that the file had when it was ingested; empty: not to be checked.
-    context : MessageRefs
-        Messages that later ones depend on. Only their places and which of them share a channel matter.
-    tolerance_ns : int
-        By how much a message may miss the ends of a clip and still belong to it.
-    """
-
-    path: Path
-    digest: str
-    context: MessageRefs
-    tolerance_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,15 +176,13 @@ def safe_name(text: str, otherwise: str) -> str:
 
 
 @contextmanager
-def export_folder(to: Path, names: Sequence[str] = ()) -> Generator[Path]:
+def export_folder(to: Path) -> Generator[Path]:
     """A folder to write the files of an export into; they are moved to ``to`` if all goes well.
 
     Parameters
     ----------
     to : Path
         Made if it does not exist, and gone again if the export is not complete.
-    names : sequence of str
-        Files and folders that are known to be there at the end, so that it is seen at once if one is taken.
 
     Raises
     ------
@@ -217,7 +193,7 @@ def export_folder(to: Path, names: Sequence[str] = ()) -> Generator[Path]:
     try:
         to.mkdir(parents=True, exist_ok=True)
         with HeldFolder(to, _PREFIX, _undo) as held:
-            _refuse_taken(to, (*names, MANIFEST))
+            _refuse_taken(to, [MANIFEST])
             work = held.path / _FILES
             work.mkdir()
             yield work
@@ -285,30 +261,10 @@ def _refuse_taken(to: Path, names: Sequence[str]) -> None:
         )
 
 
-def write_manifest(folder: Path, clips: Sequence[WrittenClip]) -> None:
-    """Write the manifest of clips as files: the same bytes for the same clips."""
-    _write_json(
-        folder, {"format": "sgstore.clips", "tool": tool(), "clips": [c.as_dict() for c in clips]}
-    )
-
-
-def write_file_manifest(
-    folder: Path, about: Mapping[str, Any], files: Sequence[WrittenFile]
-) -> None:
-    """Write the manifest of any other export: what it is about, and its files."""
-    _write_json(
-        folder,
-        {
-            "format": "sgstore.export",
-            "tool": tool(),
-            **about,
-            "files": [f.as_dict() for f in files],
-        },
-    )
-
-
-def _write_json(folder: Path, content: Mapping[str, Any]) -> None:
-    text = json.dumps(content, indent=2, sort_keys=True, ensure_ascii=False)
+def write_manifest(folder: Path, form: str, content: Mapping[str, Any]) -> None:
+    """Write the manifest of an export: the same bytes for the same content."""
+    told = {"format": form, "tool": tool(), **content}
+    text = json.dumps(told, indent=2, sort_keys=True, ensure_ascii=False)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 

@@ -15,27 +15,30 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import re
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
 from sgstore.errors import ExportError, StoreError, TraceError
 from sgstore.exporters._clips import WrittenFile, clip_name, safe_name
-from sgstore.exporters._sensors import ImageFile, PointCloud, Video, cloud_file, sensor_of
 from sgstore.mcap import Loss
-from sgstore.readers import open_recording
+from sgstore.readers import open_recording, picture_form, png, record_reader
 from sgstore.vocabulary import natural, suggestion
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
+    from collections.abc import Generator, Iterator
     from pathlib import Path
 
+    from mcap.records import Channel, Schema
+    from numpy.typing import NDArray
+
     from sgstore.exporters._labels import ClipFrames, Export
-    from sgstore.exporters._sensors import Sensed
     from sgstore.mcap import Messages, Recording
     from sgstore.store import StoredTrace
 
@@ -74,25 +77,25 @@ class _FrameMessage:
     place: Place
 
 
-@dataclass(slots=True)
-class _File:
-    """A file that was written."""
-
-    name: str
-    holds: str
-    form: str
-    sha256: str
-    picture: str = ""
+File = tuple[str, str, str, str, str]
+"""A file that was written, as the last columns of :data:`FILE_COLUMNS`: name, holds, form, picture, hash."""
+Found = dict[tuple[str, Place], File | None]
+"""Files of messages, by channel and place; ``None`` where one is neither picture nor cloud."""
 
 
 @dataclass(slots=True)
 class _Film:
     """The file of a video, where its latest picture stands in the recording, and how many there are."""
 
-    file: _File
     path: Path
+    form: str
     last: Place
     count: int
+
+    def as_file(self) -> File:
+        """The latest picture."""
+        name = f"{self.path.parent.name}/{self.path.name}"
+        return name, "video", self.form, str(self.count - 1), ""
 
 
 @dataclass(slots=True)
@@ -223,15 +226,15 @@ class _Writing:
     frames: ClipFrames
     folder: Path
     tables: _Tables
-    _known: dict[str, Callable[[bytes], Sensed]] = field(
-        default_factory=dict[str, "Callable[[bytes], Sensed]"]
+    _known: dict[str, Callable[[bytes], Sensed | None]] = field(
+        default_factory=dict[str, "Callable[[bytes], Sensed | None]"]
     )
     _names: dict[str, str] = field(default_factory=dict[str, str])
     _films: dict[str, _Film] = field(default_factory=dict[str, _Film])
 
     def write(self) -> None:
         """Write the files of all frames, some frames at a time."""
-        before: dict[tuple[str, Place], _File | None] = {}
+        before: Found = {}
         for start in range(0, len(self.frames), WINDOW):
             rows = list(self._rows(self.frames.take(slice(start, start + WINDOW))))
             wanted: dict[tuple[str, Place], _FrameMessage] = {}
@@ -244,7 +247,8 @@ class _Writing:
                 self._tell(row, found.get((row.channel, row.place)))
             before = found
         for film in self._films.values():
-            _test_film(film)
+            if not film.path.stat().st_size:
+                raise ExportError(f"{film.path.name}: is empty")
 
     def _rows(self, frames: ClipFrames) -> Iterator[_FrameMessage]:
         seq = dict(zip(frames.frame_id.tolist(), frames.seq.tolist(), strict=True))
@@ -258,7 +262,7 @@ class _Writing:
     def _fetch(
         self,
         wanted: dict[tuple[str, Place], _FrameMessage],
-        found: dict[tuple[str, Place], _File | None],
+        found: Found,
     ) -> None:
         """Write the messages at some places into files; ``None`` where one is neither picture nor cloud."""
         chunks = {place[0] for _, place in wanted}
@@ -290,7 +294,7 @@ class _Writing:
         run: Messages,
         at: int,
         wanted: dict[tuple[str, Place], _FrameMessage],
-        found: dict[tuple[str, Place], _File | None],
+        found: Found,
         ends: dict[str, Place],
     ) -> None:
         """Write a message, if it is wanted, or if a video goes on with it up to one that is."""
@@ -304,15 +308,18 @@ class _Writing:
             if not film.last < place <= ends.get(channel.topic, film.last):
                 return
             sensed = self._sensed(int(run.channel[at]), bytes(run.data(at)), row)
-            if isinstance(sensed, Video):
-                self._append(film, place, sensed)
+            if sensed is not None and sensed.holds == "video":
+                with film.path.open("ab") as stream:
+                    stream.write(sensed.data)
+                film.last = place
+                film.count += 1
             if row is not None:
-                found[channel.topic, place] = self._of_film(film)
+                found[channel.topic, place] = film.as_file()
         elif row is not None:
             sensed = self._sensed(int(run.channel[at]), bytes(run.data(at)), row)
             found[channel.topic, place] = self._file(row, sensed)
 
-    def _sensed(self, number: int, message: bytes, row: _FrameMessage | None) -> Sensed:
+    def _sensed(self, number: int, message: bytes, row: _FrameMessage | None) -> Sensed | None:
         channel = self.recording.channels[number]
         if channel.topic not in self._known:
             schema = self.recording.schemas.get(channel.schema_id)
@@ -324,19 +331,17 @@ class _Writing:
                 self._lose(row, str(error))
             return None
 
-    def _file(self, row: _FrameMessage, sensed: Sensed) -> _File | None:
-        match sensed:
-            case ImageFile():
-                return self._store(row, "picture", sensed.form, sensed.data)
-            case PointCloud():
-                form = self.export.clouds
-                return self._store(row, "cloud", form, cloud_file(sensed.points, form))
-            case Video():
-                return self._begin(row, sensed)
-            case None:
-                return None
+    def _file(self, row: _FrameMessage, sensed: Sensed | None) -> File | None:
+        if sensed is None:
+            return None
+        if sensed.holds == "video":
+            return self._begin(row, sensed)
+        if sensed.holds == "cloud":
+            form = self.export.clouds
+            return self._store(row, "cloud", form, cloud_file(sensed.data, form))
+        return self._store(row, "picture", sensed.form, sensed.data)
 
-    def _store(self, row: _FrameMessage, holds: str, form: str, data: bytes) -> _File:
+    def _store(self, row: _FrameMessage, holds: str, form: str, data: bytes) -> File:
         name = f"{self._name(row.channel)}/{row.seq:06d}.{ENDINGS.get(form, form)}"
         path = self.folder / name
         path.parent.mkdir(exist_ok=True)
@@ -348,9 +353,9 @@ class _Writing:
             np.load(io.BytesIO(data), allow_pickle=False)
         self._count(row).files += 1
         digest = hashlib.sha256(data).hexdigest()
-        return _File(f"{self.folder.name}/{name}", holds, form, digest)
+        return f"{self.folder.name}/{name}", holds, form, "", digest
 
-    def _begin(self, row: _FrameMessage, video: Video) -> _File | None:
+    def _begin(self, row: _FrameMessage, video: Sensed) -> File | None:
         """Begin the file of a video with the key frame that a picture needs, and all between."""
         try:
             carried = self.export.store.file.carried(row.frame_id, row.channel)
@@ -366,35 +371,24 @@ class _Writing:
         path = self.folder / f"{self._name(row.channel)}.{form}"
         with path.open("xb") as stream:
             stream.write(carried.data)
-        file = _File(f"{self.folder.name}/{path.name}", "video", form, "")
-        film = _Film(file, path, row.place, carried.messages)
+        film = _Film(path, form, row.place, carried.messages)
         self._films[row.channel] = film
         self._count(row).files += 1
-        return self._of_film(film)
+        return film.as_file()
 
-    def _append(self, film: _Film, place: Place, video: Video) -> None:
-        with film.path.open("ab") as stream:
-            stream.write(video.data)
-        film.last = place
-        film.count += 1
-
-    def _of_film(self, film: _Film) -> _File:
-        """The latest picture of a video."""
-        told = film.file
-        return _File(told.name, told.holds, told.form, "", str(film.count - 1))
-
-    def _tell(self, row: _FrameMessage, file: _File | None) -> None:
+    def _tell(self, row: _FrameMessage, file: File | None) -> None:
         """A row of the table of files."""
         count = self._count(row)
         count.frames += 1
         if file is None:
             return
-        count.holds = file.holds
+        count.holds = file[1]
         self.tables.rows += 1
         self.tables.files.writerow(
             (
                 *(self.frames.number, row.frame_id, self.frames.clip.trace, row.seq, row.channel),
-                *(row.log_time_ns, file.name, file.holds, file.form, file.picture, file.sha256),
+                row.log_time_ns,
+                *file,
             )
         )
 
@@ -446,6 +440,241 @@ def _test_picture(path: Path, data: bytes) -> None:
             raise ExportError(f"{path.name}: cannot be opened again: {error}") from error
 
 
-def _test_film(film: _Film) -> None:
-    if not film.path.stat().st_size:
-        raise ExportError(f"{film.path.name}: is empty")
+# What a message of a sensor holds: a picture or a cloud of points, by the schema in the file ----
+# Messages that wrap the file of a picture (``data`` and ``format``) give that file; those that hold pixels
+# (``width``, ``height``, ``encoding``, ``data``) give a PNG, or an array where a PNG cannot hold them; those
+# that hold points (``fields`` and their places in ``data``) give columns. Of anything else nothing is known
+# here.
+#
+# Source: ROS 2, ``sensor_msgs`` (``Image``, ``PointCloud2``; ``image_encodings.hpp``); Foxglove's schemas
+# ``RawImage``, ``CompressedImage``, ``PointCloud``, ``PackedElementField``.
+
+VIDEO: Final = re.compile("26[45]|avc|hevc|av1|vp9", re.IGNORECASE)
+"""What formats of video are called."""
+
+MAX_POINTS: Final = 20_000_000
+"""Most points of a cloud."""
+
+_ROS: Final = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1))
+_FOXGLOVE: Final = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), 1))
+_FOXGLOVE_WORDS: Final = (
+    *("UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"),
+)
+"""Types of the numbers of points."""
+
+_LAYOUTS: Final = {
+    **dict.fromkeys(("mono8", "8uc1"), ("u1", 1, "")),
+    **dict.fromkeys(("mono16", "16uc1"), ("u2", 1, "")),
+    **dict.fromkeys(("rgb8", "8uc3"), ("u1", 3, "")),
+    "rgb16": ("u2", 3, ""),
+    "bgr8": ("u1", 3, "bgr"),
+    "bgr16": ("u2", 3, "bgr"),
+    **dict.fromkeys(("rgba8", "8uc4"), ("u1", 4, "")),
+    "bgra8": ("u1", 4, "bgr"),
+    "rgba16": ("u2", 4, ""),
+    "bgra16": ("u2", 4, "bgr"),
+    **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), ("u1", 2, "array")),
+}
+"""Encodings of pixels: type and number of their values; whether their order is turned, or no PNG has them."""
+_BAYER: Final = re.compile(r"bayer_[a-z]{4}(8|16)")
+_OPENCV: Final = re.compile(r"(8|16|32|64)([usf])c(\d)")
+
+
+class Sensed(NamedTuple):
+    """Content of a message.
+
+    Attributes
+    ----------
+    holds : str
+        ``picture``: the content of a file; ``video``: one of its pictures; ``cloud``: points.
+    form : str
+        Of a picture ``jpeg``, ``png``, ``webp``, ``tiff``, ``bmp`` or ``npy``; of a video as the message
+        calls it.
+    data : bytes or structured array
+        Points are little endian, without gaps.
+    """
+
+    holds: Literal["picture", "video", "cloud"]
+    form: str
+    data: Any
+
+
+Record = Mapping[str, Any]
+
+
+def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sensed | None]:
+    """A function that says what is in a message of a channel; ``None``: neither picture nor points.
+
+    It raises ``TraceError`` where a message looks like a picture or a cloud and is not what it says.
+    """
+    read = record_reader(channel, schema)
+
+    def sensed(message: bytes) -> Sensed | None:
+        record = read(message)
+        return None if record is None else _of_record(record)
+
+    return sensed
+
+
+def _of_record(record: Record) -> Sensed | None:
+    data = record.get("data")
+    if isinstance(data, np.ndarray) and data.dtype.itemsize == 1:
+        data = data.tobytes()
+    if not isinstance(data, bytes):
+        return None
+    if isinstance(record.get("format"), str):
+        return _of_file(data, record["format"])
+    try:
+        if isinstance(record.get("encoding"), str) and "width" in record and "height" in record:
+            return _of_pixels(data, record)
+        if "fields" in record and ("point_step" in record or "point_stride" in record):
+            return Sensed("cloud", "", _points(data, record))
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
+        raise TraceError(f"not what it says: {error}") from error
+    return None
+
+
+def _of_file(data: bytes, form: str) -> Sensed | None:
+    picture = picture_form(data)
+    if picture:
+        return Sensed("picture", picture, data)
+    return Sensed("video", form, data) if VIDEO.search(form) else None
+
+
+# Pixels ---------------------------------------------------------------------------------------------------
+
+
+def _of_pixels(data: bytes, record: Record) -> Sensed:
+    width, height = int(record["width"]), int(record["height"])
+    encoding = str(record["encoding"]).lower()
+    dtype, channels, how = _layout(encoding)
+    big = bool(record.get("is_bigendian", False))
+    kind = np.dtype(f"{'>' if big else '<'}{dtype}")
+    across = width * channels * kind.itemsize
+    step = int(record.get("step") or across)
+    if width <= 0 or height <= 0 or step < across or step * height > len(data) + step - across:
+        raise TraceError(
+            f"a picture of {width} x {height} pixels ({encoding}) in {len(data)} bytes, {step} a row"
+        )
+    rows = np.frombuffer(data, np.uint8, step * (height - 1) + across)
+    rows = np.lib.stride_tricks.as_strided(rows, (height, across), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
+    if how == "array":
+        return Sensed("picture", "npy", _npy(pixels.astype(kind.newbyteorder("<"))))
+    if how == "bgr":
+        pixels = pixels[..., [2, 1, 0, *range(3, channels)]]
+    return Sensed("picture", "png", png(pixels.astype(kind.newbyteorder("="))))
+
+
+def _layout(encoding: str) -> tuple[str, int, str]:
+    if encoding in _LAYOUTS:
+        return _LAYOUTS[encoding]
+    bayer = _BAYER.fullmatch(encoding)
+    if bayer is not None:  # as the sensor has it: grey
+        return f"u{int(bayer[1]) // 8}", 1, ""
+    opencv = _OPENCV.fullmatch(encoding)
+    if opencv is not None:
+        kind = {"u": "u", "s": "i", "f": "f"}[opencv[2]]
+        return f"{kind}{int(opencv[1]) // 8}", int(opencv[3]), "array"
+    raise TraceError(f"pixels in an encoding that is not known: {encoding!r}")
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
+    return stream.getvalue()
+
+
+# Points ---------------------------------------------------------------------------------------------------
+
+
+def _points(data: bytes, record: Record) -> NDArray[Any]:
+    ros = "point_step" in record
+    step = int(record["point_step" if ros else "point_stride"])
+    order = ">" if ros and record.get("is_bigendian") else "<"
+    fields = [_field(one, order, ros=ros) for one in record["fields"]]
+    names = [name for name, *_ in fields]
+    kind = np.dtype(
+        {
+            "names": names,
+            "formats": [form for _, form, _ in fields],
+            "offsets": [offset for *_, offset in fields],
+            "itemsize": step,
+        }
+    )
+    if ros:
+        width, height = int(record["width"]), int(record["height"])
+        row = int(record.get("row_step") or width * step)
+        if min(width, height) < 0 or row < width * step or row * height > len(data):
+            raise TraceError(f"{width} x {height} points of {step} bytes in {len(data)} bytes")
+        count, flat = width * height, row == width * step
+    else:
+        count, flat, width, height, row = len(data) // step if step else 0, True, 0, 0, 0
+    if count > MAX_POINTS:
+        raise TraceError(f"{count} points; at most {MAX_POINTS} are read")
+    if flat:
+        found = np.frombuffer(data, kind, count)
+    else:
+        rows = [np.frombuffer(data, kind, width, i * row) for i in range(height)]
+        found = np.concatenate(rows) if rows else np.zeros(0, kind)
+    packed = np.empty(count, [(name, kind[name].newbyteorder("<")) for name in names])
+    for name in names:
+        packed[name] = found[name]
+    return packed
+
+
+def _field(told: Any, order: str, *, ros: bool) -> tuple[str, Any, int]:
+    """Name, type and place of a number of points."""
+    number = told["datatype"] if ros else told["type"]
+    if isinstance(number, str):
+        number = _FOXGLOVE_WORDS.index(number)
+    form = (_ROS if ros else _FOXGLOVE).get(int(number))
+    if form is None:
+        raise TraceError(f"points with numbers of a type that is not known: {number}")
+    count = int(told.get("count") or 1) if ros else 1
+    if not 1 <= count <= 4096:
+        raise TraceError(f"points with {count} numbers in one field")
+    kind = f"{order}{form}"
+    return str(told["name"]), kind if count == 1 else (kind, (count,)), int(told["offset"])
+
+
+def cloud_file(points: NDArray[Any], form: str) -> bytes:
+    """Points as the content of a file.
+
+    Parameters
+    ----------
+    points : structured array
+    form : str
+        ``pcd``: the Point Cloud Library's format 0.7, binary. ``npy``: numpy's, structured. ``bin``: as KITTI
+        has them, x, y, z and intensity in float32, 0 where there is none.
+    """
+    if form == "npy":
+        return _npy(points)
+    if form == "bin":
+        columns = [
+            points[name] if name in (points.dtype.names or ()) else np.zeros(len(points))
+            for name in ("x", "y", "z", "intensity")
+        ]
+        return np.stack(columns, axis=1).astype("<f4").tobytes()
+    return _pcd(points)
+
+
+def _pcd(points: NDArray[Any]) -> bytes:
+    """Source: Point Cloud Library, "The PCD (Point Cloud Data) file format", version 0.7."""
+    names = points.dtype.names or ()
+    kinds = [points.dtype[name] for name in names]
+    letters = {"f": "F", "i": "I", "u": "U"}
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(re.sub(r"\W", "_", name) or "_" for name in names),
+        "SIZE " + " ".join(str(kind.base.itemsize) for kind in kinds),
+        "TYPE " + " ".join(letters[kind.base.kind] for kind in kinds),
+        "COUNT " + " ".join(str(int(np.prod(kind.shape, dtype=int))) for kind in kinds),
+        f"WIDTH {len(points)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(points)}",
+        "DATA binary",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii", "replace") + points.tobytes()

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, QueryError, TextSpan
-from sgstore.exporters._clips import ClipSource
 from sgstore.store import SEQ_BITS, trace_of
 from sgstore.world import tolerance_ns
 
@@ -237,19 +236,6 @@ class Export:
     clouds: str = "pcd"
     provenance: Mapping[str, str] = field(default_factory=dict[str, str])
     progress: Callable[[int, int], None] | None = None
-
-    def sources(self) -> dict[str, ClipSource]:
-        """The recordings of the traces of the clips."""
-        traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
-        return {
-            name: ClipSource(
-                trace.path,
-                trace.digest,
-                self.store.file.context(name),
-                tolerance_ns(trace.period_ns),
-            )
-            for name, trace in traces.items()
-        }
 
     def trace(self, name: str) -> StoredTrace:
         """A trace of the store."""

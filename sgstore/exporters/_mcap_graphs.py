@@ -12,7 +12,6 @@ The metadata of these channels says ``sgstore: derived``: they are made of the r
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mcap.records import Channel, Schema
@@ -24,10 +23,9 @@ from sgstore.exporters._nx import graphs_of
 from sgstore.readers import DERIVED
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from sgstore.exporters._labels import Export
-    from sgstore.exporters._mcap_writer import ClipWriter
     from sgstore.graph import SceneGraph
 
 
@@ -99,20 +97,8 @@ LABEL_SCHEMA: Final[dict[str, Any]] = {
     "required": ["timestamp", "trace", "frame_id", "seq", "labels"],
 }
 
-Message = tuple[int, int, int, bytes]
-"""Channel, sequence number, log time in ns, data."""
-
-
-@dataclass(slots=True)
-class _Kind:
-    """One of the channels."""
-
-    topic: str
-    schema: str
-    schema_encoding: str
-    schema_data: bytes
-    encoding: str
-    number: int = 0
+ClipMessage = tuple[int, int, int, int, bytes | memoryview]
+"""Channel, sequence number, log time and time of publication in ns, data."""
 
 
 def is_added(channel: Channel) -> bool:
@@ -130,15 +116,15 @@ class Added:
 
     def __init__(self, export: Export) -> None:
         self._export = export
-        graphs, labels = _as_json(GRAPH_SCHEMA), _as_json(LABEL_SCHEMA)
-        kinds = [_Kind(LABELS, "sgstore.Labels", "jsonschema", labels, "json")]
+        schema = ("jsonschema", _as_json(LABEL_SCHEMA), "json")
+        self._kinds = [(LABELS, "sgstore.Labels", *schema)]
         if export.with_graph:
             scene = foxglove_scene.schema(foxglove_scene.SCENE)
-            kinds = [
-                _Kind(GRAPH, "sgstore.SceneGraph", "jsonschema", graphs, "json"),
-                _Kind(SCENE, "foxglove.SceneUpdate", "protobuf", scene, "protobuf"),
+            self._kinds = [
+                (GRAPH, "sgstore.SceneGraph", "jsonschema", _as_json(GRAPH_SCHEMA), "json"),
+                (SCENE, "foxglove.SceneUpdate", "protobuf", scene, "protobuf"),
             ]
-        self._kinds = kinds
+        self._first = 0  # the number of the first channel in the clip that is written
 
     def definitions(
         self, schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
@@ -153,16 +139,16 @@ class Added:
         schema, channel = max(schemas, default=0), max(channels, default=0)
         if max(schema, channel) + len(self._kinds) >= 1 << 16:
             raise ExportError("the recording leaves no numbers for channels of scene graphs")
-        for i, kind in enumerate(self._kinds, 1):
-            kind.number = channel + i
-            yield Schema(schema + i, kind.schema_data, kind.schema_encoding, kind.schema)
-            yield Channel(kind.number, kind.topic, kind.encoding, dict(DERIVED), schema + i)
+        self._first = channel + 1
+        for i, (topic, name, form, data, encoding) in enumerate(self._kinds, 1):
+            yield Schema(schema + i, data, form, name)
+            yield Channel(channel + i, topic, encoding, dict(DERIVED), schema + i)
 
     def channels(self) -> list[tuple[int, str, str]]:
         """Number, topic and schema of each, as they were defined last."""
-        return [(kind.number, kind.topic, kind.schema) for kind in self._kinds]
+        return [(i, topic, name) for i, (topic, name, *_) in enumerate(self._kinds, self._first)]
 
-    def messages(self, number: int) -> Iterator[Message]:
+    def messages(self, number: int) -> Iterator[ClipMessage]:
         """The messages of the frames of a clip, by its number, in order of log time."""
         frames = ClipFrames.of(self._export, number, self._export.clips[number - 1])
         order = frames.log_time_ns.argsort(kind="stable")
@@ -174,8 +160,9 @@ class Added:
             window = frames.take(rows)
             found = list(self._of_window(window))
             for at in window.log_time_ns.argsort(kind="stable").tolist():
-                for kind, data in zip(self._kinds, found[at], strict=True):
-                    yield kind.number, sequence, int(window.log_time_ns[at]), data
+                time = int(window.log_time_ns[at])
+                for channel, data in enumerate(found[at], self._first):
+                    yield channel, sequence, time, time, data
                 sequence += 1
 
     def _of_window(self, frames: ClipFrames) -> Iterator[tuple[bytes, ...]]:
@@ -190,30 +177,6 @@ class Added:
         for row, graph in enumerate(graphs_of(self._export, frames)):
             told = _as_json(heads[row] | _graph(graph))
             yield told, foxglove_scene.message(graph, int(frames.log_time_ns[row]))
-
-
-class Waiting:
-    """Messages that wait until it is their turn among others, in order of log time."""
-
-    def __init__(self, writer: ClipWriter, messages: Iterable[Message]) -> None:
-        self._writer = writer
-        self._messages = iter(messages)
-        self._next = next(self._messages, None)
-
-    def write_before(self, log_time_ns: int) -> None:
-        """Write those of earlier log times."""
-        while self._next is not None and self._next[2] < log_time_ns:
-            self._write(self._next)
-
-    def write_rest(self) -> None:
-        """Write all that are left."""
-        while self._next is not None:
-            self._write(self._next)
-
-    def _write(self, message: Message) -> None:
-        channel, sequence, time_ns, data = message
-        self._writer.message(channel, sequence, time_ns, time_ns, data)
-        self._next = next(self._messages, None)
 
 
 def _head(frames: ClipFrames, row: int) -> dict[str, Any]:

@@ -14,7 +14,6 @@ Source: open-simulation-interface 3.8.0; omega-prime specification (``MapAsamOpe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -92,19 +91,9 @@ _LAMPS: Final = {
 _INDICATORS: Final = ("OFF", "LEFT", "RIGHT", "WARNING")
 
 
-@dataclass(frozen=True, slots=True)
-class _Types:
-    """Message classes, and the descriptors that an MCAP file carries for them."""
-
-    view: type[Any]
-    road_map: type[Any]
-    view_schema: bytes
-    map_schema: bytes
-
-
 @cache
-def types() -> _Types:
-    """The classes of the messages that are written."""
+def types() -> tuple[type[Any], type[Any], bytes, bytes]:
+    """Classes of a sensor view and of a road map, and the descriptors that an MCAP file carries for them."""
     view_schema = descriptors()
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(
@@ -124,12 +113,12 @@ def types() -> _Types:
         message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
         for name in (SENSOR_VIEW, ROAD_MAP)
     )
-    return _Types(view, road_map, view_schema, map_schema)
+    return view, road_map, view_schema, map_schema
 
 
 def map_message(text: str, name: str) -> bytes:
     """The message that carries a road map."""
-    message = types().road_map(map_reference=name, open_drive_xml_content=text)
+    message = types()[1](map_reference=name, open_drive_xml_content=text)
     return message.SerializeToString()
 
 
@@ -144,7 +133,7 @@ class OsiFrames:
 
     def message(self, frame: Frame) -> bytes:
         """The message of the next frame."""
-        out = types().view()
+        out = types()[0]()
         ground = out.global_ground_truth
         for part in (out, ground):
             part.version.version_major, part.version.version_minor, part.version.version_patch = (

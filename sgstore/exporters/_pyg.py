@@ -16,7 +16,7 @@ Source: RoadScene2Vec (Malawade et al., 2022), its configuration (names of actor
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
@@ -75,60 +75,51 @@ _KINDS: Final = {
 """Columns: type, and how many numbers a row has; 0: one, and no further axis."""
 
 
-class _Column:
-    """An ``.npy`` file that grows; its head is written again when its length is known."""
-
-    def __init__(self, file: Path, dtype: str, width: int = 0) -> None:
-        self._dtype = np.dtype(dtype)
-        self._width = width
-        self._rows = 0
-        self._stream = file.open("xb")
-        self._head()
-
-    def _head(self) -> None:
-        shape = (self._rows, self._width) if self._width else (self._rows,)
-        # Numpy leaves room in it for the largest number there is, so that its length stays the same.
-        np.lib.format.write_array_header_1_0(
-            self._stream,
-            {"descr": self._dtype.str, "fortran_order": False, "shape": shape},
-        )
-
-    def add(self, values: NDArray[Any]) -> None:
-        """Append rows."""
-        self._rows += len(values)
-        self._stream.write(np.ascontiguousarray(values, self._dtype).tobytes())
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._stream.seek(0)
-        self._head()
-        self._stream.close()
-
-
-@dataclass(slots=True)
 class _TensorColumns:
-    """All columns, and what is written of them so far."""
+    """All columns, as ``.npy`` files that grow, and what is written of them so far.
 
-    folder: Path
-    labels: Mapping[str, _LabelKind]
-    types: list[str] = field(default_factory=list[str])
-    relations: list[str] = field(default_factory=list[str])
-    nodes: int = 0
-    edges: int = 0
-    clips: list[list[int]] = field(default_factory=list[list[int]])
-    of: dict[str, _Column] = field(default_factory=dict[str, _Column])
+    Parameters
+    ----------
+    folder : Path
+    labels : mapping
+        Name → the kind and the words of a label; see :func:`_kind_of`.
+    """
+
+    def __init__(self, folder: Path, labels: Mapping[str, tuple[str, list[str]]]) -> None:
+        self.labels = labels
+        self.types: list[str] = []
+        self.relations: list[str] = []
+        self.nodes = self.edges = 0
+        self.clips: list[list[int]] = []
+        self._kinds = _KINDS | {f"label_{name}": ("<f8", 0) for name in labels}
+        self._rows = Counter[str]()
+        self._streams = {name: (folder / f"{name}.npy").open("xb") for name in self._kinds}
 
     def __enter__(self) -> Self:
-        kinds = _KINDS | {f"label_{name}": ("<f8", 0) for name in self.labels}
-        for name, (dtype, width) in kinds.items():
-            self.of[name] = _Column(self.folder / f"{name}.npy", dtype, width)
+        for name in self._streams:
+            self._write_head(name)
         for name in ("node_ptr", "edge_ptr"):
-            self.of[name].add(np.zeros(1))
+            self._append(name, np.zeros(1))
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        for column in self.of.values():
-            column.close()
+        for name, stream in self._streams.items():
+            stream.seek(0)
+            self._write_head(name)
+            stream.close()
+
+    def _write_head(self, name: str) -> None:
+        """Write how long a column is: at first without rows, in the end with the number that it has."""
+        dtype, width = self._kinds[name]
+        shape = (self._rows[name], width) if width else (self._rows[name],)
+        # Numpy leaves room in it for the largest number there is, so that its length stays the same.
+        np.lib.format.write_array_header_1_0(
+            self._streams[name], {"descr": dtype, "fortran_order": False, "shape": shape}
+        )
+
+    def _append(self, name: str, values: NDArray[Any]) -> None:
+        self._rows[name] += len(values)
+        self._streams[name].write(np.ascontiguousarray(values, self._kinds[name][0]).tobytes())
 
     def add(self, frames: ClipFrames, columns: Mapping[str, NDArray[Any]]) -> None:
         """Append graphs."""
@@ -146,41 +137,32 @@ class _TensorColumns:
         }
         self.nodes += int(columns["nodes"].sum())
         self.edges += int(columns["edges"].sum())
-        for name, column in self.of.items():
-            column.add(per[name] if name in per else columns[name])
+        for name in self._streams:
+            self._append(name, per[name] if name in per else columns[name])
 
 
-@dataclass(frozen=True, slots=True)
-class _LabelKind:
-    """Meaning of a label's numbers. ``kind``: ``bool``, ``number`` or ``text``; of texts, all ``words``."""
+def _kind_of(values: list[Any]) -> tuple[str, list[str]]:
+    """Kind of a label: ``bool``, ``number`` or ``text``; and of texts all words, which their numbers count."""
+    known = [value for value in values if value is not None]
+    if all(isinstance(value, bool) for value in known):
+        return "bool", []
+    if all(isinstance(value, int | float) for value in known):
+        return "number", []
+    return "text", sorted({str(value) for value in known})
 
-    kind: str
-    words: tuple[str, ...] = ()
 
-    @classmethod
-    def of(cls, values: list[Any]) -> _LabelKind:
-        known = [value for value in values if value is not None]
-        if all(isinstance(value, bool) for value in known):
-            return cls("bool")
-        if all(isinstance(value, int | float) for value in known):
-            return cls("number")
-        return cls("text", tuple(sorted({str(value) for value in known})))
-
-    def numbers(self, values: list[Any]) -> NDArray[np.float64]:
-        """Values as numbers; NaN where one is not known."""
-        place = {word: i for i, word in enumerate(self.words)}
-        told = [place[str(v)] if self.words and v is not None else v for v in values]
-        return np.array([np.nan if value is None else float(value) for value in told])
+def _numbers(values: list[Any], words: list[str]) -> NDArray[np.float64]:
+    """Values of a label as numbers; NaN where one is not known."""
+    place = {word: i for i, word in enumerate(words)}
+    told = [place[str(v)] if words and v is not None else v for v in values]
+    return np.array([np.nan if value is None else float(value) for value in told])
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write the graphs of all frames, and read them again."""
     abstraction = abstraction_named(export.abstraction or BY_ITSELF).name
-    labels = (
-        {}
-        if export.labels is None
-        else {name: _LabelKind.of(of.tolist()) for name, of in export.labels.values.items()}
-    )
+    told = {} if export.labels is None else export.labels.values
+    labels = {name: _kind_of(of.tolist()) for name, of in told.items()}
     place = folder / FOLDER
     place.mkdir()
     columns = _TensorColumns(place, labels)
@@ -217,8 +199,8 @@ def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[st
             {"name": name, "unit": unit, "meaning": meaning} for name, unit, meaning in FEATURES
         ],
         "labels": {
-            name: {"text": texts[name], "kind": of.kind, "words": list(of.words)}
-            for name, of in columns.labels.items()
+            name: {"text": texts[name], "kind": kind, "words": words}
+            for name, (kind, words) in columns.labels.items()
         },
         "clips": [
             {"trace": c.trace, "start_ns": c.start_ns, "end_ns": c.end_ns, "graphs": span}
@@ -259,7 +241,7 @@ def _columns_of(
         "node_feature": _features(seen, labelled.node_frame[kept], labelled.node[kept]),
         "edge_index": np.stack(ends, axis=1),
         "edge_type": _codes(columns.relations, named[label[order]], {}),
-    } | {f"label_{name}": columns.labels[name].numbers(of) for name, of in numbers.items()}
+    } | {f"label_{name}": _numbers(of, columns.labels[name][1]) for name, of in numbers.items()}
 
 
 def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:

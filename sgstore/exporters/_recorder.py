@@ -131,9 +131,9 @@ class Recorder:
             text, name = self._map
             if text:
                 data = osi_messages.map_message(text, name)
-                schema = (osi_messages.ROAD_MAP, PROTOBUF, osi_messages.types().map_schema)
+                schema = (osi_messages.ROAD_MAP, PROTOBUF, osi_messages.types()[3])
                 self._write(ROAD_MAP, schema, time_ns, data)
-        schema = (osi_messages.SENSOR_VIEW, PROTOBUF, osi_messages.types().view_schema)
+        schema = (osi_messages.SENSOR_VIEW, PROTOBUF, osi_messages.types()[2])
         self._write(TRUTH, schema, time_ns, self._osi.message(frame))
         self._times = (self._times[0] if self._times else time_ns, time_ns)
         self._frames += 1

@@ -1,31 +1,26 @@
 """The registry of exporters, and export from a store.
 
-Clips of recordings and their graphs → files: one file for each format, listed in :data:`EXPORTERS`.
-
-``export`` says what is to be exported, ``stored`` writes it: aside first, then all of it or nothing, with a
-manifest. A format is a function from an :class:`~sgstore.exporters._labels.Export` and a folder to what it
-wrote there; other packages add theirs as entry points of the group ``sgstore.exporters``: the name of the
-format, and an :class:`Exporter`.
+A format is a function from an :class:`Export` and a folder to what it wrote there. What it writes is there as a
+whole or not at all, with a manifest.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore import plugins
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import (
-    ClipSource,
     WrittenClip,
     WrittenFile,
     export_folder,
     provenance_of,
-    write_file_manifest,
     write_manifest,
 )
 from sgstore.exporters._labels import Export, Labels
@@ -39,32 +34,16 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 
-__all__ = [
-    "EXPORTERS",
-    "GROUP",
-    "ClipSource",
-    "Exporter",
-    "Write",
-    "WrittenClip",
-    "WrittenFile",
-    "exporter_named",
-    "exporters",
-]
-
 GROUP: Final = plugins.EXPORTERS.group
 """Group of entry points by which an installed package adds formats."""
 
 
-class Write(Protocol):
-    """Writes an export."""
+Write = Callable[["Export", Path], "Sequence[WrittenClip | WrittenFile]"]
+"""Writes an export into an empty folder, tests it with the format's own reader, and tells what is there.
 
-    def __call__(self, export: Export, folder: Path) -> Sequence[WrittenClip | WrittenFile]:
-        """Write it into an empty folder, test it with the format's own reader, and tell what is there.
-
-        Its names are those of the export; the manifest is none of its business. It may raise
-        :class:`~sgstore.errors.ExportError`: then nothing is left of it.
-        """
-        ...
+Its names are those of the export; the manifest is none of its business. It may raise
+:class:`~sgstore.errors.ExportError`: then nothing is left of it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,9 +213,11 @@ def write_export(
         clips = [one for one in written if isinstance(one, WrittenClip)]
         files = [one for one in written if isinstance(one, WrittenFile)]
         if clips and not files:
-            write_manifest(folder, clips)
+            content = {"clips": [one.as_dict() for one in clips]}
+            write_manifest(folder, "sgstore.clips", content)
         else:
-            write_file_manifest(folder, {"form": form, **told.about()}, files)
+            content = {"form": form, **told.about(), "files": [one.as_dict() for one in files]}
+            write_manifest(folder, "sgstore.export", content)
     return [replace(one, file=to / one.file.name) for one in written]
 
 
