@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import random
 import subprocess
 import sys
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import networkx as nx
@@ -13,12 +15,14 @@ import pytest
 import sgstore
 from sgstore import vocabulary
 from sgstore.config import Config, load
-from sgstore.errors import ConfigError, StoreError
+from sgstore.errors import ConfigError, QueryError, QueryNameError, StoreError
 from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest
+from sgstore.lang import Catalog, compile_query
 from sgstore.store import StoreFile, verify_file
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from sgstore.query import Store
@@ -85,6 +89,104 @@ def test_labels_relations_and_attributes_of_a_stranger_come_back(tmp_path: Path)
     store.file.compact()
     assert list(store.find("MATCH (c:TrafficCone)-[:next_to]->(m:man) RETURN c.type, m.kind"))
     assert not verify_file(store.file.path).faults
+
+
+def strange(number: int) -> nx.MultiDiGraph[str]:
+    """A random graph whose nodes have attributes of their own, some of them, and of several types."""
+    rng = random.Random(number)
+    graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(name=f"{number}.jpg")
+    for node in range(rng.choice((2, 4, 6))):
+        values = {
+            "color": rng.choice(("red", "blue", "it's", None)),
+            "weight": rng.choice((1, 2.5, -3, 10**6)),
+            "isNew": rng.random() < 0.5,
+            "tags": rng.choice(([], ["small", "wet"], {"a": [1]})),
+            "mixed": rng.choice((1, "1", 0.5, True, None)),
+            "SIZE": rng.choice((1, 2)),
+            "size": rng.choice(("big", "huge")),
+        }
+        held = {name: value for name, value in values.items() if rng.random() < 0.7}
+        graph.add_node(f"o{node}", kind=rng.choice(("car", "person")), **held)
+    for _ in range(8):
+        a, b = rng.sample(sorted(graph.nodes), 2)
+        graph.add_edge(a, b, relation="near")
+    return graph
+
+
+def text_of(value: Any) -> str | None:
+    return value if isinstance(value, str | None) else json.dumps(value, separators=(",", ":"))
+
+
+OWN: dict[str, Callable[[dict[str, Any]], bool]] = {
+    "x.color = 'red'": lambda x: x.get("color") == "red",
+    "NOT x.color = 'red'": lambda x: x.get("color") not in {None, "red"},
+    "x.color IN ['blue', 'it\\'s']": lambda x: x.get("color") in {"blue", "it's"},
+    "x.color IS NULL": lambda x: x.get("color") is None,
+    "x.weight > 1.5": lambda x: x.get("weight", -9) > 1.5,
+    "x.weight + 1 = 2 OR x.is_new": lambda x: x.get("weight") == 1 or x.get("isNew", False),
+    "NOT x.isNew": lambda x: x.get("isNew") is False,
+    "x.TAGS CONTAINS 'wet'": lambda x: "wet" in x.get("tags", ()),
+    "x.tags = '{\"a\":[1]}'": lambda x: x.get("tags") == {"a": [1]},
+    "x.mixed = '1'": lambda x: text_of(x.get("mixed")) == "1",
+    "x.mixed IN ['true', '0.5']": lambda x: text_of(x.get("mixed")) in {"true", "0.5"},
+    "x.SIZE = 1 AND x.size = 'big'": lambda x: x.get("SIZE") == 1 and x.get("size") == "big",
+    "coalesce(x.color, 'none') = 'none'": lambda x: x.get("color") is None,
+}
+
+
+@pytest.fixture(scope="module")
+def attributed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    store = brought_in(tmp_path_factory.mktemp("own"), *map(strange, range(12)))
+    with store.file.snapshot():
+        yield store
+
+
+@pytest.mark.parametrize("condition", OWN)
+def test_attributes_of_a_client_are_asked_for_in_patterns(
+    attributed: Store, condition: str
+) -> None:
+    fits, graphs = OWN[condition], {n: attributed.graph(f"genome#{n}") for n in range(12)}
+    single = {(n, i) for n, g in graphs.items() for i, x in g.nodes(data=True) if fits(x)}
+    ends = {(n, a) for n, g in graphs.items() for a, b in g.edges() if (n, b) in single}
+    pattern = f"MATCH (x) WHERE {condition} RETURN frame.seq, x.id"
+    beside = f"EXISTS {{(a)-[:near]->(x) WHERE {condition}}}"
+
+    assert {(row.frame_seq, row.x_id) for row in attributed.find(pattern)} == single
+    assert single
+    found = attributed.find(f"MATCH (a) WHERE {beside} RETURN frame.seq, a.id")
+    assert {(row.frame_seq, row.a_id) for row in found} == ends
+    found = attributed.find(f"MATCH (a)-[:near]->(x) WHERE {condition} RETURN frame.seq, a.id")
+    assert {(row.frame_seq, row.a_id) for row in found} == ends
+    for number in range(0, 12, 4):  # in memory
+        answer = attributed.why_not(f"genome#{number}", f"MATCH (x) WHERE {condition}")
+        assert answer.as_dict()["matches"] == (number in {n for n, _ in single})
+
+
+def test_attributes_of_a_client_are_returned(attributed: Store) -> None:
+    graphs = {n: attributed.graph(f"genome#{n}") for n in range(12)}
+    nodes = [(n, i, x) for n, g in graphs.items() for i, x in g.nodes(data=True)]
+    rows = attributed.find("MATCH (x) RETURN frame.seq, x.id, x.color, x.weight, x.is_new, x.mixed")
+    names = ("color", "weight", "isNew")
+
+    assert sorted(rows.rows(), key=lambda row: row[:2]) == [
+        (n, i, *(x.get(name) for name in names), text_of(x.get("mixed"))) for n, i, x in nodes
+    ]
+    counted = attributed.find("MATCH (x) WHERE x.color IS NOT NULL RETURN x.color, count(*)")
+    assert dict(counted) == Counter(x["color"] for *_, x in nodes if x.get("color"))
+    heaviest = attributed.find("MATCH (x) RETURN max(x.weight)").rows()
+    assert heaviest == [(max(x.get("weight", 0) for *_, x in nodes),)]
+    runs = attributed.find("MATCH (x) WHERE x.color = 'red' RETURN INTERVALS, x.color")
+    assert {run["color"] for run in ({"color": row[-1]} for row in runs)} == {"red"}
+
+
+def test_an_attribute_that_nobody_has_is_an_error_as_before(attributed: Store) -> None:
+    with pytest.raises(QueryNameError, match="unknown attribute 'colr'") as caught:
+        attributed.find("MATCH (x) WHERE x.colr = 'red'")
+    assert caught.value.hint == "did you mean 'color'?"
+    with pytest.raises(QueryError, match="a text cannot be compared with a number"):
+        attributed.find("MATCH (x) WHERE x.color = 5")
+    with pytest.raises(QueryNameError, match="unknown attribute 'color'"):
+        compile_query("MATCH (x) WHERE x.color = 'red'", Catalog())
 
 
 def test_what_is_exported_comes_in_again_as_it_was(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from sgstore.lang._catalog import (
     DisplayUnit,
     Type,
     class_attribute,
+    own_attribute,
 )
 from sgstore.lang._hints import comparison_hint, hint_at, said_of
 from sgstore.lang._operators import TEXT_TESTS
@@ -197,8 +198,8 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
         There is none of that name, or not for nodes of these kinds.
     """
     kinds = names.scope.kinds(key).every
-    possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds]
-    found = NODE_ATTRIBUTES.get(normalize_name(name))
+    possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds] + [*names.session.own]
+    found = NODE_ATTRIBUTES.get(normalize_name(name)) or _own_attribute(name, names.session.own)
     if found is None:
         hint = said_of("attributes", name) or _no_attribute(name)
         names.session.unknown("attribute", name, span, possible, hint)
@@ -217,6 +218,14 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
             hint=hint,
         )
     return b.NodeAttribute(key, found, found.type)
+
+
+def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
+    """An attribute of a client's own: the one that is spelled so, or else so but for case and underscores."""
+    wanted = normalize_name(name)
+    same = next((one for one in own if normalize_name(one) == wanted), None)
+    spelled = name if name in own else same
+    return None if spelled is None else own_attribute(spelled, own[spelled])
 
 
 def _no_attribute(name: str) -> str | None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.pair_numbers import PAIR_FUNCTIONS
@@ -95,6 +96,8 @@ class DisplayUnit(StrEnum):
     """Whether the class of the frame, in an abstraction, is that of a frame of a dataset."""
     role = "role"
     """What a lane is to the ego, frame by frame: in the view ``roles``."""
+    own = "own"
+    """An attribute of a client's own, frame by frame: in the view ``attributes``."""
     span = "span"
     """A length of time in nanoseconds; seen in seconds."""
 
@@ -357,6 +360,12 @@ NODE_ATTRIBUTES: Final = _named(
     )
 )
 """Attributes of nodes by folded name, in the order of the documentation."""
+
+
+@cache
+def own_attribute(name: str, kind: Type) -> Attribute:
+    """Return an attribute of a client's own, which nodes of any kind may have."""
+    return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own)
 
 
 def _of_lane(name: str, kind: Type, column: str, meaning: str, unit: DisplayUnit) -> Attribute:
@@ -643,6 +652,8 @@ class Catalog:
         Tables of users' own that are joined.
     sets : mapping of str to function
         The abstractions that a query can name: what makes the catalog of each from this one.
+    own : mapping of str to Type
+        Attributes of a client's own that nodes have, by their names.
     unknowing : frozenset of int
         Traces that do not know what a query needs (:mod:`sgstore.lang._needs`): it leaves them out.
     lacks : dict
@@ -664,6 +675,7 @@ class Catalog:
     sets: Mapping[str, Callable[[Catalog], Catalog]] = field(
         default_factory=dict[str, "Callable[[Catalog], Catalog]"]
     )
+    own: Mapping[str, Type] = field(default_factory=dict[str, Type])
     unknowing: frozenset[int] = frozenset()
     lacks: dict[Any, frozenset[int]] = field(
         default_factory=dict[Any, frozenset[int]], compare=False, repr=False

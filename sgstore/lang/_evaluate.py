@@ -6,6 +6,7 @@ logic has three values.
 
 from __future__ import annotations
 
+import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -222,6 +223,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             if attribute is NODE_ATTRIBUTES["type"]:
                 return lambda at: _type_of(at.view.nodes[at.nodes[node]])
             name = attribute.name
+            if attribute.unit is DisplayUnit.own and attribute.type is Type.text:
+                return lambda at: _text_of(at.view.nodes[at.nodes[node]].get(name))
             return lambda at: at.view.nodes[at.nodes[node]].get(name)
         case b.LabelTest(node=node, kinds=kinds):
             return lambda at: at.view.is_one(at.nodes[node], kinds)
@@ -255,6 +258,13 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
 def _in_junction(at: Binding, node: int) -> bool | None:
     """Tell whether a part of the map, whose id is below zero, belongs to a junction."""
     return "junction" in at.view.nodes[node] if node < 0 else None
+
+
+def _text_of(value: Any) -> str | None:
+    """The text of a value of JSON, as the database has it."""
+    if value is None or isinstance(value, str):
+        return value
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
 def _type_of(attributes: Attributes) -> Any:

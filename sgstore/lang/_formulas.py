@@ -209,6 +209,16 @@ def role_text(frame: str, node: str) -> str:
     return f"({role.text()})"
 
 
+def own_text(attribute: Attribute, frame: str, node: str) -> str:
+    """Return the SQL of an attribute of a client's own of a node in a frame."""
+    told = 'json_extract_string("o"."value", \'$\')'
+    value = told if attribute.type is Type.text else f"CAST({told} AS {_NATIVE[attribute.type]})"
+    on = [f'"o"."frame_id" = {frame}', f'"o"."node_id" = {node}', '"o"."relation" IS NULL']
+    on.append(f'"o"."attribute" = {literal(attribute.name)}')
+    rows = Select([f"any_value({value})"], ['"attribute" AS "o"'], on)
+    return f"({rows.text()})"
+
+
 def _part(attribute: Attribute, home: Home, column: str, alias: str, trace: str | None) -> str:
     number = f"CAST({column} AS DOUBLE)"
     unit = attribute.unit

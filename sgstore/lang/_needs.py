@@ -297,9 +297,9 @@ def _needed(  # noqa: C901, PLR0911 - a case each
     """Return the needs of an expression; ``strict``: of all its parts, even if fewer were enough."""
 
     def of_node(key: str, name: str) -> set[Need]:
-        attribute = NODE_ATTRIBUTES[normalize_name(name)]
-        own = key in nodes and name in MEASURED
-        return {Need(key, nodes[key].kinds, attribute)} if own else set()
+        if key not in nodes or name not in MEASURED:
+            return set()
+        return {Need(key, nodes[key].kinds, NODE_ATTRIBUTES[normalize_name(name)])}
 
     match expression:
         case b.Operation(word=word) if word in _TELLS:

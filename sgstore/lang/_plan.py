@@ -132,7 +132,8 @@ def _file(condition: Bound, parts: Phases) -> None:
     if all(_is_direct(leaf) for leaf in found):
         parts.direct.append(condition)
     elif any(
-        isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.role
+        isinstance(leaf, NodeAttribute)
+        and leaf.attribute.unit in {DisplayUnit.role, DisplayUnit.own}
         for leaf in found
     ):
         parts.rest.append(condition)

@@ -400,7 +400,7 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
             if attribute.unit in {DisplayUnit.binding, DisplayUnit.owner} or is_constant(leaf):
                 return True
             profile = Profile.of(scope.kinds(node), catalog)
-            if attribute.unit is DisplayUnit.role:
+            if attribute.unit in {DisplayUnit.role, DisplayUnit.own}:
                 return False
             return not profile.moving and not profile.fixed
         case _:

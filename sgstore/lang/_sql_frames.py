@@ -27,6 +27,7 @@ from sgstore.lang._formulas import (
     lane_text,
     leaves,
     nested,
+    own_text,
     owner_text,
     pair_column,
     pair_text,
@@ -243,6 +244,10 @@ def column_of(leaf: Leaf) -> str:
             name = "id"
         case NodeAttribute(node=owner, attribute=attribute):
             name = attribute.name
+            if attribute.unit is DisplayUnit.own and name != name.lower():
+                name = (
+                    name.encode().hex()
+                )  # names of columns that differ in case alone are the same
         case EdgeRelation(edge=owner):
             name = "type"
         case EdgeAttribute(edge=owner, attribute=attribute):
@@ -623,6 +628,8 @@ class Frames(Masks):
             return owner_text(join.nodes[node], profile, f"{join.frame} >> 24", f'{FRAME}."map_id"')
         if attribute.unit is DisplayUnit.role:
             return role_text(join.frame, join.nodes[node])
+        if attribute.unit is DisplayUnit.own:
+            return own_text(attribute, join.frame, join.nodes[node])
         return attribute_text(attribute, join.at[node])
 
     def _of_lane(self, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
@@ -687,7 +694,9 @@ def _is_id(leaf: Leaf) -> TypeGuard[NodeAttribute]:
     return isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.binding
 
 
-_BARE: Final = frozenset({DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role})
+_BARE: Final = frozenset(
+    {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, DisplayUnit.own}
+)
 """What is told of a node without its tables."""
 
 

@@ -83,6 +83,8 @@ class Session:
         Tables of users' own that are joined, by name.
     traces : tuple of TraceFacts
         Of the store.
+    own : mapping of str to Type
+        Attributes of a client's own, by name.
     the_ego : str or None
         The key of the ego, once the query has named it ``ego``, wherever that is.
     numbers, blocks : int
@@ -101,6 +103,7 @@ class Session:
     classed: tuple[str, ...] = ()
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, "TableFacts"])
     traces: tuple[TraceFacts, ...] = ()
+    own: Mapping[str, Type] = field(default_factory=dict[str, Type])
     the_ego: str | None = None
     numbers: int = 0
     blocks: int = 0
@@ -108,6 +111,7 @@ class Session:
     def ask(self, catalog: Catalog) -> None:
         """Take over what a catalog says of the store that is asked."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
+        self.own = catalog.own
 
     def key(self, name: str | None) -> str:
         """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.abstractions import SUBSETS
-from sgstore.lang import Catalog, RelationScope, TraceFacts
+from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
 from sgstore.quoting import literal
 from sgstore.store._derive import sets_of
 from sgstore.store._traces import stored_traces
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from sgstore.abstractions import Subset
     from sgstore.lang import Triple
     from sgstore.store._derive import DerivedSet
+
+
+_NUMBERS: Final = frozenset({"BIGINT", "UBIGINT", "HUGEINT", "DOUBLE"})
+"""Types of numbers of JSON."""
 
 
 def catalog_of(connection: DuckDBPyConnection) -> Catalog:
@@ -55,6 +59,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
             for t in stored_traces(connection)
         ),
         classed=tuple(sorted(name for (name,) in classed)),
+        own=_own(connection),
     )
     sets: dict[str, Callable[[Catalog], Catalog]] = {
         name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()
@@ -66,6 +71,22 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         changes = _derived(connection, whole, name, of)
         sets[name] = lambda catalog, changes=changes: replace(catalog, **changes)
     return replace(whole, sets=sets)
+
+
+def _own(connection: DuckDBPyConnection) -> dict[str, Type]:
+    """Attributes of a client's own that nodes have: numbers or truth values if all values are, else texts."""
+    types = "list(DISTINCT json_type(value)) FILTER (json_type(value) <> 'NULL')"
+    rows = connection.execute(
+        f"SELECT attribute, {types} FROM attribute WHERE relation IS NULL GROUP BY ALL ORDER BY ALL"
+    ).fetchall()
+    return {
+        name: Type.boolean
+        if told == ["BOOLEAN"]
+        else Type.number
+        if told and _NUMBERS.issuperset(told)
+        else Type.text
+        for name, told in rows
+    }
 
 
 def _counted(connection: DuckDBPyConnection, table: str) -> dict[Triple, int]:
