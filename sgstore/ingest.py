@@ -24,7 +24,7 @@ from sgstore.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of
 from sgstore.processes import command
 from sgstore.readers import ENDINGS
-from sgstore.segments import EgoView, Job, Progress, SegmentReader, TraceOutcome
+from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.store import Folder, Sealed, StoreFile
 from sgstore.trace_parts import TracePart
 from sgstore.world import BUCKET_FRAMES
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from sgstore.mcap import BagPart
 
     Event = tuple["_Worker", dict[str, Any] | None]
+    Views = list[tuple[TraceOutcome, Path | None]]
 
 __all__ = ["ingest", "recordings"]
 
@@ -82,7 +83,9 @@ def _inside(folder: Path) -> Iterator[Path]:
     bags = {path.parent for path in folder.rglob(METADATA) if bag_folder(path.parent) is not None}
     own = {part.path for bag in bags for part in _parts(bag)}
     yield from bags
-    yield from (path for path in folder.rglob("*") if is_recording(path) and path not in own)
+    for path in folder.rglob("*"):
+        if path.name.lower().endswith(ENDINGS) and path.is_file() and path not in own:
+            yield path
 
 
 def _parts(bag: Path) -> tuple[BagPart, ...]:
@@ -91,11 +94,6 @@ def _parts(bag: Path) -> tuple[BagPart, ...]:
         return parts_of(bag)
     except TraceError:
         return ()
-
-
-def is_recording(path: Path) -> bool:
-    """Return whether the name of a file is one of a recording."""
-    return path.name.lower().endswith(ENDINGS) and path.is_file()
 
 
 # Recordings read in several processes; what they built comes back in the order in which it was asked for ----
@@ -173,9 +171,9 @@ class Workers:
         for worker in self._workers:
             worker.end()
 
-    def read(self, paths: list[Path], folder: Path) -> Iterator[list[EgoView]]:
+    def read(self, paths: list[Path], folder: Path) -> Iterator[Views]:
         """Yield the outcomes of recordings, in order; segments are built in folders below the one given."""
-        waiting, done, given = deque(range(len(paths))), dict[int, list[EgoView]](), 0
+        waiting, done, given = deque(range(len(paths))), dict[int, "Views"](), 0
         while given < len(paths):
             self._hire(min(self._count, len(waiting) + len(self._workers)))
             self._assign(waiting, paths, folder, given + _WAITING * self._count)
@@ -184,7 +182,10 @@ class Workers:
                 self._replace(worker, waiting, paths, done)
             elif "done" in event:
                 worker.tasks.remove(event["index"])
-                done[event["index"]] = [_view(values) for values in event["done"]]
+                done[event["index"]] = [
+                    (TraceOutcome.from_dict(outcome), Path(sealed) if sealed else None)
+                    for outcome, sealed in event["done"]
+                ]
                 self._assign(waiting, paths, folder, given + _WAITING * self._count)
             else:
                 self._on_block(event["index"], event["frames"], event["bytes"], event["size"])
@@ -225,11 +226,7 @@ class Workers:
             worker.tell({"index": index, "path": str(paths[index]), "folder": str(place)})
 
     def _replace(
-        self,
-        worker: _Worker,
-        waiting: deque[int],
-        paths: list[Path],
-        done: dict[int, list[EgoView]],
+        self, worker: _Worker, waiting: deque[int], paths: list[Path], done: dict[int, Views]
     ) -> None:
         """A process has died: what it was reading has failed, what it should have read next is still to do."""
         self._workers.remove(worker)
@@ -239,13 +236,8 @@ class Workers:
             how = f"was killed by signal {-code}; is there too little memory?"
             how = how if code < 0 else f"ended with code {code}; what it said of that is on stderr"
             error = TraceError(f"the process that read it {how}", path=paths[index])
-            done[index] = [EgoView(TraceOutcome(paths[index], error=error))]
+            done[index] = [(TraceOutcome(paths[index], error=error), None)]
         waiting.extendleft(reversed(worker.tasks))
-
-
-def _view(values: dict[str, Any]) -> EgoView:
-    sealed = values["sealed"]
-    return EgoView(TraceOutcome.from_dict(values["outcome"]), Path(sealed) if sealed else None)
 
 
 # The run: recordings are read, here or in other processes, and published in the order that was given ----
@@ -324,72 +316,57 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
         dry_run=dry_run,
         block_frames=BLOCK_FRAMES,
     )
-    run = _IngestRun(job, [Path(path) for path in traces], on_progress)
-    return run.outcomes(jobs)
+    paths = [Path(path) for path in traces]
+    file = StoreFile(job.store) if job.store.exists() else None
+    if file is not None and not dry_run:
+        file.settle()
+    meter = _Meter(paths, on_progress)
+    found: list[TraceOutcome] = []
+    with ExitStack() as stack:
+        folder = Path() if dry_run else stack.enter_context(Folder(job.store)).path
+        if min(jobs, len(paths)) > 1:
+            Maps(job.road_map, config.signs)  # one that cannot be read stops the run at once
+            read = stack.enter_context(Workers(job, jobs, meter.see)).read(paths, folder)
+        else:
+            read = _one_by_one(job, paths, folder, meter)
+        for number, views in enumerate(read):
+            for outcome, sealed in views:
+                if sealed is not None and outcome.status == "sealed":
+                    file, outcome = _published(job, file, outcome, sealed)  # noqa: PLW2901
+                found.append(outcome)
+            shutil.rmtree(folder / str(number), ignore_errors=True)
+            meter.finish(number)
+    return found
 
 
-class _IngestRun:
-    """One call of :func:`ingest`."""
+def _one_by_one(job: Job, paths: list[Path], folder: Path, meter: _Meter) -> Iterator[Views]:
+    number = 0
 
-    def __init__(
-        self, job: Job, paths: list[Path], on_progress: Callable[[Progress], None] | None
-    ) -> None:
-        self._job = job
-        self._paths = paths
-        self._store = StoreFile(job.store) if job.store.exists() else None
-        if self._store is not None and not job.dry_run:
-            self._store.settle()
-        self._meter = _Meter(paths, on_progress)
+    def see(frames: int, reached: int, size: int) -> None:
+        meter.see(number, frames, reached, size)
 
-    def outcomes(self, jobs: int) -> list[TraceOutcome]:
-        job = self._job
-        found: list[TraceOutcome] = []
-        with ExitStack() as stack:
-            folder = Path() if job.dry_run else stack.enter_context(Folder(job.store)).path
-            if min(jobs, len(self._paths)) > 1:
-                Maps(
-                    job.road_map, job.config.signs
-                )  # one that cannot be read stops the run before anything is done
-                workers = stack.enter_context(Workers(job, jobs, self._meter.see))
-                read = workers.read(self._paths, folder)
-            else:
-                read = self._one_by_one(folder)
-            for number, views in enumerate(read):
-                for view in views:
-                    self._publish(view)
-                    found.append(view.outcome)
-                shutil.rmtree(folder / str(number), ignore_errors=True)
-                self._meter.finish(number)
-        return found
+    reading = SegmentReader(job, see)
+    for number, path in enumerate(paths):
+        yield reading.read(path, folder / str(number))
 
-    def _one_by_one(self, folder: Path) -> Iterator[list[EgoView]]:
-        number = 0
 
-        def see(frames: int, reached: int, size: int) -> None:
-            self._meter.see(number, frames, reached, size)
-
-        reading = SegmentReader(self._job, see)
-        for number, path in enumerate(self._paths):
-            yield reading.read(path, folder / str(number))
-
-    def _publish(self, view: EgoView) -> None:
-        """Bring a view into the store, if it was built."""
-        outcome = view.outcome
-        if view.sealed is None or outcome.status != "sealed":
-            return
-        outcome.status = "failed"
-        try:
-            store = self._store = self._store or StoreFile.create(self._job.store)
-            sealed = Sealed.read(view.sealed)
-            name = store.has(sealed, as_it_is=not self._job.force)
-            if name is not None and not self._job.force:  # the same recording twice in one run
-                known = (outcome.path, "present", name, outcome.ego, outcome.frames)
-                view.outcome = TraceOutcome(*known, seconds=outcome.seconds)
-                return
-            outcome.name = store.publish(sealed, replace=self._job.force)
-            outcome.status = "added" if name is None else "replaced"
-        except SgstoreError as error:
-            outcome.error = error
+def _published(
+    job: Job, file: StoreFile | None, outcome: TraceOutcome, place: Path
+) -> tuple[StoreFile | None, TraceOutcome]:
+    """The store, made if there is none, with the segment in a folder; and what became of the recording."""
+    outcome.status = "failed"
+    try:
+        file = file or StoreFile.create(job.store)
+        sealed = Sealed.read(place)
+        name = file.has(sealed, as_it_is=not job.force)
+        if name is not None and not job.force:  # the same recording twice in one run
+            known = (outcome.path, "present", name, outcome.ego, outcome.frames)
+            return file, TraceOutcome(*known, seconds=outcome.seconds)
+        outcome.name = file.publish(sealed, replace=job.force)
+        outcome.status = "added" if name is None else "replaced"
+    except SgstoreError as error:
+        outcome.error = error
+    return file, outcome
 
 
 class _Meter:
@@ -406,14 +383,6 @@ class _Meter:
     def see(self, number: int, frames: int, reached: int, size: int) -> None:
         """A block of a recording has been read."""
         self._frames[number], self._bytes[number] = frames, reached
-        self._tell(number, size)
-
-    def finish(self, number: int) -> None:
-        """A recording is done."""
-        self._done += 1
-        self._bytes[number] = self._sizes[number]
-
-    def _tell(self, number: int, size: int) -> None:
         if self._on_progress is not None:
             progress = Progress(
                 path=self._paths[number],
@@ -427,6 +396,11 @@ class _Meter:
                 files=len(self._paths),
             )
             self._on_progress(progress)
+
+    def finish(self, number: int) -> None:
+        """A recording is done."""
+        self._done += 1
+        self._bytes[number] = self._sizes[number]
 
 
 def _size(path: Path) -> int:

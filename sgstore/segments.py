@@ -32,7 +32,7 @@ from sgstore.mcap import Loss, check_name
 from sgstore.readers import on_map, open_trace
 from sgstore.relations import Crowds, renamed
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.store import Place, Segment, StoreFile, new_segment
+from sgstore.store import Identity, Segment, StoreFile
 from sgstore.trace_parts import TracePart
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled
 from sgstore.world import longest_step_ns
@@ -277,30 +277,16 @@ _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle
 
 
 @dataclass(slots=True)
-class EgoView:
+class _EgoView:
     """A recording as one ego has it.
 
-    Attributes
-    ----------
-    outcome : TraceOutcome
-    sealed : Path or None
-        Folder of its segment, if one was built.
+    What became of it; what is known of it, with its ego; the folder of its segment, if one was built; the
+    ego's node id, once that is known; whether a frame had it; the frames that have too many pairs.
     """
 
     outcome: TraceOutcome
-    sealed: Path | None = None
-
-
-@dataclass(slots=True)
-class _Wanted:
-    """A view that is to be read.
-
-    What is known of the recording, with its ego; the ego's node id, once that is known; whether a frame had it;
-    the frames that have too many pairs.
-    """
-
-    view: EgoView
     info: TraceInfo
+    sealed: Path | None = None
     node: int = -1
     met: bool = False
     crowds: Crowds = field(default_factory=Crowds)
@@ -327,72 +313,74 @@ class SegmentReader:
         self._maps = Maps(job.road_map, job.config.signs)
         self._file: StoreFile | None = None
 
-    def read(self, path: Path, folder: Path) -> list[EgoView]:
-        """Read a recording; segments are built in folders below the one that is given, which need not exist."""
+    def read(self, path: Path, folder: Path) -> list[tuple[TraceOutcome, Path | None]]:
+        """Read a recording; segments are built in folders below the one that is given, which need not exist.
+
+        For each ego it returns the outcome, and the folder of its segment, if one was built.
+        """
         start = time.perf_counter()
-        views: list[EgoView] = []
+        views: list[_EgoView] = []
+        failed: SgstoreError | None = None
         try:
             self._read(path, folder, views)
         except SgstoreError as error:
-            views = views or [EgoView(TraceOutcome(path))]
-            for view in views:
-                if view.outcome.status == "failed" and view.outcome.error is None:
-                    view.outcome.error = error
-        for view in views:
-            view.outcome.seconds = time.perf_counter() - start
-        return views
+            failed = error
+        found = [(view.outcome, view.sealed) for view in views] or [(TraceOutcome(path), None)]
+        for outcome, _ in found:
+            if outcome.status == "failed" and outcome.error is None:
+                outcome.error = failed
+            outcome.seconds = time.perf_counter() - start
+        return found
 
-    def _read(self, path: Path, folder: Path, views: list[EgoView]) -> None:
-        job = self._job
+    def _read(self, path: Path, folder: Path, views: list[_EgoView]) -> None:
+        job, config = self._job, self._job.config
         check_name(path)
-        with open_trace(
-            path,
-            ego=job.config.ego,
-            digest=self._known_digest(path),
-            mapping=job.config.mapping,
-        ) as trace:
+        if self._file is None and job.store.exists():
+            self._file = StoreFile(job.store)
+        store = None if job.force else self._file
+        digest = store.known_digest(path) if store else ""  # then it need not be hashed
+        with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
             road_map, odd = self._maps.of(trace.info)
-            odd = [*odd, *job.config.notes]
             lost = lost_lanes(trace.info, road_map)
             on_map(trace, road_map)
-            wanted = [one for one in self._wanted(trace, views) if self._is_new(one, road_map)]
-            if job.dry_run:
-                for one in wanted:
-                    one.view.outcome.status = "new"
-                    one.view.outcome.warnings += odd
-                    one.view.outcome.losses += lost
-                return
+            wanted = [
+                one
+                for one in self._wanted(trace, views)
+                if store is None or self._is_new(store, one, road_map)
+            ]
             for first in range(0, len(wanted), EGOS_AT_ONCE):
                 group = wanted[first : first + EGOS_AT_ONCE]
                 for one in group:
-                    one.view.outcome.warnings += odd
-                    one.view.outcome.losses += lost
-                self._build(trace, group, road_map, folder / str(first))
+                    one.outcome.warnings += [*odd, *config.notes]
+                    one.outcome.losses += lost
+                    if job.dry_run:
+                        one.outcome.status = "new"
+                if not job.dry_run:
+                    self._build(trace, group, road_map, folder / str(first))
 
     # Which views ----------------------------------------------------------------------------------------------
 
-    def _wanted(self, trace: MessageTrace, views: list[EgoView]) -> Iterator[_Wanted]:
+    def _wanted(self, trace: MessageTrace, views: list[_EgoView]) -> Iterator[_EgoView]:
         """The views of a recording that are asked for; one whose ego is not in it has an error."""
         info, egos = trace.info, self._job.config.egos
         if not egos:
-            views.append(EgoView(TraceOutcome(info.path, ego=info.ego)))
-            yield _Wanted(views[0], info)
+            views.append(_EgoView(TraceOutcome(info.path, ego=info.ego), info))
+            yield views[0]
             return
         everyone, seen = egos == (ALL_EGOS,), set[str]()
         for name in self._vehicles(trace) if everyone else egos:
-            view = EgoView(TraceOutcome(info.path, ego=name))
-            views.append(view)
+            view = _EgoView(TraceOutcome(info.path, ego=name), info)
             try:
                 found = name if everyone else _ident(info, name, self._job.config.mapping)
             except SgstoreError as error:
                 view.outcome.error = error
+                views.append(view)
                 continue
-            if found in seen:  # two names of one
-                views.pop()
-                continue
-            seen.add(found)
-            view.outcome.ego = found
-            yield _Wanted(view, replace(info, ego=found))
+            if found not in seen:  # else they are two names of one
+                seen.add(found)
+                view.outcome.ego, view.info = found, replace(info, ego=found)
+                views.append(view)
+                yield view
 
     def _excluded(self, info: TraceInfo) -> tuple[str, ...]:
         """The ids of what is to be left out; what is no role or name of a vehicle is an id."""
@@ -414,15 +402,12 @@ class SegmentReader:
             raise TraceError("no vehicle in it can be the ego", path=trace.info.path)
         return found
 
-    def _is_new(self, wanted: _Wanted, road_map: RoadMap | None) -> bool:
-        """Return whether the store lacks the trace of an ego, or it is to be read anew."""
-        store, job, outcome = self._store(), self._job, wanted.view.outcome
-        if store is None or job.force:
-            return True
-        part = (job.part.since, job.part.until)
+    def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
+        """Return whether a store lacks the trace of an ego."""
+        job, outcome = self._job, view.outcome
         try:
             shown = map_of_graphs(road_map, job.config)
-            name = store.stored(wanted.info, job.config, shown, part)
+            name = store.stored(view.info, job.config, shown, (job.part.since, job.part.until))
         except SgstoreError as error:
             outcome.error = error
             return False
@@ -432,20 +417,10 @@ class SegmentReader:
         outcome.frames = store.trace(name).frames
         return False
 
-    def _known_digest(self, path: Path) -> str:
-        """The digest of a file that the store knows by path, size and time of change: it need not be hashed."""
-        store = self._store()
-        return "" if store is None or self._job.force else store.known_digest(path)
-
-    def _store(self) -> StoreFile | None:
-        if self._file is None and self._job.store.exists():
-            self._file = StoreFile(self._job.store)
-        return self._file
-
     # Building -------------------------------------------------------------------------------------------------
 
     def _build(
-        self, trace: MessageTrace, group: list[_Wanted], road_map: RoadMap | None, folder: Path
+        self, trace: MessageTrace, group: list[_EgoView], road_map: RoadMap | None, folder: Path
     ) -> None:
         """Build the segments of some views in one pass over the recording."""
         job, size = self._job, self._job.block_frames
@@ -458,21 +433,16 @@ class SegmentReader:
             raise TraceError("no frame of it can be read", path=trace.info.path)
         with ExitStack() as stack:
             segments: list[Segment] = []
+            shown, part = map_of_graphs(road_map, job.config), (job.part.since, job.part.until)
             for number, one in enumerate(group):
-                place = folder.with_name(f"{folder.name}-{number}")
-                place.mkdir(parents=True)
-                part = (job.part.since, job.part.until)
-                segment = new_segment(
-                    job.store,
-                    one.info,
-                    job.config,
-                    road_map=map_of_graphs(road_map, job.config),
-                    answers=generator.answers,
-                    part=part,
-                    place=Place(place, len(group)),
+                one.sealed = folder.with_name(f"{folder.name}-{number}")
+                one.sealed.mkdir(parents=True)
+                identity = Identity.of(one.info, job.config, shown, part)
+                place = (one.sealed, len(group))
+                segment = Segment(
+                    job.store, one.info, identity, shown, generator.answers, place=place
                 )
                 segments.append(stack.enter_context(segment))
-                one.view.sealed = place
             while block := first or next(blocks, None):
                 first = None
                 self._append(generator, block, group, segments)
@@ -484,7 +454,7 @@ class SegmentReader:
         self,
         generator: SceneGraphGenerator,
         block: FrameBlock,
-        group: list[_Wanted],
+        group: list[_EgoView],
         segments: list[Segment],
     ) -> None:
         # Origins do not depend on the ego, so all segments keep the same numbers.
@@ -505,7 +475,7 @@ class SegmentReader:
     def _seal(
         self,
         trace: MessageTrace,
-        group: list[_Wanted],
+        group: list[_EgoView],
         segments: list[Segment],
         tally: TraceTally,
         parked: Codes,
@@ -514,7 +484,7 @@ class SegmentReader:
         moot = report.about_ego if self._job.config.egos else []
         warnings = [warning for warning in report.warnings if warning not in moot]
         for one, segment in zip(group, segments, strict=True):
-            outcome = one.view.outcome
+            outcome = one.outcome
             if self._job.config.egos and not one.met:
                 reason = f"the ego {one.info.ego!r} is in none of the frames that were read"
                 outcome.error = TraceError(reason, path=one.info.path)
@@ -540,7 +510,7 @@ def _ident(info: TraceInfo, name: str, mapping: str) -> str:
         return trace.info.ego
 
 
-def _ego_of(block: FrameBlock, one: _Wanted) -> Ints:
+def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
     """(F,) int64: node id of an ego in each frame, -1 where it is absent."""
     if one.node < 0 and one.info.ego in block.entities.ident:
         one.node = block.entities.first + block.entities.ident.index(one.info.ego)
@@ -580,10 +550,7 @@ def main() -> None:
         task = told.get()
         index = task["index"]
         views = reading.read(Path(task["path"]), Path(task["folder"]))
-        done = [
-            {"outcome": view.outcome.as_dict(), "sealed": view.sealed and str(view.sealed)}
-            for view in views
-        ]
+        done = [[outcome.as_dict(), sealed and str(sealed)] for outcome, sealed in views]
         answer({"index": index, "done": done})
 
 

@@ -16,7 +16,7 @@ from sgstore.importing._blocks import Blocks, parts_map
 from sgstore.importing._formats import read_csv, read_nodelink, read_s3c, stem_of
 from sgstore.importing._resolve import OWN, Understanding, Words, survey
 from sgstore.mcap import Loss, check_name, digest_of, mark_of
-from sgstore.store import Folder, Place, StoreFile, new_segment
+from sgstore.store import Folder, Identity, Segment, StoreFile
 from sgstore.vocabulary import DIRECTIONS, KINDS, PROXIMITY, RELATIONS
 from sgstore.world import BUCKET_FRAMES, MessageRefs, TraceInfo, TraceReport
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sgstore.graph import GraphBlock
     from sgstore.importing._resolve import FileMeaning, Meant
     from sgstore.roads import RoadMap
-    from sgstore.store import Sealed, Segment
+    from sgstore.store import Sealed
 
 
 FORMATS: Final = {"s3c": read_s3c, "nodelink": read_nodelink, "csv": read_csv}
@@ -188,9 +188,8 @@ class _ImportRun:
         any_state = self._words.unknown_as == OWN
         blocks = Blocks(info.path, road_map, self.period_ns, any_state=any_state)
         graphs = map(understanding.of, FORMATS[self._form](info.path))
-        with new_segment(
-            self._path, info, Config(), road_map=road_map, answers=answers, place=Place(folder)
-        ) as segment:
+        identity = Identity.of(info, Config(), road_map)
+        with Segment(self._path, info, identity, road_map, answers, place=(folder, 1)) as segment:
             kinds: Counter[str] = Counter()
             for some in _blocks(graphs):
                 graph = self._append(segment, blocks, some, done)

@@ -35,15 +35,14 @@ from ._rows import count_parquet as count_parquet
 from ._rows import write_csv as write_csv
 from ._rows import write_parquet as write_parquet
 from ._similarity import SimilarFrames as SimilarFrames
-from ._staging import Place as Place
 from ._staging import Sealed as Sealed
 from ._traces import FrameRef as FrameRef
+from ._traces import Identity as Identity
 from ._traces import StoredTrace as StoredTrace
 from ._traces import free_name as free_name
 from ._traces import trace_id_of as trace_id_of
 from ._verify import verify_file as verify_file
 from ._write import Segment as Segment
-from ._write import new_segment as new_segment
 
 __all__ = [
     "BUCKET_BITS",
@@ -52,12 +51,12 @@ __all__ = [
     "Folder",
     "FrameRef",
     "GivenTable",
+    "Identity",
     "Mark",
     "MessagePlaces",
     "OldMap",
     "OldTrace",
     "ParquetTable",
-    "Place",
     "Remains",
     "Rows",
     "SCHEMA_VERSION",
@@ -79,7 +78,6 @@ __all__ = [
     "marks",
     "messages_of",
     "named_as",
-    "new_segment",
     "remains_of",
     "seq_of",
     "take_place",

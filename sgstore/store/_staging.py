@@ -13,7 +13,7 @@ import json
 from dataclasses import asdict, dataclass
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import duckdb
 import numpy as np
@@ -110,21 +110,20 @@ def columns_of(
 
 
 def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
-    """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them."""
-    return ", ".join(
-        f'{_expression(name, kind)} AS "{name}"'
-        for name, kind in columns_of(connection, table, catalog)
-        if name not in _ASSIGNED
-    )
+    """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them.
 
-
-def _expression(name: str, kind: str) -> str:
-    """A column as a number: numbers as they are, enumerations by their codes, texts by 60 bits of their MD5."""
-    if kind.startswith("ENUM"):  # words in a file
-        return code_sql(f'"{name}"', kind)
-    if kind in _TEXTS:
-        return f"""('0x' || md5("{name}"::VARCHAR)[:15])::BIGINT"""
-    return f'"{name}"'
+    Numbers are as they are, enumerations their codes, texts 60 bits of their MD5.
+    """
+    listed: list[str] = []
+    for name, kind in columns_of(connection, table, catalog):
+        value = f'"{name}"'
+        if kind.startswith("ENUM"):  # words in a file
+            value = code_sql(value, kind)
+        elif kind in _TEXTS:
+            value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
+        if name not in _ASSIGNED:
+            listed.append(f'{value} AS "{name}"')
+    return ", ".join(listed)
 
 
 # Where the tables of a trace wait to be published: a little in memory, the rest in files beside the store
@@ -204,21 +203,6 @@ _NOT_SEALED: Final = {"bits", "store_info"}
 """Tables that belong to no trace."""
 
 
-class Place(NamedTuple):
-    """Folder in which tables wait to be published.
-
-    Attributes
-    ----------
-    folder : Path
-        Where the files are written; it belongs to the caller, who removes it.
-    beside : int
-        How many wait at a time, this one included: of several egos. They share what memory they take.
-    """
-
-    folder: Path
-    beside: int = 1
-
-
 class Staging:
     """The tables of one trace. ``connection`` has them in memory, under the names that they have in a store.
 
@@ -226,15 +210,18 @@ class Staging:
     ----------
     store : Path
         The store that they are meant for.
-    place : Place, optional
-        By default a folder beside the store, which is removed with this.
+    place : tuple, optional
+        The folder where the files are written, which the caller removes; and how many wait at a time, this one
+        included: those of several egos share the memory. By default a folder beside the store, removed with
+        this.
     """
 
-    def __init__(self, store: Path, place: Place | None = None) -> None:
+    def __init__(self, store: Path, place: tuple[Path, int] | None = None) -> None:
+        folder, beside = place or (None, 1)
         self._store = store
         self._rows = 0
         self._bytes = 0
-        self._memory = max(min(MEMORY, 2 * MEMORY // (place.beside if place else 1)), LEAST_MEMORY)
+        self._memory = max(min(MEMORY, 2 * MEMORY // beside), LEAST_MEMORY)
         self._most = MOST_MEMORY if self._memory == MEMORY else self._memory
         self._merge_at = MERGE_ROWS
         self._parts = 0
@@ -243,25 +230,26 @@ class Staging:
         self._known = dict.fromkeys(NAMES, 0)
         self._new: dict[str, list[str]] = {}
         self.merge = False
-        self._own = Folder(store) if place is None else None
-        self.folder = self._own.path if self._own else place.folder if place else store
+        self._own = Folder(store) if folder is None else None
+        self.folder = folder or (self._own.path if self._own else store)
         try:
             with translated(store):
                 self.connection = scratch(self.folder / "spill", memory=self._memory)
                 self._known = {enum: len(names) for enum, names in NAMES.items()}
                 self.connection.execute(tables_sql())
-                self._tables = self._names() - _NOT_SEALED
+                listed = self.connection.execute(
+                    "SELECT table_name FROM duckdb_tables() WHERE NOT internal"
+                ).fetchall()
+                self._tables = {name for (name,) in listed} - _NOT_SEALED
                 self.connection.execute(MESSAGES)
         except BaseException:
-            self._remove()
+            if self._own is not None:
+                self._own.remove()
             raise
 
     def close(self) -> None:
         """Forget the tables in memory, and the files if the folder is its own."""
         self.connection.close()
-        self._remove()
-
-    def _remove(self) -> None:
         if self._own is not None:
             self._own.remove()
 
@@ -271,7 +259,10 @@ class Staging:
         if not rows:
             return
         with translated(self._store):
-            self._make_room(columns)
+            self._bytes += sum(values.nbytes for values in columns.values())
+            wanted = min(self._bytes * _ROOM, self._most)
+            if wanted > self._memory:  # blocks that are larger than usual need more
+                self._allow(wanted)
             for column, enum in enums_of(table).items():
                 if column in columns:
                     self._learn(enum, columns[column])
@@ -296,13 +287,6 @@ class Staging:
         """Enumeration → values that a store must be able to hold: relations that are answered, what is new."""
         relations = sorted({*answers, *self._new.get("relation", ())})
         return {**self._new, "relation": relations}
-
-    def _make_room(self, columns: Columns) -> None:
-        """Let the database take what blocks need that are larger than usual."""
-        self._bytes += sum(values.nbytes for values in columns.values())
-        wanted = min(self._bytes * _ROOM, self._most)
-        if wanted > self._memory:
-            self._allow(wanted)
 
     def _allow(self, memory: int) -> None:
         self._memory = memory
@@ -393,7 +377,9 @@ class Staging:
             Table → checksum of its rows.
         """
         with translated(self._store):
-            for table in sorted(filter(self._has_rows, self._tables)):
+            for table in sorted(self._tables):
+                if not self.connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone():
+                    continue
                 if table in _GROWING:
                     self._write(table, self._sorted(table), f"{table}-{self._parts:06}")
                 else:
@@ -403,13 +389,6 @@ class Staging:
                 table: self._files[table] for table in sorted(self._files.keys() & self._tables)
             }
             return files, {table: self._checksum(table, names) for table, names in files.items()}
-
-    def _names(self) -> set[str]:
-        sql = "SELECT table_name FROM duckdb_tables() WHERE NOT internal"
-        return {name for (name,) in self.connection.execute(sql).fetchall()}
-
-    def _has_rows(self, table: str) -> bool:
-        return self.connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone() is not None
 
     def _checksum(self, table: str, names: list[str]) -> Checksum:
         """The checksum of the rows in files, as many at a time as fit into memory."""
@@ -434,17 +413,16 @@ class Staging:
 def _values(table: str, columns: Columns) -> str:
     """SQL that selects columns: enumerations by their codes, and NULL for missing values."""
     enums = enums_of(table)
-    return ", ".join(
-        f'{_value(name, values, enums.get(name))} AS "{name}"' for name, values in columns.items()
-    )
-
-
-def _value(name: str, values: NDArray[Any], enum: str | None) -> str:
-    if values.dtype.kind == "f":
-        return f'CASE WHEN isfinite("{name}") THEN "{name}" END'
-    missing = {"i": str(MISSING), "O": "''"}.get(values.dtype.kind)
-    known = f'nullif("{name}", {missing})' if missing else f'"{name}"'
-    return f"enum_range(NULL::{enum})[{known} + 1]::{enum}" if enum else known
+    listed: list[str] = []
+    for name, values in columns.items():
+        missing = {"i": str(MISSING), "O": "''"}.get(values.dtype.kind)
+        known = f'nullif("{name}", {missing})' if missing else f'"{name}"'
+        if values.dtype.kind == "f":
+            known = f'CASE WHEN isfinite("{name}") THEN "{name}" END'
+        elif name in enums:
+            known = f"enum_range(NULL::{enums[name]})[{known} + 1]::{enums[name]}"
+        listed.append(f'{known} AS "{name}"')
+    return ", ".join(listed)
 
 
 def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnection:
@@ -532,11 +510,7 @@ class Sealed:
             path=Path(values["path"]),
             identity=Identity.from_dict(values["identity"]),
             files=values["files"],
-            checksums=_checksums(values["checksums"]),
-            map_checksums=_checksums(values["map_checksums"]),
+            checksums={name: Checksum(**one) for name, one in values["checksums"].items()},
+            map_checksums={name: Checksum(**one) for name, one in values["map_checksums"].items()},
             words=values["words"],
         )
-
-
-def _checksums(values: dict[str, Any]) -> dict[str, Checksum]:
-    return {table: Checksum(**checksum) for table, checksum in values.items()}

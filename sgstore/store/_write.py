@@ -19,24 +19,23 @@ from sgstore.store._locking import translated
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store._payloads import Happenings
 from sgstore.store._publish import MAP_TABLES, fill_trace, publish_in
-from sgstore.store._staging import Place, Sealed, Staging
-from sgstore.store._traces import Identity
+from sgstore.store._staging import Sealed, Staging
 from sgstore.world import BUCKET_FRAMES, Origin, origin_of, quantize
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from sgstore.config import Config
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
     from sgstore.store._locking import Access
     from sgstore.store._packing import Columns
+    from sgstore.store._traces import Identity
     from sgstore.world import Codes, FrameBlock, Ints, TraceInfo, TraceReport
 
 
 class Segment:
-    """The graphs of one trace, until they are published. Made by :meth:`StoreFile.segment` or :func:`segment`.
+    """The graphs of one trace, until they are published.
 
     Parameters
     ----------
@@ -48,8 +47,9 @@ class Segment:
     road_map : RoadMap or None
     answers : tuple of str
         Relations that the generator can answer.
-    place : Place, optional
-        Where it is built. By default a folder beside the store, which goes with it.
+    place : tuple, optional
+        As :class:`Staging` takes it: where it is built. By default a folder beside the store, which goes with
+        it.
     access : Access, optional
         To the store, for :meth:`publish`.
 
@@ -66,7 +66,7 @@ class Segment:
         road_map: RoadMap | None,
         answers: tuple[str, ...],
         *,
-        place: Place | None = None,
+        place: tuple[Path, int] | None = None,
         access: Access | None = None,
     ) -> None:
         self._store = store
@@ -139,7 +139,6 @@ class Segment:
         self._kinds.learn(frames.entities)
         self._origin = self._origin or origin_of(frames)
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
-        self._see_messages(graph)
 
     def name_frames(self, seq: Ints, graphs: list[str], places: Ints, images: Ints) -> None:
         """Take down what the file of an import calls the graphs that became frames: table ``imported``.
@@ -241,7 +240,15 @@ class Segment:
                 self._periods,
                 identity.payloads,
             )
-            fill_trace(staging.connection, self._info, identity, self._trace_values(report, more))
+            origin = self._origin or Origin(0.0, 0.0, 0.0)
+            values = {
+                "origin_x": origin.x,
+                "origin_y": origin.y,
+                "origin_z": origin.z,
+                "answers": list(self._answers),
+                "report": packing.as_json(asdict(report) | dict(more or {})),
+            }
+            fill_trace(staging.connection, self._info, identity, values)
             files, checksums = staging.seal()
         of_map = {name: checksums.pop(name) for name in MAP_TABLES if name in checksums}
         words = staging.words(self._answers)
@@ -249,28 +256,18 @@ class Segment:
         sealed.write()
         return sealed
 
-    def _trace_values(self, report: TraceReport, more: Mapping[str, Any] | None) -> dict[str, Any]:
-        origin = self._origin or Origin(0.0, 0.0, 0.0)
-        return {
-            "origin_x": origin.x,
-            "origin_y": origin.y,
-            "origin_z": origin.z,
-            "answers": list(self._answers),
-            "report": packing.as_json(asdict(report) | dict(more or {})),
-        }
-
     def _insert_about(self) -> None:
         """Insert channels, context and map, which are known before the first frame."""
-        insert = self._staging.insert
-        insert("channel", self._owned(_channel_columns(self._info)))
+        insert, channels = self._staging.insert, self._info.channels
+        names = ("topic", "schema", "schema_encoding", "message_encoding", "role")
+        columns: Columns = {name: texts(getattr(c, name) for c in channels) for name in names}
+        insert("channel", self._owned(columns | {"channel_id": self._channel_ids}))
         context = packing.message_columns(self._info.context, self._channel_ids)
         context["channel_id"] = context.pop("channel")
         insert("context", self._owned(context))
         if self._road_map is not None:
-            insert("map", _map_columns(self._road_map))
-            insert("map_node", _map_node_columns(self._road_map))
-            insert("map_edge", _map_edge_columns(self._road_map))
-            insert("map_reach", _map_reach_columns(self._road_map))
+            for table, columns in _map_tables(self._road_map).items():
+                insert(table, columns)
 
     def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
         kinds, insert = self._kinds, self._staging.insert
@@ -287,59 +284,21 @@ class Segment:
         insert("event", self._owned(self._happenings.of(graph.frames)))
         for table, columns in abstracted.items():
             insert(table, columns)
+        messages = packing.message_columns(graph.frames.messages, self._channel_ids)
+        insert("message", messages)
+        self._periods.see(payloads.FRAMES, graph.frames.log_time_ns)
+        channel = messages["channel"]
+        for number in np.unique(channel).tolist():
+            self._periods.see(number, messages["log_time_ns"][channel == number])
 
     def _owned(self, columns: Columns) -> Columns:
         """The columns, and whose they are."""
         count = len(next(iter(columns.values())))
         return columns | {"trace_id": np.full(count, self._identity.trace_id)}
 
-    def _see_messages(self, graph: GraphBlock) -> None:
-        messages = packing.message_columns(graph.frames.messages, self._channel_ids)
-        self._staging.insert("message", messages)
-        self._periods.see(payloads.FRAMES, graph.frames.log_time_ns)
-        channel = messages["channel"]
-        for number in np.unique(channel).tolist():
-            self._periods.see(number, messages["log_time_ns"][channel == number])
 
-
-def new_segment(
-    store: Path,
-    info: TraceInfo,
-    config: Config,
-    *,
-    road_map: RoadMap | None = None,
-    answers: tuple[str, ...] = (),
-    part: tuple[float | None, float | None] = (None, None),
-    place: Place,
-) -> Segment:
-    """A segment for a store that need not be there yet, to be sealed and published by another process.
-
-    Parameters
-    ----------
-    store : Path
-    info, config, road_map, answers
-        As :meth:`StoreFile.segment` takes them.
-    part : tuple
-        The part of the recording that is read: since and until; s.
-    place : Place
-        Where it is built.
-    """
-    identity = Identity.of(info, config, road_map, part)
-    return Segment(store, info, identity, road_map, answers, place=place)
-
-
-def _channel_columns(info: TraceInfo) -> Columns:
-    names = ("topic", "schema", "schema_encoding", "message_encoding", "role")
-    columns: Columns = {name: texts(getattr(c, name) for c in info.channels) for name in names}
-    return columns | {"channel_id": np.array([c.id for c in info.channels], np.int64)}
-
-
-def _map_columns(road_map: RoadMap) -> Columns:
-    names = ("digest", "name", "text")
-    return {name: texts([getattr(road_map, name)]) for name in names}
-
-
-def _map_node_columns(road_map: RoadMap) -> Columns:
+def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
+    """Tables of a map; they are the same for all traces on it."""
     nodes = road_map.nodes
     count = len(nodes)
     is_lane = np.array([bool(kind) for kind in nodes.lane_type], np.bool_)
@@ -351,20 +310,18 @@ def _map_node_columns(road_map: RoadMap) -> Columns:
         columns[name] = getattr(nodes, name)
     for name in ("section", "lane"):
         columns[name] = packing.unless(getattr(nodes, name), ~is_lane)
-    return columns | {"node_id": -1 - np.arange(count), "kind": nodes.kind}
-
-
-def _map_edge_columns(road_map: RoadMap) -> Columns:
+    columns |= {"node_id": -1 - np.arange(count), "kind": nodes.kind}
     edges, kind = road_map.edges, road_map.nodes.kind
-    return {
-        "relation": edges.relation,
-        "src": edges.src,
-        "dst": edges.dst,
-        "src_kind": kind[-1 - edges.src],
-        "dst_kind": kind[-1 - edges.dst],
-    }
-
-
-def _map_reach_columns(road_map: RoadMap) -> Columns:
     src, dst, start = road_map.reach
-    return {"src": src, "dst": dst, "start": start}
+    return {
+        "map": {name: texts([getattr(road_map, name)]) for name in ("digest", "name", "text")},
+        "map_node": columns,
+        "map_edge": {
+            "relation": edges.relation,
+            "src": edges.src,
+            "dst": edges.dst,
+            "src_kind": kind[-1 - edges.src],
+            "dst_kind": kind[-1 - edges.dst],
+        },
+        "map_reach": {"src": src, "dst": dst, "start": start},
+    }
