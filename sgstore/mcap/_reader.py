@@ -64,7 +64,7 @@ from sgstore.mcap._fetch import (
     part_at,
     parts_of,
 )
-from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, Summary, chunks_in, read_summary
+from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, chunks_in, read_summary
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -176,7 +176,14 @@ class McapFile:
             status = os.fstat(self._file.fileno())
             self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
             self.profile, self.library = self._header()
-            self._use(read_summary(self._file, self.size))
+            summary = read_summary(self._file, self.size)
+            self.schemas.update(summary.schemas)
+            self.channels.update(summary.channels)
+            self.counts = summary.counts
+            self.chunk_offsets = summary.chunk_offsets
+            self._chunk_starts = array("q", summary.chunk_offsets.tobytes())
+            self._summary_fault = summary.fault
+            self._known_channels[[*self.channels]] = True
         except BaseException:
             self._file.close()
             raise
@@ -288,15 +295,6 @@ class McapFile:
             reason = "the header of this MCAP file is cut or malformed"
             raise TraceError(reason, path=self.path, offset=len(MAGIC)) from error
         return header.profile, header.library
-
-    def _use(self, summary: Summary) -> None:
-        self.schemas.update(summary.schemas)
-        self.channels.update(summary.channels)
-        self.counts = summary.counts
-        self.chunk_offsets = summary.chunk_offsets
-        self._chunk_starts = array("q", summary.chunk_offsets.tobytes())
-        self._summary_fault = summary.fault
-        self._known_channels[[*self.channels]] = True
 
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
         """Start to read the chunks of a walk before their turn, if they are many and all wanted."""

@@ -686,7 +686,14 @@ def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
     pieces, record = _pieces(document, lanes, plan, parts)
     stations = _stations(plan, parts, pieces, record)
     ribbons = _cross_sections(lanes, intervals, borders, stations)
-    _check_places(document, lanes, ribbons)
+    columns = (ribbons.left_x, ribbons.left_y, ribbons.right_x, ribbons.right_y, ribbons.z)
+    wild = np.zeros(len(ribbons.z), bool)
+    for column in columns:
+        wild |= ~(np.abs(column) < MAX_COORDINATE)
+    lane = np.searchsorted(ribbons.offsets, np.flatnonzero(wild), side="right") - 1
+    roads = _marked(lanes.road[lane], len(document["road"]))
+    document.accuse("road", roads, f"reaches farther than {MAX_COORDINATE:.0e} m from the origin")
+    document.settle()
     return ribbons
 
 
@@ -726,14 +733,3 @@ def _cross_sections(
         s=stations.s[at],
         along=run - run[offsets[:-1]][lane],
     )
-
-
-def _check_places(document: Document, lanes: LaneTable, ribbons: Ribbons) -> None:
-    columns = (ribbons.left_x, ribbons.left_y, ribbons.right_x, ribbons.right_y, ribbons.z)
-    wild = np.zeros(len(ribbons.z), bool)
-    for column in columns:
-        wild |= ~(np.abs(column) < MAX_COORDINATE)
-    lane = np.searchsorted(ribbons.offsets, np.flatnonzero(wild), side="right") - 1
-    roads = _marked(lanes.road[lane], len(document["road"]))
-    document.accuse("road", roads, f"reaches farther than {MAX_COORDINATE:.0e} m from the origin")
-    document.settle()

@@ -275,21 +275,16 @@ def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]
         )
         if main is None or onward is None:
             continue
-        place = _place_of_branch(document, onward, network, junctions[parent])
+        junction = junctions[parent]
+        kind = "road/predecessor" if onward.contact == START else "road/successor"
+        road = int(network.lanes.sections.road[onward.section])
+        link = _road_links(document[kind]).get(road, {})
+        place = _number(link.get("elementS", junction.get("sStart", "0")))
         section = network.section_at(main, place)
         for source, to in links[row]:
             src, dst = network.lane.get((section, source)), network.lane.get((onward.section, to))
             if src is not None and dst is not None and network.enters(dst, onward.contact):
                 yield src, dst
-
-
-def _place_of_branch(
-    document: Document, onward: Target, network: Network, junction: dict[str, str]
-) -> float:
-    kind = "road/predecessor" if onward.contact == START else "road/successor"
-    road = int(network.lanes.sections.road[onward.section])
-    link = _road_links(document[kind]).get(road, {})
-    return _number(link.get("elementS", junction.get("sStart", "0")))
 
 
 def _whole(text: str) -> int:

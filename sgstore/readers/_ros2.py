@@ -594,7 +594,10 @@ class ColumnReader:
                 break
         else:
             layout, alike = _learned(reader, self._element, self._columns), 1
-            _remember(layouts, layout)
+            # Keep a layout, as the first that is tried, unless too much would have to agree.
+            if len(layout.prefixes) <= _MAX_PREFIXES:
+                layouts.insert(0, layout)
+                del layouts[_MAX_LAYOUTS:]
         layout.copy(values, place, to[:alike])
         reader.place = place + alike * layout.size
         return alike
@@ -605,13 +608,6 @@ def _learned(reader: _MessageReader, kind: Struct, columns: dict[str, int]) -> _
     walk = _ElementWalk(reader, columns, reader.place)
     walk.step(kind, "")
     return _StructLayout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
-
-
-def _remember(layouts: list[_StructLayout], layout: _StructLayout) -> None:
-    """Keep a layout, as the first that is tried, unless too much would have to agree."""
-    if len(layout.prefixes) <= _MAX_PREFIXES:
-        layouts.insert(0, layout)
-        del layouts[_MAX_LAYOUTS:]
 
 
 class _ElementWalk:

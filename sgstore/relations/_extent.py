@@ -259,7 +259,16 @@ class Areas:
         inside[rows, -1 - nodes] = True
         if self.heights is not None:
             self._keep_storey(road_map, self.heights, inside)
-        _add_parents(road_map, inside, there)
+        # Let roads be in range where one of their lanes is, and junctions where one of their roads is.
+        kind, edges = road_map.nodes.kind, road_map.edges
+        within = edges.relation == RELATION_CODE["isIn"]
+        child, parent = -1 - edges.src[within], -1 - edges.dst[within]
+        for name in ("road", "junction"):
+            columns = np.flatnonzero(kind == KIND_CODE[name])
+            inside[np.ix_(there, columns)] = False
+            of = kind[parent] == KIND_CODE[name]
+            row, edge = np.nonzero(inside[np.ix_(there, child[of])])
+            inside[there[row], parent[of][edge]] = True
         return inside
 
     def _meet(self, frame: Ints, boxes: Floats) -> Bools:
@@ -426,19 +435,6 @@ class Strips(Areas):
         rows, nodes = road_map.near_shapes(ends.reshape(-1, 2, 2), self.settings.width / 2)
         line, index = joined(rows, same.ravel())
         return self._frame[line], nodes[index]
-
-
-def _add_parents(road_map: RoadMap, inside: Bools, frames: Rows) -> None:
-    """Let roads be in range where one of their lanes is, and junctions where one of their roads is."""
-    kind, edges = road_map.nodes.kind, road_map.edges
-    within = edges.relation == RELATION_CODE["isIn"]
-    child, parent = -1 - edges.src[within], -1 - edges.dst[within]
-    for name in ("road", "junction"):
-        columns = np.flatnonzero(kind == KIND_CODE[name])
-        inside[np.ix_(frames, columns)] = False
-        of = kind[parent] == KIND_CODE[name]
-        row, edge = np.nonzero(inside[np.ix_(frames, child[of])])
-        inside[frames[row], parent[of][edge]] = True
 
 
 def _exist(egos: EgoPoses, *, turned: bool) -> Bools:

@@ -234,7 +234,12 @@ class LaneContact:
         self._reach = SignalReach(road_map, self._net, lines, ahead)
         self._footing = _Footing(road_map, lines)
         self.driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
-        self._parent = _parents(road_map)
+        # (K,): column of the node that each node of the map is in, -1 where there is none.
+        edges = road_map.edges
+        inside = edges.relation == RELATION_CODE["isIn"]
+        parent = np.full(len(road_map.nodes), -1)
+        parent[-1 - edges.src[inside]] = -1 - edges.dst[inside]
+        self._parent = parent
         self._columns: dict[tuple[bool, str], list[int]] = {}
         for column in np.flatnonzero(are_entities(nodes.kind)).tolist():
             ref = nodes.name[column].partition("#")[0]  # of a repeated object: ref#1, ref#2, …
@@ -338,15 +343,6 @@ class LaneContact:
             present[frame, column] = True
             column = self._parent[column]
             frame, column = frame[column >= 0], column[column >= 0]
-
-
-def _parents(road_map: RoadMap) -> Ints:
-    """(K,): column of the node that each node of the map is in, -1 where there is none."""
-    edges = road_map.edges
-    inside = edges.relation == RELATION_CODE["isIn"]
-    parent = np.full(len(road_map.nodes), -1)
-    parent[-1 - edges.src[inside]] = -1 - edges.dst[inside]
-    return parent
 
 
 def _appended(table: tuple[Ints, Ints], lines: list[tuple[int, int]]) -> tuple[Ints, Ints]:

@@ -474,21 +474,23 @@ class CarlaSurvey(Survey[Lead]):
                 self._look_for_egos(run.data(row), channel)
             return
         try:
-            self._look(run, row, channel, bytes(run.data(row)))
+            data = bytes(run.data(row))
+            content = self.contents[channel]
+            if content == ODOMETRY:
+                message = decode(self.structures[channel], data)
+                place = np.array([number(message, path) for path in _ODOMETRY])
+                role = role_in(self.topic(channel))
+                self._odometry[role] = (stamp_of(message), place)
+                self._find_egos()
+            elif self._last.get(channel) != data:  # the bridge says many things again and again
+                news = content == LIGHT_STATES  # which are read with the frames
+                news = news or self._take[content](decode(self.structures[channel], data))
+                self._last[channel] = data
+                if news and content in LASTING:
+                    self._lasting.append(ref_of(run, row))
         except TraceError as error:
             reason = f"a message of {self.topic(channel)!r} cannot be read: {error.reason}"
             self.lost.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
-
-    def _look(self, run: Messages, row: int, channel: int, data: bytes) -> None:
-        content = self.contents[channel]
-        if content == ODOMETRY:
-            self._take_odometry(channel, decode(self.structures[channel], data))
-        elif self._last.get(channel) != data:  # the bridge says many things again and again
-            news = content == LIGHT_STATES  # which are read with the frames
-            news = news or self._take[content](decode(self.structures[channel], data))
-            self._last[channel] = data
-            if news and content in LASTING:
-                self._lasting.append(ref_of(run, row))
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
@@ -554,12 +556,6 @@ class CarlaSurvey(Survey[Lead]):
         role = role_in(self.topic(channel))
         tried = self._tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
-
-    def _take_odometry(self, channel: int, message: dict[str, Any]) -> None:
-        place = np.array([number(message, path) for path in _ODOMETRY])
-        role = role_in(self.topic(channel))
-        self._odometry[role] = (stamp_of(message), place)
-        self._find_egos()
 
     def _look_for_egos(self, data: memoryview, channel: int) -> None:
         egos, wanted = self.egos, self.egos.wanted

@@ -456,16 +456,14 @@ def _pose_of(odometry: Floats) -> Floats:
     values = np.full(len(POSE), np.nan)
     angles, _ = _turned(odometry[None, 3:7])
     values[:3], values[3:6] = odometry[:3], angles[0]
-    values[6:9] = _rotated(odometry[3:7], odometry[7:10])
-    values[12] = odometry[10]
-    return values
-
-
-def _rotated(quaternion: Floats, vector: Floats) -> Floats:
-    """A vector in the axes that a quaternion turns, in those that it is turned from."""
+    # A vector in the axes that a quaternion turns, in those that it is turned from.
+    quaternion = odometry[3:7]
+    vector = odometry[7:10]
     axis, w = quaternion[:3], quaternion[3]
     across = 2 * np.cross(axis, vector)
-    return vector + w * across + np.cross(axis, across)
+    values[6:9] = vector + w * across + np.cross(axis, across)
+    values[12] = odometry[10]
+    return values
 
 
 def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:

@@ -177,24 +177,20 @@ class FoxgloveSurvey(Survey[Lead]):
         try:
             data = bytes(run.data(row))
             if reader.name == SCENE:
-                self._look_at_scene(reader.scene(data), run, row)
+                scene = reader.scene(data)
+                self.count(run, row, bool(scene.boxes))
+                for box in scene.boxes:
+                    ident = self.mapping.entity.ident_of(box)
+                    if not count_ref(self._entities, ident, ref_of(run, row)):
+                        self._types[ident] = self.mapping.entity.type_of(box)
+                        self._entity_axes[box.axes] += 1
             else:
-                self._look_at_transforms(reader.transforms(data), run, row)
+                told = reader.transforms(data)
+                for one in told:
+                    if self._axes.tell(one.child, one.parent, 0, (ORIGIN, STILL)):
+                        count_ref(self._transforms, one.child, ref_of(run, row))
         except ERRORS:  # counted as a loss when the frames are read
             return
-
-    def _look_at_scene(self, scene: SceneUpdate, run: Messages, row: int) -> None:
-        self.count(run, row, bool(scene.boxes))
-        for box in scene.boxes:
-            ident = self.mapping.entity.ident_of(box)
-            if not count_ref(self._entities, ident, ref_of(run, row)):
-                self._types[ident] = self.mapping.entity.type_of(box)
-                self._entity_axes[box.axes] += 1
-
-    def _look_at_transforms(self, told: list[Transform], run: Messages, row: int) -> None:
-        for one in told:
-            if self._axes.tell(one.child, one.parent, 0, (ORIGIN, STILL)):
-                count_ref(self._transforms, one.child, ref_of(run, row))
 
 
 # Frames -------------------------------------------------------------------------------------------

@@ -224,15 +224,13 @@ class OsiLanes:
         for name in FIELDS:
             things = getattr(truth, name, ())
             if self._lacks[name]:
-                self._say_lack(name, len(things))
+                number = len(things)
+                warning = f"the schema of {name} lacks the field {self._lacks[name][0]}: none of it is used"
+                if number and warning not in self.warnings:
+                    self.warnings.append(warning)
                 continue
             for thing in things:
                 self._told[name].setdefault(int(thing.id.value), thing)
-
-    def _say_lack(self, name: str, number: int) -> None:
-        warning = f"the schema of {name} lacks the field {self._lacks[name][0]}: none of it is used"
-        if number and warning not in self.warnings:
-            self.warnings.append(warning)
 
     def text(self, signals: Iterable[LaneSignal] = ()) -> tuple[str, str]:
         """The text of the road map, and what the recording calls the map; empty if it tells no lanes.

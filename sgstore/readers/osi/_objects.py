@@ -641,7 +641,9 @@ class TrafficLights:
         except DECODE_ERRORS:  # whatever else is in the message is read all the same
             self.unreadable += 1
             return
-        head.bulbs[bulb.id.value] = self._lit(bulb.classification)
+        classification = bulb.classification
+        out = self._has_service and classification.is_out_of_service
+        head.bulbs[bulb.id.value] = 0 if out else lit(classification.mode, classification.color)
 
     def signals(self) -> dict[int, LaneSignal]:
         """First bulb of each head that is assigned to lanes → the signal that it is."""
@@ -667,10 +669,6 @@ class TrafficLights:
             np.array([head.pose for head in placed], np.float64).reshape(-1, len(POSE)),
             np.array([shown(head.bulbs.values()) for head in placed], np.int64),
         )
-
-    def _lit(self, classification: Any) -> int:
-        out = self._has_service and classification.is_out_of_service
-        return 0 if out else lit(classification.mode, classification.color)
 
     def _enter(self, bulb: Any) -> _Head:
         """The head that a bulb belongs to, which may be a new one."""

@@ -251,19 +251,16 @@ class _Latch:
         new = {item for item in items if item not in self.told_by}
         self.repeated = (self.repeated - gone) | new
         self.told_by.update(dict.fromkeys(new, ref))
-        lights = self._lit(ground)
-        if self.last is not None and self.lights - lights:
-            self.refs[self.last] = None
-        self.lights, self.last = lights, ref
-        return any(name in LANE_FIELDS for name, _ in new)
-
-    def _lit(self, ground: Any) -> set[int]:
-        """Ids of the lights in a message; those that stand in it as in the last one are not read again."""
+        # Ids of the lights in a message; those that stand in it as in the last one are not read again.
         words = lights_of(ground)
         if words != [*self.words]:
             known = self.words
             self.words = {word: known.get(word) or self._ident(word) for word in words}
-        return {ident for ident in self.words.values() if ident is not None}
+        lights = {ident for ident in self.words.values() if ident is not None}
+        if self.last is not None and self.lights - lights:
+            self.refs[self.last] = None
+        self.lights, self.last = lights, ref
+        return any(name in LANE_FIELDS for name, _ in new)
 
     def _ident(self, word: bytes) -> int | None:
         try:
