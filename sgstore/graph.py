@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise, starmap
 from operator import eq
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
+from sgstore.columns import chained, taken
 from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS
 
 if TYPE_CHECKING:
@@ -59,17 +60,18 @@ class Edges:
     def distinct(self) -> Edges:
         """Each edge once, by frame, and in it in the order of source, relation and destination."""
         order = np.lexsort((self.dst, self.relation, self.src, self.frame))
-        columns = [getattr(self, f.name)[order] for f in fields(self)]
+        every = taken(self, order)
+        columns = (every.frame, every.src, every.relation, every.dst)
         new = np.ones(len(order), np.bool_)
         new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
-        return Edges(*(column[new] for column in columns))
+        return taken(every, new)
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
         """Edges of all parts, one part after another; of no part none."""
         none = np.empty(0, dtype=np.int64)
         parts = parts or [cls(none, none.astype(np.int8), none, none)]
-        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+        return chained(parts)
 
 
 @dataclass(frozen=True, slots=True)

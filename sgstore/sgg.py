@@ -14,13 +14,14 @@ answer at all is said by :attr:`SceneGraphGenerator.answers`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
+from sgstore.columns import chained
 from sgstore.errors import ConfigError
 from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
@@ -410,7 +411,7 @@ class SceneGraphGenerator:
             if self._survey is not None:
                 self._survey.learn(entities, frames.scenery)
         if len(frames.scenery):
-            self._scenery = _stacked(self._scenery, frames.scenery)
+            self._scenery = chained([self._scenery, frames.scenery])
             if self._still.wanted:
                 states = len(frames.states)
                 everything = states + np.arange(len(self._scenery))
@@ -601,11 +602,3 @@ def _lane_states(bodies: Bodies, ground: MapContext | None) -> LaneStates:
         along=ground.standing.along,
         own=ground.standing.own,
     )
-
-
-def _stacked(first: States, second: States) -> States:
-    columns = {
-        f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
-        for f in fields(States)
-    }
-    return States(**columns)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.columns import chained, taken
 from sgstore.errors import TraceError
-from sgstore.world import TOLERANCE_NS, Entities, FrameBlock, MessageRefs, States
+from sgstore.world import TOLERANCE_NS, FrameBlock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sgstore.world import Bools, Ints
 
+
+_NONE: Final = np.zeros(0, np.intp)
 
 MAX_MESSAGES: Final = 200_000
 """References of messages that wait for a block to be full."""
@@ -184,50 +187,28 @@ def _joined(blocks: list[FrameBlock]) -> FrameBlock:
     if len(blocks) == 1:
         return first
     shifts = np.cumsum([0, *(len(block.states) for block in blocks)])
+    entities = [block.entities for block in blocks if len(block.entities)] or [first.entities]
     offsets = [block.offsets[:-1] + shift for block, shift in zip(blocks, shifts, strict=False)]
     return FrameBlock(
-        seq=_chained([block.seq for block in blocks]),
-        time_ns=_chained([block.time_ns for block in blocks]),
-        log_time_ns=_chained([block.log_time_ns for block in blocks]),
+        seq=np.concatenate([block.seq for block in blocks]),
+        time_ns=np.concatenate([block.time_ns for block in blocks]),
+        log_time_ns=np.concatenate([block.log_time_ns for block in blocks]),
         offsets=np.concatenate([*offsets, shifts[-1:]]).astype(np.int64),
-        states=_stacked(States, [block.states for block in blocks]),
-        ego=_chained([block.ego for block in blocks]),
-        entities=_entities([block.entities for block in blocks]),
-        scenery=_stacked(States, [block.scenery for block in blocks]),
-        messages=_stacked(MessageRefs, [block.messages for block in blocks]),
+        states=chained([block.states for block in blocks]),
+        ego=np.concatenate([block.ego for block in blocks]),
+        entities=chained(entities),
+        scenery=chained([block.scenery for block in blocks]),
+        messages=chained([block.messages for block in blocks]),
         events=tuple(event for block in blocks for event in block.events),
     )
 
 
-def _entities(parts: list[Entities]) -> Entities:
-    parts = [part for part in parts if len(part)] or parts[:1]
-    joined: dict[str, Any] = {"first": parts[0].first}
-    for column in fields(Entities)[1:]:
-        values = [getattr(part, column.name) for part in parts]
-        is_array = isinstance(values[0], np.ndarray)
-        joined[column.name] = (
-            _chained(values) if is_array else tuple(v for one in values for v in one)
-        )
-    return Entities(**joined)
-
-
-def _stacked(kind: Any, parts: list[Any]) -> Any:
-    return kind(*(_chained([getattr(p, f.name) for p in parts]) for f in fields(kind)))
-
-
-def _chained(parts: list[Any]) -> Any:
-    return np.concatenate(parts)
-
-
 def _without_messages(block: FrameBlock) -> FrameBlock:
-    messages = block.messages
-    none = {f.name: getattr(messages, f.name)[:0] for f in fields(MessageRefs)}
-    return replace(block, messages=MessageRefs(**none))
+    return replace(block, messages=taken(block.messages, _NONE))
 
 
 def _only_frames(block: FrameBlock) -> FrameBlock:
     entities = block.entities
-    none: dict[str, Any] = {f.name: getattr(entities, f.name)[:0] for f in fields(Entities)[1:]}
-    nowhere = block.scenery.take(np.zeros(0, np.intp))
     first = entities.first + len(entities)
-    return replace(block, entities=Entities(first=first, **none), scenery=nowhere, events=())
+    none = replace(taken(entities, _NONE), first=first)
+    return replace(block, entities=none, scenery=taken(block.scenery, _NONE), events=())

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sgstore.columns import taken
 from sgstore.geometry import wrapped
 from sgstore.mcap import Findings
 
@@ -182,7 +183,7 @@ class States:
 
     def take(self, rows: NDArray[np.intp] | Bools) -> States:
         """Some of the rows, in the order given."""
-        return States(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return taken(self, rows)
 
     @classmethod
     def of(cls, **columns: NDArray[np.generic]) -> States:

@@ -19,6 +19,7 @@ SIDE_BY_SIDE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
 TESTS = {
     "abstractions": "abstractions lane_roles",
     "cli": "cli cli_ending cli_errors cli_ingest cli_library cli_map cli_repeated",  # streams: minutes
+    "columns": "roads relations ingest",
     "config": "config config_graphs",
     "contrib": "lang_sgl",
     "demo": "api",

@@ -20,7 +20,7 @@ PACKAGE = Path(__file__).parents[1] / "sgstore"
 # From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
 # one another, except that the files of one folder know each other.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"errors", "geometry", "pair_numbers", "plugins", "processes", "quoting"}),
+    frozenset({"columns", "errors", "geometry", "pair_numbers", "plugins", "processes", "quoting"}),
     frozenset({"mcap", "vocabulary"}),
     frozenset({"abstractions", "config", "files", "graph", "lang", "roads", "world"}),
     frozenset({"contrib", "opendrive", "relations", "step", "trace_parts"}),

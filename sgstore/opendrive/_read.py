@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
+from sgstore.columns import chained
 from sgstore.config import Signs
 from sgstore.errors import MapError
 from sgstore.opendrive._document import Document, Record, Spoiled, read_document
@@ -153,7 +154,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         *road_nodes(document),
         furniture.crosswalks.nodes,
     ]
-    nodes = MapNodes.joined([*before, signals.nodes, furniture.scenery.nodes])
+    nodes = chained([*before, signals.nodes, furniture.scenery.nodes])
     first_signal = sum(map(len, before))
     lane_changes = read_lane_changes(document, lanes, ribbons)
     edges = [

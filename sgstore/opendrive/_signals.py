@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.columns import chained
 from sgstore.opendrive._document import coefficients_of, cubic, last_before
 from sgstore.opendrive._lanes import PlanView, poses
 from sgstore.opendrive._network import END, FIRST_LANE, START, junction_of, speed
@@ -274,7 +275,7 @@ def read_signals(document: Document, plan: PlanView, network: Network, signs: Si
     network.warnings.extend(reach.doubts.warnings())
     other = "" if signs.orientation == "asam" or not reach.doubts.asked else signs.orientation
     return Signals(
-        MapNodes.joined([part.nodes for part in parts]),
+        chained([part.nodes for part in parts]),
         [s for p in parts for s in p.lanes],
         " ".join(filter(None, (parts[0].told, other))),
     )

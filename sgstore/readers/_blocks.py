@@ -10,11 +10,12 @@ a block begins or ends.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
+from sgstore.columns import chained, taken
 from sgstore.mcap import IDS, Loss
 from sgstore.vocabulary import KIND_CODE
 from sgstore.world import POSE, Entities, FrameBlock, MessageRefs, States
@@ -396,30 +397,16 @@ class _Between:
         self._parts.append(refs)
         self._total += len(refs)
         if self._total > 3 * NEAR_REFS:
-            whole = _joined(self._parts)
-            first, last = slice(0, NEAR_REFS), slice(len(whole) - NEAR_REFS, None)
+            whole, near = chained(self._parts), np.arange(NEAR_REFS)
             self.dropped += len(whole) - 2 * NEAR_REFS
-            self._parts = [_some(whole, first), _some(whole, last)]
+            # As copies, so that the whole is not kept alive by a part of it.
+            self._parts = [taken(whole, near), taken(whole, near + len(whole) - NEAR_REFS)]
             self._total = 2 * NEAR_REFS
 
     def take(self) -> list[MessageRefs]:
         """All of them, in order; then there are none."""
         parts, self._parts, self._total = self._parts, [], 0
         return parts
-
-
-def _some(refs: MessageRefs, rows: slice) -> MessageRefs:
-    # Copied, so that the whole is not kept alive by a part of it.
-    return MessageRefs(*(getattr(refs, column.name)[rows].copy() for column in fields(MessageRefs)))
-
-
-def _joined(parts: list[MessageRefs]) -> MessageRefs:
-    return MessageRefs(
-        *(
-            np.concatenate([getattr(part, column.name) for part in parts])
-            for column in fields(MessageRefs)
-        )
-    )
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
@@ -486,7 +473,7 @@ def _block(
         ego=ego,
         entities=entities,
         scenery=scenery,
-        messages=_joined(refs),
+        messages=chained(refs),
         events=roster.take_events(),
     )
 

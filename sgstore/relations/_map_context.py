@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sgstore.columns import chained, taken
 from sgstore.errors import ConfigError
 from sgstore.relations._following import Centrelines, LaneNet, SignalReach, next_ahead, own_hits
 from sgstore.relations._scene import (
@@ -83,7 +84,7 @@ class Waypoints:
         )
         points = road_map.waypoints(lanes.spacing)
         rows = np.flatnonzero(has[points.lane])
-        points = replace(points, **{f.name: getattr(points, f.name)[rows] for f in fields(points)})
+        points = taken(points, rows)
         self._counts = np.bincount(points.lane, minlength=count)
         self._first = len(road_map.nodes) + np.cumsum(self._counts) - self._counts
         self.road_map = self._extended(road_map, points)
@@ -101,7 +102,7 @@ class Waypoints:
         return RoadMap(
             name=road_map.name,
             text=road_map.text,
-            nodes=MapNodes.joined([road_map.nodes, self._nodes(road_map.nodes, points)]),
+            nodes=chained([road_map.nodes, self._nodes(road_map.nodes, points)]),
             edges=MapEdges(*(np.concatenate(column) for column in zip(*parts, strict=True))),
             ribbons=road_map.ribbons,
             shapes=np.concatenate([road_map.outlines(), shapes]),

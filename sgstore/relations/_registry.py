@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from sgstore import plugins
+from sgstore.columns import taken
 from sgstore.errors import ConfigError
 from sgstore.relations._bearing import sector
 from sgstore.relations._proximity import rung
@@ -163,18 +164,18 @@ class Keeping:
         kept = self._relations[edges.relation]
         if not self.parts.all():
             kept &= self._stays(edges.src) & self._stays(edges.dst)
-        edges = edges if kept.all() else _taken(edges, kept)
+        edges = edges if kept.all() else taken(edges, kept)
         if self._same is None:
             return edges
         src, dst = self._standing_for(edges.src), self._standing_for(edges.dst)
         merged = replace(edges, src=src, dst=dst)
         key = np.column_stack([edges.frame, edges.relation, src, dst])
-        return _taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
+        return taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
         """Those in lanes that are kept. Of sections that are one lane, the one with the larger share speaks."""
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
-        lanes = lanes if kept.all() else _taken(lanes, kept)
+        lanes = lanes if kept.all() else taken(lanes, kept)
         if self._same is None or not len(lanes):
             return lanes
         lane = self._standing_for(lanes.lane)
@@ -182,13 +183,13 @@ class Keeping:
         key = np.column_stack([lanes.frame, lanes.node, lane])[order]
         first = np.flatnonzero(np.append(True, (np.diff(key, axis=0) != 0).any(axis=1)))
         overlap = np.minimum(np.add.reduceat(lanes.overlap[order], first), 1.0)
-        merged = _taken(replace(lanes, lane=lane), order[first])
+        merged = taken(replace(lanes, lane=lane), order[first])
         return replace(merged, overlap=overlap)
 
     def gaps(self, gaps: LaneGaps) -> LaneGaps:
         """Those that belong to a relation that is kept."""
         wanted = self._relations[[RELATION_CODE["leads"], RELATION_CODE["follows"]]].any()
-        return gaps if wanted else _taken(gaps, np.zeros(0, np.intp))
+        return gaps if wanted else taken(gaps, np.zeros(0, np.intp))
 
     def present(self, present: Bools) -> Bools:
         """(F, K): which nodes of the map are in the graphs, of those that are in range."""
@@ -223,8 +224,3 @@ def renamed(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
             kind[row] = KIND_CODE[meaning.kind]
             special[row], subkind[row] = meaning.special, meaning.subkind
     return replace(entities, kind=kind, special=tuple(special), subkind=tuple(subkind))
-
-
-def _taken(table: Columns, rows: Any) -> Columns:
-    """Some of the rows of a table, in the order given."""
-    return type(table)(*(getattr(table, column.name)[rows] for column in fields(table)))

@@ -5,11 +5,12 @@ Which intervals of a line meet: how candidates are found without looking at all 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.columns import taken
 from sgstore.graph import Edges
 from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
@@ -118,7 +119,7 @@ class Bodies:
 
     def take(self, rows: NDArray[np.intp]) -> Bodies:
         """Some of the rows, in the order given."""
-        return Bodies(*(getattr(self, column.name)[rows] for column in fields(self)))
+        return taken(self, rows)
 
     @property
     def bottom(self) -> Floats:
@@ -182,10 +183,10 @@ class Standing:
         """The same of some of the bodies; ``place`` (N,): their new rows, -1 for those left out."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
-        columns = {column.name: getattr(hits, column.name)[kept] for column in fields(hits)}
+        hits = taken(hits, kept)
         off_road = place[self.off_road]
         return Standing(
-            replace(hits, **(columns | {"row": place[columns["row"]]})),
+            replace(hits, row=place[hits.row]),
             self.along[kept],
             self.own[kept],
             (place[rows[there]], nodes[there]),

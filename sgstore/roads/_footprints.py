@@ -8,12 +8,13 @@ numpy over chunks of footprints that fit the caches; shapely's intersection alon
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.columns import chained
 from sgstore.roads._ribbons import Ribbons, wrapped
 
 if TYPE_CHECKING:
@@ -231,12 +232,7 @@ class LaneIndex:
         shapes = _Shapes.of(boxes, z)
         parts = [_no_touches()]
         parts += [self._gathered(shapes, row, quad) for row, quad in self._candidates(shapes)]
-        return Touches(
-            *(
-                np.concatenate([getattr(part, column.name) for part in parts])
-                for column in fields(Touches)
-            )
-        )
+        return chained(parts)
 
     def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
         """Footprints and quadrangles that are close, each pair once, by chunks of footprints."""

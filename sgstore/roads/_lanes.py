@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
+from sgstore.columns import chained
 from sgstore.errors import MapError
 from sgstore.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
 from sgstore.roads._ribbons import Ribbons, conflicts, mean_widths, turned, wrapped
@@ -117,7 +118,7 @@ def road_map_of(
     surfaces = plain_nodes(lanes, ribbons)
     roads, junctions = _road_nodes(lanes, ribbons), _junction_nodes(lanes)
     off_road = MapNodes.of("off_road", ["off_road"])
-    nodes = MapNodes.joined([off_road, surfaces, roads, junctions, _signal_nodes(signals)])
+    nodes = chained([off_road, surfaces, roads, junctions, _signal_nodes(signals)])
     return RoadMap(
         name=name,
         text=text,

@@ -8,13 +8,14 @@ import json
 from collections import Counter, defaultdict
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sgstore.columns import taken
 from sgstore.roads._footprints import LaneIndex
 from sgstore.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
 from sgstore.vocabulary import DRIVING, ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, SIGNALS
@@ -324,22 +325,7 @@ class MapNodes:
 
     def take(self, rows: Ints) -> MapNodes:
         """Some of the nodes, in the order given."""
-        columns: dict[str, Any] = {}
-        for column in fields(self):
-            values = getattr(self, column.name)
-            whole = isinstance(values, np.ndarray)
-            columns[column.name] = values[rows] if whole else tuple(values[r] for r in rows)
-        return MapNodes(**columns)
-
-    @classmethod
-    def joined(cls, parts: Sequence[MapNodes]) -> MapNodes:
-        """One part after another."""
-        columns: dict[str, Any] = {}
-        for column in fields(cls):
-            values = [getattr(part, column.name) for part in parts]
-            whole = isinstance(values[0], np.ndarray)
-            columns[column.name] = np.concatenate(values) if whole else tuple(chain(*values))
-        return cls(**columns)
+        return taken(self, rows)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,13 @@ Lanes as ribbons: what their surface is, whatever they were read from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import shapely
 
+from sgstore.columns import chained
 from sgstore.errors import MapError
 
 if TYPE_CHECKING:
@@ -59,12 +60,7 @@ class Ribbons:
     def followed_by(self, more: Ribbons) -> Ribbons:
         """The ribbons of these lanes, then of more."""
         offsets = np.concatenate((self.offsets, self.offsets[-1] + more.offsets[1:]))
-        columns = {
-            column.name: np.concatenate((getattr(self, column.name), getattr(more, column.name)))
-            for column in fields(self)
-            if column.name != "offsets"
-        }
-        return Ribbons(offsets=offsets, **columns)
+        return replace(chained([self, more]), offsets=offsets)
 
     @property
     def lengths(self) -> Floats:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sgstore.graph import Edges
+from sgstore.columns import taken
 from sgstore.world import BUCKET_FRAMES, GAP, KEPT, TOLERANCE_NS, TOLERANCE_SHARE, number, turned
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from sgstore.graph import GraphBlock
+    from sgstore.graph import Edges, GraphBlock
     from sgstore.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
 
 
@@ -207,8 +207,7 @@ def edge_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Iterator
     piece = (edges.src % count).astype(np.int32)  # what becomes one row has one source
     for which in range(count):
         rows = np.flatnonzero(piece == which)
-        part = Edges(*(getattr(edges, column.name)[rows] for column in fields(Edges)))
-        yield _edge_columns(graph, part, trace_id, kinds)
+        yield _edge_columns(graph, taken(edges, rows), trace_id, kinds)
 
 
 def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKinds) -> Columns:

@@ -1,0 +1,44 @@
+"""Tables as dataclasses, a column in each field: some of the rows, and several tables as one.
+
+A column is an array or a tuple. What is neither is the same for all rows, and is that of the first table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from _typeshed import DataclassInstance
+    from numpy.typing import NDArray
+
+Table = TypeVar("Table", bound="DataclassInstance")
+
+
+def taken(table: Table, rows: NDArray[Any]) -> Table:
+    """Some of the rows of a table, in the order given: indices, or a mask of arrays."""
+    columns = (getattr(table, field.name) for field in fields(table))
+    return type(table)(*(_taken(column, rows) for column in columns))
+
+
+def _taken(column: Any, rows: NDArray[Any]) -> Any:
+    if isinstance(column, tuple):
+        return tuple(column[row] for row in rows.tolist())
+    return column[rows] if isinstance(column, np.ndarray) else column
+
+
+def chained(tables: Sequence[Table]) -> Table:
+    """The rows of tables of one type, one table after another."""
+    columns = ([getattr(one, field.name) for one in tables] for field in fields(tables[0]))
+    return type(tables[0])(*map(_chained, columns))
+
+
+def _chained(parts: list[Any]) -> Any:
+    if isinstance(parts[0], tuple):
+        return tuple(chain(*parts))
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else parts[0]
