@@ -442,7 +442,9 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
         "autoload_known_extensions": False,
         "autoinstall_known_extensions": False,
     }
-    return duckdb.connect(":memory:", config=config)
+    connection = duckdb.connect(":memory:", config=config)
+    connection.execute("SET enable_progress_bar = false")  # on stdout, where Python is interactive
+    return connection
 
 
 # A trace that is ready to be published: files in a folder, and what is said of them -------------
