@@ -110,16 +110,8 @@ class Network:
         return bool(self.lanes.forward[lane]) == (contact in {START, "+"})
 
 
-@dataclass(frozen=True, slots=True)
-class Flow:
-    """Pairs of lanes between which traffic flows, shape (n,): from ``src`` on to ``dst``."""
-
-    src: Ints
-    dst: Ints
-
-
-def flows(document: Document, network: Network) -> Flow:
-    """All pairs of lanes between which traffic can flow, each once."""
+def flows(document: Document, network: Network) -> tuple[Ints, Ints]:
+    """All pairs of lanes between which traffic can flow, each once: from these, and on to those."""
     joints = _Joints(document, network)
     pairs = {
         (lane, beyond)
@@ -128,7 +120,7 @@ def flows(document: Document, network: Network) -> Flow:
     }
     pairs |= set(_branches(document, network))
     both = np.array(sorted(pairs), np.int64).reshape(-1, 2)
-    return Flow(both[:, 0], both[:, 1])
+    return both[:, 0], both[:, 1]
 
 
 def _exits(lanes: LaneTable) -> Iterator[tuple[int, str]]:
@@ -435,18 +427,19 @@ def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
     return np.stack((rows[:-1][same], rows[1:][same]))
 
 
-def flow_edges(lanes: LaneTable, nodes: MapNodes, ribbons: Ribbons, flow: Flow) -> list[Edge]:
+def flow_edges(
+    lanes: LaneTable, nodes: MapNodes, ribbons: Ribbons, flow: tuple[Ints, Ints]
+) -> list[Edge]:
     """``travelsTo`` and ``conflictsWith`` among lanes; ``nodes`` are theirs."""
     crossing = [
         lane
         for lane, (kind, junction) in enumerate(zip(lanes.type, nodes.junction, strict=True))
         if junction and kind in DRIVING
     ]
-    pair = (flow.src, flow.dst)
-    one, other = conflicts(ribbons, np.array(crossing, np.int64), nodes.junction, pair, STOREY)
+    one, other = conflicts(ribbons, np.array(crossing, np.int64), nodes.junction, flow, STOREY)
     both = np.concatenate((one, other)), np.concatenate((other, one))
     return [
-        ("travelsTo", flow.src + FIRST_LANE, flow.dst + FIRST_LANE),
+        ("travelsTo", flow[0] + FIRST_LANE, flow[1] + FIRST_LANE),
         ("conflictsWith", both[0] + FIRST_LANE, both[1] + FIRST_LANE),
     ]
 

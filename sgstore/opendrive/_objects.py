@@ -141,18 +141,13 @@ class _Items:
         return len(self.row) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class Furniture:
-    """Objects of a map: crosswalks, all other entities, and parking spaces with the rows of their roads."""
+def read_objects(
+    document: Document, plan: PlanView, warnings: list[str]
+) -> tuple[Objects, Objects, list[PlainLane], Ints]:
+    """Read the objects of a map; one whose place is broken is left out with a warning.
 
-    crosswalks: Objects
-    scenery: Objects
-    parking: list[PlainLane]
-    parking_road: Ints
-
-
-def read_objects(document: Document, plan: PlanView, warnings: list[str]) -> Furniture:
-    """Read the objects of a map; one whose place is broken is left out with a warning."""
+    Crosswalks, all other entities, parking spaces, and the rows of their roads.
+    """
     kind = "road/object"
     table = document[kind]
     names, types = table.texts("name"), table.texts("type")
@@ -182,7 +177,7 @@ def read_objects(document: Document, plan: PlanView, warnings: list[str]) -> Fur
     }
     flat = [nodes.name[row] for row in np.flatnonzero(parks).tolist() if row not in spaces]
     warnings.extend(f"parking space {name!r} has no extent and is left out" for name in flat)
-    return Furniture(
+    return (
         objects.take(np.flatnonzero(crosswalk)),
         objects.take(np.flatnonzero(~crosswalk & ~parks)),
         list(spaces.values()),
@@ -391,10 +386,10 @@ def _placed(
     y = columns["y"][item] + sin * local[:, 0] + cos * local[:, 1]
     along, item = _laid_out(items.along)
     road = document["road/object"].road[np.array(items.row, np.int64)[item]]
-    where = places(document, plan, road, along[:, 0], along[:, 1])
+    where_x, where_y, *_ = places(document, plan, road, along[:, 0], along[:, 1])
     return [
         *_moved(items.local, np.column_stack((x, y))),
-        *_moved(items.along, np.column_stack((where.x, where.y))),
+        *_moved(items.along, np.column_stack((where_x, where_y))),
     ]
 
 

@@ -145,28 +145,28 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
     network = Network.of(document, lanes)
     surfaces = lane_nodes(document, lanes, ribbons)
     signals = read_signals(document, plan, network, signs)
-    furniture = read_objects(document, plan, network.warnings)
-    spaces = ribbons_of(furniture.parking)
+    crosswalks, scenery, parking, parking_road = read_objects(document, plan, network.warnings)
+    spaces = ribbons_of(parking)
     before = [
         MapNodes.of("off_road", ["off_road"]),
         surfaces,
-        plain_nodes(furniture.parking, spaces),
+        plain_nodes(parking, spaces),
         *road_nodes(document),
-        furniture.crosswalks.nodes,
+        crosswalks.nodes,
     ]
-    nodes = chained([*before, signals.nodes, furniture.scenery.nodes])
+    nodes = chained([*before, signals.nodes, scenery.nodes])
     first_signal = sum(map(len, before))
     lane_changes = read_lane_changes(document, lanes, ribbons)
     edges = [
         *neighbours(lanes, ribbons),
         *flow_edges(lanes, surfaces, ribbons, flows(document, network)),
-        *containment(document, np.append(lanes.road, furniture.parking_road)),
+        *containment(document, np.append(lanes.road, parking_road)),
         ("laneChange", FIRST_LANE + lane_changes.lane, FIRST_LANE + lane_changes.to),
         signals.edges(first_signal),
     ]
     shapes = np.full(len(nodes), None, object)
     poles: Any = shapely.points(signals.nodes.x, signals.nodes.y)
-    beside = [*furniture.crosswalks.shapes, *poles, *furniture.scenery.shapes]
+    beside = [*crosswalks.shapes, *poles, *scenery.shapes]
     shapes[len(nodes) - len(beside) :] = beside
     document.settle()
     return RoadMap(

@@ -139,18 +139,13 @@ class Doubts:
 # Places along roads: (road, s, t) → position, for signals and objects ---------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class RoadPoses:
-    """Positions, shape (N,): map axes, and the heading of the road there."""
+def places(
+    document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Places ``s`` along roads and ``t`` to their left; before or beyond a road, its end is taken.
 
-    x: Floats
-    y: Floats
-    z: Floats
-    heading: Floats
-
-
-def places(document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats) -> RoadPoses:
-    """Poses of places ``s`` along roads and ``t`` to their left; before or beyond a road, its end is taken."""
+    x, y and z in map axes, and the heading of the road there.
+    """
     length = document.numbers("road", "length")[road]
     s = np.clip(s, 0.0, length)
     pose = poses(plan, last_before(plan.road, plan.s, road, s), s)
@@ -159,7 +154,7 @@ def places(document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats)
     level = np.zeros((len(at) + 1, 4))
     level[:-1] = coefficients_of(document, "road/elevation")
     into = np.maximum(s - np.append(at, 0.0)[record], 0.0)
-    return RoadPoses(
+    return (
         pose.x - t * np.sin(pose.heading),
         pose.y + t * np.cos(pose.heading),
         cubic(level[record], into),
@@ -200,12 +195,12 @@ def node_columns(
     }
     s, t, up = at or (own["s"], own["t"], own["zOffset"])
     road = table.road[rows]
-    where = places(document, plan, road, s, t)
-    heading = where.heading + own["hdg"] + own["hOffset"]
+    x, y, z, heading = places(document, plan, road, s, t)
+    heading = heading + own["hdg"] + own["hOffset"]
     return {
-        "x": where.x,
-        "y": where.y,
-        "z": where.z + up,
+        "x": x,
+        "y": y,
+        "z": z + up,
         "heading": np.pi - (np.pi - heading) % (2 * np.pi),
         "road": tuple(document.road_ids[r] for r in road.tolist()),
         "junction": tuple(junction_of(document, r) for r in road.tolist()),

@@ -71,10 +71,14 @@ def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
 
 
 def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
-    """The pairs that touch."""
+    """The pairs that touch, in height as far as it is known."""
     close = bodies.moves[a] | bodies.moves[b]
     a, b = a[close], b[close]
-    a, b = (end[_same_height(bodies, a, b)] for end in (a, b))
+    apart = np.abs(bodies.z[b] - bodies.z[a])
+    reach = (bodies.height[a] + bodies.height[b]) / 2 + TOUCH
+    bottoms = np.abs(bodies.bottom[b] - bodies.bottom[a])
+    level = ~np.where(np.isnan(reach), bottoms > STOREY, apart > reach)
+    a, b = a[level], b[level]
     touch = gap(_boxes(bodies, a), _boxes(bodies, b)) <= TOUCH
     return a[touch], b[touch]
 
@@ -82,14 +86,6 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
 def _boxes(bodies: Bodies, rows: Rows) -> Floats:
     columns = (bodies.x, bodies.y, bodies.heading, bodies.length, bodies.width)
     return np.stack([column[rows] for column in columns], axis=1)
-
-
-def _same_height(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of pairs whose boxes meet in height, as far as it is known."""
-    apart = np.abs(bodies.z[b] - bodies.z[a])
-    reach = (bodies.height[a] + bodies.height[b]) / 2 + TOUCH
-    bottoms = np.abs(bodies.bottom[b] - bodies.bottom[a])
-    return ~np.where(np.isnan(reach), bottoms > STOREY, apart > reach)
 
 
 def _edges(scene: BlockScene) -> Edges:

@@ -328,7 +328,11 @@ class LaneContact:
         hits, (at, parts), off_road = standing.hits, standing.parts, standing.off_road
         rows = np.concatenate([hits.row, at, off_road])
         nodes = np.concatenate([hits.lane, parts, np.full(len(off_road), OFF_ROAD)])
-        self._add_with_parents(present, bodies.frame[rows], -1 - nodes)
+        frame, column = bodies.frame[rows], -1 - nodes
+        for _ in range(DEPTH):
+            present[frame, column] = True
+            column = self._parent[column]
+            frame, column = frame[column >= 0], column[column >= 0]
         present &= kept
         return MapContext(
             standing,
@@ -338,12 +342,6 @@ class LaneContact:
             self._reach.of_map(present),
             next_ahead(self._net, bodies, standing, self._ahead),
         )
-
-    def _add_with_parents(self, present: Bools, frame: Ints, column: Ints) -> None:
-        for _ in range(DEPTH):
-            present[frame, column] = True
-            column = self._parent[column]
-            frame, column = frame[column >= 0], column[column >= 0]
 
 
 def _appended(table: tuple[Ints, Ints], lines: list[tuple[int, int]]) -> tuple[Ints, Ints]:
