@@ -64,12 +64,15 @@ ROOMS: Final[dict[str, tuple[str, ...]]] = {
         ),
         "test_classes.py",
     ),
-    "relations": ("test_relations*.py", "test_extent.py", "test_lane_*.py", "test_sgg*.py"),
+    "relations": (
+        *("test_relations*.py", "test_extent.py", "test_lane_*.py", "test_sgg*.py"),
+        *("test_crowds.py", "test_plugins.py"),
+    ),
     "temporal": ("test_temporal.py", "test_over_time.py", "test_monitor.py"),
-    "lang": ("test_lang_*.py", "test_query.py"),
+    "lang": ("test_lang_*.py", "test_query.py", "test_like.py", "test_notes.py"),
     "readers": (
         *("test_mcap_file.py", "test_osi*.py", "test_cdr.py", "test_carla*.py", "test_foxglove.py"),
-        *("test_flavours.py", "test_damaged.py", "test_ahead.py"),
+        *("test_flavours.py", "test_damaged.py", "test_ahead.py", "test_roads_osi*.py"),
     ),
 }
 """The tests of each room that mutants are made in."""

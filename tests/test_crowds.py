@@ -393,3 +393,19 @@ def edge_pairs(graph: GraphBlock) -> list[tuple[int, int, int]]:
     of = graph.edges
     named = zip(of.frame.tolist(), of.src.tolist(), of.dst.tolist(), strict=True)
     return list({(frame, min(a, b), max(a, b)) for frame, a, b in named})
+
+
+def test_bodies_that_are_far_from_one_another_stay_in_one_piece(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(crowds, "AT_ONCE", 150)
+    apart = [thing(f"{i}", 1e3 * i) for i in range(100)]
+    close = [thing(f"{i}", 0.1 * i) for i in range(100)]
+    kinds = np.zeros(100, np.int8)
+
+    def cut(*things: list[Any]) -> list[int]:
+        block = Recording(ego="0").block(*things)
+        return [len(piece) for piece in crowds.pieces(block, kinds, Config(), 1)]
+
+    assert cut(apart, apart) == [2]
+    assert cut(close, close) == [1, 1]

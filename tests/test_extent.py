@@ -12,7 +12,7 @@ import pytest
 import shapely
 from builders import Thing, edges, frames, graph_of, present, thing
 from conftest import REPOSITORY
-from opendrive_maps import a_map, a_road, cubic, lane, line, link, section
+from opendrive_maps import a_map, a_road, arc, cubic, lane, line, link, section
 
 from sgstore.config import Config, LaneSettings, PairSettings, RangeSettings, configured
 from sgstore.opendrive import read_map
@@ -335,13 +335,37 @@ def test_the_ego_is_in_its_graph_wherever_its_range_lies() -> None:
     assert entities(graph_of(frames(things), None, Config(range=of))) == ["ego", "there"]
 
 
+def test_a_corridor_in_a_ring_goes_round_to_its_own_lane_again() -> None:
+    around, radius = 100.0, 50 / math.pi
+    links = link("predecessor", "road", "ring", "end") + link("successor", "road", "ring", "start")
+    ring = a_road(
+        "ring",
+        arc(around, 1 / radius),
+        links=links,
+        sections=section(lane(0), lane(-1, before=-1, after=-1)),
+    )
+
+    def at(name: str, share: float, size: float = 1.0) -> Thing:
+        angle, away = 2 * math.pi * share, radius + 1.75
+        x, y = away * math.sin(angle), radius - away * math.cos(angle)
+        return thing(name, x, y, heading=angle, length=size, width=size)
+
+    of = RangeSettings(shape="corridor", width=4, length=0.5 * 2 * math.pi * (radius + 1.75))
+    things = [at("ego", 0.8), at("ahead", 0.9), at("round", 0.1), at("far", 0.5), at("behind", 0.7)]
+
+    graph = graph_of(frames(things), read_map(a_map(ring), "ring"), Config(range=of))
+
+    assert entities(graph) == ["ego", "ahead", "round"]
+
+
 # Storeys ----------------------------------------------------------------------------------------
 
-BRIDGE = a_map(
+LEVELS = (
     a_road("low", line(200, x=-100, y=0, hdg=0)),
     a_road("high", line(200, x=0, y=-100, hdg=math.pi / 2), elevation=cubic("elevation", 6, s=0)),
     a_road("ramp", line(200, x=-100, y=10, hdg=0), elevation=cubic("elevation", 0, 0.05, s=0)),
 )
+BRIDGE = a_map(*LEVELS)
 
 
 def roads(graph: GraphBlock, road_map: RoadMap) -> set[str]:
@@ -403,8 +427,12 @@ def test_a_light_hangs_over_the_road_of_its_storey() -> None:
 @pytest.mark.parametrize(
     ("ground", "ramp"), [(0.0, False), (5.0, True), (10.0, False), (2.0, False), (3.0, True)]
 )
-def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is(ground: float, ramp: bool) -> None:
-    road_map = read_map(BRIDGE, "bridge")
+@pytest.mark.parametrize("at", [2, 0], ids=["last", "first"])
+def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is(
+    at: int, ground: float, ramp: bool
+) -> None:
+    others = LEVELS[:2]
+    road_map = read_map(a_map(*others[:at], LEVELS[2], *others[at:]), "bridge")
     egos = EgoPoses(*np.array([[0.0], [9.0], [0.0], [ground]]))
     points, of = road_map.waypoints(STEP), RangeSettings(30.0, height=(-1.0, 1.0))
     expected: list[bool] = []
@@ -417,7 +445,7 @@ def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is(ground: float, r
     parts = Extent(of, road_map).areas(egos).parts(road_map)
 
     assert parts[0, 1:4].tolist() == expected
-    assert expected[2] == ramp
+    assert expected[at] == ramp
 
 
 # What is kept ------------------------------------------------------------------------------------

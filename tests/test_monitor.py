@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import random
 import re
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from oracle_monitor import try_states
 from oracle_over_time import edge_questions
 from oracle_watched import CHECKS, SEQUENCES, Drive, library_checks
 
+import sgstore.temporal._matches as joins
 from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
 from sgstore.step import Frame
@@ -256,3 +258,53 @@ def test_a_step_leaves_nothing_for_the_garbage_collector() -> None:
         assert gc.collect() == 0
     finally:
         gc.enable()
+
+
+def test_a_guard_that_holds_late_counts_as_one_that_holds_at_once() -> None:
+    text = "CHECK close: FORALL (v:Vehicle WHERE v.speed > 3) ALWAYS dist(ego, v) < 10"
+    monitor = Monitor(text)
+    for t in range(8):
+        frame = car(t / 10, 0)
+        frame.add("v", "car", 50.0, 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=t, vy=0.0)
+        monitor.step(frame)
+
+    (verdict,) = monitor.finish()
+    assert verdict.verdict == "false"
+
+
+def test_what_is_owed_in_every_frame_is_owed_once() -> None:
+    slow = "ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 90s] ego.speed < 1)"
+    monitor = Monitor(f"CHECK slow: EVENTUALLY ego.speed > 99 OR {slow}")
+    sizes: list[int] = []
+    tracemalloc.start()
+    for t in range(300):
+        monitor.step(car(t / 10, 2))
+        if t % 100 == 99:
+            gc.collect()
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+
+    assert sizes[2] - sizes[1] < 50_000
+
+
+def test_what_looks_ahead_has_no_value_at_once() -> None:
+    with pytest.raises(QueryError, match="looks ahead"):
+        Monitor("CHECK a: ALWAYS (EVENTUALLY[0s, 1s] ego.speed > 3) = TRUE")
+
+
+def test_sequences_joined_in_parts_are_those_joined_at_once(
+    town: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = SEQUENCES[1]
+    at_once = list(town.store.find(text))
+    monkeypatch.setattr(joins, "ROWS", 3)
+
+    assert list(town.store.find(text)) == at_once
+    assert len(at_once) > 1
+
+
+def test_only_values_have_been_before() -> None:
+    with pytest.raises(QueryError, match=r"prev\(\) takes a value, not a node") as caught:
+        Monitor("CHECK a: FORALL (v:Vehicle) ALWAYS prev(v) = 3")
+
+    assert caught.value.span is not None

@@ -24,6 +24,7 @@ from sgstore.errors import TraceError
 from sgstore.readers import message_class, open_trace
 from sgstore.readers._blocks import derive
 from sgstore.readers.osi._objects import MovingObjects, light_bits, lit, shown
+from sgstore.readers.osi._schema import fields_of
 from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.world import POSE, FrameBlock, States, TraceInfo, TraceReport
 
@@ -1354,3 +1355,32 @@ def test_countless_references_are_a_loss_and_cost_little(
     assert len(of(blocks, "1")) >= 2
     assert len(report.losses) == (field != 5 or count > 2 << 20)  # else known by its number
     assert process_time() - start < 10
+
+
+def test_channels_may_be_numbered_from_nought(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, use_chunking=False, summary=False, enable_crcs=False) as recorder:
+        for t in (0.0, 0.1, 0.2):
+            recorder.ground_truth(t, [car(1, t)], host=1)
+    data, at = bytearray(path.read_bytes()), 8
+    while (
+        at < len(data) - 8
+    ):  # opcode, length, content; of channels and messages the number is first
+        if data[at] in {0x04, 0x05}:
+            data[at + 9] -= 1
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    path.write_bytes(data)
+
+    with path.open("rb") as stream:
+        assert [channel.id for _, channel, _ in make_reader(stream).iter_messages()] == [0, 0, 0]
+    assert sum(map(len, read(path)[1])) == 3
+
+
+@pytest.mark.parametrize("size", [0, 1, 127, 128, 129, 255, 256, 16383, 16384])
+def test_fields_of_any_length_end_where_protobuf_says(size: int) -> None:
+    file = descriptor_pb2.FileDescriptorProto(name=size * "n", package="p")
+    data = file.SerializeToString()
+
+    found = [data[start:stop] for _, _, start, stop in fields_of(data, 0, len(data))]
+
+    assert found == [size * b"n", b"p"]

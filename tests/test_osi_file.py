@@ -15,6 +15,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from recordings import OSI, Recorder, bulb, car, ground_truth, house, ns, person
 
+import sgstore.readers.osi._file as osi_file
 from sgstore.errors import TraceError
 from sgstore.readers import OsiFile, descriptors, open_trace, read_message
 from sgstore.readers.osi._file import time_of_bytes
@@ -396,3 +397,17 @@ def test_a_world_that_is_empty_at_first_is_known_by_what_comes_later(tmp_path: P
 
     assert report.frames == 42
     assert "1" in [ident for block in blocks for ident in block.entities.ident]
+
+
+def test_a_file_may_become_as_large_as_the_bound_and_no_larger(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = packed(messages(12))
+    path = write(tmp_path / "a.osi.zst", zstandard.compress(content))
+    monkeypatch.setattr(osi_file, "MAX_RATIO", 0)
+
+    monkeypatch.setattr(osi_file, "_ALWAYS", len(content))
+    assert sum(map(len, read(path)[1])) == 12
+    monkeypatch.setattr(osi_file, "_ALWAYS", len(content) - 1)
+    with pytest.raises(TraceError, match="decompressed to more than"):
+        read(path)
