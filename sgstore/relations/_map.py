@@ -1,103 +1,11 @@
-"""Relations to the parts of a road map, and among them: ``isIn``, signals and lanes, lanes and lanes.
+"""Relations among lanes that come with a road map; :mod:`sgstore.roads` reads or derives them.
 
-A footprint is in every lane that it meets on its storey; how far, and which of them is the one above all, are
-attributes that go beside the edges (:class:`sgstore.graph.LaneStates`). What stands on no driving lane is in
-``off_road``, whether or not it is in a lane of another type too: whatever moves, and of the scenery vehicles,
-persons, animals and props. Signals hang over roads rather than stand on them, and are in nothing.
+Those that are declared in this file cannot be left out: :data:`sgstore.vocabulary.MAP_ONLY`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from sgstore.graph import Edges
-from sgstore.relations._scene import BlockScene, Relation, edges_to_map, joined
-from sgstore.roads import OFF_ROAD
-from sgstore.vocabulary import RELATION_CODE
-
-if TYPE_CHECKING:
-    from sgstore.relations._scene import MapContext
-    from sgstore.world import Ints
-
-
-def _is_in(scene: BlockScene) -> Edges:
-    ground = scene.ground
-    if ground is None:
-        raise ValueError("lanes need a map")
-    standing = ground.standing
-    at, parts = standing.parts
-    rows = np.concatenate([standing.hits.row, at, standing.off_road])
-    nowhere = np.full(len(standing.off_road), OFF_ROAD)
-    return edges_to_map(scene, "isIn", rows, np.concatenate([standing.hits.lane, parts, nowhere]))
-
-
-IS_IN = Relation(
-    name="isIn",
-    doc="an entity in a lane (with `overlap`, `lane_offset`, `heading_error`, `is_primary`, `along`), on a"
-    " crosswalk, or `off_road`; a lane in its road, a road in its junction",
-    edges=_is_in,
-    needs_map=True,
-    of_map=True,
-)
-
-
-# Which lanes signals apply to, and which lie upstream of them, as far as those lanes are in range ----
-# A signal of the trace ``controlsTrafficOf`` the lanes that the map says of the signal that it is; for signals
-# of the map that is the map's own relation. A signal ``mayAffect`` these lanes and all from which it lies ahead
-# along the lanes, up to the distance that the settings look.
-
-
-def _signal_edges(scene: BlockScene) -> Edges:
-    ground = scene.ground
-    if ground is None:
-        raise ValueError("signals need a map")
-    return Edges.chained(
-        [
-            _of_trace(scene, ground, "controlsTrafficOf", ground.controls),
-            _of_trace(scene, ground, "mayAffect", ground.affects),
-            _of_map(ground),
-        ]
-    )
-
-
-def _of_trace(
-    scene: BlockScene, ground: MapContext, relation: str, table: tuple[Ints, Ints]
-) -> Edges:
-    bodies, (signals, lanes) = scene.bodies, table
-    rows, index = joined(signals, bodies.node)
-    lanes = lanes[index]
-    present = ground.present[bodies.frame[rows], -1 - lanes]
-    return edges_to_map(scene, relation, rows[present], lanes[present])
-
-
-def _of_map(ground: MapContext) -> Edges:
-    signals, lanes = ground.map_affects
-    frame, row = np.nonzero(ground.present[:, -1 - signals] & ground.present[:, -1 - lanes])
-    code = np.full(len(frame), RELATION_CODE["mayAffect"], np.int8)
-    return Edges(frame, code, signals[row], lanes[row])
-
-
-CONTROLS_TRAFFIC_OF = Relation(
-    name="controlsTrafficOf",
-    doc="signal → lane: a traffic light, or a sign of the map, for the lanes that it applies to",
-    edges=_signal_edges,
-    needs_map=True,
-    needs_lanes=True,
-)
-MAY_AFFECT = Relation(
-    name="mayAffect",
-    doc="signal → lane: for these lanes, and those from which it lies ahead along the lanes",
-    edges=_signal_edges,
-    needs_map=True,
-    needs_lanes=True,
-    settings=lambda config: config.lanes.ahead > 0,
-    legend="a signal that lies ahead on that lane",
-)
-
-
-# Relations among lanes: :mod:`sgstore.roads` reads or derives them --------------------------------
+from sgstore.relations._scene import Relation
 
 
 def _of_lanes(name: str, doc: str, *, symmetric: bool = False) -> Relation:
