@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from xml.etree import ElementTree as Xml
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import (
     LOSS,
@@ -113,19 +114,17 @@ def check(
     store: StorePath,
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[FILE…]", help="Files of CHECK statements; - is stdin."),
+        Argument(metavar="[FILE…]", help="Files of CHECK statements; - is stdin."),
     ] = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Print how the checks are understood, and their SQL.")
+        bool, Option("--explain", help="Print how the checks are understood, and their SQL.")
     ] = False,
     require: Annotated[
-        bool, typer.Option("--require", help="End with exit code 4 if a trace violates a check.")
+        bool, Option("--require", help="End with exit code 4 if a trace violates a check.")
     ] = False,
     junit: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."
-        ),
+        Option(metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."),
     ] = None,
     *,
     statements: Statements,
@@ -226,21 +225,20 @@ def _span(interval: Interval) -> dict[str, Any]:
 @app.command(rich_help_panel=PANEL)
 def monitor(
     trace: Annotated[
-        str,
-        typer.Argument(metavar="TRACE", help="A recording; or carla://HOST:PORT, until Ctrl-C."),
+        str, Argument(metavar="TRACE", help="A recording; or carla://HOST:PORT, until Ctrl-C.")
     ],
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - is stdin."),
+        Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - is stdin."),
     ] = None,
     ego: Annotated[
-        str, typer.Option("--ego", help="Id, role or name of the ego; else as the recording says.")
+        str, Option("--ego", help="Id, role or name of the ego; else as the recording says.")
     ] = "",
     duration: Annotated[
-        str | None, typer.Option("--duration", metavar="TIME", help="Simulation time: 60s.")
+        str | None, Option("--duration", metavar="TIME", help="Simulation time: 60s.")
     ] = None,
     require: Annotated[
-        bool, typer.Option("--require", help="End with exit code 4 if a check is violated.")
+        bool, Option("--require", help="End with exit code 4 if a check is violated.")
     ] = False,
     as_json: AsJson = False,
     *,
@@ -354,17 +352,17 @@ def _line(text: str) -> None:
 def timeline(
     store: StorePath,
     queries: Annotated[
-        list[str] | None, typer.Argument(metavar="[QUERY…]", help="'MATCH …', or 'CHECK …'.")
+        list[str] | None, Argument(metavar="[QUERY…]", help="'MATCH …', or 'CHECK …'.")
     ] = None,
     files: Annotated[
         list[Path] | None,
-        typer.Option("--file", "-f", help="Read a query, or checks, from a file; repeatable."),
+        Option("--file", "-f", help="Read a query, or checks, from a file; repeatable."),
     ] = None,
     names: PatternNames = None,
     parameters: Parameters = None,
     traces: Traces = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
+        Path | None, Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
     ] = None,
     *,
     bounds: QueryLimits,

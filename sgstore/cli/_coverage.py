@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import Abstraction, AskOptions, Picture, Verbs, app, say_left_out
 from sgstore.cli._output import say
@@ -28,32 +29,30 @@ app.add_typer(
 
 A = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="A",
         help="Frames: a store, STORE:QUERY for those that match, STORE:TESTS.lock for those of a lock;"
         " TESTS.lock alone takes the store beside it that has its recordings.",
     ),
 ]
-B = Annotated[str, typer.Argument(metavar="B", help="Frames, as A.")]
+B = Annotated[str, Argument(metavar="B", help="Frames, as A.")]
 Limit = Annotated[
-    int | None,
-    typer.Option("--limit", min=0, help="Rows at most; 0: all.", show_default="40 in a table"),
+    int | None, Option("--limit", min=0, help="Rows at most; 0: all.", show_default="40 in a table")
 ]
 Unit = Annotated[
     Literal["frame", "run", "trace"],
-    typer.Option("--unit", help="Count frames, runs of frames of one class, or traces with it."),
+    Option("--unit", help="Count frames, runs of frames of one class, or traces with it."),
 ]
 Window = Annotated[
-    int,
-    typer.Option("--window", "-t", min=1, help="Number of frames that form one class together."),
+    int, Option("--window", "-t", min=1, help="Number of frames that form one class together.")
 ]
 Slots = Annotated[
-    Path | None, typer.Option("--slots", metavar="FILE", help="TOML file with declared slots.")
+    Path | None, Option("--slots", metavar="FILE", help="TOML file with declared slots.")
 ]
 Missing = Annotated[
-    bool, typer.Option("--missing", help="List what is missing, each with a query for it.")
+    bool, Option("--missing", help="List what is missing, each with a query for it.")
 ]
-Covered = Annotated[bool, typer.Option("--covered", help="List what is covered, with its frames.")]
+Covered = Annotated[bool, Option("--covered", help="List what is covered, with its frames.")]
 
 
 @dataclass(frozen=True)
@@ -61,17 +60,10 @@ class WindowOptions:
     """Options for the classes of frames."""
 
     abstraction: Abstraction = "RSV"
-    window: Annotated[
-        int,
-        typer.Option(
-            "--window", "-t", min=1, help="Number of frames that form one class together."
-        ),
-    ] = 1
+    window: Window = 1
     incomplete: Annotated[
         Literal["equal", "distinct", "drop"],
-        typer.Option(
-            "--incomplete", help="Windows with missing frames: equal, distinct, or dropped."
-        ),
+        Option("--incomplete", help="Windows with missing frames: equal, distinct, or dropped."),
     ] = "equal"
 
     def of(self, ask: AskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
@@ -99,12 +91,7 @@ class WindowOptions:
 class LongWindowOptions(WindowOptions):
     """Options for the classes of windows."""
 
-    window: Annotated[
-        int,
-        typer.Option(
-            "--window", "-t", min=1, help="Number of frames that form one class together."
-        ),
-    ] = 10
+    window: Window = 10
 
 
 @dataclass(frozen=True)
@@ -143,7 +130,7 @@ def classes_(
 @coverage.command("of")
 def of_(
     a: A,
-    by: Annotated[str, typer.Option("--by", metavar="B", help="Frames that cover it, as A.")],
+    by: Annotated[str, Option("--by", metavar="B", help="Frames that cover it, as A.")],
     *,
     scenes: SceneOptions,
     ask: AskOptions,
@@ -157,10 +144,10 @@ def of_(
 @coverage.command("novel")
 def novel_(
     a: A,
-    than: Annotated[str, typer.Option("--not-in", metavar="B", help="Known frames, as A.")],
+    than: Annotated[str, Option("--not-in", metavar="B", help="Known frames, as A.")],
     listing: Annotated[
         Literal["classes", "frames", "clips"],
-        typer.Option("--list", help="Classes, frames, or clips of consecutive frames."),
+        Option("--list", help="Classes, frames, or clips of consecutive frames."),
     ] = "classes",
     limit: Limit = None,
     *,
@@ -175,13 +162,7 @@ def novel_(
 
 
 @coverage.command("venn")
-def venn_(
-    a: A,
-    b: B,
-    *,
-    scenes: SceneOptions,
-    ask: AskOptions,
-) -> None:
+def venn_(a: A, b: B, *, scenes: SceneOptions, ask: AskOptions) -> None:
     """Count what A and B share, and what only one of them has."""
     from sgstore.coverage import venn
 
@@ -192,7 +173,7 @@ def venn_(
 def growth_(
     a: A,
     unit: Unit = "frame",
-    points: Annotated[int, typer.Option("--points", min=2, help="Rows of the curve.")] = 40,
+    points: Annotated[int, Option("--points", min=2, help="Rows of the curve.")] = 40,
     picture: Picture = None,
     *,
     scenes: SceneOptions,
@@ -216,16 +197,16 @@ def growth_(
 @coverage.command("combos")
 def combos_(
     a: A,
-    k: Annotated[int, typer.Option("--k", min=1, help="Number of features in a combination.")] = 2,
+    k: Annotated[int, Option("--k", min=1, help="Number of features in a combination.")] = 2,
     by: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--by", metavar="B", help="Reference: combinations that occur in B; by default all."
         ),
     ] = None,
     abstraction: Abstraction = "RSV",
     of_ego: Annotated[
-        bool, typer.Option("--ego", help="Only features of the ego, and of lanes as it has them.")
+        bool, Option("--ego", help="Only features of the ego, and of lanes as it has them.")
     ] = False,
     slots: Slots = None,
     missing: Missing = False,
@@ -265,15 +246,14 @@ def spec_(
     a: A,
     query: Annotated[
         str | None,
-        typer.Argument(metavar="QUERY", help="'MATCH … RETURN a, b': each combination is a cell."),
+        Argument(metavar="QUERY", help="'MATCH … RETURN a, b': each combination is a cell."),
     ] = None,
     slots: Slots = None,
     cells: Annotated[
-        int, typer.Option("--cells", min=0, help="How many cells there are, if that is known.")
+        int, Option("--cells", min=0, help="How many cells there are, if that is known.")
     ] = 0,
     by: Annotated[
-        str | None,
-        typer.Option("--by", metavar="B", help="The cells are those that occur in B."),
+        str | None, Option("--by", metavar="B", help="The cells are those that occur in B.")
     ] = None,
     missing: Missing = False,
     covered: Covered = False,
@@ -301,13 +281,7 @@ def spec_(
 
 
 @coverage.command("windows")
-def windows_(
-    a: A,
-    limit: Limit = None,
-    *,
-    windows: LongWindowOptions,
-    ask: AskOptions,
-) -> None:
+def windows_(a: A, limit: Limit = None, *, windows: LongWindowOptions, ask: AskOptions) -> None:
     """List the classes of windows: of a frame together with those recorded before it."""
     from sgstore.coverage import classes
 
@@ -318,15 +292,13 @@ def windows_(
 @coverage.command("explain")
 def explain_(
     b: B,
-    versus: Annotated[str, typer.Option("--vs", metavar="A", help="Frames to compare with, as B.")],
+    versus: Annotated[str, Option("--vs", metavar="A", help="Frames to compare with, as B.")],
     abstraction: Abstraction = "RSV",
     tree: Annotated[
-        bool, typer.Option("--tree", help="Print a decision tree of a few questions instead.")
+        bool, Option("--tree", help="Print a decision tree of a few questions instead.")
     ] = False,
-    depth: Annotated[int, typer.Option("--depth", min=1, max=10, help="Questions at most.")] = 4,
-    frames: Annotated[
-        bool, typer.Option("--frames", help="Weight classes by their frames.")
-    ] = False,
+    depth: Annotated[int, Option("--depth", min=1, max=10, help="Questions at most.")] = 4,
+    frames: Annotated[bool, Option("--frames", help="Weight classes by their frames.")] = False,
     limit: Limit = None,
     *,
     ask: AskOptions,
@@ -343,11 +315,11 @@ def explain_(
 
 @coverage.command("failures")
 def failures_(
-    train: Annotated[str, typer.Option("--train", metavar="A", help="Training frames.")],
-    test: Annotated[str, typer.Option("--test", metavar="B", help="Test frames.")],
+    train: Annotated[str, Option("--train", metavar="A", help="Training frames.")],
+    test: Annotated[str, Option("--test", metavar="B", help="Test frames.")],
     outcomes: Annotated[
         Path,
-        typer.Option(
+        Option(
             "--outcomes",
             metavar="FILE",
             help="CSV: frame (or town, filename), and failed, or error, or label and pred.",
@@ -355,11 +327,9 @@ def failures_(
     ],
     threshold: Annotated[
         str | None,
-        typer.Option(
-            "--threshold", help="Errors above it are failures.", show_default="5/140, as S3C"
-        ),
+        Option("--threshold", help="Errors above it are failures.", show_default="5/140, as S3C"),
     ] = None,
-    novel: Annotated[bool, typer.Option("--novel", help="List the novel failures.")] = False,
+    novel: Annotated[bool, Option("--novel", help="List the novel failures.")] = False,
     limit: Limit = None,
     *,
     windows: WindowOptions,

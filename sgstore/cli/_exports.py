@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import (
     LOSS,
@@ -39,33 +40,29 @@ class ClipOptions:
     """Options for the content of clips."""
 
     before: Annotated[
-        str, typer.Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
+        str, Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
     ] = "2s"
-    after: Annotated[
-        str, typer.Option("--after", metavar="TIME", help="Time after each match.")
-    ] = "2s"
+    after: Annotated[str, Option("--after", metavar="TIME", help="Time after each match.")] = "2s"
     labels: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--label",
             metavar="NAME=TEXT",
             help="A value for each frame: an expression, or a query that is true where it matches.",
         ),
     ] = None
     with_graph: Annotated[
-        bool,
-        typer.Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw."),
+        bool, Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw.")
     ] = False
     abstraction: Annotated[
-        str, typer.Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs.")
+        str, Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs.")
     ] = ""
     channels: Annotated[
         list[str] | None,
-        typer.Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
+        Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
     ] = None
     clouds: Annotated[
-        Literal["pcd", "npy", "bin"],
-        typer.Option("--clouds", help="frames: format of point clouds."),
+        Literal["pcd", "npy", "bin"], Option("--clouds", help="frames: format of point clouds.")
     ] = "pcd"
 
 
@@ -74,24 +71,20 @@ def export(
     store: StorePath,
     question: Question,
     to: Annotated[
-        Path,
-        typer.Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten."),
+        Path, Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten.")
     ] = Path("clips"),
     frames: Annotated[
         Path | None,
-        typer.Option(
-            "--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."
-        ),
+        Option("--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."),
     ] = None,
     lock: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
         ),
     ] = None,
     form: Annotated[
-        str,
-        typer.Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package."),
+        str, Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package.")
     ] = "mcap",
     as_json: AsJson = False,
     *,
@@ -176,25 +169,23 @@ class DrawOptions:
     """Options for a picture."""
 
     relations: Annotated[
-        Literal["ego", "all", "none"], typer.Option("--relations", help="Which edges are drawn.")
+        Literal["ego", "all", "none"], Option("--relations", help="Which edges are drawn.")
     ] = "ego"
     camera: Annotated[
         str | None,
-        typer.Option(
-            "--camera", help="Channel of a picture to put beside it; 'none' for no picture."
-        ),
+        Option("--camera", help="Channel of a picture to put beside it; 'none' for no picture."),
     ] = None
     radius: Annotated[
-        float | None, typer.Option("--radius", help="Half the side of the window, in metres.")
+        float | None, Option("--radius", help="Half the side of the window, in metres.")
     ] = None
-    north_up: Annotated[
-        bool, typer.Option("--north-up", help="North is up, not the ego's heading.")
-    ] = False
-    graph: Annotated[
-        bool, typer.Option("--graph", help="Beside it the graph as nodes and edges.")
-    ] = False
+    north_up: Annotated[bool, Option("--north-up", help="North is up, not the ego's heading.")] = (
+        False
+    )
+    graph: Annotated[bool, Option("--graph", help="Beside it the graph as nodes and edges.")] = (
+        False
+    )
     fps: Annotated[
-        float, typer.Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
+        float, Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
     ] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
@@ -214,15 +205,14 @@ def show(
     store: StorePath,
     frame: Annotated[
         str,
-        typer.Argument(
-            metavar="FRAME",
-            help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.",
+        Argument(
+            metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s."
         ),
     ],
     question: Question,
     output: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--output",
             "-o",
             help="The picture: .png or .svg; of a clip: .gif.",

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperCommand
 
 from sgstore.cli._output import Format, say, write_rows
@@ -110,13 +111,11 @@ ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
 IN_TABLE: Final = 40
 """Rows of a report on a terminal, unless more are asked for."""
 
-StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="The store: one DuckDB file.")]
-FrameName = Annotated[
-    str, typer.Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")
-]
+StorePath = Annotated[Path, Argument(metavar="STORE", help="The store: one DuckDB file.")]
+FrameName = Annotated[str, Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")]
 Parameters = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--param",
         metavar="NAME=VALUE",
         help="Value of $NAME in the query, a list as [1, 2]; repeatable.",
@@ -124,44 +123,37 @@ Parameters = Annotated[
 ]
 With = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--with",
         metavar="[NAME=]FILE",
         help="Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns"
         " or t; repeatable.",
     ),
 ]
-QueryText = Annotated[
-    str | None, typer.Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")
-]
+QueryText = Annotated[str | None, Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")]
 QueryFile = Annotated[
-    Path | None, typer.Option("--file", "-f", help="Read the query from a file; - is stdin.")
+    Path | None, Option("--file", "-f", help="Read the query from a file; - is stdin.")
 ]
 PatternNames = Annotated[
     list[str] | None,
-    typer.Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
+    Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
 ]
 Abstraction = Annotated[
-    str, typer.Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
+    str, Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
 ]
 Picture = Annotated[
-    Path | None, typer.Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
+    Path | None, Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
 ]
-Traces = Annotated[list[str] | None, typer.Option("--trace", help="Only this trace; repeatable.")]
+Traces = Annotated[list[str] | None, Option("--trace", help="Only this trace; repeatable.")]
 Jobs = Annotated[
-    int,
-    typer.Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core."),
+    int, Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core.")
 ]
 ROWS: Final = "Rows"
 LIMITS: Final = "Limits"
-AsJson = Annotated[
-    bool, typer.Option("--json", help="Short for --format json.", rich_help_panel=ROWS)
-]
+AsJson = Annotated[bool, Option("--json", help="Short for --format json.", rich_help_panel=ROWS)]
 Output = Annotated[
     Path | None,
-    typer.Option(
-        "--output", "-o", help="Write to this file instead of stdout.", rich_help_panel=ROWS
-    ),
+    Option("--output", "-o", help="Write to this file instead of stdout.", rich_help_panel=ROWS),
 ]
 
 
@@ -170,17 +162,17 @@ class PrintedRows:
     """Options for the format of rows, and the one way in which verbs write rows."""
 
     form: Annotated[
-        Format, typer.Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
+        Format, Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
     ] = Format.table
     as_json: AsJson = False
 
     def __post_init__(self) -> None:
-        form_of(self.form, as_json=self.as_json)  # refuses before anything is done
+        _ = self.chosen  # refuses what does not fit together before anything is done
 
     @property
     def file(self) -> Path | None:
         """File that the rows go to; ``None``: stdout."""
-        return None
+        return getattr(self, "output", None)
 
     @property
     def chosen(self) -> Format:
@@ -219,11 +211,6 @@ class RowOptions(PrintedRows):
 
     output: Output = None
 
-    @property
-    def file(self) -> Path | None:
-        """File that the rows go to; ``None``: stdout."""
-        return self.output
-
 
 @dataclass(frozen=True)
 class QueryLimits:
@@ -231,7 +218,7 @@ class QueryLimits:
 
     timeout: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--timeout",
             metavar="TIME",
             help="Stop after this time, such as 30s.",
@@ -240,7 +227,7 @@ class QueryLimits:
     ] = None
     max_spill: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--max-spill",
             metavar="SIZE",
             help="Most disk space for what does not fit into memory: 500MB, 50GB.",
@@ -281,9 +268,6 @@ class QueryLimits:
 class AskOptions(QueryLimits, RowOptions):
     """Options of a verb that asks a store: format of the rows, their file, and limits."""
 
-    def __post_init__(self) -> None:
-        _ = self.chosen  # refuses what does not fit together before anything is searched
-
 
 @dataclass(frozen=True)
 class Question:
@@ -293,7 +277,7 @@ class Question:
     file: QueryFile = None
     name: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--pattern", "-p", metavar="NAME", help="A pattern of the library, in place of a query."
         ),
     ] = None
@@ -315,12 +299,12 @@ class Statements:
     names: PatternNames = None
     texts: Annotated[
         list[str] | None,
-        typer.Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
+        Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
     ] = None
     parameters: Parameters = None
     sgsm_compat: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
         ),
     ] = False
@@ -357,11 +341,11 @@ class GraphOptions:
     """Options for the settings of the scene graphs."""
 
     config: Annotated[
-        Path | None, typer.Option("--config", help="TOML file with settings of the scene graphs.")
+        Path | None, Option("--config", help="TOML file with settings of the scene graphs.")
     ] = None
     preset: Annotated[
         str | None,
-        typer.Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
+        Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
     ] = None
 
     def settings(self) -> Config | None:
@@ -382,7 +366,7 @@ class ReadingOptions(GraphOptions):
 
     road_map: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--map",
             help="OpenDRIVE file, or folder of NAME.xodr, for recordings that carry no map of their own.",
         ),
@@ -392,7 +376,7 @@ class ReadingOptions(GraphOptions):
 @app.callback(invoke_without_command=True)
 def sgstore(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    version: Annotated[bool, Option("--version", help="Print the version.")] = False,
 ) -> None:
     """Find the driving scenes that matter.
 

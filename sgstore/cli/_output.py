@@ -355,8 +355,7 @@ def _cell(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) and abs(value) < 1e4 else f"{value:.1f}"
-    text = str(value)
-    return "".join(c if c.isprintable() else "�" for c in text)
+    return _shown(str(value))
 
 
 def _is_number(cell: str) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import (
     NO_MATCH,
@@ -46,13 +47,9 @@ PANEL: Final = "Questions"
 
 Safe = Annotated[
     bool,
-    typer.Option(
-        "--safe", help="Run in a separate process with bounded time (5s), memory and rows."
-    ),
+    Option("--safe", help="Run in a separate process with bounded time (5s), memory and rows."),
 ]
-MaxRows = Annotated[
-    int, typer.Option("--max-rows", min=0, help="With --safe: maximum number of rows.")
-]
+MaxRows = Annotated[int, Option("--max-rows", min=0, help="With --safe: maximum number of rows.")]
 
 
 @app.command(rich_help_panel=PANEL)
@@ -60,13 +57,13 @@ def find(
     store: StorePath,
     question: Question,
     count: Annotated[
-        bool, typer.Option("--count", help="Print the number of distinct frames and nothing else.")
+        bool, Option("--count", help="Print the number of distinct frames and nothing else.")
     ] = False,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Print the stages of the query, and its SQL.")
+        bool, Option("--explain", help="Print the stages of the query, and its SQL.")
     ] = False,
     require: Annotated[
-        bool, typer.Option("--require", help="End with exit code 4 if nothing matches.")
+        bool, Option("--require", help="End with exit code 4 if nothing matches.")
     ] = False,
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
@@ -159,12 +156,12 @@ def like(
     frame: FrameName,
     ignore: Annotated[
         list[str] | None,
-        typer.Option("--ignore", metavar="NAME", help="Ignore a relation or a kind; repeatable."),
+        Option("--ignore", metavar="NAME", help="Ignore a relation or a kind; repeatable."),
     ] = None,
     abstraction: Abstraction = "RSV",
-    limit: Annotated[int, typer.Option("--limit", min=1, help="Number of runs of frames.")] = 10,
+    limit: Annotated[int, Option("--limit", min=1, help="Number of runs of frames.")] = 10,
     pattern: Annotated[
-        bool, typer.Option("--pattern", help="Print a pattern that describes the frame instead.")
+        bool, Option("--pattern", help="Print a pattern that describes the frame instead.")
     ] = False,
     *,
     out: RowOptions,
@@ -216,9 +213,9 @@ def _counted(features: dict[str, int]) -> str:
 
 @app.command(rich_help_panel=PANEL)
 def translate(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="What to translate; - is stdin.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="What to translate; - is stdin.")],
     language: Annotated[
-        Literal["sgl"], typer.Option("--from", help="sgl: properties of SGSM, as Python.")
+        Literal["sgl"], Option("--from", help="sgl: properties of SGSM, as Python.")
     ] = "sgl",
     output: Output = None,
 ) -> int:
@@ -233,7 +230,7 @@ def translate(
 def sql(
     store: StorePath,
     statement: Annotated[
-        str | None, typer.Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
+        str | None, Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
     ] = None,
     file: QueryFile = None,
     safe: Safe = False,
@@ -293,7 +290,7 @@ app.add_typer(
 )
 
 LibraryName = Annotated[
-    str, typer.Argument(metavar="NAME", help="Of a pattern, such as cut_in or ParkingExit.")
+    str, Argument(metavar="NAME", help="Of a pattern, such as cut_in or ParkingExit.")
 ]
 
 
@@ -309,7 +306,7 @@ class Kind(StrEnum):
 @library.command("list")
 def list_patterns(
     kinds: Annotated[
-        list[Kind] | None, typer.Option("--kind", help="Only of this kind; repeatable.")
+        list[Kind] | None, Option("--kind", help="Only of this kind; repeatable.")
     ] = None,
     *,
     out: RowOptions,
@@ -354,20 +351,20 @@ def run_pattern(
     name: LibraryName,
     chosen: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
+        Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
     ] = None,
     clips: Annotated[
-        bool, typer.Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
+        bool, Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
     ] = False,
     before: Annotated[
-        str, typer.Option("--before", metavar="TIME", help="With --clips: time before each match.")
+        str, Option("--before", metavar="TIME", help="With --clips: time before each match.")
     ] = "0s",
     after: Annotated[
-        str, typer.Option("--after", metavar="TIME", help="With --clips: time after each match.")
+        str, Option("--after", metavar="TIME", help="With --clips: time after each match.")
     ] = "0s",
     require: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--require",
             help="End with exit code 4 if nothing matches, or if the property is violated.",
         ),

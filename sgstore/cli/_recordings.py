@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import (
     ERROR,
@@ -37,13 +38,13 @@ PANEL: Final = "Recordings"
 
 Recordings = Annotated[
     list[str],
-    typer.Argument(
+    Argument(
         metavar="TRACE…",
         help="Recordings, folders of them, patterns ('drives/**/day?.mcap'); - reads a list from stdin.",
     ),
 ]
 Force = Annotated[
-    bool, typer.Option("--force", help="Read again and replace what is in the store already.")
+    bool, Option("--force", help="Read again and replace what is in the store already.")
 ]
 
 
@@ -54,22 +55,22 @@ def ingest(
     reading: ReadingOptions,
     ego: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--ego",
             help="Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.",
         ),
     ] = None,
     jobs: Jobs = 1,
     since: Annotated[
-        str | None, typer.Option("--since", help="Start at this time of a recording: 10s.")
+        str | None, Option("--since", help="Start at this time of a recording: 10s.")
     ] = None,
-    until: Annotated[str | None, typer.Option("--until", help="Stop at this time: 1min.")] = None,
+    until: Annotated[str | None, Option("--until", help="Stop at this time: 1min.")] = None,
     rate: Annotated[
-        float | None, typer.Option("--rate", min=0, help="Frames per second to keep; 0: all.")
+        float | None, Option("--rate", min=0, help="Frames per second to keep; 0: all.")
     ] = None,
     force: Force = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Report what would be done, and do nothing.")
+        bool, Option("--dry-run", help="Report what would be done, and do nothing.")
     ] = False,
     *,
     out: PrintedRows,
@@ -146,9 +147,7 @@ def info(
     store: StorePath,
     traces: Annotated[
         list[str] | None,
-        typer.Option(
-            "--trace", help="A trace in full: a name, id, or beginning of one; repeatable."
-        ),
+        Option("--trace", help="A trace in full: a name, id, or beginning of one; repeatable."),
     ] = None,
     *,
     out: PrintedRows,
@@ -236,31 +235,27 @@ PORT: Final = 2000
 @app.command(rich_help_panel=PANEL)
 def record(
     output: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten."),
+        Path, Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten.")
     ],
-    host: Annotated[str, typer.Option("--host", help="Host of the CARLA server.")] = "localhost",
-    port: Annotated[int, typer.Option("--port", help="Its port.")] = PORT,
+    host: Annotated[str, Option("--host", help="Host of the CARLA server.")] = "localhost",
+    port: Annotated[int, Option("--port", help="Its port.")] = PORT,
     ego: Annotated[
-        str, typer.Option("--ego", help="Id or role name of the ego; by default hero, ego_vehicle.")
+        str, Option("--ego", help="Id or role name of the ego; by default hero, ego_vehicle.")
     ] = "",
     sensors: Annotated[
         Path | None,
-        typer.Option("--sensors", help="A TOML file with a table [[sensor]] for each sensor."),
+        Option("--sensors", help="A TOML file with a table [[sensor]] for each sensor."),
     ] = None,
     duration: Annotated[
         str | None,
-        typer.Option("--duration", metavar="TIME", help="Simulation time: 60s; else until Ctrl-C."),
+        Option("--duration", metavar="TIME", help="Simulation time: 60s; else until Ctrl-C."),
     ] = None,
     step: Annotated[
         str | None,
-        typer.Option(
-            "--step", metavar="TIME", help="Drive the world in steps: 50ms; else follow it."
-        ),
+        Option("--step", metavar="TIME", help="Drive the world in steps: 50ms; else follow it."),
     ] = None,
     scenery: Annotated[
-        bool,
-        typer.Option("--scenery/--no-scenery", help="Include buildings, poles, … of the level."),
+        bool, Option("--scenery/--no-scenery", help="Include buildings, poles, … of the level.")
     ] = True,
 ) -> int:
     """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego."""
@@ -314,17 +309,15 @@ class ImportOptions:
 
     kind: Annotated[
         list[str] | None,
-        typer.Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
+        Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
     ] = None
     relation: Annotated[
         list[str] | None,
-        typer.Option(
-            "--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."
-        ),
+        Option("--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."),
     ] = None
     unknown_as: Annotated[
         str,
-        typer.Option(
+        Option(
             "--unknown-as",
             metavar="KIND",
             help="Take labels that nobody knows for this kind ('other': unknown), leave out relations; "
@@ -333,11 +326,11 @@ class ImportOptions:
     ] = ""
     new_kind: Annotated[
         list[str] | None,
-        typer.Option("--new-kind", metavar="KIND", help="A kind that --kind may name; repeatable."),
+        Option("--new-kind", metavar="KIND", help="A kind that --kind may name; repeatable."),
     ] = None
     answers: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--answers",
             metavar="RELATION",
             help="A relation that the graphs can hold, even if none of them does; repeatable.",
@@ -345,9 +338,7 @@ class ImportOptions:
     ] = None
     period: Annotated[
         str,
-        typer.Option(
-            "--period", metavar="TIME", help="Time between frames, where the file has none."
-        ),
+        Option("--period", metavar="TIME", help="Time between frames, where the file has none."),
     ] = "1s"
 
 
@@ -356,19 +347,17 @@ def import_(
     store: StorePath,
     files: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."
-        ),
+        Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
     ],
     form_of_graphs: Annotated[
         Literal["s3c", "nodelink", "csv"],
-        typer.Option(
+        Option(
             "--format",
             help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx.",
         ),
     ],
     force: Force = False,
-    form: Annotated[Format, typer.Option("--rows", help="Format of the rows.")] = Format.table,
+    form: Annotated[Format, Option("--rows", help="Format of the rows.")] = Format.table,
     as_json: AsJson = False,
     *,
     meaning: ImportOptions,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import (
     ERROR,
@@ -46,13 +47,12 @@ app.add_typer(
 )
 
 
-LockPath = Annotated[Path, typer.Argument(metavar="LOCK", help="A lock that select wrote.")]
-LockA = Annotated[Path, typer.Argument(metavar="A", help="A lock.")]
-LockB = Annotated[Path, typer.Argument(metavar="B", help="A lock.")]
-LockOut = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The lock to write.")]
+LockPath = Annotated[Path, Argument(metavar="LOCK", help="A lock that select wrote.")]
+LockA = Annotated[Path, Argument(metavar="A", help="A lock.")]
+LockB = Annotated[Path, Argument(metavar="B", help="A lock.")]
+LockOut = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The lock to write.")]
 NoPayloads = Annotated[
-    bool,
-    typer.Option("--no-payloads", help="Skip sensor messages: recordings are not read."),
+    bool, Option("--no-payloads", help="Skip sensor messages: recordings are not read.")
 ]
 Objective = Literal["units", "frames", "seconds", "bytes"]
 
@@ -62,29 +62,27 @@ class ChoiceOptions:
     """Options for a choice: its strategy, its units, and its limits."""
 
     minimal: Annotated[
-        bool, typer.Option("--minimal", help="The fewest that keep everything that occurs.")
+        bool, Option("--minimal", help="The fewest that keep everything that occurs.")
     ] = False
     per_class: Annotated[
-        int | None,
-        typer.Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times."),
+        int | None, Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times.")
     ] = None
-    rarest: Annotated[bool, typer.Option("--rarest", help="Rarest classes first.")] = False
+    rarest: Annotated[bool, Option("--rarest", help="Rarest classes first.")] = False
     stratify: Annotated[
-        str, typer.Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
+        str, Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
     ] = ""
     budget: Annotated[
-        str, typer.Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
+        str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
     ] = ""
     unit: Annotated[
-        Literal["frame", "clip", "trace"],
-        typer.Option("--unit", help="Frames, clips, or whole traces."),
+        Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
     ] = "frame"
-    clip: Annotated[
-        str, typer.Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")
-    ] = "2s"
+    clip: Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")] = (
+        "2s"
+    )
     stride: Annotated[
         str,
-        typer.Option(
+        Option(
             "--stride",
             metavar="TIME",
             help="Time from the start of a clip to that of the next; below --clip, they overlap.",
@@ -93,19 +91,18 @@ class ChoiceOptions:
     ] = ""
     abstraction: Abstraction = "RSV"
     combos: Annotated[
-        int, typer.Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
+        int, Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
     ] = 0
-    ego: Annotated[bool, typer.Option("--ego", help="--combos: only features of the ego.")] = False
+    ego: Annotated[bool, Option("--ego", help="--combos: only features of the ego.")] = False
     objective: Annotated[
-        Objective, typer.Option("--objective", help="Quantity that --minimal minimizes.")
+        Objective, Option("--objective", help="Quantity that --minimal minimizes.")
     ] = "units"
     alpha: Annotated[
-        float,
-        typer.Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal."),
+        float, Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal.")
     ] = 1.0
-    least: Annotated[Objective | None, typer.Option("--least", hidden=True)] = None  # until 0.3
-    temper: Annotated[float | None, typer.Option("--temper", hidden=True)] = None  # until 0.3
-    seed: Annotated[int, typer.Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
+    least: Annotated[Objective | None, Option("--least", hidden=True)] = None  # until 0.3
+    temper: Annotated[float | None, Option("--temper", hidden=True)] = None  # until 0.3
+    seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
 
     def spec(self) -> SelectionSpec:
         """Make what the options say together."""
@@ -150,19 +147,17 @@ def select(
     query: QueryText = None,
     parameters: Parameters = None,
     split: Annotated[
-        str, typer.Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
+        str, Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
     ] = "",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write a lock.")
+        Path | None, Option("--output", "-o", metavar="FILE", help="Write a lock.")
     ] = None,
     no_payloads: NoPayloads = False,
     curve: Annotated[
-        bool,
-        typer.Option("--curve", help="Print how much is kept by how many, beside a random order."),
+        bool, Option("--curve", help="Print how much is kept by how many, beside a random order.")
     ] = False,
     picture: Annotated[
-        Path | None,
-        typer.Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg."),
+        Path | None, Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
     ] = None,
     *,
     out: PrintedRows,
@@ -251,8 +246,7 @@ def _lock(
         made = locked_selection(
             found, asked[0], parts, parameters=asked[1], payloads=payloads, progress=progress
         )
-    made.write(output)
-    say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
+    _made(made, output)
 
 
 @lock.command("verify")
@@ -261,7 +255,7 @@ def verify_(
     store: StorePath,
     no_payloads: NoPayloads = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Count another version of sgstore as a difference.")
+        bool, Option("--strict", help="Count another version of sgstore as a difference.")
     ] = False,
     *,
     ask: AskOptions,
@@ -326,25 +320,23 @@ def _made(made: Lock, output: Path) -> None:
 
 @app.command(rich_help_panel=PANEL)
 def diff(
-    a: Annotated[str, typer.Argument(metavar="A", help="Before: a store, STORE:QUERY, or a lock.")],
-    b: Annotated[str, typer.Argument(metavar="B", help="After, as A.")],
+    a: Annotated[str, Argument(metavar="A", help="Before: a store, STORE:QUERY, or a lock.")],
+    b: Annotated[str, Argument(metavar="B", help="After, as A.")],
     name: Annotated[
         str | None,
-        typer.Option(
-            "--pattern", "-p", metavar="NAME", help="Compare by a pattern of the library."
-        ),
+        Option("--pattern", "-p", metavar="NAME", help="Compare by a pattern of the library."),
     ] = None,
     query: Annotated[
         str | None,
-        typer.Option("--query", "-q", metavar="TEXT", help="Compare by a query, or by 'CHECK …'."),
+        Option("--query", "-q", metavar="TEXT", help="Compare by a query, or by 'CHECK …'."),
     ] = None,
     by_frame: Annotated[
-        bool, typer.Option("--by-frame", help="Scenes of traces of one name, frame by frame.")
+        bool, Option("--by-frame", help="Scenes of traces of one name, frame by frame.")
     ] = False,
     abstraction: Abstraction = "RSV",
     parameters: Parameters = None,
     require: Annotated[
-        bool, typer.Option("--require", help="End with exit code 4 if anything is different.")
+        bool, Option("--require", help="End with exit code 4 if anything is different.")
     ] = False,
     *,
     ask: AskOptions,

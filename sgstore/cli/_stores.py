@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from typer import Argument, Option
 
 from sgstore.cli._options import (
     ERROR,
@@ -34,9 +35,7 @@ PANEL: Final = "Stores and maps"
 @app.command(rich_help_panel=PANEL)
 def verify(
     store: StorePath,
-    payloads: Annotated[
-        bool, typer.Option("--payloads", help="Also hash the recordings again.")
-    ] = False,
+    payloads: Annotated[bool, Option("--payloads", help="Also hash the recordings again.")] = False,
     *,
     out: PrintedRows,
 ) -> int:
@@ -58,12 +57,10 @@ def verify(
 def remove(
     store: StorePath,
     traces: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="TRACE…", help="Names, ids, or beginnings of names."),
+        list[str] | None, Argument(metavar="TRACE…", help="Names, ids, or beginnings of names.")
     ] = None,
     compact: Annotated[
-        bool,
-        typer.Option("--compact", help="Rewrite the file to free its space; also without a TRACE."),
+        bool, Option("--compact", help="Rewrite the file to free its space; also without a TRACE.")
     ] = False,
     *,
     out: PrintedRows,
@@ -89,7 +86,7 @@ def rebuild(
     store: StorePath,
     look_in: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             "--look-in",
             metavar="FOLDER",
             help="Folder to look in for recordings that were moved; repeatable.",
@@ -97,7 +94,7 @@ def rebuild(
     ] = None,
     leave_out: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--leave-out",
             metavar="TRACE",
             help="Leave out a trace that cannot be rebuilt; repeatable.",
@@ -130,25 +127,24 @@ def rebuild(
 def derive(
     store: StorePath,
     name: Annotated[
-        str | None,
-        typer.Option("--as", metavar="NAME", help="Name of the set: USING ABSTRACTION NAME."),
+        str | None, Option("--as", metavar="NAME", help="Name of the set: USING ABSTRACTION NAME.")
     ] = None,
     abstraction: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--abstraction",
             metavar="NAME",
             help="Keep what this makes of the graphs: roadscene2vec.",
         ),
     ] = None,
     trace: Annotated[
-        list[str] | None, typer.Option("--trace", help="Only of this trace; repeatable.")
+        list[str] | None, Option("--trace", help="Only of this trace; repeatable.")
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace a set of this name with other settings.")
+        bool, Option("--force", help="Replace a set of this name with other settings.")
     ] = False,
     remove: Annotated[
-        str | None, typer.Option("--remove", metavar="NAME", help="Delete a set instead.")
+        str | None, Option("--remove", metavar="NAME", help="Delete a set instead.")
     ] = None,
     *,
     graphs: GraphOptions,
@@ -196,14 +192,10 @@ def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
 @app.command("map", rich_help_panel=PANEL)
 def map_(
     file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE", help="OpenDRIVE (.xodr), or a recording that carries roads."
-        ),
+        Path, Argument(metavar="FILE", help="OpenDRIVE (.xodr), or a recording that carries roads.")
     ],
     picture: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Draw it there, north up: .png or .svg."),
+        Path | None, Option("--output", "-o", help="Draw it there, north up: .png or .svg.")
     ] = None,
     *,
     out: PrintedRows,
@@ -258,17 +250,13 @@ def _road_map(file: Path) -> RoadMap:
 @app.command(rich_help_panel=PANEL)
 def payload(
     store: StorePath,
-    frame: Annotated[
-        str, typer.Argument(metavar="FRAME", help="frame_id, TRACE#SEQ or TRACE@12.3s.")
-    ],
+    frame: Annotated[str, Argument(metavar="FRAME", help="frame_id, TRACE#SEQ or TRACE@12.3s.")],
     channel: Annotated[
-        str | None,
-        typer.Argument(metavar="CHANNEL", help="Topic; without it, list those there are."),
+        str | None, Argument(metavar="CHANNEL", help="Topic; without it, list those there are.")
     ] = None,
     output: Output = None,
     message: Annotated[
-        bool,
-        typer.Option("--message", help="The message as it was recorded, not the picture in it."),
+        bool, Option("--message", help="The message as it was recorded, not the picture in it.")
     ] = False,
     *,
     out: PrintedRows,
@@ -316,15 +304,14 @@ def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
 @app.command(rich_help_panel=PANEL)
 def config(
     file: Annotated[
-        Path | None,
-        typer.Argument(metavar="FILE", help="A TOML file: check it, and print it whole."),
+        Path | None, Argument(metavar="FILE", help="A TOML file: check it, and print it whole.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option("--preset", metavar="NAME", help="Settings of this preset.")
+        str | None, Option("--preset", metavar="NAME", help="Settings of this preset.")
     ] = None,
-    every: Annotated[bool, typer.Option("--list", help="List the presets.")] = False,
+    every: Annotated[bool, Option("--list", help="List the presets.")] = False,
     page: Annotated[
-        bool, typer.Option("--page", help="Print the page docs/parameters.md instead.")
+        bool, Option("--page", help="Print the page docs/parameters.md instead.")
     ] = False,
     *,
     out: PrintedRows,
@@ -352,11 +339,10 @@ def config(
 @app.command(rich_help_panel=PANEL)
 def demo(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
+        Path, Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
     ] = Path("sgstore-demo"),
     recording: Annotated[
-        Path | None,
-        typer.Option("--recording", help="The sample recording, where the package lacks it."),
+        Path | None, Option("--recording", help="The sample recording, where the package lacks it.")
     ] = None,
 ) -> int:
     """Run the main job on the bundled recording: ingest, find, show, export."""
