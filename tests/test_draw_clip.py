@@ -13,7 +13,7 @@ from PIL import Image
 from sgstore.cli import run
 from sgstore.draw import draw_clip, draw_stored, range_of
 from sgstore.draw._page import Gif, changed
-from sgstore.draw._stored import Film, FrameRange, Shot
+from sgstore.draw._stored import Film, Shot
 from sgstore.errors import ExportError, StoreError
 from sgstore.query import Store
 
@@ -148,7 +148,7 @@ def shots() -> list[Shot]:
         graph = graph_of(nodes, related(nodes))
         graph = type(graph)(**{name: getattr(graph, name) for name in graph.__slots__}
                             | {"seq": step, "time_ns": step * 200_000_000})  # fmt: skip
-        made.append(Shot(graph, {"p": 1} if step == 1 else {}))
+        made.append((graph, {"p": 1} if step == 1 else {}, None))
     return made
 
 
@@ -166,8 +166,8 @@ def test_a_film_is_of_one_size_and_runs_as_fast_as_the_trace(tmp_path: Path, dia
 
 def test_the_scale_is_that_of_the_whole_clip(tmp_path: Path) -> None:
     road_map = Crossing()
-    near = Shot(graph_of({0: entity("car", 0.0, 0.0, 90.0, is_ego=True)}, []), {})
-    far = Shot(crowd(road_map), {})
+    near = (graph_of({0: entity("car", 0.0, 0.0, 90.0, is_ego=True)}, []), {}, None)
+    far = (crowd(road_map), {}, None)
     film = Film(tmp_path / "a.gif", road_map, [near, far])
     with film:
         scales = {film._scene(shot).view.radius for shot in (near, far)}
@@ -202,7 +202,7 @@ def store(town_store: Path) -> Path:
     ],
 )
 def test_a_clip_is_named_by_its_ends(text: str, ends: tuple[str, str] | None) -> None:
-    assert range_of(text) == (ends and FrameRange(*ends))
+    assert range_of(text) == ends
 
 
 def test_a_clip_of_a_store_is_drawn_with_what_matches(store: Path, tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_a_clip_of_a_store_is_drawn_with_what_matches(store: Path, tmp_path: Pat
 
     marked = draw_clip(
         opened,
-        FrameRange("town#210", "town#218"),
+        ("town#210", "town#218"),
         tmp_path / "a.gif",
         matches=opened.find(RED),
         radius=30.0,
@@ -229,11 +229,11 @@ def test_a_clip_that_is_none_says_why(store: Path, tmp_path: Path) -> None:
     opened, to = Store(store), tmp_path / "a.gif"
 
     with pytest.raises(ExportError, match="ends before it begins"):
-        draw_clip(opened, FrameRange("town@20s", "town@10s"), to)
+        draw_clip(opened, ("town@20s", "town@10s"), to)
     with pytest.raises(StoreError, match="town"):
-        draw_clip(opened, FrameRange("town@70s", "town@500s"), to)
+        draw_clip(opened, ("town@70s", "town@500s"), to)
     with pytest.raises(ValueError, match="fps"):
-        draw_clip(opened, FrameRange("town@1s", "town@2s"), to, fps=0.0)
+        draw_clip(opened, ("town@1s", "town@2s"), to, fps=0.0)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -71,14 +71,14 @@ def test_pictures_are_drawn_into_a_file_that_is_named_by_a_text(
     town_store: Path, tmp_path: Path
 ) -> None:
     from sgstore.draw import draw_clip, draw_map, draw_stored
-    from sgstore.draw._stored import FrameRange, map_of
+    from sgstore.draw._stored import map_of
 
     store = sgstore.open(str(town_store))
     there = [str(tmp_path / name) for name in ("x.png", "x.svg", "x.gif", "map.png")]
 
     draw_stored(store, "town#3", there[0], camera="none")
     draw_stored(store, "town#3", there[1], camera="none")
-    draw_clip(store, FrameRange("town#3", "town#4"), there[2], camera="none")
+    draw_clip(store, ("town#3", "town#4"), there[2], camera="none")
     road_map = map_of(store, "town")
     assert road_map is not None
     draw_map(road_map, there[3])

@@ -10,7 +10,7 @@ import pytest
 from sgstore.cli import run
 from sgstore.demo import RECORDING
 from sgstore.draw import lines_of, timelines
-from sgstore.draw._swimlanes import Lane, LaneSpan, Timeline
+from sgstore.draw._swimlanes import Lane, Timeline
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def test_a_letter_is_full_where_most_of_it_is_covered_and_half_where_some_of_it_
         "brakes",
         "car 3",
         "",
-        [LaneSpan(0, 2, False), LaneSpan(1, 3, False), LaneSpan(7.1, 7.2, False)],
+        [(0, 2, False), (1, 3, False), (7.1, 7.2, False)],
     )
     head, line = lines_of(Timeline("drive", 10.0, [lane]), letters=10)
 
@@ -46,7 +46,7 @@ def test_the_lanes_of_a_store_are_its_violations_and_its_matches(town: Path) -> 
     (fast,) = [lane for lane in timeline.lanes if lane.name == "fast"]
 
     assert violated == {(w.names["v"], len(w.violations)) for w in verdict.witnesses}
-    assert [(s.start, s.end) for s in fast.spans] == [
+    assert [(start, end) for start, end, _ in fast.spans] == [
         (i.start, i.end) for i in store.find(text).intervals()
     ]
     assert timelines(store, {"fast": (text, {})}, "elsewhere") == []

@@ -55,13 +55,11 @@ def _page(
     MissingExtraError
         The packages for drawing are not installed.
     """
-    from sgstore.draw._picture import check_installed
+    from sgstore.draw._picture import drawing
 
-    check_installed()
-    from sgstore.draw._page import Page, check_format, own_style
+    with drawing(to):
+        from sgstore.draw._page import Page
 
-    check_format(to)
-    with own_style():
         page = Page(width, height)
         page.text(14, height - 20, title, fontsize=10, weight="bold")
         for number, line in enumerate(wrap(below, int((width - 28) / _LETTER))[:2]):
@@ -275,21 +273,11 @@ def _explain_colours(page: Page, gaps: NDArray[np.bool_]) -> None:
         "few": "#edf1f6",
         f"a gap: no frame has both ({many} pairs)": _GAP,
     }
-    page.sheet.legend(
-        handles=[
-            Patch(facecolor=colour, edgecolor=JUNCTION, linewidth=0.4, label=text)
-            for text, colour in entries.items()
-        ],
-        loc="lower left",
-        bbox_to_anchor=(8, 4),
-        bbox_transform=page.sheet.transData,
-        ncols=3,
-        fontsize=6.5,
-        labelcolor=INK,
-        frameon=False,
-        handlelength=1.2,
-        handleheight=1.2,
-    )
+    handles = [
+        Patch(facecolor=colour, edgecolor=JUNCTION, linewidth=0.4, label=text)
+        for text, colour in entries.items()
+    ]
+    page.legend(handles, (8, 4), "lower left", fontsize=6.5, handlelength=1.2, handleheight=1.2)
 
 
 def draw_curve(

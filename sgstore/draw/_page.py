@@ -414,6 +414,18 @@ class Page:
         axes.tick_params(length=0, pad=4, labelsize=7, labelcolor=FAINT_INK)
         return axes
 
+    def legend(self, handles: list[Any], at: tuple[float, float], loc: str, **look: Any) -> None:
+        """Explain some artists on the sheet; ``at`` is where the corner ``loc`` of the legend lies."""
+        style: dict[str, Any] = {
+            "ncols": 3,
+            "labelcolor": INK,
+            "frameon": False,
+            "loc": loc,
+            **look,
+        }
+        place = {"bbox_to_anchor": at, "bbox_transform": self.sheet.transData}
+        self.sheet.legend(handles=handles, **place, **style)
+
     def picture(
         self, picture: bytes, left: float, top: float, width: float, height: float
     ) -> float:

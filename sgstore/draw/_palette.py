@@ -47,26 +47,22 @@ DIAGRAM_TINTS: Final[Mapping[str, str]] = {
 }
 """Nodes of a diagram that are parts of the map; entities have their own colours."""
 
+TRAVELLED: Final = frozenset(
+    (
+        *("driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp"),
+        *("slipLane", "bus", "taxi", "HOV"),
+    )
+)
+"""Lane types that motor traffic travels on: these have markings, and arrows along their centre lines."""
+
 LANE_TINTS: Final[Mapping[str, str]] = {
-    "driving": "#d3d9e2",
-    "bidirectional": "#d3d9e2",
-    "entry": "#d3d9e2",
-    "exit": "#d3d9e2",
-    "onRamp": "#d3d9e2",
-    "offRamp": "#d3d9e2",
-    "connectingRamp": "#d3d9e2",
-    "slipLane": "#d3d9e2",
-    "bus": "#d8d3e2",
-    "taxi": "#d8d3e2",
-    "HOV": "#d8d3e2",
-    "tram": "#d8d3e2",
-    "rail": "#d8d3e2",
+    **dict.fromkeys(TRAVELLED, "#d3d9e2"),
+    **dict.fromkeys(("bus", "taxi", "HOV", "tram", "rail"), "#d8d3e2"),
+    **dict.fromkeys(("sidewalk", "walking"), "#ece5d8"),
     "stop": "#dde1e6",
     "shoulder": "#e2e5e8",
     "border": "#e6e9e8",
     "curb": "#dcdcd6",
-    "sidewalk": "#ece5d8",
-    "walking": "#ece5d8",
     "biking": "#cfe5da",
     "parking": "#dbe3ee",
     "median": "#e3e9dc",
@@ -75,44 +71,17 @@ LANE_TINTS: Final[Mapping[str, str]] = {
 }
 """Tint of each OpenDRIVE lane type; :func:`lane_tint` knows what to do with any other."""
 
-TRAVELLED: Final = frozenset(
-    {
-        "driving",
-        "bidirectional",
-        "entry",
-        "exit",
-        "onRamp",
-        "offRamp",
-        "connectingRamp",
-        "slipLane",
-        "bus",
-        "taxi",
-        "HOV",
-    }
-)
-"""Lane types that motor traffic travels on: these have markings, and arrows along their centre lines."""
-
 ENTITY_TINTS: Final[Mapping[str, str]] = {
-    "car": "#c2408f",
+    **dict.fromkeys(("car", "vehicle"), "#c2408f"),
+    **dict.fromkeys(("truck", "bus", "trailer"), "#6d2468"),
+    **dict.fromkeys(("motorcycle", "bicycle"), "#d873b5"),
+    **dict.fromkeys(("person", "animal"), "#e3115f"),
+    **dict.fromkeys(("stop_sign", "yield_sign", "speed_limit", "sign"), "#5a6b85"),
+    **dict.fromkeys(("prop", "pole", "barrier"), "#a9a39b"),
     "van": "#93307c",
-    "truck": "#6d2468",
-    "bus": "#6d2468",
-    "trailer": "#6d2468",
     "train": "#4a1a4c",
-    "vehicle": "#c2408f",
-    "motorcycle": "#d873b5",
-    "bicycle": "#d873b5",
-    "person": "#e3115f",
-    "animal": "#e3115f",
     "traffic_light": "#3a4250",
-    "stop_sign": "#5a6b85",
-    "yield_sign": "#5a6b85",
-    "speed_limit": "#5a6b85",
-    "sign": "#5a6b85",
-    "prop": "#a9a39b",
     "building": "#d2cfc9",
-    "pole": "#a9a39b",
-    "barrier": "#a9a39b",
     "vegetation": "#c6d4ba",
     "unknown": "#8f8a94",
 }

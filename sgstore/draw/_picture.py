@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
@@ -21,7 +22,7 @@ from sgstore.draw._view import clean, counted, number, view_of
 from sgstore.errors import MissingExtraError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Generator, Sequence
     from pathlib import Path
 
     from sgstore.draw._labels import Rect
@@ -90,12 +91,9 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
     MissingExtraError
         If the drawing packages are not installed.
     """
-    check_installed()
-    from sgstore.draw._page import check_format, own_style
-    from sgstore.draw._scene import DrawnFrame
+    with drawing(to):
+        from sgstore.draw._scene import DrawnFrame
 
-    check_format(to)
-    with own_style():
         matched = matched_nodes(highlight)
         view = view_of(graph, checked(radius), matched, north_up=north_up)
         scene = DrawnFrame.of(graph, road_map, matched, view, relations)
@@ -208,10 +206,6 @@ def draw_sheet(
     """
     if not 1 <= len(frames) <= 100 or columns < 1:
         raise ValueError(f"a sheet has 1 to 100 frames in columns, not {len(frames)} in {columns}")
-    check_installed()
-    from sgstore.draw._page import Page, check_format, own_style
-
-    check_format(to)
     reach = checked(radius) or max(
         view_of(f.graph, None, matched_nodes(f.highlight)).radius for f in frames
     )
@@ -219,7 +213,9 @@ def draw_sheet(
     down = -(-len(frames) // across)
     head = _TITLE if title else _MARGIN
     step, tall = _CELL + _MARGIN, _CELL + _MARGIN + 8
-    with own_style():
+    with drawing(to):
+        from sgstore.draw._page import Page
+
         page = Page(_MARGIN + across * step, down * tall + head)
         for index, frame in enumerate(frames):
             left, top = _MARGIN + index % across * step, page.height - head - index // across * tall
@@ -250,12 +246,10 @@ def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> 
     MissingExtraError
         If the drawing packages are not installed.
     """
-    check_installed()
-    from sgstore.draw._atlas import paint_atlas
-    from sgstore.draw._page import Page, check_format, own_style
+    with drawing(to):
+        from sgstore.draw._atlas import paint_atlas
+        from sgstore.draw._page import Page
 
-    check_format(to)
-    with own_style():
         page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE)
         window: Rect = (_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW)
         subtitle = paint_atlas(page, road_map, window, _panel_box(page))
@@ -286,6 +280,25 @@ def check_installed() -> None:
     except ImportError as error:
         raise MissingExtraError("drawing", "viz") from error
     del mpl, PIL
+
+
+@contextmanager
+def drawing(to: str | Path) -> Generator[None]:
+    """Draw a picture for a file in the style of this house; refuse at once what could not be written.
+
+    Raises
+    ------
+    ExportError
+        The ending is none of a picture.
+    MissingExtraError
+        The drawing packages are not installed.
+    """
+    check_installed()
+    from sgstore.draw._page import check_format, own_style
+
+    check_format(to)
+    with own_style():
+        yield
 
 
 def checked(radius: float | None) -> float | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import re
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -47,22 +46,13 @@ DPI: Final = 85.0
 ENDING: Final = ".gif"
 
 
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A frame of a clip.
+Shot = tuple["SceneGraph", "Mapping[str, int]", "bytes | None"]
+"""A frame of a clip: its graph; what is marked, as in :func:`sgstore.draw.draw_frame`; what the camera saw.
 
-    Attributes
-    ----------
-    graph : SceneGraph
-    highlight : mapping of str to int
-        As in :func:`sgstore.draw.draw_frame`.
-    picture : bytes or None
-        What the camera saw; ``None``: what it saw before stays.
-    """
-
-    graph: SceneGraph
-    highlight: Mapping[str, int]
-    picture: bytes | None = None
+Where it has no picture, the one before stays.
+"""
+FrameRange = tuple[str, str]
+"""Frames of a trace from one to another, both included; each is named as everywhere: ``town@12s``."""
 
 
 class Film:
@@ -103,7 +93,7 @@ class Film:
         self._north_up = north_up
         self._diagram = diagram
         self._radius = checked(radius) or max(
-            (view_of(s.graph, None, matched_nodes(s.highlight)).radius for s in samples),
+            (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples),
             default=None,
         )
         self._entries = self._legend(samples)
@@ -120,7 +110,8 @@ class Film:
 
     def add(self, shot: Shot) -> None:
         """Draw the next shot."""
-        graph, self._picture = shot.graph, shot.picture or self._picture
+        graph, _, picture = shot
+        self._picture = picture or self._picture
         start = self._start_ns = graph.time_ns if self._start_ns is None else self._start_ns
         scene, title = self._scene(shot), title_of(graph)
         with own_style():
@@ -132,9 +123,10 @@ class Film:
             self._gif.add(page.pixels(), (graph.time_ns - start) / 1e9)
 
     def _scene(self, shot: Shot) -> DrawnFrame:
-        matched = matched_nodes(shot.highlight)
-        view = view_of(shot.graph, self._radius, matched, north_up=self._north_up)
-        return DrawnFrame.of(shot.graph, self._map, matched, view, self._relations)
+        graph, marked, _ = shot
+        matched = matched_nodes(marked)
+        view = view_of(graph, self._radius, matched, north_up=self._north_up)
+        return DrawnFrame.of(graph, self._map, matched, view, self._relations)
 
     def _legend(self, samples: Sequence[Shot]) -> list[Entry]:
         """Entries of all samples, each once, in the order of the first that has it."""
@@ -219,21 +211,13 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     return bool(bindings)
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRange:
-    """Frames of a trace from one to another, both included; each is named as everywhere: ``town@12s``."""
-
-    first: str
-    last: str
-
-
 def range_of(text: str) -> FrameRange | None:
     """The frames that ``TRACE@12s..18s`` or ``TRACE#120..180`` means; ``None`` if it is a frame.
 
     >>> range_of("town@12.5s..18s")
-    FrameRange(first='town@12.5s', last='town@18s')
-    >>> range_of("town#120..180").last, range_of("town#120")
-    ('town#180', None)
+    ('town@12.5s', 'town@18s')
+    >>> range_of("town#120..180"), range_of("town#120")
+    (('town#120', 'town#180'), None)
     """
     found = _RANGE.fullmatch(text.strip())
     if found is None:
@@ -241,7 +225,7 @@ def range_of(text: str) -> FrameRange | None:
     trace, mark, first, last = found.groups()
     unit = "s" if mark == "@" else ""
     first, last = (f"{trace}{mark}{end.removesuffix('s')}{unit}" for end in (first, last))
-    return FrameRange(first, last)
+    return first, last
 
 
 def draw_clip(  # noqa: PLR0913  as many options as the picture has
@@ -292,7 +276,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         with store.file.snapshot():
             bindings = matches.bindings(ref) if matches is not None else []
             picture = _picture(store, ref, camera) if seen and not diagram else None
-            return Shot(store.file.graph(ref.frame_id), bindings[0] if bindings else {}, picture)
+            return store.file.graph(ref.frame_id), bindings[0] if bindings else {}, picture
 
     with store.file.snapshot():
         chosen = _chosen(store, frames, fps)
@@ -306,7 +290,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         for number, ref in enumerate(chosen, start=1):
             now = shot(ref, seen=True)
             film.add(now)
-            marked += bool(now.highlight)
+            marked += bool(now[1])
             if on_frame is not None:
                 on_frame(number, len(chosen))
     return marked
@@ -314,9 +298,9 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
 
 def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
     """The frames of a clip that are drawn: the first, and each that comes late enough after the last one."""
-    first, last = store.file.frame(frames.first), store.file.frame(frames.last)
+    first, last = (store.file.frame(end) for end in frames)
     if last.seq < first.seq:
-        raise ExportError(f"the clip from {frames.first} to {frames.last} ends before it begins")
+        raise ExportError(f"the clip from {' to '.join(frames)} ends before it begins")
     chosen: list[FrameRef] = []
     due: float | None = None
     for seq in range(first.seq, last.seq + 1):

@@ -26,20 +26,8 @@ NAME: Final = 36
 """Letters of the name of a lane, at most."""
 
 
-@dataclass(frozen=True, slots=True)
-class LaneSpan:
-    """A time in which something holds, in s since the trace began.
-
-    Attributes
-    ----------
-    start, end : float
-    violation : bool
-        True if it should not hold.
-    """
-
-    start: float
-    end: float
-    violation: bool
+LaneSpan = tuple[float, float, bool]
+"""From when to when something holds, in s since the trace began; and whether it should not."""
 
 
 @dataclass(slots=True)
@@ -159,7 +147,7 @@ def _matched(
 
 
 def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
-    return [LaneSpan(one.start, one.end, violation) for one in intervals]
+    return [(one.start, one.end, violation) for one in intervals]
 
 
 def lines_of(timeline: Timeline, letters: int = LETTERS) -> list[str]:
@@ -199,11 +187,11 @@ def _letters(lane: Lane, seconds: float, letters: int) -> str:
 def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
     """Times that spans cover, each once."""
     found: list[tuple[float, float]] = []
-    for span in sorted(spans, key=lambda one: one.start):
-        if found and span.start <= found[-1][1]:
-            found[-1] = found[-1][0], max(found[-1][1], span.end)
+    for start, end, _ in sorted(spans, key=lambda one: one[0]):
+        if found and start <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], end)
         else:
-            found.append((span.start, span.end))
+            found.append((start, end))
     return found
 
 
@@ -212,7 +200,7 @@ def _told(lane: Lane) -> str:
     if not lane.spans:
         return lane.verdict
     seconds = sum(end - start for start, end in _merged(lane.spans))
-    what = "violated" if lane.spans[0].violation else "found"
+    what = "violated" if lane.spans[0][2] else "found"
     times = "once" if len(lane.spans) == 1 else f"{len(lane.spans)} times"
     return f"{what} {times}, {seconds:.1f} s"
 
@@ -256,12 +244,8 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
     MissingExtraError
         The packages for drawing are not installed.
     """
-    from sgstore.draw._picture import check_installed
+    from sgstore.draw._picture import drawing
 
-    check_installed()
-    from sgstore.draw._page import Page, check_format, own_style
-
-    check_format(to)
     left = MOST_LANES
     shown: list[tuple[Timeline, int]] = []
     for timeline in timelines:
@@ -269,7 +253,9 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
         left = max(left - len(timeline.lanes), 0)
     shown = [(timeline, lanes) for timeline, lanes in shown if lanes]
     height = _TOP + sum(_ABOVE + lanes * _LANE + _BELOW for _, lanes in shown)
-    with own_style():
+    with drawing(to):
+        from sgstore.draw._page import Page
+
         page = Page(_WIDTH, height)
         _key(page, sum(len(one.lanes) for one in timelines) - MOST_LANES)
         top = height - _TOP
@@ -286,17 +272,7 @@ def _key(page: Page, more: int) -> None:
     handles = [Patch(color=ROAD_EDGE, label="found"), Patch(color=EGO, label="violated")]
     if more > 0:
         handles.append(Patch(visible=False, label=f"{more} more lanes are not shown"))
-    page.sheet.legend(
-        handles=handles,
-        loc="upper left",
-        bbox_to_anchor=(8, page.height - 6),
-        bbox_transform=page.sheet.transData,
-        ncols=3,
-        fontsize=8,
-        labelcolor=INK,
-        frameon=False,
-        handlelength=1.6,
-    )
+    page.legend(handles, (8, page.height - 6), "upper left", fontsize=8, handlelength=1.6)
 
 
 def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
@@ -330,8 +306,8 @@ def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
             )
         for violation, colour in ((False, ROAD_EDGE), (True, EGO)):
             spans = [
-                (one.start, max(one.end - one.start, shortest))
-                for one in lane.spans
-                if one.violation is violation
+                (start, max(end - start, shortest))
+                for start, end, violated in lane.spans
+                if violated is violation
             ]
             axes.broken_barh(spans, across, color=colour, linewidth=0, zorder=2)
