@@ -25,7 +25,7 @@ from sgstore.lang._catalog import (
     Catalog,
     Type,
 )
-from sgstore.lang._external import SPAN, ExternalMatches, nothing, with_places
+from sgstore.lang._external import SPAN, external_matches, nothing, with_places
 from sgstore.lang._operators import INFIX
 from sgstore.lang._parse import parse
 from sgstore.lang._rewrite import rewritten, unfold_paths
@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     from sgstore.lang._external import ExternalRelation
     from sgstore.lang._plan import Window
     from sgstore.lang._results import SqlStatement
+    from sgstore.lang._sql_masks import SqlBuilder
     from sgstore.lang.syntax import Statement
 
 
@@ -568,7 +569,7 @@ class Compiled:
 
     def _told(
         self, query: Query, window: Window | None
-    ) -> tuple[Query, ExternalMatches | None, results.Span | None]:
+    ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
         """Return the finder of a query over several frames; ``None`` for any other query."""
         if not query.steps:
             return query, None, None
@@ -581,7 +582,7 @@ class Compiled:
             found = self.finder(tuple(places), window)
         else:
             found = partial(self.finder, tuple(places))
-        return query, ExternalMatches(query, self.catalog, found, told), span
+        return query, external_matches(query, self.catalog, found, told), span
 
     def frames(self, window: Window | None = None) -> SqlStatement:
         """The frames that match, each once, with their log times."""

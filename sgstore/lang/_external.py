@@ -2,7 +2,7 @@
 
 What looks at several frames is worked out in columns, of relations that come from a store
 (:func:`relation`); what is found comes back as a relation that the results of a query are taken from, as if the
-pattern had just been searched for (:class:`ExternalMatches`).
+pattern had just been searched for (:func:`external_matches`).
 """
 
 from __future__ import annotations
@@ -22,19 +22,17 @@ from sgstore.lang._formulas import (
     Aliases,
     Select,
     attribute_text,
-    columns_of,
     expression_text,
     leaves,
     nested,
 )
 from sgstore.lang._kinds import kind_conditions
-from sgstore.lang._plan import TRACE_OF_FRAME, Gathered, Phases, SharedRelation
+from sgstore.lang._plan import TRACE_OF_FRAME, FoundRelation, Gathered
 from sgstore.lang._results import SqlStatement, rows
 from sgstore.lang._rewrite import rewritten
-from sgstore.lang._sql_frames import PATTERN, Frames, Join, column_of
-from sgstore.lang._sql_masks import folded
+from sgstore.lang._sql_frames import column_of, frames
+from sgstore.lang._sql_masks import SqlBuilder
 from sgstore.lang.ir import (
-    BlockValue,
     FrameAttribute,
     Kinds,
     NodeAttribute,
@@ -55,7 +53,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from sgstore.lang._catalog import Catalog
-    from sgstore.lang._formulas import Leaf
     from sgstore.lang._plan import Window
     from sgstore.lang.ir import Bound, Query
 
@@ -97,27 +94,25 @@ def relation(
     edges = sorted(keys & {edge.key for edge in query.scope.edges})
     query = rewritten(query, catalog)
     values = list(values)
-    writer = Frames(query, catalog, window)
+    sql = SqlBuilder(query, catalog, window)
     wanted = [leaf for value in values for leaf in leaves(value)]
-    text = writer.frames(query.scope, None, frozenset(nodes), frozenset(edges), wanted)
+    text = frames(sql, query.scope, None, frozenset(nodes), frozenset(edges), wanted)
     columns = [f'":rows"."{FRAME}" AS "{FRAME}"']
     columns += [f'":rows".{quoted(f"{key}.id")} AS {quoted(key)}' for key in nodes]
     columns += [
         f'CAST(":rows".{quoted(f"{key}.type")} AS VARCHAR) AS {quoted(key)}' for key in edges
     ]
     for number, value in enumerate(values):
-        told = expression_text(
-            value, lambda leaf: f'":rows".{quoted(column_of(leaf))}', writer.values
-        )
+        told = expression_text(value, lambda leaf: f'":rows".{quoted(column_of(leaf))}', sql.values)
         columns.append(f'{told} AS ":{number}"')
     body = "SELECT " + ",\n  ".join(columns) + "\nFROM " + nested(text, ":rows")
     before = [
         f"{quoted(name)} AS NOT MATERIALIZED (\n{shadow}\n)" for name, shadow in catalog.shadows
     ]
-    before += [f"{quoted(name)} AS (\n{shared}\n)" for name, shared in writer.shared]
-    sql = f"WITH {', '.join(before)}\n{body}" if before else body
+    before += [f"{quoted(name)} AS (\n{shared}\n)" for name, shared in sql.shared]
+    text = f"WITH {', '.join(before)}\n{body}" if before else body
     names = (FRAME, *nodes, *edges, *(f":{number}" for number in range(len(values))))
-    return SqlStatement(sql, tuple(writer.values.items), names)
+    return SqlStatement(text, tuple(sql.values.items), names)
 
 
 _CLOCK: Final = """SELECT "frame_id", "seq", "time_ns", "log_time_ns" FROM "frame"
@@ -230,7 +225,7 @@ class ExternalRelation:
     edges : dict of str to list of str
         Relations by the keys of the edges that have names.
     values : list of lists
-        What was worked out for each match: in the order of the places of :class:`ExternalMatches`.
+        What was worked out for each match: in the order of the places of :func:`external_matches`.
     """
 
     first: list[int]
@@ -256,8 +251,13 @@ SPAN: Final = (FROM, TO)
 """The first and the last ``frame_id`` of a match over several frames."""
 
 
-class ExternalMatches(Frames):
-    """Writes relations of a query whose matches are known; what is returned of them is asked of the store.
+def external_matches(
+    query: Query,
+    catalog: Catalog,
+    found: ExternalRelation | Callable[[Window | None], ExternalRelation],
+    told: Sequence[FrameAttribute],
+) -> SqlBuilder:
+    """A builder for a query whose matches are known; what is returned of them is asked of the store.
 
     Parameters
     ----------
@@ -269,115 +269,35 @@ class ExternalMatches(Frames):
     told : sequence of FrameAttribute
         What stands for the values of ``found``.
     """
-
-    def __init__(
-        self,
-        query: Query,
-        catalog: Catalog,
-        found: ExternalRelation | Callable[[Window | None], ExternalRelation],
-        told: Sequence[FrameAttribute],
-    ) -> None:
-        super().__init__(query, catalog, None)
-        self._find = None if isinstance(found, ExternalRelation) else found
-        self._found = found if isinstance(found, ExternalRelation) else nothing(query, len(told))
-        self._told = {leaf: f":value {number}" for number, leaf in enumerate(told)}
-        self._table = ""
-
-    def phases(self, scope: Scope) -> Phases:
-        """Of the pattern itself nothing is left to be tested."""
-        return Phases() if scope is self.query.scope else super().phases(scope)
-
-    def frames(
-        self,
-        scope: Scope,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str] = frozenset(),
-        columns: Iterable[Leaf] = (),
-    ) -> str:
-        """As of any pattern; matches that differ in nothing that is asked come once."""
-        text = super().frames(scope, given, nodes, edges, columns)
-        whole = set(self._found.nodes) <= nodes and set(self._found.edges) <= edges
-        if whole or scope is not self.query.scope or text.startswith("SELECT DISTINCT"):
-            return text
-        return "SELECT DISTINCT" + text.removeprefix("SELECT")
-
-    def _first_phase(
-        self,
-        join: Join,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        bound: frozenset[str],
-        ties: frozenset[str],
-        needed: list[Leaf],
-    ) -> SharedRelation | None:
-        if scope is not self.query.scope:
-            return super()._first_phase(join, scope, parts, given, bound, ties, needed)
-        if not self._table:
-            self._table = self.share(self._told_rows(), "found")
-        join.select = _Lenient()
-        join.select.join(f"{quoted(self._table)} AS {PATTERN}", [])
-        join.frame = f'{PATTERN}."frame_id"'
-        join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in bound}
-        join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
-        if not any(isinstance(leaf, BlockValue) for leaf in needed):
-            return None
-        keys = columns_of(bound)
-        rows = Select(['"frame_id"', *keys], [quoted(self._table)], distinct=True)
-        return SharedRelation(self.share(folded(rows.text(), keys), "pattern"), bound, frozenset())
-
-    def _lasting(self, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-        return None if scope is self.query.scope else super()._lasting(scope, wanted)
-
-    def _say(self, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf) -> None:
-        if isinstance(leaf, FrameAttribute) and leaf in self._told:
-            join.texts[leaf] = f"{PATTERN}.{quoted(self._told[leaf])}"
-        else:
-            super()._say(join, scope, given, leaf)
-
-    def _told_rows(self) -> str:
-        """Return what was found, one row for each frame."""
-        columns = {"first": "BIGINT", "last": "BIGINT"}
-        columns |= {f"{key}.id": "BIGINT" for key in self._found.nodes}
-        columns |= {f"{key}.type": "VARCHAR" for key in self._found.edges}
-        for leaf, name in self._told.items():
-            columns[name] = "BIGINT" if leaf in SPAN else _TYPES[leaf.type]
-        select = Select(['unnest(range("first", "last" + 1)) AS "frame_id"'])
-        select.columns += [quoted(name) for name in list(columns)[2:]]
-        if self._find is not None:
-            find = self._find
-            self.gathered = (
-                Gathered(GATHERED, columns, lambda window: self._columns(find(window))),
-            )
-            select.join(quoted(GATHERED), [])
-            return select.text()
-        told = zip(self._columns(self._found), columns.items(), strict=True)
+    sql = SqlBuilder(query, catalog)
+    shape = found if isinstance(found, ExternalRelation) else nothing(query, len(told))
+    names = {leaf: f":value {number}" for number, leaf in enumerate(told)}
+    columns = {"first": "BIGINT", "last": "BIGINT"}
+    columns |= {f"{key}.id": "BIGINT" for key in shape.nodes}
+    columns |= {f"{key}.type": "VARCHAR" for key in shape.edges}
+    columns |= {n: "BIGINT" if one in SPAN else _TYPES[one.type] for one, n in names.items()}
+    select = Select(['unnest(range("first", "last" + 1)) AS "frame_id"'])
+    select.columns += [quoted(name) for name in list(columns)[2:]]
+    if isinstance(found, ExternalRelation):
         parts = [
-            f"unnest(CAST({self.values.add(rows)} AS {kind}[])) AS {quoted(name)}"
-            for rows, (name, kind) in told
+            f"unnest(CAST({sql.values.add(rows)} AS {kind}[])) AS {quoted(name)}"
+            for rows, (name, kind) in zip(_columns(found, shape), columns.items(), strict=True)
         ]
         select.join(nested("SELECT " + ",\n  ".join(parts), ":runs"), [])
-        return select.text()
-
-    def _columns(self, found: ExternalRelation) -> list[list[Any]]:
-        """All that is known of matches, a column after the other, in the order of :meth:`_told_rows`."""
-        keys = self._found.nodes, self._found.edges
-        nodes = [found.nodes[key] for key in keys[0]]
-        return [
-            found.first,
-            found.last,
-            *nodes,
-            *(found.edges[key] for key in keys[1]),
-            *found.values,
-        ]
+    else:
+        gathered = Gathered(GATHERED, columns, lambda window: _columns(found(window), shape))
+        sql.gathered = (gathered,)
+        select.join(quoted(GATHERED), [])
+    name = sql.share(select.text(), "found")
+    sql.found = FoundRelation(name, frozenset(shape.nodes), frozenset(shape.edges), names)
+    return sql
 
 
-class _Lenient(Select):
-    """A statement that keeps its rows: what is not there in the frame is unknown."""
-
-    def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
-        super().join(table, conditions, "LEFT JOIN" if conditions else how)
+def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]]:
+    """All that is known of matches, a column after the other: nodes and edges in the order of ``shape``."""
+    nodes = [found.nodes[key] for key in shape.nodes]
+    edges = [found.edges[key] for key in shape.edges]
+    return [found.first, found.last, *nodes, *edges, *found.values]
 
 
 def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:

@@ -95,7 +95,10 @@ class BoundValues:
 
 @dataclass(slots=True)
 class Select:
-    """A statement in the making: one line for each column, table and condition."""
+    """A statement in the making: one line for each column, table and condition.
+
+    One that is ``lenient`` keeps its rows where a table that is joined has none for them.
+    """
 
     columns: list[str] = field(default_factory=list[str])
     tables: list[str] = field(default_factory=list[str])
@@ -105,6 +108,7 @@ class Select:
     order: list[str] = field(default_factory=list[str])
     limit: int | None = None
     distinct: bool = False
+    lenient: bool = False
 
     def text(self) -> str:
         """The statement."""
@@ -124,6 +128,7 @@ class Select:
             self.tables.append(table)
             self.where += conditions
         elif conditions:
+            how = "LEFT JOIN" if self.lenient else how
             self.tables.append(f"{how} {table} ON " + " AND ".join(conditions))
         else:
             self.tables.append(f"CROSS JOIN {table}")
@@ -189,6 +194,28 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
         return _ABSENT[attribute.type]
     if attribute.values and len(parts) > 1:
         parts = [f"CAST({part} AS VARCHAR)" for part in parts]
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def raw_text(name: str, at: Aliases) -> str:
+    """A raw column of a node, wherever it lives; positions about the trace's origin.
+
+    What stands for ever has no states, and velocity 0.
+    """
+    still = name in {"vx", "vy"}
+    parts: list[str] = []
+    if at.state:
+        parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")
+    if at.entity:
+        value = f"CAST({at.entity}.{quoted(name)} AS DOUBLE)"
+        parts.append(f'CASE WHEN {at.entity}."is_static" THEN 0e0 END' if still else value)
+    if at.map:
+        value = "0e0" if still else f"{at.map}.{quoted(name)}"
+        value = f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value
+        # Signs and lights of a map are entities; of lanes and roads there are no numbers of pairs.
+        parts.append(f'CASE WHEN {at.map}."kind" NOT IN ({PLACES}) THEN {value} END')
+    if not parts:
+        return "CAST(NULL AS DOUBLE)"
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
 
 

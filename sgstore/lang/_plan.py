@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang._catalog import Catalog
     from sgstore.lang._formulas import BoundValues, Select
+    from sgstore.lang.ir import FrameAttribute
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,25 @@ class SharedRelation:
     name: str
     nodes: frozenset[str]
     edges: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundRelation:
+    """A shared relation of matches that are known already: one row a frame and match.
+
+    Attributes
+    ----------
+    name : str
+    nodes, edges : frozenset of str
+        What it binds.
+    told : mapping of FrameAttribute to str
+        Values that it has beside them, and their columns.
+    """
+
+    name: str
+    nodes: frozenset[str]
+    edges: frozenset[str]
+    told: Mapping[FrameAttribute, str]
 
 
 @dataclass(slots=True)

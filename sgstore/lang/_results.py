@@ -30,7 +30,9 @@ from sgstore.lang._formulas import (
 )
 from sgstore.lang._kinds import Profile
 from sgstore.lang._plan import TRACE_OF_BUCKET, frame_key, name_key, traces_of
-from sgstore.lang._sql_frames import Frames, column_of
+from sgstore.lang._sql_frames import column_of, in_masks, masks, phases
+from sgstore.lang._sql_frames import frames as frames_of
+from sgstore.lang._sql_masks import SqlBuilder, number_of_frames
 from sgstore.lang.ir import (
     CLIP_COLUMNS,
     FRAME_COLUMNS,
@@ -230,7 +232,7 @@ def rows(
     query: Query,
     catalog: Catalog,
     window: Window | None = None,
-    writer: Frames | None = None,
+    writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
     """The statement for what a query returns, whatever its form.
@@ -240,7 +242,7 @@ def rows(
     query : Query
     catalog : Catalog
     window : Window, optional
-    writer : Frames, optional
+    writer : SqlBuilder, optional
         Says what matches; by default what the pattern finds.
     span : Span, optional
         Of a query whose matches are intervals themselves.
@@ -248,15 +250,15 @@ def rows(
     if query.result.form in {"intervals", "clips"}:
         return intervals(query, catalog, window, writer, span)
     query = counted_apart(_spelled(query, catalog), catalog)
-    return _RowStatement(query, writer or Frames(query, catalog, window)).statement()
+    return _RowStatement(query, writer or SqlBuilder(query, catalog, window)).statement()
 
 
 def frames(
-    query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
+    query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
 ) -> SqlStatement:
     """The frames that match, each once, with their log times."""
-    writer = writer or Frames(query, catalog, window)
-    relation = writer.frames(query.scope, None, frozenset())
+    writer = writer or SqlBuilder(query, catalog, window)
+    relation = frames_of(writer, query.scope, None, frozenset())
     outputs = [*_frame_columns(), (LOG_TIME, f'{_FRAME}."{LOG_TIME}"')]
     select = Select([_named(text, name) for name, text in outputs])
     _from_frames(select, relation)
@@ -266,16 +268,16 @@ def frames(
 
 
 def count(
-    query: Query, catalog: Catalog, window: Window | None = None, writer: Frames | None = None
+    query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
 ) -> SqlStatement:
     """Return the statement for the number of frames that match."""
-    told, writer = writer is not None, writer or Frames(query, catalog, window)
-    parts = writer.phases(query.scope)
+    told, writer = writer is not None, writer or SqlBuilder(query, catalog, window)
+    parts = phases(writer, query.scope)
     if parts.rest or parts.late or told:
-        relation = writer.frames(query.scope, None, frozenset())
+        relation = frames_of(writer, query.scope, None, frozenset())
         text = Select(['count(*) AS "frames"'], [nested(relation, ":rows")]).text()
     else:
-        text = writer.number_of_frames(writer.masks(query.scope, parts, None, frozenset()))
+        text = number_of_frames(masks(writer, query.scope, parts, None, frozenset()))
     return _finished(writer, text, ("frames",))
 
 
@@ -283,12 +285,12 @@ def intervals(
     query: Query,
     catalog: Catalog,
     window: Window | None = None,
-    writer: Frames | None = None,
+    writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
     """Intervals in which what is returned (nothing but a match, if nothing is) stays the same."""
     query = _spelled(query, catalog)
-    return _IntervalStatement(query, writer or Frames(query, catalog, window), span).statement()
+    return _IntervalStatement(query, writer or SqlBuilder(query, catalog, window), span).statement()
 
 
 def about_frame(attributes: Sequence[FrameAttribute]) -> str:
@@ -318,7 +320,7 @@ def with_bindings(query: Query) -> Query:
 class _RowStatement:
     """Writes the statement of a query whose results are rows."""
 
-    def __init__(self, query: Query, writer: Frames) -> None:
+    def __init__(self, query: Query, writer: SqlBuilder) -> None:
         self.query, self.result = query, query.result
         self.writer = writer
         scope = query.scope
@@ -343,7 +345,7 @@ class _RowStatement:
         values += self._per_values()
         values += [name for _, name in self._names()]
         wanted = [leaf for value in values for leaf in leaves(value)]
-        relation = self.writer.frames(self.query.scope, None, self.nodes, self.edges, wanted)
+        relation = frames_of(self.writer, self.query.scope, None, self.nodes, self.edges, wanted)
         outputs = self._outputs()
         names = [name for name, _ in outputs]
         select = Select([_named(text, name) for name, text in outputs])
@@ -449,7 +451,7 @@ class _IntervalStatement:
     together, its parts.
     """
 
-    def __init__(self, query: Query, writer: Frames, span: Span | None) -> None:
+    def __init__(self, query: Query, writer: SqlBuilder, span: Span | None) -> None:
         self.query, self.result = query, query.result
         self.writer, self.span = writer, span
         kept = [value for column in self.result.columns for value in _kept(column.value)]
@@ -511,7 +513,7 @@ class _IntervalStatement:
         scope = self.query.scope
         if self.span is not None:
             wanted = [*wanted, *self.span]
-            relation = self.writer.frames(scope, None, frozenset(), frozenset(), wanted)
+            relation = frames_of(self.writer, scope, None, frozenset(), frozenset(), wanted)
             ends = [_column(leaf) for leaf in self.span]
             select = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"'])
             select.columns += [f"{text} AS {key}" for key, text in self._keys().items()]
@@ -519,7 +521,7 @@ class _IntervalStatement:
             select.distinct = True
             return select.text()
         keys = list(self.keys.values())
-        return runs(self.writer.in_masks(scope, wanted, self._keys()), keys, self.apart)
+        return runs(in_masks(self.writer, scope, wanted, self._keys()), keys, self.apart)
 
     def _between(self, spans: str) -> str:
         """Return the columns about the frames at both ends."""
@@ -675,7 +677,7 @@ def _aggregates(column: ReturnColumn) -> bool:
     return any(isinstance(part, Aggregate) for part in walk(column.value))
 
 
-def _finished(writer: Frames, text: str, columns: Iterable[str]) -> SqlStatement:
+def _finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:
     """A statement with the shared relations before it."""
     before = [
         (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows

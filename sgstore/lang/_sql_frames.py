@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final, TypeGuard
 
 from sgstore.lang._catalog import DisplayUnit, Home, Type
 from sgstore.lang._formulas import (
-    PLACES,
     Aliases,
     Leaf,
     Select,
@@ -31,13 +30,28 @@ from sgstore.lang._formulas import (
     owner_text,
     pair_column,
     pair_text,
+    raw_text,
     role_text,
     way_text,
 )
 from sgstore.lang._kinds import Profile, homes_of, kind_conditions
-from sgstore.lang._plan import Phases, SharedRelation, apart
-from sgstore.lang._rewrite import INVARIANT, is_lasting
-from sgstore.lang._sql_masks import BUCKET, Masks, folded, merged
+from sgstore.lang._operators import COMPARISONS, Column
+from sgstore.lang._plan import Phases, SharedRelation, apart, phases_of
+from sgstore.lang._rewrite import INVARIANT, complement, counted_block, is_lasting
+from sgstore.lang._sql_masks import (
+    BUCKET,
+    CountRange,
+    SqlBuilder,
+    base_rows,
+    expanded,
+    folded,
+    frames_with,
+    held,
+    in_mask,
+    in_which,
+    merged,
+    with_blocks,
+)
 from sgstore.lang.ir import (
     BlockValue,
     Bound,
@@ -50,6 +64,7 @@ from sgstore.lang.ir import (
     PairNumber,
     Scope,
     TraceAttribute,
+    blocks_of,
     nodes_of,
 )
 from sgstore.pair_numbers import LANE_DIST, PAIR_FUNCTIONS, needed_for, parts_of, stage_of
@@ -60,7 +75,6 @@ if TYPE_CHECKING:
 
     from sgstore.lang._catalog import Attribute, Catalog
     from sgstore.lang._formulas import BoundValues
-    from sgstore.lang._plan import Gathered
 
 
 _LESS: Final = {"<", "<=", "="}
@@ -204,32 +218,10 @@ class Layers:
             for name in sorted(needed_for(pair.function)):
                 if stage_of(name) == 0:
                     key = pair.a if name[0] == "a" else pair.b
-                    columns[pair_column(name, pair.a, pair.b)] = _raw_text(
+                    columns[pair_column(name, pair.a, pair.b)] = raw_text(
                         name[2:], self.join.at[key]
                     )
         return columns
-
-
-def _raw_text(name: str, at: Aliases) -> str:
-    """A raw column of a node, wherever it lives; positions about the trace's origin.
-
-    What stands for ever has no states, and velocity 0.
-    """
-    still = name in {"vx", "vy"}
-    parts: list[str] = []
-    if at.state:
-        parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")
-    if at.entity:
-        value = f"CAST({at.entity}.{quoted(name)} AS DOUBLE)"
-        parts.append(f'CASE WHEN {at.entity}."is_static" THEN 0e0 END' if still else value)
-    if at.map:
-        value = "0e0" if still else f"{at.map}.{quoted(name)}"
-        value = f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value
-        # Signs and lights of a map are entities; of lanes and roads there are no numbers of pairs.
-        parts.append(f'CASE WHEN {at.map}."kind" NOT IN ({PLACES}) THEN {value} END')
-    if not parts:
-        return "CAST(NULL AS DOUBLE)"
-    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
 
 
 def named(text: str, name: str) -> str:
@@ -305,389 +297,501 @@ TRACE: Final = '":trace"'
 MAP: Final = '":map"'
 
 
-class Frames(Masks):
-    """Writes relations of both phases for one query.
+def phases(sql: SqlBuilder, scope: Scope) -> Phases:
+    """The conditions of a scope by phase; of matches that are known nothing is left to be tested."""
+    return Phases() if sql.found_in(scope) else phases_of(scope, sql.query, sql.catalog)
 
-    Attributes
+
+def masks(
+    sql: SqlBuilder,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    nodes: frozenset[str],
+    edges: frozenset[str] = frozenset(),
+) -> str:
+    """The relation of the first phase: one row a bucket and binding of some nodes and edges."""
+    if not parts.blocks:
+        return base_rows(sql, scope, parts, given, nodes, edges)
+    outside = {key for c in parts.blocks for block in blocks_of(c) for key in block.scope.outer}
+    wide = nodes | frozenset(outside)
+    name = sql.share(base_rows(sql, scope, parts, given, wide, edges), "pattern")
+    shared = SharedRelation(name, wide, edges)
+    return with_blocks([_block(sql, one, shared) for one in parts.blocks], shared, nodes, edges)
+
+
+def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> str:
+    """In which frames a block has a match: one row a bucket and binding of the nodes outside."""
+    keys = frozenset(scope.outer)
+    parts = phases(sql, scope)
+    if parts.rest or parts.late:
+        return folded(frames(sql, scope, given, keys), columns_of(keys))
+    text = masks(sql, scope, parts, given, keys)
+    if set(scope.nodes) and not parts.blocks:
+        return text  # grouped already, for the nodes inside are dropped
+    return merged(text, {column: column for column in columns_of(keys)})
+
+
+def _block(
+    sql: SqlBuilder, condition: Bound, given: SharedRelation
+) -> tuple[str, frozenset[str], bool]:
+    """Return where a block is true (or, if the last is false, where it is not), and its outer nodes."""
+    match condition:
+        case BlockValue(scope=scope):
+            return existence(sql, scope, given), frozenset(scope.outer), True
+        case Operation("NOT", (BlockValue(scope=scope),)):
+            return existence(sql, scope, given), frozenset(scope.outer), False
+        case _:
+            return _block_counted(sql, condition, given)
+
+
+def _block_counted(
+    sql: SqlBuilder, condition: Bound, given: SharedRelation
+) -> tuple[str, frozenset[str], bool]:
+    counted = counted_block(condition)
+    assert counted is not None, condition  # noqa: S101 - it was filed so
+    block, sign, number = counted
+    wanted = not COMPARISONS[sign].columns((Column(0), Column(number))).true
+    sign = sign if wanted else complement(sign)
+    keys = frozenset(block.scope.outer)
+    parts = phases(sql, block.scope)
+    if not (parts.rest or parts.late):
+        rows = masks(sql, block.scope, parts, given, *_told_apart(block.scope))
+        name = sql.share(rows, "counted")
+        return frames_with(name, columns_of(keys), CountRange.of(sign, number)), keys, wanted
+    select = Select(['"frame_id"', *columns_of(keys)])
+    select.join(nested(block_matches(sql, block, given), ":counted"), [])
+    select.group = ['"frame_id"', *columns_of(keys)]
+    select.having = [f"count(*) {sign} {sql.values.add(number)}"]
+    return folded(select.text(), columns_of(keys)), keys, wanted
+
+
+def block_matches(
+    sql: SqlBuilder, block: BlockValue, given: SharedRelation | None, columns: Iterable[Leaf] = ()
+) -> str:
+    """The matches of a block, one row each and frame."""
+    nodes, edges = _told_apart(block.scope)
+    return frames(sql, block.scope, given, nodes, edges, columns)
+
+
+def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
+    """Nodes and edges by which the matches of a block differ, and the nodes outside that it speaks of."""
+    nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
+    edges = frozenset(edge.key for edge in scope.edges if edge.named)
+    return frozenset(nodes) | frozenset(scope.outer), edges
+
+
+def frames(
+    sql: SqlBuilder,
+    scope: Scope,
+    given: SharedRelation | None,
+    nodes: frozenset[str],
+    edges: frozenset[str] = frozenset(),
+    columns: Iterable[Leaf] = (),
+) -> str:
+    """The relation of the second phase: one row a frame and binding of some nodes and edges.
+
+    Parameters
     ----------
-    gathered : tuple of Gathered
-        Tables that they speak of and the store has not.
+    sql : SqlBuilder
+    scope : Scope
+    given : SharedRelation or None
+        What binds the outer nodes.
+    nodes, edges : frozenset of str
+        What is to be bound; every binding comes once for each frame.
+    columns : iterable of Leaf
+        Values wanted beside them, each a column named by :func:`column_of`.
     """
+    parts = phases(sql, scope)
+    wanted = list(dict.fromkeys(columns))
+    if INVARIANT in wanted and not (parts.rest or parts.late):
+        return _by_buckets(sql, scope, parts, given, nodes, edges, wanted)
+    conditions = [*parts.rest, *bounds(parts.rest)]
+    needed = list(dict.fromkeys([*(leaf for c in conditions for leaf in leaves(c)), *wanted]))
+    bound = nodes | {key for leaf in needed for key in nodes_of(leaf)}
+    edged = {leaf.edge for leaf in needed if isinstance(leaf, EdgeAttribute)}
+    bound |= {end for e in scope.edges if e.key in edged for end in (e.src, e.dst)}
+    every = {*scope.nodes, *scope.outer}
+    bound |= {key for pair in apart(scope, every, parts.late) for key in pair}
+    ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation)}
+    join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
+    _second_phase(sql, join, scope, parts, given, needed)
+    layers = Layers(join, needed, conditions)
+    text = layers.text(sql.values, columns_of(nodes, edges), wanted)
+    told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
+    told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
+    told |= {leaf.node for leaf in wanted if _is_id(leaf)}
+    hidden = (bound | parts.late | ties) - nodes - edges - told
+    hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
+    known = sql.found_in(scope)
+    if hidden or (known and not (known.nodes <= nodes and known.edges <= edges)):
+        return "SELECT DISTINCT" + text.removeprefix("SELECT")
+    return text
 
-    gathered: tuple[Gathered, ...] = ()
 
-    def frames(
-        self,
-        scope: Scope,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str] = frozenset(),
-        columns: Iterable[Leaf] = (),
-    ) -> str:
-        """The relation of the second phase: one row a frame and binding of some nodes and edges.
+def _by_buckets(
+    sql: SqlBuilder,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    nodes: frozenset[str],
+    edges: frozenset[str],
+    wanted: list[Leaf],
+) -> str:
+    """One row a bucket and binding, with the number of frames that it stands for."""
+    select, texts = _of_buckets(sql, scope, parts, given, nodes, edges, wanted)
+    texts[INVARIANT] = held(PATTERN)
+    columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
+    columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
+    select.columns = [named(text, name) for name, text in columns.items()]
+    return select.text()
 
-        Parameters
-        ----------
-        scope : Scope
-        given : SharedRelation or None
-            What binds the outer nodes.
-        nodes, edges : frozenset of str
-            What is to be bound; every binding comes once for each frame.
-        columns : iterable of Leaf
-            Values wanted beside them, each a column named by :func:`column_of`.
-        """
-        parts = self.phases(scope)
-        wanted = list(dict.fromkeys(columns))
-        if INVARIANT in wanted and not (parts.rest or parts.late):
-            return self._by_buckets(scope, parts, given, nodes, edges, wanted)
-        conditions = [*parts.rest, *bounds(parts.rest)]
-        needed = list(dict.fromkeys([*(leaf for c in conditions for leaf in leaves(c)), *wanted]))
-        join = Join()
-        bound = nodes | {key for leaf in needed for key in nodes_of(leaf)}
-        bound |= self._ends(scope, needed)
-        every = {*scope.nodes, *scope.outer}
-        bound |= {key for pair in apart(scope, every, parts.late) for key in pair}
-        ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation)}
-        given = self._first_phase(join, scope, parts, given, bound, ties, needed)
-        self._second_phase(join, scope, parts, given, needed)
-        layers = Layers(join, needed, conditions)
-        text = layers.text(self.values, columns_of(nodes, edges), wanted)
-        told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
-        told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
-        told |= {leaf.node for leaf in wanted if _is_id(leaf)}
-        hidden = (bound | parts.late | ties) - nodes - edges - told
-        hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
-        return "SELECT DISTINCT" + text.removeprefix("SELECT") if hidden else text
 
-    def _by_buckets(
-        self,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str],
-        wanted: list[Leaf],
-    ) -> str:
-        """One row a bucket and binding, with the number of frames that it stands for."""
-        select, texts = self._of_buckets(scope, parts, given, nodes, edges, wanted)
-        texts[INVARIANT] = self.held(PATTERN)
-        columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
-        columns |= {quoted(column_of(leaf)): texts[leaf] for leaf in wanted}
-        select.columns = [named(text, name) for name, text in columns.items()]
-        return select.text()
+def _of_buckets(
+    sql: SqlBuilder,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    nodes: frozenset[str],
+    edges: frozenset[str],
+    wanted: Iterable[Leaf],
+) -> tuple[Select, dict[Leaf, str]]:
+    """Return the result of the first phase, joined with the tables of lasting values, and their SQL."""
+    select = Select()
+    select.join(nested(masks(sql, scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
+    bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
+    bucket = f'{PATTERN}."bucket"'
+    texts = _join_lasting(select, bucket, bound, scope, sql.catalog, wanted)
+    for leaf in wanted:
+        if isinstance(leaf, EdgeRelation):
+            texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
+    return select, texts
 
-    def _of_buckets(
-        self,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str],
-        wanted: Iterable[Leaf],
-    ) -> tuple[Select, dict[Leaf, str]]:
-        """Return the result of the first phase, joined with the tables of lasting values, and their SQL."""
-        select = Select()
-        select.join(nested(self.masks(scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
-        bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
-        bucket = f'{PATTERN}."bucket"'
-        texts = _join_lasting(select, bucket, bound, scope, self.catalog, wanted)
-        for leaf in wanted:
-            if isinstance(leaf, EdgeRelation):
-                texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
-        return select, texts
 
-    def in_masks(self, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]) -> str:
-        """In which frames some match has which values: one row a bucket and combination of them.
+def in_masks(
+    sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]
+) -> str:
+    """In which frames some match has which values: one row a bucket and combination of them.
 
-        Parameters
-        ----------
-        scope : Scope
-        wanted : iterable of Leaf
-            What the values are made of.
-        values : mapping of str to str
-            Column, quoted → its text in terms of a relation ``":rows"`` that has the columns ``wanted``.
-        """
-        rows = self._lasting(scope, wanted)
-        if rows is not None:
-            return merged(rows, values)
-        rows = self.frames(scope, None, frozenset(), frozenset(), wanted)
-        select = Select(['"frame_id"'], [nested(rows, ":rows")])
-        select.columns += [f"{text} AS {column}" for column, text in values.items()]
-        return folded(select.text(), list(values))
+    Parameters
+    ----------
+    sql : SqlBuilder
+    scope : Scope
+    wanted : iterable of Leaf
+        What the values are made of.
+    values : mapping of str to str
+        Column, quoted → its text in terms of a relation ``":rows"`` that has the columns ``wanted``.
+    """
+    rows = _lasting(sql, scope, wanted)
+    if rows is not None:
+        return merged(rows, values)
+    rows = frames(sql, scope, None, frozenset(), frozenset(), wanted)
+    select = Select(['"frame_id"'], [nested(rows, ":rows")])
+    select.columns += [f"{text} AS {column}" for column, text in values.items()]
+    return folded(select.text(), list(values))
 
-    def _lasting(self, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-        """One row a bucket and match, with values that last as long; ``None`` if frames must be looked at."""
-        parts, wanted = self.phases(scope), list(dict.fromkeys(wanted))
-        if parts.rest or parts.late or not all(is_lasting(v, scope, self.catalog) for v in wanted):
-            return None
-        nodes = frozenset(key for leaf in wanted for key in nodes_of(leaf))
-        edges = frozenset(leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation))
-        select, texts = self._of_buckets(scope, parts, None, nodes, edges, wanted)
-        select.columns = self.in_which(PATTERN)
-        select.columns += [named(texts[leaf], quoted(column_of(leaf))) for leaf in wanted]
-        return select.text()
 
-    def _ends(self, scope: Scope, needed: list[Leaf]) -> set[str]:
-        """Nodes at the ends of edges whose attributes are needed."""
-        keys = {leaf.edge for leaf in needed if isinstance(leaf, EdgeAttribute)}
-        return {end for e in scope.edges if e.key in keys for end in (e.src, e.dst)}
+def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
+    """One row a bucket and match, with values that last as long; ``None`` if frames must be looked at."""
+    parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
+    if sql.found_in(scope) or parts.rest or parts.late:
+        return None
+    if not all(is_lasting(v, scope, sql.catalog) for v in wanted):
+        return None
+    nodes = frozenset(key for leaf in wanted for key in nodes_of(leaf))
+    edges = frozenset(leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation))
+    select, texts = _of_buckets(sql, scope, parts, None, nodes, edges, wanted)
+    select.columns = in_which(PATTERN)
+    select.columns += [named(texts[leaf], quoted(column_of(leaf))) for leaf in wanted]
+    return select.text()
 
-    def _first_phase(
-        self,
-        join: Join,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        bound: frozenset[str],
-        ties: frozenset[str],
-        needed: list[Leaf],
-    ) -> SharedRelation | None:
-        """Return the result of the first phase and its frames, and what the blocks of the second phase need."""
-        if parts.empty:
-            return None
-        nodes = bound - parts.late
-        text = self.masks(scope, parts, given, nodes, ties)
-        blocks = [leaf for leaf in needed if isinstance(leaf, BlockValue)]
-        if blocks:
-            given = SharedRelation(self.share(text, "pattern"), nodes, ties)
-            text = Select(["*"], [quoted(given.name)]).text()
-        join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
-        join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
-        leader = self._leader(scope, parts, nodes, needed)
-        if leader is None:
-            join.select.join(nested(self.expanded(text, nodes, ties), PATTERN[1:-1]), [])
-            join.frame = f'{PATTERN}."frame_id"'
-        else:
-            join.select.join(nested(text, PATTERN[1:-1]), [])
-            self._join_leader(join, scope, leader)
-        return given
 
-    def _leader(
-        self, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
-    ) -> str | None:
-        """The node whose states bring the frames with them, so that masks need not be expanded.
+def _first_phase(
+    sql: SqlBuilder,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    bound: frozenset[str],
+    ties: frozenset[str],
+    needed: list[Leaf],
+) -> tuple[Join, SharedRelation | None]:
+    """Return the result of the first phase and its frames, and what the blocks of the second phase need."""
+    join, nodes = Join(), bound - parts.late
+    if parts.empty:
+        return join, None
+    blocks = any(isinstance(leaf, BlockValue) for leaf in needed)
+    join.nodes |= {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
+    join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
+    known = sql.found_in(scope)
+    if known is not None:
+        join.select.lenient = True  # what is not there in the frame is unknown
+        join.select.join(f"{quoted(known.name)} AS {PATTERN}", [])
+        join.frame = f'{PATTERN}."frame_id"'
+        if not blocks:
+            return join, None
+        keys = columns_of(bound)
+        rows = Select(['"frame_id"', *keys], [quoted(known.name)], distinct=True)
+        name = sql.share(folded(rows.text(), keys), "pattern")
+        return join, SharedRelation(name, bound, frozenset())
+    text = masks(sql, scope, parts, given, nodes, ties)
+    if blocks:
+        given = SharedRelation(sql.share(text, "pattern"), nodes, ties)
+        text = Select(["*"], [quoted(given.name)]).text()
+    leader = _leader(sql, scope, parts, nodes, needed)
+    if leader is None:
+        join.select.join(nested(expanded(text, nodes, ties), PATTERN[1:-1]), [])
+        join.frame = f'{PATTERN}."frame_id"'
+    else:
+        join.select.join(nested(text, PATTERN[1:-1]), [])
+        _join_leader(sql, join, scope, leader)
+    return join, given
 
-        The many states are then looked up in the few rows of the first phase, rather than these, one row a
-        frame, among the states. Only where a query chooses traces it is better to say which frames are asked.
-        """
-        if parts.trace or (scope is self.query.scope and self.chooses_traces):
-            return None
-        moving = [
-            key
-            for key in sorted({key for leaf in needed for key in _valued(leaf)} & nodes)
-            if Profile.of(scope.kinds(key), self.catalog).places == 1
-            and Home.state in self._homes(scope, key, needed)
-        ]
-        others = [key for key in moving if scope.kinds(key).other]
-        return next(iter(others or moving), None)
 
-    def _join_leader(self, join: Join, scope: Scope, key: str) -> None:
-        alias = quoted(key)
-        frame = f'{alias}."frame_id"'
-        on = [f'{frame} >> 6 = {PATTERN}."bucket"', f'{alias}."node_id" = {join.nodes[key]}']
-        on += self._of_kinds(scope, key, alias)
-        join.select.join(f'"state" AS {alias}', [*on, self.in_mask(PATTERN, frame)])
-        join.select.where += self.within(frame, 64)
-        join.frame = frame
-        # Said of the bucket, so that constants are looked up for the rows of masks, and not for all states.
-        join.trace = f'{PATTERN}."bucket" >> 18'
-        join.at[key] = Aliases(state=alias)
+def _leader(
+    sql: SqlBuilder, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
+) -> str | None:
+    """The node whose states bring the frames with them, so that masks need not be expanded.
 
-    def _of_kinds(self, scope: Scope, key: str, state: str) -> list[str]:
-        """Conditions that keep states to what a node may be; of the ego's states it is enough that they are."""
-        if scope.kinds(key).one_a_frame and key not in self.phases(scope).late:
-            return [f'{state}."is_ego"']
-        return kind_conditions(
-            scope.kinds(key), f'{state}."kind"', f'{state}."is_ego"', self.catalog.moving
-        )
+    The many states are then looked up in the few rows of the first phase, rather than these, one row a
+    frame, among the states. Only where a query chooses traces it is better to say which frames are asked.
+    """
+    if parts.trace or (
+        scope is sql.query.scope and (sql.query.ego is not None or sql.catalog.only is not None)
+    ):
+        return None
+    moving = [
+        key
+        for key in sorted({key for leaf in needed for key in _valued(leaf)} & nodes)
+        if Profile.of(scope.kinds(key), sql.catalog).places == 1
+        and Home.state in _tables_of(sql, scope, key, needed)
+    ]
+    others = [key for key in moving if scope.kinds(key).other]
+    return next(iter(others or moving), None)
 
-    def _homes(
-        self, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
-    ) -> set[Home]:
-        """Return the tables of the needed values of a node; ``stated``: its state is joined anyway."""
-        profile = Profile.of(scope.kinds(key), self.catalog)
-        of_it = [leaf for leaf in needed if key in _valued(leaf)]
-        homes = _homes(of_it, profile)
-        if profile.places == 1 and profile.moving and (stated or Home.state in homes):
-            # Its state says its kind as well, and so its name.
-            homes = {Home.state} | _homes([leaf for leaf in of_it if not _of_kind(leaf)], profile)
-        return homes
 
-    def _second_phase(
-        self,
-        join: Join,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        needed: list[Leaf],
-    ) -> None:
-        """Join whatever the values come from, and say how each is computed."""
-        for key in sorted(parts.late):
-            self._bind_late(join, scope, key)
-        join.select.where += [
-            f"{join.nodes[a]} <> {join.nodes[b]}"
-            for a, b in apart(scope, set(join.nodes), parts.late)
-        ]
-        if parts.empty:
-            join.select.where += self.of_traces(f"{join.frame} >> 24", scope)
-        self._join_rows(join, scope, parts, needed)
-        for key in sorted({key for leaf in needed for key in _valued(leaf)}):
-            stated = key in join.at and join.at[key].state is not None
-            homes = self._homes(scope, key, needed, stated=stated)
-            self._join_values(join, scope, key, homes)
-        for leaf in needed:
-            self._say(join, scope, given, leaf)
+def _join_leader(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
+    alias = quoted(key)
+    frame = f'{alias}."frame_id"'
+    on = [f'{frame} >> 6 = {PATTERN}."bucket"', f'{alias}."node_id" = {join.nodes[key]}']
+    on += _of_kinds(sql, scope, key, alias)
+    join.select.join(f'"state" AS {alias}', [*on, in_mask(PATTERN, frame)])
+    join.select.where += sql.within(frame, 64)
+    join.frame = frame
+    # Said of the bucket, so that constants are looked up for the rows of masks, and not for all states.
+    join.trace = f'{PATTERN}."bucket" >> 18'
+    join.at[key] = Aliases(state=alias)
 
-    def _bind_late(self, join: Join, scope: Scope, key: str) -> None:
-        """A node that is bound by its state in the frame."""
-        alias = quoted(key)
-        on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
-        on += self._of_kinds(scope, key, alias)
-        join.select.join(f'"state" AS {alias}', on)
-        join.select.where += self.within(f'{alias}."frame_id"', 64)
-        join.frame = join.frame or f'{alias}."frame_id"'
-        join.nodes[key] = f'{alias}."node_id"'
-        join.at[key] = Aliases(state=alias)
 
-    def _join_rows(self, join: Join, scope: Scope, parts: Phases, needed: list[Leaf]) -> None:
-        """The rows of the frame, of its trace and of the map, where they are needed."""
-        kinds = {type(leaf) for leaf in needed}
-        on_map = any(
-            Profile.of(scope.kinds(key), self.catalog).mapped
-            for leaf in needed
-            for key in (_valued(leaf) or _owned(leaf))
-        )
-        position = any(is_position(leaf) for leaf in needed)
-        pairs_on_map = on_map and PairNumber in kinds
-        trace = TraceAttribute in kinds or position or pairs_on_map
-        since = any(_since_start(leaf) for leaf in needed)
-        if on_map or trace or since or any(_of_frame(leaf) for leaf in needed):
-            join.select.join(f'"frame" AS {FRAME}', [f'{FRAME}."frame_id" = {join.frame}'])
-        if trace or since:
-            on = [f'{TRACE}."trace_id" = {FRAME}."trace_id"']
-            join.select.join(f'"trace" AS {TRACE}', on)
-        if any(
-            isinstance(leaf, TraceAttribute) and Home.map in leaf.attribute.columns
-            for leaf in needed
-        ):
-            on = [f'{MAP}."map_id" = {TRACE}."map_id"']
-            join.select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
+def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
+    """Conditions that keep states to what a node may be; of the ego's states it is enough that they are."""
+    if scope.kinds(key).one_a_frame and key not in phases(sql, scope).late:
+        return [f'{state}."is_ego"']
+    return kind_conditions(
+        scope.kinds(key), f'{state}."kind"', f'{state}."is_ego"', sql.catalog.moving
+    )
 
-    def _join_values(self, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
-        """The tables that some values of a node come from."""
-        profile = Profile.of(scope.kinds(key), self.catalog)
-        at, node = join.at.get(key, Aliases()), join.nodes[key]
-        state, entity, part = at.state, None, None
-        if Home.state in homes and state is None:
-            state = quoted(key)
-            on = [f'{state}."frame_id" = {join.frame}']
-            if not scope.kinds(key).one_a_frame:  # one column filters the scan as it reads
-                on.append(f'{state}."node_id" = {node}')
-            on += self._of_kinds(scope, key, state) + self.within(f'{state}."frame_id"', 64)
-            alone = profile.places == 1
-            join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
-        if homes & {Home.entity, Home.scenery}:
-            entity = quoted(f"{key}.entity")
-            trace = join.trace or f"{join.frame} >> 24"
-            on = [f'{entity}."trace_id" = {trace}', f'{entity}."node_id" = {node}']
-            how = "LEFT JOIN" if profile.mapped else "JOIN"
-            join.select.join(f'"entity" AS {entity}', on, how)
-        if Home.map in homes:
-            part = quoted(f"{key}.map")
-            on = [f'{part}."map_id" = {FRAME}."map_id"', f'{part}."node_id" = {node}']
-            how = "JOIN" if profile.places == 1 else "LEFT JOIN"
-            join.select.join(f'"map_node" AS {part}', on, how)
-        join.at[key] = Aliases(state, entity, part, TRACE)
 
-    def _say(self, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf) -> None:
-        """Return the SQL of a value; a block or the attributes of an edge are joined for it."""
-        match leaf:
-            case NodeValue(node=node):
-                join.texts[leaf] = join.nodes[node]
-            case NodeAttribute(node=node, attribute=attribute):
-                join.texts[leaf] = self._of_node(join, scope, node, attribute)
-            case EdgeRelation(edge=edge):
-                join.texts[leaf] = f"CAST({join.edges[edge]} AS VARCHAR)"
-            case EdgeAttribute(edge=edge):
-                join.texts[leaf] = self._of_lane(join, scope, edge, leaf)
-            case FrameAttribute() if leaf is INVARIANT:
-                join.texts[leaf] = "1"
-            case FrameAttribute() | TraceAttribute():
-                join.texts[leaf] = frame_text(leaf, FRAME, TRACE, MAP)
-            case BlockValue():
-                join.texts[leaf] = self._of_block(join, given, leaf)
-            case PairNumber(function=function, a=a, b=b):
-                if function == LANE_DIST:  # the others are computed in layers
-                    join.texts[leaf] = self._of_ways(join, scope, a, b)
+def _tables_of(
+    sql: SqlBuilder, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
+) -> set[Home]:
+    """Return the tables of the needed values of a node; ``stated``: its state is joined anyway."""
+    profile = Profile.of(scope.kinds(key), sql.catalog)
+    of_it = [leaf for leaf in needed if key in _valued(leaf)]
+    homes = _homes(of_it, profile)
+    if profile.places == 1 and profile.moving and (stated or Home.state in homes):
+        # Its state says its kind as well, and so its name.
+        homes = {Home.state} | _homes([leaf for leaf in of_it if not _of_kind(leaf)], profile)
+    return homes
 
-    def _of_node(self, join: Join, scope: Scope, node: str, attribute: Attribute) -> str:
-        if attribute.unit is DisplayUnit.binding:
+
+def _second_phase(
+    sql: SqlBuilder,
+    join: Join,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    needed: list[Leaf],
+) -> None:
+    """Join whatever the values come from, and say how each is computed."""
+    for key in sorted(parts.late):
+        _bind_late(sql, join, scope, key)
+    join.select.where += [
+        f"{join.nodes[a]} <> {join.nodes[b]}" for a, b in apart(scope, set(join.nodes), parts.late)
+    ]
+    if parts.empty:
+        join.select.where += sql.of_traces(f"{join.frame} >> 24", scope)
+    _join_rows(sql, join, scope, needed)
+    for key in sorted({key for leaf in needed for key in _valued(leaf)}):
+        stated = key in join.at and join.at[key].state is not None
+        homes = _tables_of(sql, scope, key, needed, stated=stated)
+        _join_values(sql, join, scope, key, homes)
+    told: dict[Leaf, str] = {INVARIANT: "1"}
+    if sql.found is not None:
+        told |= {leaf: f"{PATTERN}.{quoted(name)}" for leaf, name in sql.found.told.items()}
+    for leaf in needed:
+        if not (isinstance(leaf, PairNumber) and leaf.function != LANE_DIST):
+            join.texts[leaf] = told.get(leaf) or _value_text(sql, join, scope, given, leaf)
+
+
+def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
+    """A node that is bound by its state in the frame."""
+    alias = quoted(key)
+    on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
+    on += _of_kinds(sql, scope, key, alias)
+    join.select.join(f'"state" AS {alias}', on)
+    join.select.where += sql.within(f'{alias}."frame_id"', 64)
+    join.frame = join.frame or f'{alias}."frame_id"'
+    join.nodes[key] = f'{alias}."node_id"'
+    join.at[key] = Aliases(state=alias)
+
+
+def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) -> None:
+    """The rows of the frame, of its trace and of the map, where they are needed."""
+    kinds = {type(leaf) for leaf in needed}
+    about = {key for leaf in needed for key in _valued(leaf)}
+    about |= {
+        leaf.node
+        for leaf in needed
+        if isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.owner
+    }
+    on_map = any(Profile.of(scope.kinds(key), sql.catalog).mapped for key in about)
+    position = any(is_position(leaf) for leaf in needed)
+    pairs_on_map = on_map and PairNumber in kinds
+    trace = TraceAttribute in kinds or position or pairs_on_map
+    of_frame = [leaf for leaf in needed if isinstance(leaf, FrameAttribute) and leaf != INVARIANT]
+    since = any(leaf.attribute.unit is DisplayUnit.seconds for leaf in of_frame)
+    if on_map or trace or since or of_frame:
+        join.select.join(f'"frame" AS {FRAME}', [f'{FRAME}."frame_id" = {join.frame}'])
+    if trace or since:
+        on = [f'{TRACE}."trace_id" = {FRAME}."trace_id"']
+        join.select.join(f'"trace" AS {TRACE}', on)
+    if any(
+        isinstance(leaf, TraceAttribute) and Home.map in leaf.attribute.columns for leaf in needed
+    ):
+        on = [f'{MAP}."map_id" = {TRACE}."map_id"']
+        join.select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
+
+
+def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
+    """The tables that some values of a node come from."""
+    profile = Profile.of(scope.kinds(key), sql.catalog)
+    at, node = join.at.get(key, Aliases()), join.nodes[key]
+    state, entity, part = at.state, None, None
+    if Home.state in homes and state is None:
+        state = quoted(key)
+        on = [f'{state}."frame_id" = {join.frame}']
+        if not scope.kinds(key).one_a_frame:  # one column filters the scan as it reads
+            on.append(f'{state}."node_id" = {node}')
+        on += _of_kinds(sql, scope, key, state) + sql.within(f'{state}."frame_id"', 64)
+        alone = profile.places == 1
+        join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
+    if homes & {Home.entity, Home.scenery}:
+        entity = quoted(f"{key}.entity")
+        trace = join.trace or f"{join.frame} >> 24"
+        on = [f'{entity}."trace_id" = {trace}', f'{entity}."node_id" = {node}']
+        how = "LEFT JOIN" if profile.mapped else "JOIN"
+        join.select.join(f'"entity" AS {entity}', on, how)
+    if Home.map in homes:
+        part = quoted(f"{key}.map")
+        on = [f'{part}."map_id" = {FRAME}."map_id"', f'{part}."node_id" = {node}']
+        how = "JOIN" if profile.places == 1 else "LEFT JOIN"
+        join.select.join(f'"map_node" AS {part}', on, how)
+    join.at[key] = Aliases(state, entity, part, TRACE)
+
+
+def _value_text(  # noqa: PLR0911 - a case each
+    sql: SqlBuilder, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf
+) -> str:
+    """Return the SQL of a value; a block or the attributes of an edge are joined for it."""
+    match leaf:
+        case NodeValue(node=node):
             return join.nodes[node]
-        if attribute.unit is DisplayUnit.owner:
-            profile = Profile.of(scope.kinds(node), self.catalog)
-            return owner_text(join.nodes[node], profile, f"{join.frame} >> 24", f'{FRAME}."map_id"')
-        if attribute.unit is DisplayUnit.role:
-            return role_text(join.frame, join.nodes[node])
-        if attribute.unit is DisplayUnit.own:
-            return own_text(attribute, join.frame, join.nodes[node])
-        return attribute_text(attribute, join.at[node])
+        case NodeAttribute(node=node, attribute=attribute):
+            return _of_node(sql, join, scope, node, attribute)
+        case EdgeRelation(edge=edge):
+            return f"CAST({join.edges[edge]} AS VARCHAR)"
+        case EdgeAttribute(edge=edge):
+            return _of_lane(sql, join, scope, edge, leaf)
+        case FrameAttribute() | TraceAttribute():
+            return frame_text(leaf, FRAME, TRACE, MAP)
+        case BlockValue():
+            return _of_block(sql, join, given, leaf)
+        case PairNumber(a=a, b=b):  # along lanes; the others are computed in layers
+            return _of_ways(sql, join, scope, a, b)
 
-    def _of_lane(self, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
-        alias = quoted(f"{key}:in")
-        if alias not in join.lanes:
-            join.lanes.add(alias)
-            edge = next(edge for edge in scope.edges if edge.key == key)
-            table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
-            on = [f'{alias}."frame_id" = {join.frame}']
-            on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
-            join.select.join(f"{quoted(table)} AS {alias}", on, "LEFT JOIN")
-        return lane_text(leaf, alias)
 
-    def _of_ways(self, join: Join, scope: Scope, a: str, b: str) -> str:
-        every = self.catalog.moving | self.catalog.fixed
-        conditions = [
-            condition
-            for alias, key in (('"a"', a), ('"b"', b))
-            for condition in kind_conditions(
-                scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', every
-            )
-        ]
-        return way_text(join.frame, join.nodes[a], join.nodes[b], conditions)
+def _of_node(sql: SqlBuilder, join: Join, scope: Scope, node: str, attribute: Attribute) -> str:
+    if attribute.unit is DisplayUnit.binding:
+        return join.nodes[node]
+    if attribute.unit is DisplayUnit.owner:
+        profile = Profile.of(scope.kinds(node), sql.catalog)
+        return owner_text(join.nodes[node], profile, f"{join.frame} >> 24", f'{FRAME}."map_id"')
+    if attribute.unit is DisplayUnit.role:
+        return role_text(join.frame, join.nodes[node])
+    if attribute.unit is DisplayUnit.own:
+        return own_text(attribute, join.frame, join.nodes[node])
+    return attribute_text(attribute, join.at[node])
 
-    def _of_block(self, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
-        """The value of a block for each frame and binding of the nodes outside."""
-        keys = frozenset(leaf.scope.outer)
-        alias = f":block {leaf.number}"
-        rows = self._block_rows(leaf, given, keys)
-        on = [f'{quoted(alias)}."frame_id" = {join.frame}']
-        on += [
-            f"{quoted(alias)}.{column} = {join.nodes[key]}"
-            for key, column in zip(sorted(keys), columns_of(keys), strict=True)
-        ]
-        join.select.join(nested(rows, alias), on, "LEFT JOIN")
-        value = f'{quoted(alias)}."value"'
-        if leaf.word == "EXISTS":
-            return f"coalesce({value}, FALSE)"
-        return f"coalesce({value}, 0)" if leaf.word in {"COUNT", "SUM"} else value
 
-    def _block_rows(
-        self, leaf: BlockValue, given: SharedRelation | None, keys: frozenset[str]
-    ) -> str:
-        if (
-            leaf.word == "EXISTS"
-        ):  # a column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL
-            rows = self.frames(leaf.scope, given, keys)
-            return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
-        parts = list(leaves(leaf.value)) if leaf.value is not None else []
-        select = Select(['"frame_id"', *columns_of(keys)])
-        select.join(nested(self.counted(leaf, given, parts), ":counted"), [])
-        select.group = list(select.columns)
-        if leaf.value is None:
-            select.columns.append('count(*) AS "value"')
-        else:
-            value = expression_text(leaf.value, lambda part: quoted(column_of(part)), self.values)
-            select.columns.append(f'{leaf.word.lower()}({value}) AS "value"')
-        return select.text()
+def _of_lane(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
+    alias = quoted(f"{key}:in")
+    if alias not in join.lanes:
+        join.lanes.add(alias)
+        edge = next(edge for edge in scope.edges if edge.key == key)
+        table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
+        on = [f'{alias}."frame_id" = {join.frame}']
+        on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
+        join.select.join(f"{quoted(table)} AS {alias}", on, "LEFT JOIN")
+    return lane_text(leaf, alias)
+
+
+def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, a: str, b: str) -> str:
+    every = sql.catalog.moving | sql.catalog.fixed
+    conditions = [
+        condition
+        for alias, key in (('"a"', a), ('"b"', b))
+        for condition in kind_conditions(
+            scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', every
+        )
+    ]
+    return way_text(join.frame, join.nodes[a], join.nodes[b], conditions)
+
+
+def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
+    """The value of a block for each frame and binding of the nodes outside."""
+    keys = frozenset(leaf.scope.outer)
+    alias = f":block {leaf.number}"
+    rows = _block_rows(sql, leaf, given, keys)
+    on = [f'{quoted(alias)}."frame_id" = {join.frame}']
+    on += [
+        f"{quoted(alias)}.{column} = {join.nodes[key]}"
+        for key, column in zip(sorted(keys), columns_of(keys), strict=True)
+    ]
+    join.select.join(nested(rows, alias), on, "LEFT JOIN")
+    value = f'{quoted(alias)}."value"'
+    if leaf.word == "EXISTS":
+        return f"coalesce({value}, FALSE)"
+    return f"coalesce({value}, 0)" if leaf.word in {"COUNT", "SUM"} else value
+
+
+def _block_rows(
+    sql: SqlBuilder, leaf: BlockValue, given: SharedRelation | None, keys: frozenset[str]
+) -> str:
+    if (
+        leaf.word == "EXISTS"
+    ):  # a column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL
+        rows = frames(sql, leaf.scope, given, keys)
+        return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
+    parts = list(leaves(leaf.value)) if leaf.value is not None else []
+    select = Select(['"frame_id"', *columns_of(keys)])
+    select.join(nested(block_matches(sql, leaf, given, parts), ":counted"), [])
+    select.group = list(select.columns)
+    if leaf.value is None:
+        select.columns.append('count(*) AS "value"')
+    else:
+        value = expression_text(leaf.value, lambda part: quoted(column_of(part)), sql.values)
+        select.columns.append(f'{leaf.word.lower()}({value}) AS "value"')
+    return select.text()
 
 
 def _is_id(leaf: Leaf) -> TypeGuard[NodeAttribute]:
@@ -698,13 +802,6 @@ _BARE: Final = frozenset(
     {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, DisplayUnit.own}
 )
 """What is told of a node without its tables."""
-
-
-def _owned(leaf: Leaf) -> frozenset[str]:
-    """Nodes of which it is asked whose numbers their ids are."""
-    if isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.owner:
-        return frozenset({leaf.node})
-    return frozenset()
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:
@@ -737,14 +834,6 @@ def _of_kind(leaf: Leaf) -> bool:
     )
 
 
-def _of_frame(leaf: Leaf) -> bool:
-    return isinstance(leaf, FrameAttribute) and leaf is not INVARIANT
-
-
-def _since_start(leaf: Leaf) -> bool:
-    return isinstance(leaf, FrameAttribute) and leaf.attribute.unit is DisplayUnit.seconds
-
-
 # Values that a binding has for a whole bucket: constants of entities, of parts of the map, and of traces ----
 # Results that are made of nothing else need no single frames; how often they count is the number of frames that
 # a mask holds.
@@ -761,7 +850,12 @@ def _join_lasting(
     """Join what lasting values come from to a relation of buckets; how each value is computed."""
     needed = list(needed)
     trace = f"{bucket} >> 18"
-    _join_trace_of(select, trace, [leaf for leaf in needed if isinstance(leaf, TraceAttribute)])
+    of_traces = [leaf for leaf in needed if isinstance(leaf, TraceAttribute)]
+    if of_traces:
+        select.join(f'"trace" AS {TRACE}', [f'{TRACE}."trace_id" = {trace}'])
+    if any(Home.map in leaf.attribute.columns for leaf in of_traces):
+        on = [f'{MAP}."map_id" = {TRACE}."map_id"']
+        select.join(f'"map" AS {MAP}', on, "LEFT JOIN")
     of_nodes = [leaf for leaf in needed if isinstance(leaf, NodeAttribute)]
     of_nodes = [leaf for leaf in of_nodes if leaf.attribute.unit is not DisplayUnit.binding]
     profiles = {leaf.node: Profile.of(scope.kinds(leaf.node), catalog) for leaf in of_nodes}
@@ -796,11 +890,3 @@ def _join_lasting(
             case _:
                 pass
     return texts
-
-
-def _join_trace_of(select: Select, trace: str, needed: list[TraceAttribute]) -> None:
-    if needed:
-        select.join(f'"trace" AS {TRACE}', [f'{TRACE}."trace_id" = {trace}'])
-    if any(Home.map in leaf.attribute.columns for leaf in needed):
-        on = [f'{MAP}."map_id" = {TRACE}."map_id"']
-        select.join(f'"map" AS {MAP}', on, "LEFT JOIN")

@@ -6,17 +6,14 @@ Presence of nodes and conditions on one node alone: as masks, a relation for eac
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from itertools import combinations, count, product
-from operator import eq, ge, gt, le, lt, ne
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang._catalog import Home
 from sgstore.lang._formulas import (
     Aliases,
     BoundValues,
-    Leaf,
     Select,
     among,
     bound_text,
@@ -38,27 +35,21 @@ from sgstore.lang._plan import (
     Phases,
     SharedRelation,
     apart,
-    phases_of,
     traces_of,
 )
 from sgstore.lang._rewrite import (
     FALSE,
     chain,
-    complement,
-    counted_block,
     narrowed,
     ordered,
     possible,
 )
 from sgstore.lang.ir import (
-    BlockValue,
     Bound,
     Edge,
     Node,
     NodeAttribute,
-    Operation,
     Scope,
-    blocks_of,
 )
 from sgstore.quoting import quoted
 from sgstore.vocabulary import entity_kinds
@@ -67,7 +58,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.lang._catalog import Catalog
-    from sgstore.lang._plan import Window
+    from sgstore.lang._plan import FoundRelation, Gathered, Window
     from sgstore.lang.ir import Kinds, Query
 
 
@@ -252,8 +243,6 @@ _MANY: Final = 5
 _BRANCHES: Final = 8
 """A pattern with paths is joined so many times at most, once for each length of its paths."""
 
-_COMPARED: Final = {"=": eq, "<>": ne, "<": lt, "<=": le, ">": gt, ">=": ge}
-
 
 @dataclass(slots=True)
 class Base:
@@ -316,39 +305,42 @@ class Base:
             self.bucket = self.bucket or f'{BUCKET}."bucket"'
 
 
-class Masks(ABC):
-    """Writes relations of the first phase for one query.
+@dataclass(slots=True)
+class SqlBuilder:
+    """SQL of one query in the making: its values, and relations that stand before it.
 
-    Parameters
+    Attributes
     ----------
     query : Query
         Rewritten.
     catalog : Catalog
     window : Window or None
         The buckets to look at; ``None``: all.
+    values : BoundValues
+    shared : list of (str, str)
+        Names and texts of relations that are used more than once.
+    found : FoundRelation or None
+        What is known already of the matches of the outermost scope.
+    gathered : tuple of Gathered
+        Tables that are spoken of and the store has not.
     """
 
-    def __init__(self, query: Query, catalog: Catalog, window: Window | None = None) -> None:
-        self.query, self.catalog, self.window = query, catalog, window
-        self.values = BoundValues()
-        self.shared: list[tuple[str, str]] = []
-        self._numbers = count(1)
-
-    @abstractmethod
-    def frames(
-        self,
-        scope: Scope,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str] = frozenset(),
-        columns: Iterable[Leaf] = (),
-    ) -> str:
-        """The relation of the second phase: one row a frame and binding of some nodes and edges."""
+    query: Query
+    catalog: Catalog
+    window: Window | None = None
+    values: BoundValues = field(default_factory=BoundValues)
+    shared: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    found: FoundRelation | None = None
+    gathered: tuple[Gathered, ...] = ()
 
     @property
     def standing(self) -> frozenset[str]:
         """Kinds of what is present by masks: static entities and parts of the map."""
         return self.catalog.fixed | self.catalog.mapped
+
+    def found_in(self, scope: Scope) -> FoundRelation | None:
+        """Matches of a scope, if they are known already."""
+        return self.found if scope is self.query.scope else None
 
     def within(self, column: str, per: int = 1) -> list[str]:
         """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window."""
@@ -361,72 +353,11 @@ class Masks(ABC):
             found.append(among(f"{column} >> {shift}", list(self.window.traces)))
         return found
 
-    def phases(self, scope: Scope) -> Phases:
-        """The conditions of a scope by phase."""
-        return phases_of(scope, self.query, self.catalog)
-
     def share(self, text: str, name: str) -> str:
         """The name under which a relation stands before the statement, to be used more than once."""
-        full = f"{name} {next(self._numbers)}"
+        full = f"{name} {len(self.shared) + 1}"
         self.shared.append((full, text))
         return full
-
-    def masks(
-        self,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str] = frozenset(),
-    ) -> str:
-        """The relation of the first phase: one row a bucket and binding of some nodes and edges."""
-        if not parts.blocks:
-            return self._base(scope, parts, given, nodes, edges)
-        outside = {key for c in parts.blocks for block in blocks_of(c) for key in block.scope.outer}
-        wide = nodes | frozenset(outside)
-        name = self.share(self._base(scope, parts, given, wide, edges), "pattern")
-        return self._with_blocks(parts.blocks, SharedRelation(name, wide, edges), nodes, edges)
-
-    def expanded(self, text: str, nodes: frozenset[str], edges: frozenset[str]) -> str:
-        """A relation of the first phase, one row a frame."""
-        keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
-        select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
-        select.join(nested(text, ":pattern"), [])
-        select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
-        return select.text()
-
-    def in_mask(self, alias: str, frame: str) -> str:
-        """Tell whether a frame of the same bucket is one of those in which a row of the first phase holds."""
-        return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
-
-    def number_of_frames(self, text: str) -> str:
-        """Return the number of frames of a first-phase relation that binds nothing, as ``frames``."""
-        total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
-        return Select([total], [nested(text, ":pattern")]).text()
-
-    def in_which(self, alias: str) -> list[str]:
-        """The columns that say in which frames a row of a relation of the first phase holds."""
-        return [f'{alias}."bucket"', f'{alias}."mask"']
-
-    def held(self, alias: str) -> str:
-        """In how many frames a row of a relation of the first phase holds."""
-        return f'bit_count({alias}."mask")'
-
-    def existence(self, scope: Scope, given: SharedRelation | None) -> str:
-        """In which frames a block has a match: one row a bucket and binding of the nodes outside."""
-        keys = frozenset(scope.outer)
-        parts = self.phases(scope)
-        if parts.rest or parts.late:
-            return folded(self.frames(scope, given, keys), columns_of(keys))
-        text = self.masks(scope, parts, given, keys)
-        if set(scope.nodes) and not parts.blocks:
-            return text  # grouped already, for the nodes inside are dropped
-        return merged(text, {column: column for column in columns_of(keys)})
-
-    @property
-    def chooses_traces(self) -> bool:
-        """Tell whether the query chooses some of the traces, by their ego or by a dataset."""
-        return self.query.ego is not None or self.catalog.only is not None
 
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
         """Conditions on a trace id that keep the traces that are asked, in the outermost scope."""
@@ -439,366 +370,379 @@ class Masks(ABC):
 
     # The join of edges and nodes
 
-    def _base(
-        self,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str],
-    ) -> str:
-        unfolded = self._unfolded(scope, parts, given, nodes, edges)
-        if unfolded:
-            return unfolded
-        base = Base()
-        if given is not None and scope.outer:
-            self._join_given(base, scope, given)
-        for edge in scope.edges:
-            self._join_edge(base, scope, edge)
-        single = dict(parts.single)
-        for key in scope.nodes:
-            if key not in parts.late and key not in base.present:
-                self._join_presence(base, key, scope.kinds(key), single.pop(key, []))
-        for key, conditions in single.items():
-            self._join_conditions(base, key, scope.kinds(key), conditions)
-        for key, conditions in parts.lane.items():
-            self._join_lane(base, next(e for e in scope.edges if e.key == key), conditions)
-        if not base.masks:  # all nodes wait for the second phase
-            base.need_bucket()
-            base.masks.append(f'{BUCKET}."valid"')
-        where, bound = base.select.where, set(base.nodes)
-        where += [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in apart(scope, bound, bound)]
-        where += [bound_text(c, base.nodes, base.edges, self.values) for c in parts.direct]
-        where += self.within(base.bucket)
-        where += self.of_traces(f"{base.bucket} >> 18", scope)
-        where += [trace_text(c, f"{base.bucket} >> 18", self.values) for c in parts.trace]
-        return _masked(base, nodes, edges)
 
-    def _join_given(self, base: Base, scope: Scope, given: SharedRelation) -> None:
-        """The bindings of the nodes outside that a block speaks of."""
-        columns = columns_of(frozenset(scope.outer))
-        table = f"{quoted(given.name)} AS {OUTSIDE}"
-        if given.edges or given.nodes != frozenset(scope.outer):
-            reduced = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
-            reduced.join(quoted(given.name), [])
-            reduced.group = ['"bucket"', *columns]
-            table = nested(reduced.text(), ":outside")
-        ends = zip(sorted(scope.outer), columns, strict=True)
-        base.join(table, OUTSIDE, {key: f"{OUTSIDE}.{column}" for key, column in ends})
+def expanded(text: str, nodes: frozenset[str], edges: frozenset[str]) -> str:
+    """A relation of the first phase, one row a frame."""
+    keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+    select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
+    select.join(nested(text, ":pattern"), [])
+    select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
+    return select.text()
 
-    def _join_edge(self, base: Base, scope: Scope, edge: Edge) -> None:
-        ends = scope.kinds(edge.src), scope.kinds(edge.dst)
-        moving = any(possible(edge, *ends, self.catalog.edges))
-        lasting = any(possible(edge, *ends, self.catalog.map_edges))
-        alias = quoted(alias_of(edge))
-        ends = {edge.src: f'{alias}."src"', edge.dst: f'{alias}."dst"'}
-        base.edges[edge.key] = f'{alias}."relation"'
-        if edge.src == edge.dst:
-            base.select.where.append(f'{alias}."src" = {alias}."dst"')
-        if edge.high > 1:
-            base.repeats = True
-            base.join(nested(self._paths(scope, edge), alias[1:-1]), alias, ends)
-        elif edge.both or (moving and lasting):
-            base.repeats = True
-            rows = self._rows(scope, edge, moving=moving, lasting=lasting)
-            base.join(nested(rows, alias[1:-1]), alias, ends)
-        elif lasting:
-            base.need_bucket()
-            on = edge_conditions(self.catalog, scope, edge, alias, moving=False)
-            on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
-            base.repeats |= len(edge.relations) > 1
-            base.tie(f'"map_edge" AS {alias}', ends, on)
-        else:
-            base.repeats |= len(edge.relations) > 1
-            base.join(
-                f'"edge" AS {alias}',
-                alias,
-                ends,
-                edge_conditions(self.catalog, scope, edge, alias, moving=True),
+
+def in_mask(alias: str, frame: str) -> str:
+    """Tell whether a frame of the same bucket is one of those in which a row of the first phase holds."""
+    return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
+
+
+def number_of_frames(text: str) -> str:
+    """Return the number of frames of a first-phase relation that binds nothing, as ``frames``."""
+    total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
+    return Select([total], [nested(text, ":pattern")]).text()
+
+
+def in_which(alias: str) -> list[str]:
+    """The columns that say in which frames a row of a relation of the first phase holds."""
+    return [f'{alias}."bucket"', f'{alias}."mask"']
+
+
+def held(alias: str) -> str:
+    """In how many frames a row of a relation of the first phase holds."""
+    return f'bit_count({alias}."mask")'
+
+
+def with_blocks(
+    blocks: Iterable[tuple[str, frozenset[str], bool]],
+    given: SharedRelation,
+    nodes: frozenset[str],
+    edges: frozenset[str],
+) -> str:
+    """A relation of the first phase with the frames in which blocks are true (or, of some, are not).
+
+    Parameters
+    ----------
+    blocks : iterable of (str, frozenset of str, bool)
+        Relation of each, the nodes outside that it speaks of, and whether it is to be true.
+    given : SharedRelation
+    nodes, edges : frozenset of str
+    """
+    select = Select()
+    select.join(f'{quoted(given.name)} AS ":pattern"', [])
+    mask = '":pattern"."mask"'
+    for number, (text, keys, wanted) in enumerate(blocks, start=1):
+        alias = f":block {number}"
+        on = [f'":pattern".{c} = {quoted(alias)}.{c}' for c in ('"bucket"', *columns_of(keys))]
+        select.join(nested(text, alias), on, "JOIN" if wanted else "LEFT JOIN")
+        theirs = f'{quoted(alias)}."mask"'
+        mask += f" & {theirs}" if wanted else f" & ~coalesce({theirs}, 0)"
+    select.where.append(f"({mask}) <> 0")
+    keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+    select.columns = ['":pattern"."bucket"', *keep, f'{mask} AS "mask"']
+    if nodes != given.nodes:
+        select.columns[-1] = f'bit_or({mask}) AS "mask"'
+        select.group = ['":pattern"."bucket"', *keep]
+    return select.text()
+
+
+def base_rows(
+    sql: SqlBuilder,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    nodes: frozenset[str],
+    edges: frozenset[str],
+) -> str:
+    unfolded = _unfolded(sql, scope, parts, given, nodes, edges)
+    if unfolded:
+        return unfolded
+    base = Base()
+    if given is not None and scope.outer:
+        _join_given(sql, base, scope, given)
+    for edge in scope.edges:
+        _join_edge(sql, base, scope, edge)
+    single = dict(parts.single)
+    for key in scope.nodes:
+        if key not in parts.late and key not in base.present:
+            _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
+    for key, conditions in single.items():
+        _join_conditions(sql, base, key, scope.kinds(key), conditions)
+    for key, conditions in parts.lane.items():
+        _join_lane(sql, base, next(e for e in scope.edges if e.key == key), conditions)
+    if not base.masks:  # all nodes wait for the second phase
+        base.need_bucket()
+        base.masks.append(f'{BUCKET}."valid"')
+    where, bound = base.select.where, set(base.nodes)
+    where += [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in apart(scope, bound, bound)]
+    where += [bound_text(c, base.nodes, base.edges, sql.values) for c in parts.direct]
+    where += sql.within(base.bucket)
+    where += sql.of_traces(f"{base.bucket} >> 18", scope)
+    where += [trace_text(c, f"{base.bucket} >> 18", sql.values) for c in parts.trace]
+    return _masked(base, nodes, edges)
+
+
+def _join_given(sql: SqlBuilder, base: Base, scope: Scope, given: SharedRelation) -> None:
+    """The bindings of the nodes outside that a block speaks of."""
+    columns = columns_of(frozenset(scope.outer))
+    table = f"{quoted(given.name)} AS {OUTSIDE}"
+    if given.edges or given.nodes != frozenset(scope.outer):
+        reduced = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
+        reduced.join(quoted(given.name), [])
+        reduced.group = ['"bucket"', *columns]
+        table = nested(reduced.text(), ":outside")
+    ends = zip(sorted(scope.outer), columns, strict=True)
+    base.join(table, OUTSIDE, {key: f"{OUTSIDE}.{column}" for key, column in ends})
+
+
+def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
+    ends = scope.kinds(edge.src), scope.kinds(edge.dst)
+    moving = any(possible(edge, *ends, sql.catalog.edges))
+    lasting = any(possible(edge, *ends, sql.catalog.map_edges))
+    alias = quoted(alias_of(edge))
+    ends = {edge.src: f'{alias}."src"', edge.dst: f'{alias}."dst"'}
+    base.edges[edge.key] = f'{alias}."relation"'
+    if edge.src == edge.dst:
+        base.select.where.append(f'{alias}."src" = {alias}."dst"')
+    if edge.high > 1:
+        base.repeats = True
+        base.join(nested(_paths(sql, scope, edge), alias[1:-1]), alias, ends)
+    elif edge.both or (moving and lasting):
+        base.repeats = True
+        rows = _rows(sql, scope, edge, moving=moving, lasting=lasting)
+        base.join(nested(rows, alias[1:-1]), alias, ends)
+    elif lasting:
+        base.need_bucket()
+        on = edge_conditions(sql.catalog, scope, edge, alias, moving=False)
+        on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
+        base.repeats |= len(edge.relations) > 1
+        base.tie(f'"map_edge" AS {alias}', ends, on)
+    else:
+        base.repeats |= len(edge.relations) > 1
+        base.join(
+            f'"edge" AS {alias}',
+            alias,
+            ends,
+            edge_conditions(sql.catalog, scope, edge, alias, moving=True),
+        )
+
+
+def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
+    """Rows of an edge that may run either way, or hold in frames as well as on the map."""
+    directions = (False, True) if edge.both else (False,)
+    branches: list[str] = []
+    for swapped in directions:
+        if moving or not lasting:
+            select = Select(_row_columns('"e"', '"e"."mask"', swapped=swapped))
+            select.join('"edge" AS "e"', [])
+            select.where = edge_conditions(
+                sql.catalog, scope, edge, '"e"', moving=True, swapped=swapped
             )
+            select.where += sql.within('"e"."bucket"')
+            branches.append(select.text())
+        if lasting:
+            branches.append(_lasting_rows(sql, scope, edge, swapped=swapped))
+    return "\nUNION ALL\n".join(branches)
 
-    def _rows(self, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
-        """Rows of an edge that may run either way, or hold in frames as well as on the map."""
-        directions = (False, True) if edge.both else (False,)
-        branches: list[str] = []
-        for swapped in directions:
-            if moving or not lasting:
-                select = Select(_row_columns('"e"', '"e"."mask"', swapped=swapped))
-                select.join('"edge" AS "e"', [])
-                select.where = edge_conditions(
-                    self.catalog, scope, edge, '"e"', moving=True, swapped=swapped
-                )
-                select.where += self.within('"e"."bucket"')
-                branches.append(select.text())
-            if lasting:
-                branches.append(self._lasting_rows(scope, edge, swapped=swapped))
-        return "\nUNION ALL\n".join(branches)
 
-    def _lasting_rows(self, scope: Scope, edge: Edge, *, swapped: bool) -> str:
-        """Rows of a map's edges with the frames in which both ends are present."""
-        mask = '"p"."mask" & "q"."mask"'
-        select = Select(_row_columns('"m"', mask, swapped=swapped))
-        select.columns[0] = '"p"."bucket" AS "bucket"'
-        select.join('"map_edge" AS "m"', [])
-        select.join('"bucket" AS "b"', ['"b"."map_id" = "m"."map_id"'])
-        for alias, end in (("p", "src"), ("q", "dst")):
-            select.join(
-                f'"node" AS "{alias}"',
-                [f'"{alias}"."bucket" = "b"."bucket"', f'"{alias}"."node_id" = "m"."{end}"'],
-            )
-        select.where = edge_conditions(
-            self.catalog, scope, edge, '"m"', moving=False, swapped=swapped
-        )
-        select.where += [f"({mask}) <> 0", *self.within('"b"."bucket"')]
-        return select.text()
-
-    def _unfolded(
-        self,
-        scope: Scope,
-        parts: Phases,
-        given: SharedRelation | None,
-        nodes: frozenset[str],
-        edges: frozenset[str],
-    ) -> str:
-        """The join, once for each length that its paths may have; empty if that is no use, or too often.
-
-        So a path begins where other edges lead, rather than anywhere.
-        """
-        paths = [edge for edge in scope.edges if edge.high > 1]
-        lengths = list(product(*(range(path.low, path.high + 1) for path in paths)))
-        wanted = any(path.key in edges for path in paths)
-        if not paths or wanted or len(paths) == len(scope.edges) or len(lengths) > _BRANCHES:
-            return ""
-        branches: list[str] = []
-        for chosen in lengths:
-            inner = scope
-            for path, length in zip(paths, chosen, strict=True):
-                inner = chain(inner, path, length, injective=self.query.injective)
-            inner = ordered(narrowed(inner, self.catalog), self.catalog)
-            if inner.where != (FALSE,):
-                branches.append(self._base(inner, parts, given, nodes, edges))
-        if not branches:
-            return ""
-        columns = ['"bucket"', *columns_of(nodes, edges)]
-        select = Select([*columns, 'bit_or("mask") AS "mask"'], group=columns)
-        select.join(nested("\nUNION ALL\n".join(branches), ":lengths"), [])
-        select.where = self.of_traces('"bucket" >> 18', scope)
-        return select.text()
-
-    def _paths(self, scope: Scope, edge: Edge) -> str:
-        """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
-        nodes = {
-            key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)
-        }
-        single = replace(edge, low=1, high=1)
-        branches: list[str] = []
-        for length in range(edge.low, edge.high + 1):
-            inner = Scope(nodes, {}, (single,), (), frozenset())
-            inner = chain(inner, single, length, injective=self.query.injective)
-            inner = ordered(narrowed(inner, self.catalog), self.catalog)
-            if inner.where != (FALSE,):
-                rows = self._base(inner, Phases(), None, frozenset(nodes), frozenset())
-                ends = ((edge.src, "src"), (edge.dst, "dst"))
-                columns = [f'{quoted(f"{key}.id")} AS "{end}"' for key, end in ends]
-                select = Select(['"bucket"', *columns, '"mask"'], [nested(rows, ":path")])
-                branches.append(select.text())
-        if not branches:
-            columns = ['"bucket"', '"src"', '"dst"', '"mask"']
-            branches.append(Select(columns, ['"edge"'], ["FALSE"]).text())
-        return "\nUNION ALL\n".join(branches)
-
-    # Presence and conditions
-
-    def _join_presence(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
-        """The frames in which a node is present and meets conditions on its attributes."""
-        alias = quoted(f"{key}:")
-        profile = Profile.of(kinds, self.catalog)
-        if profile.moving or conditions:
-            rows = self._present(kinds, profile, conditions)
-            base.join(nested(rows, f"{key}:"), alias, {key: f'{alias}."node_id"'})
-        else:
-            on = kind_conditions(kinds, f'{alias}."kind"', None, self.standing)
-            base.join(f'"node" AS {alias}', alias, {key: f'{alias}."node_id"'}, on)
-
-    def _join_conditions(self, base: Base, key: str, kinds: Kinds, conditions: list[Bound]) -> None:
-        """The frames in which a node that is present meets conditions on its attributes."""
-        profile, alias = Profile.of(kinds, self.catalog), quoted(f"{key}:")
-        constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
-        if profile.mapped and profile.places == 1:
-            base.need_bucket()
-            table, at = "map_node", Aliases(map=alias)
-            on = [f'{alias}."map_id" = {BUCKET}."map_id"']
-        elif constant and not profile.mapped:
-            table, at = "entity", Aliases(entity=alias)
-            on = [f'{alias}."trace_id" = {base.bucket} >> 18']
-        else:
-            self._join_presence(base, key, kinds, conditions)
-            return
-        node = f'{alias}."node_id"'
-        base.tie(f'"{table}" AS {alias}', {key: node}, on)
-        base.select.where += [node_text(c, node, at, self.values) for c in conditions]
-
-    def _join_lane(self, base: Base, edge: Edge, conditions: list[Bound]) -> None:
-        """The frames in which an edge meets conditions on its attributes."""
-        frame = '"l"."frame_id"'
-        table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
-        ends = [f'"l".{quoted(column)}' for column in nodes]
-        select = Select(
-            [f'{frame} >> 6 AS "bucket"', *ends, f'bit_or({bit_of(frame)}) AS "mask"'],
-            [f'{quoted(table)} AS "l"'],
-            self.within(frame, 64),
-            [f"{frame} >> 6", *ends],
-        )
-        select.where += [
-            expression_text(c, lambda leaf: lane_text(leaf, '"l"'), self.values) for c in conditions
-        ]
-        name = f"{edge.key}:in"
-        alias = quoted(name)
-        on = [f"{alias}.{quoted(column)} = {node}" for column, node in nodes.items()]
-        base.join(nested(select.text(), name), alias, {}, on)
-
-    def _present(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-        """Frames in which nodes are present and meet conditions, for each place where they may live."""
-        branches: list[str] = []
-        if (
-            profile.moving
-            and not conditions
-            and not kinds.other
-            and profile.moving >= (self.catalog.moving & entity_kinds())
-        ):
-            branches.append(self._ego())
-        elif profile.moving:
-            branches.append(self._moving(kinds, profile, conditions))
-        if profile.fixed:
-            branches.append(self._standing(kinds.only(profile.fixed), conditions, "fixed"))
-        if profile.mapped:
-            branches.append(self._standing(kinds.only(profile.mapped), conditions, "mapped"))
-        return "\nUNION ALL\n".join(branches)
-
-    def _ego(self) -> str:
-        select = Select(['"bucket"', '"ego" AS "node_id"', f'bit_or({bit_of(_BIT)}) AS "mask"'])
-        select.join('"frame"', ['"ego" IS NOT NULL', *self.within('"bucket"')])
-        select.group = ['"bucket"', '"ego"']
-        return select.text()
-
-    def _moving(self, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-        frame, node = '"s"."frame_id"', '"s"."node_id"'
-        select = Select(
-            [f'{frame} >> 6 AS "bucket"', node, f'bit_or({bit_of(frame)}) AS "mask"'],
-            group=[f"{frame} >> 6", node],
-        )
+def _lasting_rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, swapped: bool) -> str:
+    """Rows of a map's edges with the frames in which both ends are present."""
+    mask = '"p"."mask" & "q"."mask"'
+    select = Select(_row_columns('"m"', mask, swapped=swapped))
+    select.columns[0] = '"p"."bucket" AS "bucket"'
+    select.join('"map_edge" AS "m"', [])
+    select.join('"bucket" AS "b"', ['"b"."map_id" = "m"."map_id"'])
+    for alias, end in (("p", "src"), ("q", "dst")):
         select.join(
-            '"state" AS "s"',
-            kind_conditions(kinds, '"s"."kind"', '"s"."is_ego"', self.catalog.moving),
+            f'"node" AS "{alias}"',
+            [f'"{alias}"."bucket" = "b"."bucket"', f'"{alias}"."node_id" = "m"."{end}"'],
         )
-        select.where += self.within(frame, 64)
-        found = [leaf for c in conditions for leaf in leaves(c) if isinstance(leaf, NodeAttribute)]
-        homes = {home for leaf in found for home in homes_of(leaf.attribute, profile)}
-        entity = '"n"' if Home.entity in homes else None
-        if entity:
-            on = [f'"n"."trace_id" = {frame} >> 24', f'"n"."node_id" = {node}']
-            select.join('"entity" AS "n"', on)
-        at = Aliases('"s"', entity, None, self._join_trace(select, f"{frame} >> 24", conditions))
-        select.where += [node_text(c, node, at, self.values) for c in conditions]
-        return select.text()
-
-    def _standing(self, kinds: Kinds, conditions: list[Bound], place: str) -> str:
-        bucket, node = '"p"."bucket"', '"p"."node_id"'
-        select = Select([bucket, node, '"p"."mask"'])
-        select.join('"node" AS "p"', kind_conditions(kinds, '"p"."kind"', None, self.standing))
-        select.where += [f"{node} {'>=' if place == 'fixed' else '<'} 0", *self.within(bucket)]
-        at = Aliases()
-        if conditions and place == "fixed":
-            on = [f'"n"."trace_id" = {bucket} >> 18', f'"n"."node_id" = {node}']
-            select.join('"entity" AS "n"', on)
-            trace = self._join_trace(select, f"{bucket} >> 18", conditions)
-            at = Aliases(entity='"n"', trace=trace)
-        elif conditions:
-            select.join('"bucket" AS "b"', [f'"b"."bucket" = {bucket}'])
-            on = ['"n"."map_id" = "b"."map_id"', f'"n"."node_id" = {node}']
-            select.join('"map_node" AS "n"', on)
-            at = Aliases(map='"n"')
-        select.where += [node_text(c, node, at, self.values) for c in conditions]
-        return select.text()
-
-    def _join_trace(self, select: Select, trace: str, conditions: list[Bound]) -> str | None:
-        """The row of the trace, if a condition is on a position, which is stored about the trace's origin."""
-        if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
-            return None
-        select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
-        return '"t"'
-
-    # Blocks
-
-    def _with_blocks(
-        self,
-        blocks: list[Bound],
-        given: SharedRelation,
-        nodes: frozenset[str],
-        edges: frozenset[str],
-    ) -> str:
-        """A relation of the first phase with the frames in which blocks are true."""
-        select = Select()
-        select.join(f'{quoted(given.name)} AS ":pattern"', [])
-        mask = '":pattern"."mask"'
-        for number, condition in enumerate(blocks, start=1):
-            text, keys, wanted = self._block(condition, given)
-            alias = f":block {number}"
-            on = [f'":pattern".{c} = {quoted(alias)}.{c}' for c in ('"bucket"', *columns_of(keys))]
-            select.join(nested(text, alias), on, "JOIN" if wanted else "LEFT JOIN")
-            theirs = f'{quoted(alias)}."mask"'
-            mask += f" & {theirs}" if wanted else f" & ~coalesce({theirs}, 0)"
-        select.where.append(f"({mask}) <> 0")
-        keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
-        select.columns = ['":pattern"."bucket"', *keep, f'{mask} AS "mask"']
-        if nodes != given.nodes:
-            select.columns[-1] = f'bit_or({mask}) AS "mask"'
-            select.group = ['":pattern"."bucket"', *keep]
-        return select.text()
-
-    def _block(self, condition: Bound, given: SharedRelation) -> tuple[str, frozenset[str], bool]:
-        """Return where a block is true (or, if the last is false, where it is not), and its outer nodes."""
-        match condition:
-            case BlockValue(scope=scope):
-                return self.existence(scope, given), frozenset(scope.outer), True
-            case Operation("NOT", (BlockValue(scope=scope),)):
-                return self.existence(scope, given), frozenset(scope.outer), False
-            case _:
-                return self._block_counted(condition, given)
-
-    def _block_counted(
-        self, condition: Bound, given: SharedRelation
-    ) -> tuple[str, frozenset[str], bool]:
-        counted = counted_block(condition)
-        assert counted is not None, condition  # noqa: S101 - it was filed so
-        block, sign, number = counted
-        wanted = not _COMPARED[sign](0, number)
-        sign = sign if wanted else complement(sign)
-        keys = frozenset(block.scope.outer)
-        parts = self.phases(block.scope)
-        if not (parts.rest or parts.late):
-            rows = self.masks(block.scope, parts, given, *_told_apart(block.scope))
-            name = self.share(rows, "counted")
-            return frames_with(name, columns_of(keys), CountRange.of(sign, number)), keys, wanted
-        select = Select(['"frame_id"', *columns_of(keys)])
-        select.join(nested(self.counted(block, given), ":counted"), [])
-        select.group = ['"frame_id"', *columns_of(keys)]
-        select.having = [f"count(*) {sign} {self.values.add(number)}"]
-        return folded(select.text(), columns_of(keys)), keys, wanted
-
-    def counted(
-        self, block: BlockValue, given: SharedRelation | None, columns: Iterable[Leaf] = ()
-    ) -> str:
-        """The matches of a block, one row each and frame."""
-        nodes, edges = _told_apart(block.scope)
-        return self.frames(block.scope, given, nodes, edges, columns)
+    select.where = edge_conditions(sql.catalog, scope, edge, '"m"', moving=False, swapped=swapped)
+    select.where += [f"({mask}) <> 0", *sql.within('"b"."bucket"')]
+    return select.text()
 
 
-def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Nodes and edges by which the matches of a block differ, and the nodes outside that it speaks of."""
-    nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
-    edges = frozenset(edge.key for edge in scope.edges if edge.named)
-    return frozenset(nodes) | frozenset(scope.outer), edges
+def _unfolded(
+    sql: SqlBuilder,
+    scope: Scope,
+    parts: Phases,
+    given: SharedRelation | None,
+    nodes: frozenset[str],
+    edges: frozenset[str],
+) -> str:
+    """The join, once for each length that its paths may have; empty if that is no use, or too often.
+
+    So a path begins where other edges lead, rather than anywhere.
+    """
+    paths = [edge for edge in scope.edges if edge.high > 1]
+    lengths = list(product(*(range(path.low, path.high + 1) for path in paths)))
+    wanted = any(path.key in edges for path in paths)
+    if not paths or wanted or len(paths) == len(scope.edges) or len(lengths) > _BRANCHES:
+        return ""
+    branches: list[str] = []
+    for chosen in lengths:
+        inner = scope
+        for path, length in zip(paths, chosen, strict=True):
+            inner = chain(inner, path, length, injective=sql.query.injective)
+        inner = ordered(narrowed(inner, sql.catalog), sql.catalog)
+        if inner.where != (FALSE,):
+            branches.append(base_rows(sql, inner, parts, given, nodes, edges))
+    if not branches:
+        return ""
+    columns = ['"bucket"', *columns_of(nodes, edges)]
+    select = Select([*columns, 'bit_or("mask") AS "mask"'], group=columns)
+    select.join(nested("\nUNION ALL\n".join(branches), ":lengths"), [])
+    select.where = sql.of_traces('"bucket" >> 18', scope)
+    return select.text()
+
+
+def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
+    """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
+    nodes = {key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)}
+    single = replace(edge, low=1, high=1)
+    branches: list[str] = []
+    for length in range(edge.low, edge.high + 1):
+        inner = Scope(nodes, {}, (single,), (), frozenset())
+        inner = chain(inner, single, length, injective=sql.query.injective)
+        inner = ordered(narrowed(inner, sql.catalog), sql.catalog)
+        if inner.where != (FALSE,):
+            rows = base_rows(sql, inner, Phases(), None, frozenset(nodes), frozenset())
+            ends = ((edge.src, "src"), (edge.dst, "dst"))
+            columns = [f'{quoted(f"{key}.id")} AS "{end}"' for key, end in ends]
+            select = Select(['"bucket"', *columns, '"mask"'], [nested(rows, ":path")])
+            branches.append(select.text())
+    if not branches:
+        columns = ['"bucket"', '"src"', '"dst"', '"mask"']
+        branches.append(Select(columns, ['"edge"'], ["FALSE"]).text())
+    return "\nUNION ALL\n".join(branches)
+
+
+def _join_presence(
+    sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
+) -> None:
+    """The frames in which a node is present and meets conditions on its attributes."""
+    alias = quoted(f"{key}:")
+    profile = Profile.of(kinds, sql.catalog)
+    if profile.moving or conditions:
+        rows = _present(sql, kinds, profile, conditions)
+        base.join(nested(rows, f"{key}:"), alias, {key: f'{alias}."node_id"'})
+    else:
+        on = kind_conditions(kinds, f'{alias}."kind"', None, sql.standing)
+        base.join(f'"node" AS {alias}', alias, {key: f'{alias}."node_id"'}, on)
+
+
+def _join_conditions(
+    sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
+) -> None:
+    """The frames in which a node that is present meets conditions on its attributes."""
+    profile, alias = Profile.of(kinds, sql.catalog), quoted(f"{key}:")
+    constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
+    if profile.mapped and profile.places == 1:
+        base.need_bucket()
+        table, at = "map_node", Aliases(map=alias)
+        on = [f'{alias}."map_id" = {BUCKET}."map_id"']
+    elif constant and not profile.mapped:
+        table, at = "entity", Aliases(entity=alias)
+        on = [f'{alias}."trace_id" = {base.bucket} >> 18']
+    else:
+        _join_presence(sql, base, key, kinds, conditions)
+        return
+    node = f'{alias}."node_id"'
+    base.tie(f'"{table}" AS {alias}', {key: node}, on)
+    base.select.where += [node_text(c, node, at, sql.values) for c in conditions]
+
+
+def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound]) -> None:
+    """The frames in which an edge meets conditions on its attributes."""
+    frame = '"l"."frame_id"'
+    table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
+    ends = [f'"l".{quoted(column)}' for column in nodes]
+    select = Select(
+        [f'{frame} >> 6 AS "bucket"', *ends, f'bit_or({bit_of(frame)}) AS "mask"'],
+        [f'{quoted(table)} AS "l"'],
+        sql.within(frame, 64),
+        [f"{frame} >> 6", *ends],
+    )
+    select.where += [
+        expression_text(c, lambda leaf: lane_text(leaf, '"l"'), sql.values) for c in conditions
+    ]
+    name = f"{edge.key}:in"
+    alias = quoted(name)
+    on = [f"{alias}.{quoted(column)} = {node}" for column, node in nodes.items()]
+    base.join(nested(select.text(), name), alias, {}, on)
+
+
+def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
+    """Frames in which nodes are present and meet conditions, for each place where they may live."""
+    branches: list[str] = []
+    if (
+        profile.moving
+        and not conditions
+        and not kinds.other
+        and profile.moving >= (sql.catalog.moving & entity_kinds())
+    ):
+        branches.append(
+            _ego(
+                sql,
+            )
+        )
+    elif profile.moving:
+        branches.append(_moving(sql, kinds, profile, conditions))
+    if profile.fixed:
+        branches.append(_standing(sql, kinds.only(profile.fixed), conditions, "fixed"))
+    if profile.mapped:
+        branches.append(_standing(sql, kinds.only(profile.mapped), conditions, "mapped"))
+    return "\nUNION ALL\n".join(branches)
+
+
+def _ego(
+    sql: SqlBuilder,
+) -> str:
+    select = Select(['"bucket"', '"ego" AS "node_id"', f'bit_or({bit_of(_BIT)}) AS "mask"'])
+    select.join('"frame"', ['"ego" IS NOT NULL', *sql.within('"bucket"')])
+    select.group = ['"bucket"', '"ego"']
+    return select.text()
+
+
+def _moving(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
+    frame, node = '"s"."frame_id"', '"s"."node_id"'
+    select = Select(
+        [f'{frame} >> 6 AS "bucket"', node, f'bit_or({bit_of(frame)}) AS "mask"'],
+        group=[f"{frame} >> 6", node],
+    )
+    select.join(
+        '"state" AS "s"',
+        kind_conditions(kinds, '"s"."kind"', '"s"."is_ego"', sql.catalog.moving),
+    )
+    select.where += sql.within(frame, 64)
+    found = [leaf for c in conditions for leaf in leaves(c) if isinstance(leaf, NodeAttribute)]
+    homes = {home for leaf in found for home in homes_of(leaf.attribute, profile)}
+    entity = '"n"' if Home.entity in homes else None
+    if entity:
+        on = [f'"n"."trace_id" = {frame} >> 24', f'"n"."node_id" = {node}']
+        select.join('"entity" AS "n"', on)
+    at = Aliases('"s"', entity, None, _join_trace(sql, select, f"{frame} >> 24", conditions))
+    select.where += [node_text(c, node, at, sql.values) for c in conditions]
+    return select.text()
+
+
+def _standing(sql: SqlBuilder, kinds: Kinds, conditions: list[Bound], place: str) -> str:
+    bucket, node = '"p"."bucket"', '"p"."node_id"'
+    select = Select([bucket, node, '"p"."mask"'])
+    select.join(
+        '"node" AS "p"',
+        kind_conditions(kinds, '"p"."kind"', None, sql.standing),
+    )
+    select.where += [f"{node} {'>=' if place == 'fixed' else '<'} 0", *sql.within(bucket)]
+    at = Aliases()
+    if conditions and place == "fixed":
+        on = [f'"n"."trace_id" = {bucket} >> 18', f'"n"."node_id" = {node}']
+        select.join('"entity" AS "n"', on)
+        trace = _join_trace(sql, select, f"{bucket} >> 18", conditions)
+        at = Aliases(entity='"n"', trace=trace)
+    elif conditions:
+        select.join('"bucket" AS "b"', [f'"b"."bucket" = {bucket}'])
+        on = ['"n"."map_id" = "b"."map_id"', f'"n"."node_id" = {node}']
+        select.join('"map_node" AS "n"', on)
+        at = Aliases(map='"n"')
+    select.where += [node_text(c, node, at, sql.values) for c in conditions]
+    return select.text()
+
+
+def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bound]) -> str | None:
+    """The row of the trace, if a condition is on a position, which is stored about the trace's origin."""
+    if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
+        return None
+    select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
+    return '"t"'
 
 
 def _masked(base: Base, nodes: frozenset[str], edges: frozenset[str]) -> str:
