@@ -24,7 +24,7 @@ from sgstore.lang import (
 from sgstore.lang.ir import Query, Result
 from sgstore.matches import Interval, notes_in
 from sgstore.temporal._formula import tolerant
-from sgstore.temporal._offline import Ask, PlanValues, TraceReader, asks_of, traces
+from sgstore.temporal._offline import PlanValues, TraceReader, traces
 from sgstore.temporal._plan import Plan
 from sgstore.temporal._verdicts import (
     CERTAINLY_TRUE,
@@ -463,11 +463,10 @@ class _Check:
     def verdicts(self) -> Iterator[Verdict]:
         """The verdict of each trace, by name of the trace."""
         gaps = "bridge" if self._check.gaps == "bridge" else "break"
-        asks: dict[str, Ask] = asks_of(self._plan)
         self._read_people()
         lacks = lacking(self._file, self._catalog, of_check(self._check))
         catalog = replace(self._catalog, unknowing=frozenset(lacks))
-        told = traces(self._file, catalog, self._whole, asks, gaps=gaps)
+        told = traces(self._file, catalog, self._whole, self._plan.asks, gaps=gaps)
         known = (self._verdict(trace) for trace in told if len(trace))
         unknown = self._unknown(catalog, lacks)
         yield from merge(known, unknown, key=lambda verdict: natural(verdict.trace))
@@ -554,9 +553,8 @@ class _Check:
         """
         if not len(bindings):
             return bindings, np.zeros(0, np.int64)
-        asks = asks_of(self._plan)
         found: list[Ints] = []
-        for name, ask in asks.items():
+        for name, ask in self._plan.asks.items():
             columns = [self._variables.index(v) for v in ask.variables]
             found.append(trace.relations[name].find(bindings[:, columns]))
         if not found:

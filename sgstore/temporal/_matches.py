@@ -9,21 +9,20 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.lang import ExternalRelation, Window, of_query, relation, value_text, with_places
-from sgstore.lang.ir import Bound, Query, Result, SignalCall, StepTime, Tense
+from sgstore.lang.ir import Bound, Query, SignalCall, StepTime, Tense
 from sgstore.matches import Matches
 from sgstore.store import BUCKET_BITS
 from sgstore.temporal._checks import lacking
 from sgstore.temporal._formula import formula_text
-from sgstore.temporal._offline import (
-    Ask,
-    PlanValues,
-    TimedRelation,
-    TraceReader,
-    asks_of,
-    traces,
-    words,
+from sgstore.temporal._offline import PlanValues, TimedRelation, TraceReader, traces, words
+from sgstore.temporal._plan import (
+    ask_of_step,
+    hold_text,
+    link_text,
+    needs_text,
+    plan_of_steps,
+    sql_text,
 )
-from sgstore.temporal._plan import hold_text, link_text, needs_text, plan_of_steps, sql_text
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Generator, Iterator, Sequence
@@ -31,9 +30,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, Column, Compiled
-    from sgstore.lang.ir import BoundHold, BoundStep, Length, StepLink
+    from sgstore.lang.ir import BoundHold, Length, StepLink
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
+    from sgstore.temporal._plan import Ask
     from sgstore.temporal._signals import Clock
     from sgstore.world import Bools, Ints
 
@@ -357,19 +357,9 @@ class Finder:
         self._file, self._query, self._catalog = file, query, catalog
         self._plan = plan_of_steps(query, query.steps)
         self._when = [tuple(map(self._plan.formula, step.when)) for step in query.steps]
-        self._steps = [self._ask(step) for step in query.steps]
         self._kept = tuple(sorted(query.scope.nodes))
+        self._steps = [ask_of_step(query, step, self._kept) for step in query.steps]
         self._edges = tuple(edge.key for edge in query.scope.edges)
-
-    def _ask(self, step: BoundStep) -> Ask:
-        """The pattern of a step; what only matters in it is bound too where its conditions need that."""
-        kept = set(self._query.scope.nodes)
-        if step.when:
-            kept |= set(step.scope.nodes)
-        variables = tuple(sorted(kept & set(step.scope.nodes)))
-        edges = tuple(sorted(edge.key for edge in step.scope.edges if edge.named))
-        query = replace(self._query, scope=step.scope, result=Result(), steps=(), links=())
-        return Ask(query, variables, (), () if step.absent else edges)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
         """The matches in a window, or in the whole traces that it is a part of.
@@ -388,8 +378,7 @@ class Finder:
         for place in places:
             if place not in formulas and not isinstance(place, StepTime):
                 self._plan.test(place)
-        asks = asks_of(self._plan)
-        asks |= {f"step {number}": ask for number, ask in enumerate(self._steps)}
+        asks = self._plan.asks | {f"step {number}": ask for number, ask in enumerate(self._steps)}
         found = _MatchCollector(values=[[] for _ in range(len(places) + self._spans * 2)])
         about = self._file, self._catalog, self._query, asks
         for trace in traces(*about, gaps=self._query.gaps, within=window):
@@ -409,8 +398,7 @@ class Finder:
             lines += [f"    when {formula_text(formula)}" for formula in self._when[number]]
             lines += [f"    {hold_text(step.hold)}"] if step.hold else []
             if not ask.everywhere:
-                bound = {*ask.variables, *ask.edges}
-                lines += sql_text(relation(ask.query, self._catalog, None, (), bound))
+                lines += sql_text(relation(ask.query, self._catalog, None, (), {*ask.columns}))
         for place in places:
             if not isinstance(place, StepTime):
                 told = self._plan.formula(place) if _is_condition(place) else None
@@ -457,8 +445,7 @@ class Finder:
         for formula in self._when[number]:
             kept &= self._true(trace, relation, ask, formula, owners)
         keys, frames = relation.keys[owners[kept]], relation.frames[kept]
-        columns = (*ask.variables, *ask.edges)
-        keys = keys[:, [columns.index(name) for name in self._named(number)]]
+        keys = keys[:, [ask.columns.index(name) for name in self._named(number)]]
         relation = TimedRelation.of(frames, keys)
         if step.hold is None:
             return relation

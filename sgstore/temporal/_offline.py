@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog, Window
     from sgstore.lang.ir import Bound, Query
     from sgstore.store import StoreFile
-    from sgstore.temporal._plan import Plan, Signal, Test
+    from sgstore.temporal._plan import Ask, Plan, Test
     from sgstore.world import Bools, Ints
 
     Keys = NDArray[np.int64]
@@ -146,38 +146,6 @@ CELLS: Final = 4_000_000
 """Bindings times frames that are worked on at once."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ask:
-    """A relation that is asked of a store.
-
-    Attributes
-    ----------
-    query : Query
-        The pattern.
-    variables : tuple of str
-        Keys of its nodes that are bound: the columns of the relation's keys.
-    values : tuple of Bound
-        Asked of each match.
-    edges : tuple of str
-        Keys of its edges that are bound: further columns of the keys, places in :func:`words`.
-    first : bool
-        Whether these are no columns, and of matches that differ in them alone the one counts whose relations
-        come first.
-    """
-
-    query: Query
-    variables: tuple[str, ...]
-    values: tuple[Bound, ...] = ()
-    edges: tuple[str, ...] = ()
-    first: bool = False
-
-    @property
-    def everywhere(self) -> bool:
-        """Tell whether it asks nothing, and so holds in every frame."""
-        scope = self.query.scope
-        return not (scope.nodes or scope.edges or scope.where)
-
-
 @dataclass(slots=True)
 class TraceReader:
     """One trace while it is looked at.
@@ -267,7 +235,7 @@ class PlanValues:
         values = SignalValues(test, clock, self._signal, condition, self._proposition)
         return values.column(evaluator_over_time(test))
 
-    def _signal(self, signal: Signal) -> Column:
+    def _signal(self, signal: Ask) -> Column:
         found = self._trace.relations[signal.name]
         places = found.find(self._projected(signal.variables))
         return found.column(places, len(self._trace))
@@ -276,16 +244,6 @@ class PlanValues:
         if not variables:
             return np.zeros((1, 0), np.int64)
         return self._bindings[:, [self._variables.index(name) for name in variables]]
-
-
-def asks_of(plan: Plan) -> dict[str, Ask]:
-    """Return the questions of a plan to a store, by the names of its atoms and signals."""
-    atoms = {name: Ask(atom.query, atom.variables) for name, atom in plan.atoms.items()}
-    signals = {
-        name: Ask(signal.query, signal.variables, (signal.value,), signal.edges, first=True)
-        for name, signal in plan.signals.items()
-    }
-    return atoms | signals
 
 
 def traces(
@@ -393,15 +351,15 @@ def _relate(
             every = np.arange(len(trace))
             trace.relations[name] = TimedRelation.of(every, np.zeros((len(trace), 0), np.int64))
         return 0
-    bound = {*ask.variables, *ask.edges}
-    statement = relation(ask.query, catalog, window, ask.values, bound)
+    asked = () if ask.value is None else (ask.value,)
+    statement = relation(ask.query, catalog, window, asked, {*ask.variables, *ask.edges})
     arrays = file.arrays(statement.sql, statement.values)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
     columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
     keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
-    values = [arrays[f":{number}"] for number in range(len(ask.values))]
-    told = len(ask.variables) if ask.first else keys.shape[1]
+    values = [arrays[":0"]] if asked else []
+    told = len(ask.columns)
     order = np.lexsort((*keys.T[told:][::-1], ids))
     keys = keys[:, :told]
     ids, keys, values = ids[order], keys[order], [value[order] for value in values]

@@ -50,37 +50,40 @@ TRUE: Final = b.Value(value=True, type=Type.boolean)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Atom:
-    """A condition on one frame.
+class Ask:
+    """A question about single frames: an atom, a signal, or the pattern of a step.
 
     Attributes
     ----------
     name : str
-        The proposition.
+        Of an atom the proposition.
     query : Query
         Its nodes and the condition; matches say where it is true.
     variables : tuple of str
         Those of its nodes that a binding speaks of, in order; the others (the ego) are only asked to exist.
+    value : Bound or None
+        What is asked of each match: of a signal.
+    edges : tuple of str
+        Keys of its edges that a binding speaks of, too. Of a signal those that its value speaks of: of matches
+        that differ in these alone, the one counts whose relations come first in the alphabet.
     """
 
     name: str
     query: b.Query
     variables: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Signal:
-    """A value of one frame: the one column of ``query``; ``variables`` as of :class:`Atom`.
-
-    ``edges`` are the keys of the edges that it speaks of: of matches that differ in these alone, the one counts
-    whose relations come first in the alphabet.
-    """
-
-    name: str
-    query: b.Query
-    variables: tuple[str, ...]
-    value: b.Bound
+    value: b.Bound | None = None
     edges: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Keys of the nodes and edges that a binding speaks of."""
+        return (*self.variables, *self.edges) if self.value is None else self.variables
+
+    @property
+    def everywhere(self) -> bool:
+        """Tell whether it asks nothing, and so holds in every frame."""
+        scope = self.query.scope
+        return not (scope.nodes or scope.edges or scope.where)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +97,7 @@ class Test:
     expression : Bound
         Constants, operations and courses; other parts are the values of ``signals``.
     variables : tuple of str
-    signals : dict of Bound to Signal
+    signals : dict of Bound to Ask
         By the part of the expression that each is.
     formulas : dict of Bound to Formula
         Of the conditions within ``run_length`` and ``since_true``.
@@ -105,7 +108,7 @@ class Test:
     name: str
     expression: b.Bound
     variables: tuple[str, ...]
-    signals: dict[b.Bound, Signal] = field(default_factory=dict[b.Bound, Signal])
+    signals: dict[b.Bound, Ask] = field(default_factory=dict[b.Bound, Ask])
     formulas: dict[b.Bound, f.Formula] = field(default_factory=dict[b.Bound, f.Formula])
     presence: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -127,17 +130,23 @@ class Plan:
 
     Attributes
     ----------
-    atoms, signals, tests : dict of str to Atom, Signal, Test
+    atoms, signals : dict of str to Ask
+    tests : dict of str to Test
         By name.
     """
 
     whole: b.Query
     bound: frozenset[str]
     absent: frozenset[str] = frozenset()
-    atoms: dict[str, Atom] = field(default_factory=dict[str, Atom])
-    signals: dict[str, Signal] = field(default_factory=dict[str, Signal])
+    atoms: dict[str, Ask] = field(default_factory=dict[str, Ask])
+    signals: dict[str, Ask] = field(default_factory=dict[str, Ask])
     tests: dict[str, Test] = field(default_factory=dict[str, Test])
     _names: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def asks(self) -> dict[str, Ask]:
+        """All that is asked of single frames, by name."""
+        return self.atoms | self.signals
 
     def formula(self, expression: b.Bound) -> f.Formula:
         """The formula of a condition; atoms and tests that it needs become part of the plan."""
@@ -241,7 +250,7 @@ class Plan:
         if name is None:
             name = self._names[key] = f"a{len(self.atoms) + 1}"
             where = () if expression == TRUE else tuple(b.conjuncts(_two_valued(expression)))
-            self.atoms[name] = Atom(name, self._query(things, where), self._variables(things))
+            self.atoms[name] = Ask(name, self._query(things, where), self._variables(things))
         return self._lapsing(name, frozenset() if expression == TRUE else things)
 
     def _lapsing(self, name: str, things: Iterable[str]) -> f.Formula:
@@ -281,14 +290,14 @@ class Plan:
             case _:
                 test.signals[expression] = self._signal(expression)
 
-    def _signal(self, value: b.Bound) -> Signal:
+    def _signal(self, value: b.Bound) -> Ask:
         things, edges = self._things(value), tuple(sorted(b.edges_of(value)))
         key = ":" + unnumbered_text(value) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
             name = self._names[key] = f"s{len(self.signals) + 1}"
             query = self._query(things, ())
-            self.signals[name] = Signal(name, query, self._variables(things), value, edges)
+            self.signals[name] = Ask(name, query, self._variables(things), value, edges)
         return self.signals[name]
 
     def _variables(self, things: frozenset[str]) -> tuple[str, ...]:
@@ -317,6 +326,15 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
     scope = b.Scope(nodes, {}, edges, (), frozenset())
     whole = replace(query, scope=scope, result=b.Result(), steps=(), links=())
     return Plan(whole, frozenset(nodes))
+
+
+def ask_of_step(query: b.Query, step: BoundStep, kept: Iterable[str]) -> Ask:
+    """Return the pattern of a step; all its nodes are bound where its conditions need that, else those kept."""
+    scope = step.scope
+    bound = scope.nodes.keys() if step.when else scope.nodes.keys() & set(kept)
+    edges = () if step.absent else sorted(edge.key for edge in scope.edges if edge.named)
+    pattern = replace(query, scope=scope, result=b.Result(), steps=(), links=())
+    return Ask("", pattern, tuple(sorted(bound)), None, tuple(edges))
 
 
 def _all(parts: list[b.Bound]) -> b.Bound:
@@ -377,15 +395,12 @@ def plan_text(
 def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
     """Return the needs of a plan as text, a line each; with a catalog, also the SQL."""
     lines: list[str] = []
-    for atom in plan.atoms.values():
-        where = " AND ".join(value_text(part) for part in atom.query.scope.where) or "TRUE"
-        lines.append(f"atom {atom.name}({', '.join(atom.variables)}) = {where}")
-        lines += [] if catalog is None else sql_text(relation(atom.query, catalog, None))
-    for signal in plan.signals.values():
-        told = value_text(signal.value)
-        lines.append(f"signal {signal.name}({', '.join(signal.variables)}) = {told}")
-        if catalog is not None:
-            lines += sql_text(relation(signal.query, catalog, None, (signal.value,)))
+    for ask in plan.asks.values():
+        where = " AND ".join(value_text(part) for part in ask.query.scope.where) or "TRUE"
+        what, told = ("atom", where) if ask.value is None else ("signal", value_text(ask.value))
+        lines.append(f"{what} {ask.name}({', '.join(ask.variables)}) = {told}")
+        values = () if ask.value is None else (ask.value,)
+        lines += [] if catalog is None else sql_text(relation(ask.query, catalog, None, values))
     for test in plan.tests.values():
         lines.append(
             f"test {test.name}({', '.join(test.variables)}) = {value_text(test.expression)}"

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import TextSpan
-from sgstore.lang.ir import BoundStep, Query, Result, StepLink
+from sgstore.lang.ir import BoundStep, Query, StepLink
 from sgstore.temporal._formula import And, Formula, Past, Progression, ProgressionFrame, Term
-from sgstore.temporal._plan import plan_of_steps
+from sgstore.temporal._plan import ask_of_step, plan_of_steps
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 
 if TYPE_CHECKING:
@@ -285,7 +285,8 @@ class SequenceMonitor:
         self._steps: Sequence[BoundStep] = query.steps or (one,)
         self._named = _named(query)
         self._edges = tuple(edge.key for edge in query.scope.edges if edge.named)
-        self._asks = [self._ask(step) for step in self._steps]
+        asks = [ask_of_step(query, step, self._named) for step in self._steps]
+        self._asks = [(questions.add(ask), ask.columns) for ask in asks]
         self._conditions = _Conditions(query, self._steps, questions, pulse)
         self._columns = [self._projected(number) for number in range(len(self._steps))]
         self._held: list[dict[Key, StepState]] = [{} for _ in self._steps]
@@ -295,16 +296,6 @@ class SequenceMonitor:
         self._names: dict[int, str] = {}
         self._ended = False
         self._happen = [n for n, step in enumerate(self._steps) if not step.absent]
-
-    def _ask(self, step: BoundStep) -> tuple[int, tuple[str, ...]]:
-        """The question of a step, and the variables of its answers."""
-        scope = step.scope
-        kept = set(scope.nodes) if step.when else set(self._named)
-        variables = tuple(sorted(kept & set(scope.nodes)))
-        edges = tuple(sorted(edge.key for edge in scope.edges if edge.named))
-        edges = () if step.absent else edges
-        query = replace(self._query, scope=scope, result=Result(), steps=(), links=())
-        return self._questions.add(query, variables, None, edges), (*variables, *edges)
 
     # Frame by frame
 
@@ -609,8 +600,7 @@ class _Conditions:
         assert isinstance(whole_formula, And)  # noqa: S101 - it was made so
         self._when: tuple[Formula, ...] = whole_formula.operands
         self._asked = [bool(step.when) for step in steps]
-        told = [*plan.atoms.values(), *plan.signals.values()]
-        self._variables = tuple(sorted({name for one in told for name in one.variables}))
+        self._variables = tuple(sorted({n for ask in plan.asks.values() for n in ask.variables}))
         bridge = query.gaps == "bridge"
         self._letters = Valuation(plan, self._variables, questions, pulse, bridge=bridge)
         self._pulse = pulse

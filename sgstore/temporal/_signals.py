@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Columns
-    from sgstore.temporal._plan import Signal, Test
+    from sgstore.temporal._plan import Ask, Test
     from sgstore.world import Bools, Ints
 
     Places = NDArray[np.int32 | np.int64]
@@ -313,7 +313,7 @@ class SignalValues:
         self,
         test: Test,
         clock: Clock,
-        signal: Callable[[Signal], Column],
+        signal: Callable[[Ask], Column],
         condition: Callable[[b.Bound], Bools],
         present: Callable[[str], Bools],
     ) -> None:

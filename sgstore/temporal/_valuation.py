@@ -29,8 +29,8 @@ from sgstore.world import longest_step_ns, tolerance_ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from sgstore.lang import Evaluate, FrameView
-    from sgstore.temporal._plan import Plan, Signal, Test
+    from sgstore.lang import FrameView
+    from sgstore.temporal._plan import Ask, Plan, Test
     from sgstore.world import Bools
 
 
@@ -149,64 +149,41 @@ Key = tuple[int, ...]
 """What some variables are bound to, in their order."""
 
 
-class FrameQuery:
-    """A pattern of one frame, and what is asked of its matches.
+def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
+    """Return a function from a graph to the bindings of a question, each with its value (``None``: unknown).
 
-    Parameters
-    ----------
-    query : Query
-    variables : tuple of str
-        Keys of its nodes that an answer tells; the others are only asked to exist.
-    value : Bound, optional
-        What is asked of each match.
-    edges : tuple of str
-        Keys of its edges that an answer tells, behind the nodes: by places in :data:`RELATIONS`.
-    first : tuple of str
-        Keys of its edges of which, where matches differ in these alone, the relations count that come first in
-        the alphabet.
+    Edges of a binding are places in :data:`RELATIONS`.
     """
+    scope, injective = ask.query.scope, ask.query.injective
+    search = ScopeSearch(scope, injective=injective)
+    value = None if ask.value is None else expression(ask.value, injective=injective)
+    first, edges = ((), ask.edges) if value is None else (ask.edges, ())
 
-    def __init__(
-        self,
-        query: b.Query,
-        variables: tuple[str, ...],
-        value: b.Bound | None = None,
-        edges: tuple[str, ...] = (),
-        first: tuple[str, ...] = (),
-    ) -> None:
-        scope = query.scope
-        self._variables, self._edges, self._first = variables, edges, first
-        self._search = ScopeSearch(scope, injective=query.injective)
-        self._value: Evaluate | None = None
-        if value is not None:
-            self._value = expression(value, injective=query.injective)
-        self._kinds: b.Kinds | None = None
-        if value is None and len(scope.nodes) == 1 and not scope.where and not scope.edges:
-            self._kinds = next(iter(scope.nodes.values())).kinds
+    def present(_: FrameView, people: NodeNames) -> Mapping[Key, Any]:
+        there = people.of(next(iter(scope.nodes.values())).kinds)
+        if ask.variables:
+            return {(node,): None for node in there}
+        return {(): None} if there else {}
 
-    def answers(self, view: FrameView, people: NodeNames) -> Mapping[Key, Any]:
-        """Return the bindings of the variables in a graph, each with its value (``None``: unknown)."""
-        if self._kinds is not None:
-            present = people.of(self._kinds)
-            if self._variables:
-                return {(node,): None for node in present}
-            return {(): None} if present else {}
-        at, found = Binding(view), dict[Key, Any]()
+    def found(view: FrameView, _: NodeNames) -> Mapping[Key, Any]:
+        at, told = Binding(view), dict[Key, Any]()
         words: dict[Key, tuple[str, ...]] = {}
-        for _ in self._search.run(at):
-            key = tuple(at.nodes[name] for name in self._variables)
-            if self._edges:
-                key += tuple(RELATIONS.index(at.edges[name][0]) for name in self._edges)
-            if self._first:
-                word = tuple(at.edges[name][0] for name in self._first)
+        for _match in search.run(at):
+            key = tuple(at.nodes[name] for name in ask.variables)
+            key += tuple(RELATIONS.index(at.edges[name][0]) for name in edges)
+            if first:
+                word = tuple(at.edges[name][0] for name in first)
                 if words.setdefault(key, word) > word:
                     words[key] = word
-                    del found[key]
-            if key not in found:
-                found[key] = self._value(at) if self._value is not None else None
-                if not (key or self._first):
+                    del told[key]
+            if key not in told:
+                told[key] = value(at) if value is not None else None
+                if not (key or first):
                     break
-        return found
+        return told
+
+    plain = value is None and len(scope.nodes) == 1 and not scope.where and not scope.edges
+    return present if plain else found
 
 
 class NodeNames:
@@ -257,7 +234,7 @@ class QueryCache:
     """
 
     _known: dict[Any, int] = field(default_factory=dict[Any, int])
-    _all: list[FrameQuery] = field(default_factory=list["FrameQuery"])
+    _all: list[Callable[[FrameView, NodeNames], Mapping[Key, Any]]] = field(default_factory=list)
     _met: dict[b.Kinds, dict[int, str]] = field(default_factory=dict["b.Kinds", dict[int, str]])
     answers: list[Mapping[Key, Any]] = field(default_factory=list["Mapping[Key, Any]"])
     fresh: set[b.Kinds] = field(default_factory=set["b.Kinds"])
@@ -266,20 +243,13 @@ class QueryCache:
         """Return the nodes of some kinds seen so far: node → name; it grows with each frame."""
         return self._met.setdefault(kinds, {})
 
-    def add(
-        self,
-        query: b.Query,
-        variables: tuple[str, ...],
-        value: b.Bound | None = None,
-        edges: tuple[str, ...] = (),
-        first: tuple[str, ...] = (),
-    ) -> int:
+    def add(self, ask: Ask) -> int:
         """The number of a question; the same for those that ask the same."""
-        asked = None if value is None else unnumbered_text(value)
-        key = _told(query), variables, asked, edges, first
+        value = None if ask.value is None else unnumbered_text(ask.value)
+        key = _told(ask.query), ask.variables, value, ask.edges
         if key not in self._known:
             self._known[key] = len(self._all)
-            self._all.append(FrameQuery(query, variables, value, edges, first))
+            self._all.append(answerer(ask))
         return self._known[key]
 
     def ask(self, view: FrameView, people: NodeNames) -> None:
@@ -290,7 +260,7 @@ class QueryCache:
             if not present <= known.keys():
                 known.update((node, people.name(node)) for node in present - known.keys())
                 self.fresh.add(kinds)
-        self.answers = [question.answers(view, people) for question in self._all]
+        self.answers = [answers(view, people) for answers in self._all]
 
 
 def _told(query: b.Query) -> tuple[Any, ...]:
@@ -446,7 +416,7 @@ class SignalState:
         self,
         memories: Sequence[Memory],
         atom: Callable[[str], Bools],
-        signal: Callable[[Signal], Column],
+        signal: Callable[[Ask], Column],
     ) -> tuple[dict[str, Column], list[Memory]]:
         """The values of all tests in this frame for some bindings, and what these remember from now on.
 
@@ -477,7 +447,7 @@ class _Now:
         courses: SignalState,
         memories: Sequence[Memory],
         atom: Callable[[str], Bools],
-        signal: Callable[[Signal], Column],
+        signal: Callable[[Ask], Column],
     ) -> None:
         self._all, self._atom, self.signal = courses, atom, signal
         self._tick = courses.pulse.tick
@@ -709,26 +679,18 @@ class Valuation:
         *,
         bridge: bool,
     ) -> None:
-        self._variables, self._questions = variables, questions
+        self._questions = questions
         self.lattice = Lattice(len(variables))
         self._courses = SignalState(plan, pulse, bridge=bridge)
         self._measured = bool(plan.tests)
         self.begun = self._courses.begun
         self.bits = {name: 1 << number for number, name in enumerate([*plan.atoms, *plan.tests])}
-        self._atoms = [
-            (self.bits[name], questions.add(one.query, one.variables), self._places(one.variables))
-            for name, one in plan.atoms.items()
-        ]
-        self._signals = {
-            name: (
-                questions.add(one.query, one.variables, one.value, (), one.edges),
-                self._places(one.variables),
-            )
-            for name, one in plan.signals.items()
+        asked = {
+            name: (questions.add(ask), tuple(map(variables.index, ask.variables)))
+            for name, ask in plan.asks.items()
         }
-
-    def _places(self, variables: tuple[str, ...]) -> tuple[int, ...]:
-        return tuple(self._variables.index(name) for name in variables)
+        self._atoms = [(self.bits[name], *asked[name]) for name in plan.atoms]
+        self._signals = {name: asked[name] for name in plan.signals}
 
     def read(
         self, held: Iterable[Partial], memory: Callable[[Partial], Memory | None]
@@ -801,7 +763,7 @@ class Valuation:
                 columns[name] = np.array([bool(letters[row] & bit) for row in rows], np.bool_)
             return columns[name]
 
-        def signal(one: Signal) -> Column:
+        def signal(one: Ask) -> Column:
             number, places = self._signals[one.name]
             answers: Mapping[Partial, object] = self._questions.answers[number]  # type: ignore[assignment]
             return column_of([answers.get(tuple(row[p] for p in places)) for row in rows])
