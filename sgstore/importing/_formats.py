@@ -15,7 +15,6 @@ import stat
 import sys
 import zlib
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import StringIO
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -134,26 +133,6 @@ MAX_ROW: Final = 1 << 20
 """Longest row, with all the lines that it goes over; characters."""
 
 
-@dataclass(frozen=True, slots=True)
-class _RowColumns:
-    """Places of the columns in a row; -1: there is none. ``place``: where edges stand, but for the row."""
-
-    graph: int
-    src: int
-    relation: int
-    dst: int
-    src_kind: int
-    dst_kind: int
-    src_is_ego: int
-    dst_is_ego: int
-    time: int
-    time_ns: int
-    images: int
-    names: tuple[str, ...]
-    lost: tuple[int, ...]
-    place: str
-
-
 def read_s3c(path: Path) -> Iterator[GivenGraph]:
     """The graphs of a file of S3C, in its order.
 
@@ -181,184 +160,159 @@ def read_csv(path: Path) -> Iterator[GivenGraph]:
 
 def _read(path: Path, header: tuple[str, ...]) -> Iterator[GivenGraph]:
     with lines_of(path) as lines:
-        rows = _CsvLines(path, lines)
-        reader = csv.reader(rows, strict=True)
-        try:
-            first = next(reader, None)
-            columns = _columns_of(path, first, header)
-            yield from _graphs(path, rows.each(reader), columns)
-        except csv.Error as error:
-            raise wrong(path, f"row {reader.line_num}", f"no CSV: {error}") from error
+        yield from _EdgeTable(path, lines).graphs(header)
 
 
-class _CsvLines:
-    """Lines for a CSV reader, which takes as many of them as a row goes over: not too many."""
+class _EdgeTable:
+    """A table of edges, row after row."""
 
     def __init__(self, path: Path, lines: Iterator[str]) -> None:
-        self._path = path
-        self._lines = lines
-        self._number = self._taken = 0
+        self._path, self._lines = path, lines
+        self._line = self._taken = 0
+        self._number, self._row = 1, list[str]()
+        self._names: tuple[str, ...] = ()
+        self._places: dict[str, int] = {}  # of columns by what they are; -1: there is none
+        self._lost: list[int] = []
+        self._edge_place = ""
 
-    def __iter__(self) -> Iterator[str]:
+    def graphs(self, header: tuple[str, ...]) -> Iterator[GivenGraph]:
+        """The graphs; with a header, only if it is this one."""
+        reader = csv.reader(self._bounded(), strict=True)
+        try:
+            self._read_header(next(reader, None), header)
+            yield from self._graphs(reader)
+        except csv.Error as error:
+            raise wrong(self._path, f"row {reader.line_num}", f"no CSV: {error}") from error
+
+    def _bounded(self) -> Iterator[str]:
+        """Lines for a CSV reader, which takes as many of them as a row goes over: not too many."""
         for line in self._lines:
-            self._number += 1
+            self._line += 1
             self._taken += len(line)
             if self._taken > MAX_ROW:
-                where = f"line {self._number}"
-                raise wrong(self._path, where, f"a row of more than {MAX_ROW:,} characters")
+                reason = f"a row of more than {MAX_ROW:,} characters"
+                raise wrong(self._path, f"line {self._line}", reason)
             yield line
 
-    def each(self, rows: Iterator[list[str]]) -> Iterator[list[str]]:
-        """The rows, each of which may be as long again."""
-        self._taken = 0
-        for row in rows:
-            yield row
-            self._taken = 0
-
-
-def _columns_of(path: Path, first: list[str] | None, header: tuple[str, ...]) -> _RowColumns:
-    if first is None:
-        raise wrong(path, "", "empty; expected a header")
-    names = tuple(name.strip() for name in first)
-    if header and names != header:
-        raise wrong(
-            path,
-            "row 1",
-            f"expected the header of S3C, {','.join(header)}; found {','.join(names)[:200]}"
-            " (another table of edges can be read with --format csv)",
-        )
-    places: dict[str, int] = {}
-    known: set[int] = set()
-    for what, words in _NAMES.items():
-        found = [
-            i
-            for i, name in enumerate(names)
-            if normalize_name(name) in set(map(normalize_name, words))
-        ]
-        if len(found) > 1:
-            both = " and ".join(names[i] for i in found)
-            raise wrong(path, "row 1", f"columns {both} both say {what!r}; expected one")
-        if not found and what in {"graph", "src", "relation", "dst"}:
+    def _read_header(self, first: list[str] | None, header: tuple[str, ...]) -> None:
+        if first is None:
+            raise wrong(self._path, "", "empty; expected a header")
+        names = self._names = tuple(name.strip() for name in first)
+        if header and names != header:
             raise wrong(
-                path,
+                self._path,
                 "row 1",
-                f"no column {what!r} (or {', '.join(words[1:])}); found {','.join(names)[:200]}",
+                f"expected the header of S3C, {','.join(header)}; found {','.join(names)[:200]}"
+                " (another table of edges can be read with --format csv)",
             )
-        places[what] = found[0] if found else -1
-        known.update(found)
-    lost = [i for i, name in enumerate(names) if i not in known and name not in _IGNORED]
-    place = f"row {{}}, column {names[places['relation']]}"
-    return _RowColumns(**places, names=names, lost=tuple(lost), place=place)
+        folded = list(map(normalize_name, names))
+        for what, words in _NAMES.items():
+            found = [i for i, name in enumerate(folded) if name in set(map(normalize_name, words))]
+            if len(found) > 1:
+                both = " and ".join(names[i] for i in found)
+                reason = f"columns {both} both say {what!r}; expected one"
+                raise wrong(self._path, "row 1", reason)
+            if not found and what in {"graph", "src", "relation", "dst"}:
+                reason = f"no column {what!r} (or {', '.join(words[1:])})"
+                raise wrong(self._path, "row 1", f"{reason}; found {','.join(names)[:200]}")
+            self._places[what] = found[0] if found else -1
+        known = set(self._places.values())
+        self._lost = [i for i, n in enumerate(names) if i not in known and n not in _IGNORED]
+        self._edge_place = f"row {{}}, column {names[self._places['relation']]}"
 
+    def _graphs(self, rows: Iterator[list[str]]) -> Iterator[GivenGraph]:
+        graph: GivenGraph | None = None
+        self._taken = 0
+        for self._number, self._row in enumerate(rows, start=2):
+            self._taken = 0
+            where = f"row {self._number}"
+            if not self._row:
+                continue
+            if len(self._row) != len(self._names):
+                reason = f"{len(self._row)} columns, expected {len(self._names)}"
+                raise wrong(self._path, where, reason)
+            name = self._row[self._places["graph"]]
+            if graph is None or name != graph.name:
+                if graph is not None:
+                    yield graph
+                graph = self._opened(name)
+            self._add(graph)
+            check_size(self._path, where, graph)
+        if graph is None:
+            raise wrong(self._path, "", "no row beside the header; expected graphs")
+        yield graph
 
-def _graphs(path: Path, rows: Iterator[list[str]], columns: _RowColumns) -> Iterator[GivenGraph]:
-    graph: GivenGraph | None = None
-    number = 1
-    for number, row in enumerate(rows, start=2):
-        if not row:
-            continue
-        if len(row) != len(columns.names):
-            raise wrong(path, f"row {number}", f"{len(row)} columns, expected {len(columns.names)}")
-        name = row[columns.graph]
-        if graph is None or name != graph.name:
-            if graph is not None:
-                yield graph
-            graph = _opened(path, number, row, columns)
-        _add(path, graph, number, row, columns)
-        check_size(path, f"row {number}", graph)
-    if graph is None:
-        raise wrong(path, "", "no row beside the header; expected graphs")
-    yield graph
+    def _wrong(self, column: str, reason: str) -> TraceError:
+        return wrong(self._path, self._where(column), reason)
 
+    def _where(self, column: str) -> str:
+        return f"row {self._number}, column {self._names[self._places[column]]}"
 
-def _opened(path: Path, number: int, row: list[str], columns: _RowColumns) -> GivenGraph:
-    """A new graph, from its first row."""
-    name = row[columns.graph]
-    if not name or len(name) > LONGEST:
-        where = f"row {number}, column {columns.names[columns.graph]}"
-        raise wrong(path, where, f"expected the name of a graph, of 1 to {LONGEST} characters")
-    graph = GivenGraph(name, number)
-    if columns.images >= 0:
-        graph.images = int(_number(path, number, row, columns, columns.images, 1, 1 << 31))
-    if columns.time_ns >= 0:
-        place = columns.time_ns
-        graph.time_ns = int(_number(path, number, row, columns, place, -(1 << 62), 1 << 62))
-    elif columns.time >= 0:
-        graph.time_ns = round(_number(path, number, row, columns, columns.time, -4e9, 4e9) * 1e9)
-    return graph
+    def _text(self, column: str) -> str:
+        """The text in a column; empty if there is no such column."""
+        place = self._places[column]
+        return self._row[place].strip() if place >= 0 else ""
 
+    def _opened(self, name: str) -> GivenGraph:
+        """A new graph, from its first row."""
+        if not name or len(name) > LONGEST:
+            raise self._wrong(
+                "graph", f"expected the name of a graph, of 1 to {LONGEST} characters"
+            )
+        graph = GivenGraph(name, self._number)
+        if self._places["images"] >= 0:
+            graph.images = int(self._value("images", 1, 1 << 31))
+        if self._places["time_ns"] >= 0:
+            graph.time_ns = int(self._value("time_ns", -(1 << 62), 1 << 62))
+        elif self._places["time"] >= 0:
+            graph.time_ns = round(self._value("time", -4e9, 4e9) * 1e9)
+        return graph
 
-def _number(
-    path: Path,
-    number: int,
-    row: list[str],
-    columns: _RowColumns,
-    place: int,
-    low: float,
-    high: float,
-) -> float:
-    text = row[place].strip()
-    where = f"row {number}, column {columns.names[place]}"
-    try:
-        value = int(text) if text.lstrip("+-").isdigit() and len(text) < 20 else float(text)
-    except ValueError:
-        raise wrong(path, where, f"expected a number, found {text[:80]!r}") from None
-    if not low <= value <= high:
-        raise wrong(path, where, f"{text[:80]} is out of range")
-    return value
+    def _value(self, column: str, low: float, high: float) -> float:
+        text = self._text(column)
+        try:
+            value = int(text) if text.lstrip("+-").isdigit() and len(text) < 20 else float(text)
+        except ValueError:
+            raise self._wrong(column, f"expected a number, found {text[:80]!r}") from None
+        if not low <= value <= high:
+            raise self._wrong(column, f"{text[:80]} is out of range")
+        return value
 
+    def _add(self, graph: GivenGraph) -> None:
+        src = self._node(graph, "src")
+        relation, dst = self._text("relation"), self._text("dst")
+        for place in self._lost:
+            if self._row[place]:
+                what = f"column {self._names[place]}"
+                graph.lost[what] = graph.lost.get(what, 0) + 1
+        if not relation and not dst:
+            return
+        if not relation or len(relation) > LONGEST:
+            what = "empty, beside a second node" if not relation else f"{len(relation)} characters"
+            raise self._wrong("relation", f"{what}; expected a relation")
+        dst = self._node(graph, "dst")
+        if not graph.edges or graph.edges[-1].relation != relation:
+            graph.characters += len(relation)
+        place = self._edge_place, self._number
+        graph.edges.append(GivenEdge(src, sys.intern(relation), dst, *place, NO_ATTRIBUTES))
 
-def _add(path: Path, graph: GivenGraph, number: int, row: list[str], columns: _RowColumns) -> None:
-    src = _node(
-        path, graph, number, row, columns, (columns.src, columns.src_kind, columns.src_is_ego)
-    )
-    relation, dst = row[columns.relation].strip(), row[columns.dst].strip()
-    for place in columns.lost:
-        if row[place]:
-            what = f"column {columns.names[place]}"
-            graph.lost[what] = graph.lost.get(what, 0) + 1
-    if not relation and not dst:
-        return
-    if not relation or len(relation) > LONGEST:
-        where = f"row {number}, column {columns.names[columns.relation]}"
-        what = "empty, beside a second node" if not relation else f"{len(relation)} characters"
-        raise wrong(path, where, f"{what}; expected a relation")
-    dst = _node(
-        path, graph, number, row, columns, (columns.dst, columns.dst_kind, columns.dst_is_ego)
-    )
-    if not graph.edges or graph.edges[-1].relation != relation:
-        graph.characters += len(relation)
-    graph.edges.append(
-        GivenEdge(src, sys.intern(relation), dst, columns.place, number, NO_ATTRIBUTES)
-    )
-
-
-def _node(
-    path: Path,
-    graph: GivenGraph,
-    number: int,
-    row: list[str],
-    columns: _RowColumns,
-    places: tuple[int, int, int],
-) -> str:
-    """Take note of a node; its name."""
-    place, kind_place, ego_place = places
-    name = row[place].strip()
-    where = f"row {number}, column {columns.names[place]}"
-    if not name or len(name) > LONGEST:
-        raise wrong(path, where, f"expected the name of a node, of 1 to {LONGEST} characters")
-    label = row[kind_place].strip() if kind_place >= 0 else ""
-    known = graph.nodes.get(name)
-    if known is None:
-        known = graph.nodes[name] = GivenNode(name, label, where)
-        graph.characters += len(name) + len(label)
-    elif label and known.label and known.label != label:
-        raise wrong(path, where, f"{name!r} is {label!r} here and {known.label!r} in {known.where}")
-    else:
-        known.label = known.label or label
-    if ego_place >= 0 and (text := row[ego_place].strip()):
-        known.attributes["is_ego"] = text.lower() in {"true", "1", "t", "yes"}
-    return known.name
+    def _node(self, graph: GivenGraph, end: str) -> str:
+        """Take note of a node, ``src`` or ``dst``; its name."""
+        name, label = self._text(end), self._text(f"{end}_kind")
+        if not name or len(name) > LONGEST:
+            raise self._wrong(end, f"expected the name of a node, of 1 to {LONGEST} characters")
+        known = graph.nodes.get(name)
+        if known is None:
+            known = graph.nodes[name] = GivenNode(name, label, self._where(end))
+            graph.characters += len(name) + len(label)
+        elif label and known.label and known.label != label:
+            told = f"{name!r} is {label!r} here and {known.label!r} in {known.where}"
+            raise self._wrong(end, told)
+        else:
+            known.label = known.label or label
+        if text := self._text(f"{end}_is_ego"):
+            known.attributes["is_ego"] = text.lower() in {"true", "1", "t", "yes"}
+        return known.name
 
 
 # Graphs as networkx writes them: node-link JSON, one graph a line, a list of graphs, or one graph ----

@@ -10,6 +10,7 @@ import re
 from array import array
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from hashlib import blake2b
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -615,8 +616,8 @@ class Understanding:
     def __init__(self, path: Path, words: Words) -> None:
         self._path = path
         self._words = words
-        self._known: dict[tuple[str, str], LabelMeaning | None] = {}
-        self._relations: dict[str, str | None] = {}
+        self._known = lru_cache(_REMEMBERED)(words.meaning)
+        self._relations = lru_cache(_REMEMBERED)(words.relation)
 
     def of(self, graph: GivenGraph) -> Meant:
         """Resolve a graph; parts without a meaning are left out and counted in ``graph.lost``, or are an error.
@@ -663,22 +664,13 @@ class Understanding:
             raise wrong(self._path, node.where, f"{reason}; expected one")
 
     def _meaning(self, node: GivenNode) -> LabelMeaning:
-        key = (node.name, node.label)
-        if key not in self._known:
-            if len(self._known) >= _REMEMBERED:
-                self._known.clear()
-            self._known[key] = self._words.meaning(node.name, node.label)
-        meaning = self._known[key]
+        meaning = self._known(node.name, node.label)
         if meaning is None:
             raise wrong(self._path, node.where, self._words.why_not_kind(node.name, node.label))
         return meaning
 
     def _relation(self, edge: GivenEdge) -> str | None:
-        if edge.relation not in self._relations:
-            if len(self._relations) >= _REMEMBERED:
-                self._relations.clear()
-            self._relations[edge.relation] = self._words.relation(edge.relation)
-        relation = self._relations[edge.relation]
+        relation = self._relations(edge.relation)
         if relation is None and not self._words.unknown_as:
             raise wrong(self._path, edge.where, self._words.why_not_relation(edge.relation))
         return relation
@@ -719,9 +711,11 @@ def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeanin
     found, understanding = FileMeaning(), Understanding(path, words)
     egos: set[str] = set()
     entities: set[int] = set()
-    names = _GraphNames(path)
+    digests, places = array("Q"), array("q")
     for graph in graphs:
-        names.see(graph)
+        name = graph.name.encode("utf-8", "surrogatepass")
+        digests.append(int.from_bytes(blake2b(name, digest_size=8).digest(), "little"))
+        places.append(graph.place)
         meant = understanding.of(graph)
         found.graphs += 1
         found.timed += graph.time_ns is not None
@@ -742,35 +736,20 @@ def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeanin
         found.relations.update(relation for _, relation in meant.edges)
         if meant.ego and len(egos) < 2:
             egos.add(meant.ego)
-    names.check()
+    _check_names(path, digests, places)
     found.ego = egos.pop() if len(egos) == 1 else ""
     return found
 
 
-class _GraphNames:
-    """Looks whether graphs of a file have different names, of which 16 bytes each are remembered."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._digests = array("Q")
-        self._places = array("q")
-
-    def see(self, graph: GivenGraph) -> None:
-        digest = blake2b(graph.name.encode("utf-8", "surrogatepass"), digest_size=8).digest()
-        self._digests.append(int.from_bytes(digest, "little"))
-        self._places.append(graph.place)
-
-    def check(self) -> None:
-        digests = np.frombuffer(self._digests, np.uint64)
-        order = np.argsort(digests, kind="stable")
-        again = np.flatnonzero(digests[order[1:]] == digests[order[:-1]])
-        if len(again):
-            first, second = (self._places[int(order[i])] for i in (again[0], again[0] + 1))
-            reason = (
-                f"a graph of the same name begins at {first} already; expected names that differ,"
-            )
-            reason += " and the rows of a graph together"
-            raise wrong(self._path, f"row {second}", reason)
+def _check_names(path: Path, digests: array[int], places: array[int]) -> None:
+    """Refuse graphs of one name, of which 8 bytes are remembered."""
+    names = np.frombuffer(digests, np.uint64)
+    order = np.argsort(names, kind="stable")
+    again = np.flatnonzero(names[order[1:]] == names[order[:-1]])
+    if len(again):
+        first, second = (places[int(order[i])] for i in (again[0], again[0] + 1))
+        reason = f"a graph of the same name begins at {first} already; expected names that differ,"
+        raise wrong(path, f"row {second}", f"{reason} and the rows of a graph together")
 
 
 def _part(node: GivenNode, meaning: LabelMeaning) -> Part:
