@@ -216,26 +216,22 @@ def read_lock(path: str | Path) -> Lock:
         raise StoreError(f"{path}: not a lock: {error}") from error
     try:
         return _lock(values)
-    except _WrongError as error:
+    except StoreError as error:
         raise StoreError(f"{path}: not a lock that can be read: {error}") from error
-
-
-class _WrongError(Exception):
-    """Fault of a lock."""
 
 
 def _lock(values: Any) -> Lock:
     if not isinstance(values, dict) or KEY not in values:
-        raise _WrongError(f"expected an object with {KEY!r}")
+        raise StoreError(f"expected an object with {KEY!r}")
     if values[KEY] != FORMAT:
-        raise _WrongError(f"{KEY} is {values[KEY]!r}; expected {FORMAT}: upgrade sgstore")
+        raise StoreError(f"{KEY} is {values[KEY]!r}; expected {FORMAT}: upgrade sgstore")
     known = {KEY, "made_with", "selection", "traces", "cases"}
     if values.keys() != known:
         odd = ", ".join(sorted(map(repr, values.keys() ^ known)))
-        raise _WrongError(f"missing or unknown: {odd}")
+        raise StoreError(f"missing or unknown: {odd}")
     for name, kind in (("made_with", dict), ("selection", dict), ("traces", list), ("cases", list)):
         if not isinstance(values[name], kind):
-            raise _WrongError(f"{name}: expected {'an object' if kind is dict else 'a list'}")
+            raise StoreError(f"{name}: expected {'an object' if kind is dict else 'a list'}")
     traces = tuple(_row(LockedTrace, r, f"traces[{i}]") for i, r in enumerate(values["traces"]))
     cases = tuple(_row(LockedCase, r, f"cases[{i}]") for i, r in enumerate(values["cases"]))
     _check_names(traces, cases)
@@ -245,14 +241,14 @@ def _lock(values: Any) -> Lock:
 def _check_names(traces: tuple[LockedTrace, ...], cases: tuple[LockedCase, ...]) -> None:
     names = {trace.name for trace in traces}
     if len(names) < len(traces):
-        raise _WrongError("two traces have one name")
+        raise StoreError("two traces have one name")
     if len({case.id for case in cases}) < len(cases):
-        raise _WrongError("two cases have one id")
+        raise StoreError("two cases have one id")
     for i, case in enumerate(cases):
         if case.trace not in names:
-            raise _WrongError(f"cases[{i}]: no trace {case.trace!r} among the traces")
+            raise StoreError(f"cases[{i}]: no trace {case.trace!r} among the traces")
         if not 0 <= case.first <= case.last <= _LAST or case.start_ns > case.end_ns:
-            raise _WrongError(f"cases[{i}]: it ends before it begins")
+            raise StoreError(f"cases[{i}]: it ends before it begins")
 
 
 _LAST: Final = 60 * 2**18 - 1
@@ -271,16 +267,16 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
 def _row(kind: type[_Row], values: Any, where: str) -> _Row:
     names = [one.name for one in fields(kind)]
     if not isinstance(values, dict) or sorted(values) != sorted(names):
-        raise _WrongError(f"{where}: expected {', '.join(names)}")
+        raise StoreError(f"{where}: expected {', '.join(names)}")
     for one in fields(kind):
         value = values[one.name]
         allowed = _KINDS[str(one.type)]
         if not isinstance(value, allowed) or isinstance(value, bool):
-            raise _WrongError(f"{where}.{one.name}: {str(value)[:40]!r}; expected {one.type}")
+            raise StoreError(f"{where}.{one.name}: {str(value)[:40]!r}; expected {one.type}")
         if isinstance(value, int) and abs(value) >= 1 << 63:
-            raise _WrongError(f"{where}.{one.name}: {value} is beyond 64 bits")
+            raise StoreError(f"{where}.{one.name}: {value} is beyond 64 bits")
         if isinstance(value, dict) and not all(isinstance(v, str) for v in value.values()):
-            raise _WrongError(f"{where}.{one.name}: expected texts")
+            raise StoreError(f"{where}.{one.name}: expected texts")
     return kind(**values)
 
 
@@ -311,18 +307,9 @@ def made_with() -> dict[str, Any]:
 
 def locked(trace: StoredTrace, mark: Mark) -> LockedTrace:
     """A trace as a lock has it."""
-    return LockedTrace(
-        trace.name,
-        trace.digest,
-        trace.ego,
-        trace.flavour,
-        trace.frames,
-        trace.since,
-        trace.until,
-        mark.config,
-        mark.map,
-        trace.version,
-    )
+    source = trace.name, trace.digest, trace.ego, trace.flavour
+    part = trace.frames, trace.since, trace.until
+    return LockedTrace(*source, *part, mark.config, mark.map, trace.version)
 
 
 def lock_of(
@@ -354,10 +341,10 @@ def lock_of(
     with store.file.snapshot():
         known = {trace.trace_id: trace for trace in store.info()}
         of = [known[int(trace_of(part.frame_id[:1])[0])] for part in parts]
-        order = sorted(
-            range(len(parts)), key=lambda i: (natural(of[i].name), int(parts[i].frame_id[0]))
+        pairs = sorted(
+            zip(parts, of, strict=True), key=lambda one: (natural(one[1].name), one[0].frame_id[0])
         )
-        parts, of = [parts[i] for i in order], [of[i] for i in order]
+        parts, of = [part for part, _ in pairs], [trace for _, trace in pairs]
         groups = [part.frame_id for part in parts]
         graphs = list(graph_digests(store.file, groups))
         read = payload_digests(store, groups) if payloads else iter([None] * len(parts))
@@ -368,9 +355,8 @@ def lock_of(
                 progress(len(cases), len(parts))
         made = marks(store.file)
         used = {trace.trace_id: trace for trace in of}
-        traces = sorted(
-            (locked(t, made[i]) for i, t in used.items()), key=lambda t: natural(t.name)
-        )
+        traces = [locked(trace, made[i]) for i, trace in used.items()]
+        traces.sort(key=lambda trace: natural(trace.name))
     return Lock(made_with(), selection, tuple(traces), tuple(cases))
 
 
@@ -550,9 +536,8 @@ def store_beside(path: str | Path, lock: Lock) -> Path:
     StoreError
         There is none, or there are several.
     """
-    beside = {
-        one.resolve(): one for folder in (Path(path).parent, Path()) for one in _stores(folder)
-    }
+    folders = Path(path).parent, Path()
+    beside = {one.resolve(): one for f in folders for one in sorted(f.glob("*.sgstore"))}
     wanted = {trace_id_of(one.recording, one.ego) for one in lock.traces}
     having: list[Path] = []
     for one in beside.values():
@@ -567,10 +552,6 @@ def store_beside(path: str | Path, lock: Lock) -> Path:
     raise StoreError(
         f"{path}: which store? Those beside it that have its traces: {names}; write STORE:{path}"
     )
-
-
-def _stores(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.sgstore"))
 
 
 # Locks as sets of cases. Two cases are the same if they are the same frames of the same trace ----
@@ -621,7 +602,7 @@ def minus(a: Lock, b: Lock) -> Lock:
 
 def meets(a: Lock, b: Lock) -> Callable[[LockedCase], bool]:
     """A function that says whether a case of ``a`` shares a frame with a case of ``b``."""
-    sources = {trace.name: (trace.recording, trace.ego) for trace in a.traces}
+    sources = _sources(a)
     firsts: dict[Source, list[int]] = {}
     ends: dict[Source, list[int]] = {}
     for source, first, last in sorted(_placed(b)):
@@ -637,8 +618,12 @@ def meets(a: Lock, b: Lock) -> Callable[[LockedCase], bool]:
     return common
 
 
+def _sources(lock: Lock) -> dict[str, Source]:
+    return {trace.name: (trace.recording, trace.ego) for trace in lock.traces}
+
+
 def _placed(lock: Lock) -> dict[tuple[Source, int, int], LockedCase]:
-    sources = {trace.name: (trace.recording, trace.ego) for trace in lock.traces}
+    sources = _sources(lock)
     return {(sources[case.trace], case.first, case.last): case for case in lock.cases}
 
 
@@ -676,12 +661,10 @@ def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[Locke
     cases = ours + [_renamed(case, names[case.trace]) for case in theirs]
     cases.sort(key=lambda case: (natural(case.trace), case.first, case.last))
     used = {case.trace for case in cases}
-    kept: list[LockedTrace] = sorted(
-        (trace for trace in traces.values() if trace.name in used),
-        key=lambda trace: natural(trace.name),
-    )
+    kept = (trace for trace in traces.values() if trace.name in used)
+    ordered = tuple(sorted(kept, key=lambda trace: natural(trace.name)))
     selection: dict[str, Any] = {how: [dict(a.selection), dict(b.selection)]}
-    return Lock(made_with(), selection, tuple(kept), tuple(cases))
+    return Lock(made_with(), selection, ordered, tuple(cases))
 
 
 def _renamed(case: LockedCase, trace: str) -> LockedCase:
@@ -690,17 +673,7 @@ def _renamed(case: LockedCase, trace: str) -> LockedCase:
 
 # Whether a store still has what a lock says, case by case ---------------------------------------
 
-_TRACE: tuple[tuple[str, str], ...] = (
-    ("recording", "recording"),
-    ("ego", "ego"),
-    ("since", "part"),
-    ("until", "part"),
-    ("frames", "frames"),
-    ("config", "config"),
-    ("map", "map"),
-    ("flavour", "flavour"),
-    ("version", "version"),
-)
+_COMPARED = ("recording", "ego", "since", "until", "frames", "config", "map", "flavour", "version")
 
 
 @dataclass(frozen=True, slots=True)
@@ -787,8 +760,9 @@ def _found(trace: LockedTrace, known: Sequence[StoredTrace]) -> StoredTrace | No
 
 
 def _trace(was: LockedTrace, now: LockedTrace) -> Iterator[Difference]:
-    for name, what in _TRACE:
+    for name in _COMPARED:
         old, new = getattr(was, name), getattr(now, name)
+        what = "part" if name in {"since", "until"} else name
         if old != new:
             yield Difference(was.name, what, f"was {_short(old)}, is {_short(new)}")
 
