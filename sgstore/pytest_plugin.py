@@ -30,8 +30,7 @@ its tests, not of the session: the others run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import pytest
@@ -40,7 +39,7 @@ from sgstore.errors import SgstoreError
 from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     import networkx as nx
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from sgstore.readers import Media
     from sgstore.store import FrameRef
     from sgstore.temporal import Verdict
+    from sgstore.world import Clip
 
 MARK: Final = "scenes"
 OPTION: Final = "scenes_store"
@@ -62,43 +62,25 @@ _SOURCES: Final = ("query", "lock", "check")
 _KNOWN: Final = {*_SOURCES, "store", "before", "after", "parameters", "allow_empty"}
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """A clip that a test is about.
-
-    Attributes
-    ----------
-    trace : str
-        Name of the trace in its store.
-    start_ns, end_ns : int
-        Log times, both included.
-    id : str
-        What the test is called by; empty: by its trace and frames.
-    """
-
-    trace: str
-    start_ns: int
-    end_ns: int
-    id: str = ""
-
-
 class ClipScene:
     """A clip as a test sees it: what the fixture ``scene`` is.
 
     Attributes
     ----------
     store : Store
-    case : Case
+    clip : Clip
+        Its trace, and log times.
+    name : str
+        Id of its test; empty: its trace and frames.
     """
 
-    def __init__(self, store: Store, case: Case) -> None:
-        self.store = store
-        self.case = case
+    def __init__(self, store: Store, clip: Clip, name: str = "") -> None:
+        self.store, self.clip, self.name = store, clip, name
 
     @cached_property
     def frames(self) -> tuple[FrameRef, ...]:
         """The frames of the clip, in order."""
-        return _frames(self.store, self.case)
+        return _frames(self.store, self.clip)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -120,12 +102,12 @@ class ClipScene:
     @property
     def id(self) -> str:
         """Id of its test."""
-        return self.case.id or f"{self.trace}#{self.frames[0].seq}-{self.frames[-1].seq}"
+        return self.name or f"{self.trace}#{self.frames[0].seq}-{self.frames[-1].seq}"
 
     @property
     def trace(self) -> str:
         """Name of its trace."""
-        return self.case.trace
+        return self.clip.trace
 
     @property
     def time(self) -> tuple[float, float]:
@@ -151,17 +133,14 @@ class ClipScene:
         -------
         networkx.MultiDiGraph
         """
-        ref = self._frame(frame)
-        if abstraction is None:
-            return self.store.graph(ref)
-        return self.store.graph(ref, abstraction)
+        asked = () if abstraction is None else (abstraction,)
+        return self.store.graph(self._frame(frame), *asked)
 
     def graphs(self) -> Iterator[nx.MultiDiGraph[int]]:
         """The scene graphs of all frames, in order."""
         from sgstore.exporters import FEW, Export, graphs_of
-        from sgstore.world import Clip
 
-        export = Export(self.store, (Clip(self.trace, self.case.start_ns, self.case.end_ns),))
+        export = Export(self.store, (self.clip,))
         for frames in export.windows(FEW):
             for graph in graphs_of(export, frames):
                 yield graph.to_networkx()
@@ -203,8 +182,8 @@ class LockedScene(ClipScene):
         Its place among the cases of the lock.
     """
 
-    def __init__(self, store: Store, case: Case, lock: Lock, path: Path, number: int) -> None:
-        super().__init__(store, case)
+    def __init__(self, store: Store, clip: Clip, lock: Lock, path: Path, number: int) -> None:
+        super().__init__(store, clip, lock.cases[number].id)
         self.lock, self.path, self.number = lock, path, number
         self._verified: set[bool] = set()
 
@@ -228,37 +207,32 @@ class CheckedTrace(ClipScene):
 
     Attributes
     ----------
-    checks : Checks
     check : str
         Name of the check.
+    verdicts : function
+        Gives the verdicts of all checks, by trace and check; they are asked once in a process, and not before
+        a test needs one.
     """
 
-    def __init__(self, store: Store, case: Case, checks: Checks, check: str) -> None:
-        super().__init__(store, case)
-        self.checks, self.check = checks, check
+    def __init__(
+        self,
+        store: Store,
+        clip: Clip,
+        check: str,
+        verdicts: Callable[[], Mapping[tuple[str, str], Verdict]],
+    ) -> None:
+        super().__init__(store, clip, f"{clip.trace}-{check}")
+        self.check, self.verdicts = check, verdicts
 
     @property
     def verdict(self) -> Verdict:
         """Verdict of the check for the trace."""
-        found = self.checks.verdicts.get((self.trace, self.check))
+        found = self.verdicts().get((self.trace, self.check))
         if found is None:  # of another ego
             from sgstore.temporal import Verdict
 
             found = Verdict(self.check, self.trace, "unknown")
         return found
-
-
-class Checks:
-    """The checks of a file, asked once in a process, and not before a test needs a verdict."""
-
-    def __init__(self, store: Store, text: str, parameters: Mapping[str, Any]) -> None:
-        self._run = store.check(text, **parameters)
-        self.names = self._run.names
-
-    @cached_property
-    def verdicts(self) -> Mapping[tuple[str, str], Verdict]:
-        """Verdicts by trace and check."""
-        return {(one.trace, one.check): one for one in self._run}
 
 
 # What pytest calls ----------------------------------------------------------------------------------------
@@ -286,7 +260,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         scenes: list[Any] = _scenes(metafunc.config, metafunc.definition.path.parent, mark)
         ids = [scene.id for scene in scenes]
     except (SgstoreError, OSError, TypeError, ValueError) as error:
-        scenes, ids = [_WrongMark(f"@pytest.mark.{MARK}: {error}")], ["error"]
+        scenes, ids = [f"@pytest.mark.{MARK}: {error}"], ["error"]  # its test says so
     metafunc.parametrize("scene", scenes, indirect=True, ids=ids)
 
 
@@ -301,8 +275,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def scene(request: pytest.FixtureRequest) -> ClipScene:
     """The clip that a test is about; it needs ``@pytest.mark.scenes(…)``."""
     found = getattr(request, "param", None)
-    if isinstance(found, _WrongMark):
-        pytest.fail(found.problem, pytrace=False)
+    if isinstance(found, str):
+        pytest.fail(found, pytrace=False)
     if not isinstance(found, ClipScene):
         pytest.fail(f"the fixture `scene` needs @pytest.mark.{_EXPLAINED}", pytrace=False)
     found.verify()
@@ -340,13 +314,6 @@ def violations_text(verdict: Verdict) -> str:
 
 _FOUND: Final = pytest.StashKey[dict[str, list[ClipScene]]]()
 """Results of marks, so that many tests of one mark ask once."""
-
-
-@dataclass(frozen=True, slots=True)
-class _WrongMark:
-    """Stands for the scenes of a mark that has none, so that its test says why."""
-
-    problem: str
 
 
 def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[ClipScene]:
@@ -392,8 +359,7 @@ def _asked(store: Store, folder: Path, told: Mapping[str, Any]) -> list[ClipScen
     matches = store.find(told["query"], **told.get("parameters", {}))
     with store.file.snapshot():
         clips = list(matches.clips(float(told.get("before", 0.0)), float(told.get("after", 0.0))))
-        scenes = [ClipScene(store, Case(c.trace, c.start_ns, c.end_ns)) for c in clips]
-        return [scene for scene in scenes if scene.frames]
+        return [scene for clip in clips if (scene := ClipScene(store, clip)).frames]
 
 
 def scenes_of(path: Path, store: Store) -> list[ClipScene]:
@@ -405,10 +371,11 @@ def scenes_of(path: Path, store: Store) -> list[ClipScene]:
         The lock cannot be read, or the store lacks what it names.
     """
     from sgstore.locks import cases_of, read_lock
+    from sgstore.world import Clip
 
     lock = read_lock(path)
-    cases = [Case(*case) for case in cases_of(lock, store)]
-    return [LockedScene(store, case, lock, path, number) for number, case in enumerate(cases)]
+    clips = [Clip(trace, start, end) for trace, start, end, _ in cases_of(lock, store)]
+    return [LockedScene(store, clip, lock, path, number) for number, clip in enumerate(clips)]
 
 
 def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> list[ClipScene]:
@@ -421,27 +388,30 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
     OSError
         The file cannot be read.
     """
-    checks = Checks(store, path.read_text(encoding="utf-8"), parameters)
+    from sgstore.world import Clip
+
+    run = store.check(path.read_text(encoding="utf-8"), **parameters)
+
+    @cache
+    def verdicts() -> Mapping[tuple[str, str], Verdict]:
+        return {(one.trace, one.check): one for one in run}
+
     with store.file.snapshot():
         spans = store.file.rows(
             "SELECT trace, min(log_time_ns), max(log_time_ns) FROM frames GROUP BY trace"
         ).values
-    spans = sorted(spans, key=lambda span: natural(span[0]))
-    cases = [Case(*span, id=f"{span[0]}-{name}") for span in spans for name in checks.names]
-    names = checks.names * len(spans)
-    return [CheckedTrace(store, c, checks, name) for c, name in zip(cases, names, strict=True)]
+    clips = [Clip(*span) for span in sorted(spans, key=lambda span: natural(span[0]))]
+    return [CheckedTrace(store, clip, name, verdicts) for clip in clips for name in run.names]
 
 
-def _frames(store: Store, case: Case) -> tuple[FrameRef, ...]:
+def _frames(store: Store, clip: Clip) -> tuple[FrameRef, ...]:
     from sgstore.exporters import ClipFrames, Export
     from sgstore.store import SEQ_BITS, FrameRef
-    from sgstore.world import Clip
 
-    clip = Clip(case.trace, case.start_ns, case.end_ns)
     found = ClipFrames.of(Export(store, (clip,)), 1, clip)
     columns = (found.frame_id, found.seq, found.time_ns, found.log_time_ns, found.t)
     return tuple(
-        FrameRef(frame_id, frame_id >> SEQ_BITS, case.trace, seq, time_ns, log_time_ns, t)
+        FrameRef(frame_id, frame_id >> SEQ_BITS, clip.trace, seq, time_ns, log_time_ns, t)
         for frame_id, seq, time_ns, log_time_ns, t in zip(
             *(c.tolist() for c in columns), strict=True
         )
