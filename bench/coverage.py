@@ -38,7 +38,7 @@ from sgstore.coverage import (
     selection_of,
 )
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence, named_graph
-from sgstore.importing._blocks import parts_map
+from sgstore.importing._run import parts_map
 from sgstore.store import StoreFile
 from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE, RELATIONS
 from sgstore.world import Channel, Entities, FrameBlock, MessageRefs, States, TraceInfo, TraceReport

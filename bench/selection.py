@@ -25,7 +25,7 @@ from bench.coverage import PARTS, Library, made
 from bench.measure import Measure
 from sgstore.coverage import selection_of
 from sgstore.errors import ConfigError
-from sgstore.importing._blocks import parts_map
+from sgstore.importing._run import parts_map
 from sgstore.selection import Budget, SelectionSpec, SelectionUnit, Strategy, curve, select
 
 if TYPE_CHECKING:

@@ -42,7 +42,7 @@ from sgstore.coverage import (
     venn,
 )
 from sgstore.coverage._compare import estimate, expected_classes
-from sgstore.coverage._explain import tree
+from sgstore.coverage._features import tree
 from sgstore.coverage._frames import block_of, query_of_features
 from sgstore.errors import ConfigError, QueryError, StoreError
 from sgstore.importing import import_graphs

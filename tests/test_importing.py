@@ -21,8 +21,8 @@ import sgstore
 from sgstore.cli import run
 from sgstore.errors import ConfigError, TraceError
 from sgstore.importing import FORMATS, Words, import_graphs
-from sgstore.importing._blocks import Blocks, parts_map
 from sgstore.importing._resolve import Understanding, survey
+from sgstore.importing._run import Blocks, parts_map
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 

@@ -15,7 +15,6 @@ from ._compare import novel_clips as novel_clips
 from ._compare import novel_frames as novel_frames
 from ._compare import rank_sizes as rank_sizes
 from ._compare import venn as venn
-from ._explain import explain as explain
 from ._failures import S3C_THRESHOLD as S3C_THRESHOLD
 from ._failures import failures as failures
 from ._failures import read_outcomes as read_outcomes
@@ -23,6 +22,7 @@ from ._features import Combinations as Combinations
 from ._features import Combos as Combos
 from ._features import combined as combined
 from ._features import combos as combos
+from ._features import explain as explain
 from ._features import features as features
 from ._frames import ChosenFrames as ChosenFrames
 from ._frames import ReportTable as ReportTable

@@ -1,8 +1,10 @@
 # The face of this package: what others may import from it.
 
+from ._choose import Curve as Curve
 from ._choose import Selection as Selection
 from ._choose import SelectionSpec as SelectionSpec
 from ._choose import Strategy as Strategy
+from ._choose import curve as curve
 from ._choose import listed as listed
 from ._choose import locked_selection as locked_selection
 from ._choose import select as select
@@ -10,8 +12,6 @@ from ._cover import Cover as Cover
 from ._cover import Fitted as Fitted
 from ._cover import minimal as minimal
 from ._cover import within as within
-from ._curve import Curve as Curve
-from ._curve import curve as curve
 from ._sets import SetFamily as SetFamily
 from ._splits import parse_split as parse_split
 from ._splits import split as split
