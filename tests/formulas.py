@@ -9,6 +9,7 @@ import numpy as np
 from sgstore.errors import QueryError
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
+from sgstore.temporal import evaluate
 from sgstore.temporal._formula import (
     LOGIC,
     TEMPORAL,
@@ -22,7 +23,6 @@ from sgstore.temporal._formula import (
     Tick,
     TruthConstant,
 )
-from sgstore.temporal._signals import PropositionTable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -108,10 +108,6 @@ def _bound(e: s.Temporal) -> Bound:
     return Bound(ends[0] or 0, ends[1], frames)
 
 
-CELLS: Final = 4_000_000
-"""Frames times prefixes that are worked on at once."""
-
-
 def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
     """The value of a formula at the first frame, if the trace ended at each of its frames in turn.
 
@@ -123,16 +119,13 @@ def prefix_verdicts(formula: Formula, columns: Mapping[str, Bools], times: Ints)
     Returns
     -------
     (F,) bool
-        The verdict over the frames 0 … f. Time grows with the square of F; memory does not.
+        The verdict over the frames 0 … f. Time grows with the square of F.
     """
-    table = PropositionTable.of(formula, columns, times)
-    frames = len(times)
-    rows = max(CELLS // max(frames, 1), 1)
-    parts = [
-        table.value(formula, np.arange(start, min(start + rows, frames))[:, None])[:, 0]
-        for start in range(0, frames, rows)
-    ]
-    return np.concatenate([np.zeros(0, np.bool_), *parts])
+    found = np.zeros(len(times), np.bool_)
+    for end in range(len(times)):
+        part = {name: column[: end + 1] for name, column in columns.items()}
+        found[end] = evaluate(formula, part, times[: end + 1])[0]
+    return found
 
 
 REMEMBERED: Final = 100_000

@@ -46,7 +46,7 @@ def told(seed: int) -> tuple[Spans, Spans, str] | None:
         spans.append((since, frames - 1, False))
     elif not state.ended:
         spans.append((frames - 1, frames - 1, True))
-    return spans, [(v.start, v.end, v.at_end) for v in wanted], f"{seed}: {formula}, {reset}"
+    return spans, wanted, f"{seed}: {formula}, {reset}"
 
 
 def try_states(first: int, count: int) -> tuple[int, int]:

@@ -264,7 +264,7 @@ def test_what_is_known_no_other_future_changes() -> None:
         columns = {name: np.array([letter[name] for letter in word]) for name in "abc"}
         told = known(formula, PropositionTable(columns, np.array(times, np.int64)))
         for i in range(len(word)):
-            for at, value in ((int(told.true[i]), True), (int(told.false[i]), False)):
+            for at, value in ((int(told[0][i]), True), (int(told[1][i]), False)):
                 if at == len(word):
                     continue
                 more, later = random_word(rng)
@@ -287,7 +287,7 @@ def test_what_was_before_a_reset_is_seen_by_operators_of_the_past_that_look_ahea
     columns["bad"] = np.array([0, 0, 1, 0, 0, 0], np.bool_)
 
     (violation,) = Settled(twice, columns, np.arange(6)).violations(columns["bad"])
-    assert (violation.start, violation.end) == (2, 2)
+    assert violation == (2, 2, False)
 
 
 def test_a_violation_lasts_to_its_reset_and_the_formula_is_asked_anew() -> None:
@@ -295,8 +295,8 @@ def test_a_violation_lasts_to_its_reset_and_the_formula_is_asked_anew() -> None:
     fine = np.array([0, 0, 1, 0, 0, 0, 1, 0], np.bool_)
     settled = Settled(formula_of("ALWAYS NOT bad"), {"bad": bad}, np.arange(8))
 
-    assert [(v.start, v.end) for v in settled.violations(fine)] == [(1, 2), (4, 6), (7, 7)]
-    assert [(v.start, v.end) for v in settled.violations(None)] == [(1, 7)]
+    assert [v[:2] for v in settled.violations(fine)] == [(1, 2), (4, 6), (7, 7)]
+    assert [v[:2] for v in settled.violations(None)] == [(1, 7)]
 
 
 def test_what_only_the_end_refutes_is_violated_in_the_last_frame_or_forgiven() -> None:
@@ -305,7 +305,7 @@ def test_what_only_the_end_refutes_is_violated_in_the_last_frame_or_forgiven() -
 
     (violation,) = settled.violations(None)
 
-    assert (violation.start, violation.end, violation.at_end) == (4, 4, True)
+    assert violation == (4, 4, True)
     assert settled.violations(None, weak=True) == []
 
 

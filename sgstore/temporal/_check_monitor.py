@@ -16,7 +16,6 @@ import numpy as np
 from sgstore.errors import QueryError
 from sgstore.matches import Interval
 from sgstore.temporal._checks import (
-    CheckPlan,
     Level,
     Verdict,
     folded_values,
@@ -38,6 +37,7 @@ from sgstore.temporal._formula import (
     looks_ahead,
     propositions,
 )
+from sgstore.temporal._plan import plan_of_check
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 from sgstore.temporal._verdicts import (
@@ -382,8 +382,8 @@ class CheckMonitor:
     ) -> None:
         self._check, self._pulse, self._compat = check, pulse, compat
         self._last: FrameTime | None = None
-        planned = CheckPlan(check, reset=not compat)
-        self._variables, formula, reset = planned.variables, planned.formula, planned.reset
+        plan, formula, reset, guards = plan_of_check(check, reset=not compat)
+        self._variables = plan.bound
         if check.gaps == "unknown":
             raise QueryError(
                 f"USING GAPS unknown of {check.name} is a question about what was recorded",
@@ -394,12 +394,11 @@ class CheckMonitor:
                 f"RESET WHEN of {check.name} looks ahead",
                 hint="a monitor begins anew in the next frame, so what resets it must be known by then",
             )
-        guards = planned.guards
         self._guards: dict[BoundQuantifier, int] = {
             check.quantifiers[number]: 1 << place for place, number in enumerate(guards)
         }
         self._letters = Valuation(
-            planned.plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
+            plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
         )
         bits = self._letters.bits
         self._automaton = Automaton(formula, reset, tuple(guards.values()), bits)

@@ -21,11 +21,10 @@ from sgstore.lang import (
     traces_of,
     traces_with,
 )
-from sgstore.lang.ir import Query, Result
 from sgstore.matches import Interval, notes_in
 from sgstore.temporal._formula import tolerant
 from sgstore.temporal._offline import PlanValues, TraceReader, traces
-from sgstore.temporal._plan import Plan
+from sgstore.temporal._plan import plan_of_check, plan_text
 from sgstore.temporal._verdicts import (
     CERTAINLY_TRUE,
     PRESUMABLY_TRUE,
@@ -179,50 +178,6 @@ def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list
         (np.minimum if every else np.maximum).at(joined, level.parents, found[0])
         found.insert(0, joined)
     return found
-
-
-class CheckPlan:
-    """A check with the formulas that it is made of.
-
-    Parameters
-    ----------
-    check : BoundCheck
-    reset : bool
-        Whether what resets it matters.
-
-    Attributes
-    ----------
-    whole : Query
-        The nodes that it speaks of, and its settings.
-    variables : tuple of str
-        Those of its quantifiers.
-    plan : Plan
-    formula : Formula
-    reset : Formula or None
-    guards : dict of int to Formula
-        What restricts quantifiers, by their numbers.
-    """
-
-    def __init__(self, check: BoundCheck, *, reset: bool = True) -> None:
-        self.whole = Query(
-            check.scope,
-            Result(),
-            check.relations,
-            check.injective,
-            check.ego,
-            check.unknown_is_false,
-        )
-        self.variables = tuple(node for q in check.quantifiers for node in q.nodes)
-        absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
-        self.plan = Plan(self.whole, frozenset(self.variables), absent)
-        self.formula = self.plan.formula(check.formula)
-        written = check.reset if reset else None
-        self.reset = None if written is None else self.plan.formula(written)
-        self.guards = {
-            number: self.plan.formula(quantifier.where)
-            for number, quantifier in enumerate(check.quantifiers)
-            if quantifier.where is not None
-        }
 
 
 # ``CHECK`` over a store: verdicts of its traces, where they are violated, and by whom -----------
@@ -442,23 +397,16 @@ class _Check:
         check = one.check
         self._file, self._check, self._catalog = file, check, one.catalog
         self._compat, self._want_status = compat, status
-        planned = CheckPlan(check)
-        self._whole, self._variables, self._plan = planned.whole, planned.variables, planned.plan
-        self._formula, self._reset = planned.formula, planned.reset
-        self._guards = planned.guards
+        self._plan, self._formula, self._reset, self._guards = plan_of_check(check)
+        self._whole, self._variables = self._plan.whole, self._plan.bound
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     def text(self) -> str:
         """The check as it is asked."""
-        from sgstore.temporal._plan import plan_text  # for who asks
-
         head = [f"---- {self._check.name}"]
         head += [f"{q.word} {', '.join(q.nodes)}" for q in self._check.quantifiers]
-        return (
-            "\n".join(head)
-            + "\n"
-            + plan_text(self._plan, self._formula, self._reset, self._catalog)
-        )
+        plan = plan_text(self._plan, self._formula, self._reset, self._catalog)
+        return "\n".join([*head, plan])
 
     def verdicts(self) -> Iterator[Verdict]:
         """The verdict of each trace, by name of the trace."""
@@ -613,7 +561,7 @@ class _Check:
 
         kept = status if self._want_status else None
         names = self._people.get(trace.trace_id, {})
-        last = _interval(trace, Violation(len(trace) - 1, len(trace) - 1), {})
+        last = _interval(trace, (len(trace) - 1, len(trace) - 1, True), {})
         found = Verdict(self._check.name, trace.name, verdict, status=kept)
         return verdict_of(self._check, found, levels, truths, names, violations, last)
 
@@ -631,18 +579,12 @@ class _Check:
 def _runs(flags: Bools) -> Iterator[Violation]:
     edges = np.flatnonzero(np.diff(flags, prepend=False, append=False))
     for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        yield Violation(start, end - 1)
+        yield start, end - 1, False
 
 
 def _interval(trace: TraceReader, of: Violation, names: Mapping[str, str]) -> Interval:
-    return Interval(
-        trace.name,
-        int(trace.numbers[of.start]),
-        int(trace.numbers[of.end]),
-        int(trace.times[of.start]),
-        int(trace.times[of.end]),
-        trace.seconds(of.start),
-        trace.seconds(of.end),
-        of.end - of.start + 1,
-        dict(names),
-    )
+    start, end, _ = of
+    (first, last), (begin, stop) = trace.numbers[[start, end]], trace.times[[start, end]]
+    seqs_ns = int(first), int(last), int(begin), int(stop)
+    seconds = trace.seconds(start), trace.seconds(end)
+    return Interval(trace.name, *seqs_ns, *seconds, end - start + 1, dict(names))

@@ -199,22 +199,14 @@ def _xor(*operands: Formula) -> Formula:
     return first
 
 
-def _and(*operands: Formula) -> Formula:
-    return And(operands)
-
-
-def _or(*operands: Formula) -> Formula:
-    return Or(operands)
-
-
 def _implies(condition: Formula, consequence: Formula) -> Formula:
     return Or((Not(condition), consequence))
 
 
 LOGIC: Final[dict[str, Callable[..., Formula]]] = {
     "NOT": Not,
-    "AND": _and,
-    "OR": _or,
+    "AND": lambda *operands: And(operands),
+    "OR": lambda *operands: Or(operands),
     "XOR": _xor,
     "IMPLIES": _implies,
 }
@@ -484,10 +476,10 @@ class Progression:
         What they keep before the first frame.
     """
 
-    def __init__(self, formula: Formula, terms: Terms | None = None) -> None:
+    def __init__(self, formula: Formula) -> None:
         self.formula = interned(formula)
         self.names = tuple(sorted(propositions(formula)))
-        self.terms = terms or Terms()
+        self.terms = Terms()
         parts = {id(part): part for part in walk(self.formula)}
         self.past = tuple(p for p in parts.values() if isinstance(p, Previous | Since))
         self.looking = frozenset(id(p) for p in parts.values() if looks_ahead(p))

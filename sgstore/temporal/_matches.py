@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from sgstore.temporal._checks import lacking
 from sgstore.temporal._formula import formula_text
 from sgstore.temporal._offline import PlanValues, TimedRelation, TraceReader, traces, words
 from sgstore.temporal._plan import (
+    Test,
     ask_of_step,
     hold_text,
     link_text,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, Column, Compiled
-    from sgstore.lang.ir import BoundHold, Length, StepLink
+    from sgstore.lang.ir import BoundHold, Length
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
     from sgstore.temporal._plan import Ask
@@ -331,14 +332,8 @@ def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
 # The matches of a query over several frames -------------------------------------------------------
 
 
-@dataclass(slots=True)
-class _MatchCollector:
-    """Matches while they are collected."""
-
-    first: list[Ints] = field(default_factory=list["Ints"])
-    last: list[Ints] = field(default_factory=list["Ints"])
-    bindings: list[Keys] = field(default_factory=list["Keys"])
-    values: list[list[list[Any]]] = field(default_factory=list[list[list[Any]]])
+_Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
+"""Some matches: ids of their first and last frames, their nodes and edges, and the values of each place."""
 
 
 class Finder:
@@ -374,17 +369,30 @@ class Finder:
             high = ((window.high - 1) >> BUCKET_BITS) + 1
             low = window.low >> BUCKET_BITS << BUCKET_BITS
             window = Window(low, high << BUCKET_BITS, window.traces)
-        formulas = {p: self._plan.formula(p) for p in places if _is_condition(p)}
         for place in places:
-            if place not in formulas and not isinstance(place, StepTime):
-                self._plan.test(place)
+            if not isinstance(place, StepTime):
+                self._planned(place)  # what it asks of single frames becomes part of the plan
         asks = self._plan.asks | {f"step {number}": ask for number, ask in enumerate(self._steps)}
-        found = _MatchCollector(values=[[] for _ in range(len(places) + self._spans * 2)])
         about = self._file, self._catalog, self._query, asks
-        for trace in traces(*about, gaps=self._query.gaps, within=window):
-            if len(trace):
-                self._find(trace, places, formulas, found)
-        return self._collected(found)
+        found = traces(*about, gaps=self._query.gaps, within=window)
+        parts = [part for trace in found if len(trace) for part in self._find(trace, places)]
+        first = [frame for part in parts for frame in part[0].tolist()]
+        last = [frame for part in parts for frame in part[1].tolist()]
+        width = len(self._kept) + len(self._edges)
+        keys = np.concatenate([np.zeros((0, width), np.int64), *(part[2] for part in parts)]).T
+        nodes = dict(zip(self._kept, keys.tolist(), strict=False))
+        edges = dict(zip(self._edges, words()[keys[len(self._kept) :]].tolist(), strict=True))
+        many = len(places) + self._spans * 2
+        values = [[item for part in parts for item in part[3][n]] for n in range(many)]
+        return ExternalRelation(first, last, nodes, edges, values)
+
+    def _planned(self, place: Bound) -> Formula | Test:
+        """The formula, or the test, whose value is asked for at a place."""
+        if isinstance(place, Tense) or (
+            isinstance(place, SignalCall) and place.word == "exists_now"
+        ):
+            return self._plan.formula(place)
+        return self._plan.test(place)
 
     def text(self, places: tuple[Bound, ...]) -> str:
         """The questions about single frames, and the formulas over their answers."""
@@ -401,8 +409,8 @@ class Finder:
                 lines += sql_text(relation(ask.query, self._catalog, None, (), {*ask.columns}))
         for place in places:
             if not isinstance(place, StepTime):
-                told = self._plan.formula(place) if _is_condition(place) else None
-                name = formula_text(told) if told else self._plan.test(place).name
+                asked = self._planned(place)
+                name = asked.name if isinstance(asked, Test) else formula_text(asked)
                 lines.append(f"returned {value_text(place)} = {name}")
         return "\n".join([*lines, *needs_text(self._plan, self._catalog)])
 
@@ -410,22 +418,16 @@ class Finder:
     def _spans(self) -> bool:
         return len(self._query.steps) > 1
 
-    def _find(
-        self,
-        trace: TraceReader,
-        places: tuple[Bound, ...],
-        formulas: dict[Bound, Formula],
-        found: _MatchCollector,
-    ) -> None:
+    def _find(self, trace: TraceReader, places: tuple[Bound, ...]) -> Iterator[_Part]:
         line = BindingLine(trace.clock)
         held = [self._held(trace, line, number) for number in range(len(self._steps))]
         if not self._spans:
-            self._tell_frames(trace, held[0], places, formulas, found)
+            yield self._frames(trace, held[0], places)
             return
         happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
         together = joined([(self._named(n), held[n]) for n in happen], self._apart)
         for part in together.parts([held[n] for n in happen]):
-            self._tell_matches(trace, line, held, part, places, formulas, found)
+            yield from self._matches(trace, line, held, part, places)
 
     @property
     def _apart(self) -> tuple[str, ...]:
@@ -466,20 +468,15 @@ class Finder:
 
     # Single frames
 
-    def _tell_frames(
-        self,
-        trace: TraceReader,
-        relation: TimedRelation,
-        places: tuple[Bound, ...],
-        formulas: dict[Bound, Formula],
-        found: _MatchCollector,
-    ) -> None:
+    def _frames(
+        self, trace: TraceReader, relation: TimedRelation, places: tuple[Bound, ...]
+    ) -> _Part:
         names = self._named(0)
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
         told = [np.zeros(len(owners), object) for _ in places]
         for low, high, rows in _chunks(relation.starts, trace.together):
             at = owners[rows] - low, relation.frames[rows]
-            values = self._values(trace, names, relation.keys[low:high], places, formulas)
+            values = self._values(trace, names, relation.keys[low:high], places)
             for number, column in enumerate(values):
                 told[number][rows] = _picked(column, at)
         ids = trace.frame_ids[relation.frames]
@@ -489,33 +486,28 @@ class Finder:
             new[1:] |= column[1:] != column[:-1]
         first = np.flatnonzero(new)
         last = np.append(first[1:], len(ids))[: len(first)] - 1
-        found.first.append(ids[first])
-        found.last.append(ids[last])
-        found.bindings.append(self._ordered(names, relation.keys[owners[first]]))
-        for number, column in enumerate(told):
-            found.values[number].append(column[first].tolist())
+        keys = self._ordered(names, relation.keys[owners[first]])
+        return ids[first], ids[last], keys, [column[first].tolist() for column in told]
 
     # Sequences
 
-    def _tell_matches(
+    def _matches(
         self,
         trace: TraceReader,
         line: BindingLine,
         held: list[TimedRelation],
         part: JoinedBindings,
         places: tuple[Bound, ...],
-        formulas: dict[Bound, Formula],
-        found: _MatchCollector,
-    ) -> None:
+    ) -> Iterator[_Part]:
         steps = self._query.steps
         happen = [n for n, step in enumerate(steps) if not step.absent]
         at = [self._placed(line, held[n], part.places[:, i]) for i, n in enumerate(happen)]
         by_step = dict(zip(happen, at, strict=True))
-        absent = {
-            n: self._placed(line, held[n], held[n].find(self._projected(part, n)))
-            for n, step in enumerate(steps)
-            if step.absent
-        }
+        absent: dict[int, Ints] = {}
+        for n, step in enumerate(steps):
+            if step.absent:
+                own = part.bindings[:, [part.variables.index(name) for name in self._named(n)]]
+                absent[n] = self._placed(line, held[n], held[n].find(own))
         told = matches_of(line, by_step[0], self._legs(by_step, absent), self._query.policy)
         if not len(told):
             return
@@ -525,36 +517,25 @@ class Finder:
         if steps[happen[-1]].hold is not None:
             runs = line.run_ends(at[-1])
             ends = line.frame(runs[np.searchsorted(at[-1], told[:, -1])])
-        found.first.append(trace.frame_ids[frames[:, -1]])
-        found.last.append(trace.frame_ids[frames[:, -1]])
-        found.bindings.append(self._ordered(part.variables, part.bindings[owners]))
-        values = self._at_matches(trace, part, owners, frames, places, formulas)
-        for number, column in enumerate(values):
-            found.values[number].append(column)
-        found.values[-2].append(trace.frame_ids[frames[:, 0]].tolist())
-        found.values[-1].append(trace.frame_ids[ends].tolist())
+        keys = self._ordered(part.variables, part.bindings[owners])
+        values = self._at_matches(trace, part, owners, frames, places)
+        values += [trace.frame_ids[frames[:, 0]].tolist(), trace.frame_ids[ends].tolist()]
+        last = trace.frame_ids[frames[:, -1]]
+        yield last, last, keys, values
 
     def _placed(self, line: BindingLine, relation: TimedRelation, places: Ints) -> Ints:
         owner, rows = relation.rows_of(places)
         return owner * line.stride + relation.frames[rows]
 
-    def _projected(self, part: JoinedBindings, number: int) -> Keys:
-        return part.bindings[:, [part.variables.index(n) for n in self._named(number)]]
-
     def _legs(self, at: dict[int, Ints], absent: dict[int, Ints]) -> list[Leg]:
         """The ways between the steps that happen; what must not happen lies on them."""
         legs: list[Leg] = []
-        links, steps = self._query.links, self._query.steps
-        number = 1
-        while number < len(steps):
+        links, number = self._query.links, 1
+        while number <= len(links):
+            there = absent.get(number)
+            number += there is not None and number < len(links)
             link = links[number - 1]
-            if number not in absent:
-                legs.append(_leg(link, None, at[number]))
-            elif number + 1 < len(steps):
-                legs.append(_leg(links[number], absent[number], at[number + 1]))
-                number += 1
-            else:
-                legs.append(_leg(link, absent[number], None))
+            legs.append(Leg(link.kind, link.after, link.within, there, at.get(number)))
             number += 1
         return legs
 
@@ -565,31 +546,22 @@ class Finder:
         owners: Ints,
         frames: Ints,
         places: tuple[Bound, ...],
-        formulas: dict[Bound, Formula],
     ) -> list[list[Any]]:
         happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
-        told: list[list[Any]] = []
-        worked_out = [place for place in places if not isinstance(place, StepTime)]
-        columns: dict[Bound, Any] = {}
-        if worked_out:
-            size = trace.together
-            picked: list[list[Any]] = [[] for _ in worked_out]
-            for low in range(0, len(owners), size):
-                some = owners[low : low + size]
-                values = self._values(
-                    trace, part.variables, part.bindings[some], tuple(worked_out), formulas
-                )
-                at = np.arange(len(some)), frames[low : low + size, -1]
-                for number, column in enumerate(values):
-                    picked[number] += _picked(column, at).tolist()
-            columns = dict(zip(worked_out, picked, strict=True))
+        asked = tuple(place for place in places if not isinstance(place, StepTime))
+        picked: dict[Bound, list[Any]] = {place: [] for place in asked}
+        size = trace.together
+        for low in range(0, len(owners) if asked else 0, size):
+            some = owners[low : low + size]
+            at = np.arange(len(some)), frames[low : low + size, -1]
+            values = self._values(trace, part.variables, part.bindings[some], asked)
+            for place, column in zip(asked, values, strict=True):
+                picked[place] += _picked(column, at).tolist()
         for place in places:
             if isinstance(place, StepTime):
                 times = trace.times[frames[:, happen.index(place.step)]] - trace.start
-                told.append((times / 1e9).tolist())
-            else:
-                told.append(columns[place])
-        return told
+                picked[place] = (times / 1e9).tolist()
+        return [picked[place] for place in places]
 
     # Values
 
@@ -599,45 +571,15 @@ class Finder:
         names: tuple[str, ...],
         bindings: Keys,
         places: tuple[Bound, ...],
-        formulas: dict[Bound, Formula],
-    ) -> list[Any]:
-        """Return values over time of some bindings: (B, F) flags, or columns."""
+    ) -> Iterator[Any]:
+        """Values over time of some bindings: (B, F) flags, or columns."""
         values = PlanValues(self._plan, trace, names, bindings)
-        return [
-            values.formula(formulas[place])
-            if place in formulas
-            else values.test(self._plan.test(place))
-            for place in places
-        ]
+        for asked in map(self._planned, places):
+            yield values.test(asked) if isinstance(asked, Test) else values.formula(asked)
 
     def _ordered(self, names: tuple[str, ...], keys: Keys) -> Keys:
         """Bindings with the columns in the order of the query's nodes and edges."""
         return keys[:, [names.index(name) for name in (*self._kept, *self._edges)]]
-
-    def _collected(self, found: _MatchCollector) -> ExternalRelation:
-        def flat(parts: list[Ints]) -> list[int]:
-            return [item for part in parts for item in part.tolist()]
-
-        width = len(self._kept) + len(self._edges)
-        keys = np.concatenate([np.zeros((0, width), np.int64), *found.bindings])
-        nodes = {key: keys[:, number].tolist() for number, key in enumerate(self._kept)}
-        named = words()
-        edges = {
-            key: named[keys[:, len(self._kept) + number]].tolist()
-            for number, key in enumerate(self._edges)
-        }
-        values = [[item for part in parts for item in part] for parts in found.values]
-        return ExternalRelation(flat(found.first), flat(found.last), nodes, edges, values)
-
-
-def _leg(link: StepLink, absent: Ints | None, places: Ints | None) -> Leg:
-    return Leg(link.kind, link.after, link.within, absent, places)
-
-
-def _is_condition(place: Bound) -> bool:
-    return isinstance(place, Tense) or (
-        isinstance(place, SignalCall) and place.word == "exists_now"
-    )
 
 
 def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:

@@ -25,7 +25,7 @@ from sgstore.lang import (
 from sgstore.matches import Windows
 from sgstore.store import trace_of
 from sgstore.temporal._formula import Formula, propositions, tolerant
-from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows, evaluator_over_time
+from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
 from sgstore.vocabulary import RELATIONS
 from sgstore.world import longest_step_ns, tolerance_ns
 
@@ -185,7 +185,7 @@ class TraceReader:
         return float(self.times[frame] - self.start) / 1e9
 
 
-class PlanValues:
+class PlanValues(SignalValues):
     """The values of a plan's formulas and tests in one trace, for some bindings.
 
     Parameters
@@ -200,42 +200,38 @@ class PlanValues:
     def __init__(
         self, plan: Plan, trace: TraceReader, variables: tuple[str, ...], bindings: Keys
     ) -> None:
+        super().__init__(trace.clock)
         self._plan, self._trace = plan, trace
         self._variables, self._bindings = variables, bindings
         self._atoms: dict[str, Bools] = {}
 
     def formula(self, formula: Formula) -> Bools:
         """(B, F) where a formula is true."""
-        columns, clock = self.columns(formula), self._trace.clock
-        lenient = tolerant(formula, clock.tolerance)
-        return evaluate_rows(lenient, columns, clock.times, len(self._bindings))
+        lenient = tolerant(formula, self.clock.tolerance)
+        times, rows = self.clock.times, len(self._bindings)
+        return evaluate_rows(lenient, self.columns(formula), times, rows)
 
     def columns(self, formula: Formula) -> dict[str, Bools]:
         """The propositions of a formula: (B, F), or (1, F) where a proposition is the same for all."""
-        return {name: self._proposition(name) for name in propositions(formula)}
+        return {name: self.proposition(name) for name in propositions(formula)}
 
-    def _proposition(self, name: str) -> Bools:
+    def proposition(self, name: str) -> Bools:
+        """(B, F), or (1, F), where the atom, or the test, of that name is true."""
         if name in self._plan.tests:
             found = self.test(self._plan.tests[name]).true
-            shape = len(found), len(self._trace)
-            return np.broadcast_to(found, shape)
+            return np.broadcast_to(found, (len(found), len(self._trace)))
         if name not in self._atoms:
             found = self._trace.relations[name]
             places = found.find(self._projected(self._plan.atoms[name].variables))
             self._atoms[name] = found.flags(places, len(self._trace))
         return self._atoms[name]
 
-    def test(self, test: Test) -> Column:
-        """The value of a test."""
+    def condition(self, expression: Bound, test: Test) -> Bools:
+        """(B, F) where a condition within a test is true."""
+        return self.formula(test.formulas[expression])
 
-        def condition(expression: Bound) -> Bools:
-            return self.formula(test.formulas[expression])
-
-        clock = self._trace.clock
-        values = SignalValues(test, clock, self._signal, condition, self._proposition)
-        return values.column(evaluator_over_time(test))
-
-    def _signal(self, signal: Ask) -> Column:
+    def signal(self, signal: Ask) -> Column:
+        """The values of a signal: (B, F)."""
         found = self._trace.relations[signal.name]
         places = found.find(self._projected(signal.variables))
         return found.column(places, len(self._trace))

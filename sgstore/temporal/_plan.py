@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from sgstore.lang import Catalog, SqlStatement
-    from sgstore.lang.ir import BoundHold, BoundStep, Length, StepLink
+    from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink
 
 
 _CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
@@ -123,7 +123,7 @@ class Plan:
     ----------
     whole : Query
         The statement: settings and relations are taken from it, and of its scope the nodes and edges.
-    bound : frozenset of str
+    bound : tuple of str
         Keys of the nodes that a binding speaks of.
     absent : frozenset of str
         Those of which conditions are true where they are absent.
@@ -136,7 +136,7 @@ class Plan:
     """
 
     whole: b.Query
-    bound: frozenset[str]
+    bound: tuple[str, ...]
     absent: frozenset[str] = frozenset()
     atoms: dict[str, Ask] = field(default_factory=dict[str, Ask])
     signals: dict[str, Ask] = field(default_factory=dict[str, Ask])
@@ -301,7 +301,7 @@ class Plan:
         return self.signals[name]
 
     def _variables(self, things: frozenset[str]) -> tuple[str, ...]:
-        return tuple(sorted(things & self.bound))
+        return tuple(sorted(things.intersection(self.bound)))
 
     def _query(self, things: frozenset[str], where: tuple[b.Bound, ...]) -> b.Query:
         known = self.whole.scope
@@ -325,7 +325,26 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
     edges = tuple(edge for step in steps for edge in step.scope.edges)
     scope = b.Scope(nodes, {}, edges, (), frozenset())
     whole = replace(query, scope=scope, result=b.Result(), steps=(), links=())
-    return Plan(whole, frozenset(nodes))
+    return Plan(whole, tuple(nodes))
+
+
+PlannedCheck = tuple[Plan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
+"""The plan of a check, its formula, what resets it, and what restricts quantifiers, by their numbers."""
+
+
+def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
+    """Return a check with the formulas that it is made of; ``reset``: whether what resets it matters."""
+    about = check.relations, check.injective, check.ego, check.unknown_is_false
+    whole = b.Query(check.scope, b.Result(), *about)
+    variables = tuple(node for q in check.quantifiers for node in q.nodes)
+    absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
+    plan = Plan(whole, variables, absent)
+    formula = plan.formula(check.formula)
+    resets = plan.formula(check.reset) if reset and check.reset is not None else None
+    guards = {
+        n: plan.formula(q.where) for n, q in enumerate(check.quantifiers) if q.where is not None
+    }
+    return plan, formula, resets, guards
 
 
 def ask_of_step(query: b.Query, step: BoundStep, kept: Iterable[str]) -> Ask:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import TextSpan
@@ -122,32 +122,33 @@ class StepFrame:
     run: Run
 
 
-@dataclass(slots=True)
-class _PendingFrame:
-    """A frame of which it is not known yet whether the step's conditions hold."""
-
-    number: int
-    time: int
-    gap: bool
-    holds: Needs
-
-
-@dataclass(slots=True)
 class StepState:
     """A step and one binding.
+
+    Parameters
+    ----------
+    pulse : StreamClock
+        Told of each frame before this is.
+    hold : BoundHold, optional
+        How long the step is to hold.
 
     Attributes
     ----------
     places : list of StepFrame
         Those that are kept, ascending.
+    open : deque of Needs
+        Of the frames that are not decided yet, the earliest first.
     """
 
-    places: list[StepFrame] = field(default_factory=list[StepFrame])
-    _queue: deque[_PendingFrame] = field(default_factory=deque["_PendingFrame"])
-    _run: Run | None = None
-    _waiting: list[StepFrame] = field(default_factory=list[StepFrame])
-    _start: tuple[int, int] = (0, 0)
-    _fits: bool = True
+    def __init__(self, pulse: StreamClock, hold: BoundHold | None = None) -> None:
+        self._pulse, self._hold = pulse, hold
+        self.places: list[StepFrame] = []
+        self.open: deque[Needs] = deque()
+        self._queue: deque[tuple[int, int, bool]] = deque()  # their numbers, times, and gaps before
+        self._run: Run | None = None
+        self._waiting: list[StepFrame] = []
+        self._start = (0, 0)
+        self._fits = True
 
     @property
     def idle(self) -> bool:
@@ -166,77 +167,62 @@ class StepState:
         """The number of the first frame that may still turn out to be a place; :data:`NEVER`: none so far."""
         if self._waiting:
             return self._waiting[0].number
-        return self._queue[0].number if self._queue else NEVER
+        return self._queue[0][0] if self._queue else NEVER
 
-    def ask(self, number: int, time: int, *, gap: bool, holds: Needs) -> None:
+    def ask(self, holds: Needs, *, gap: bool) -> None:
         """The next frame, and what its conditions still need."""
-        self._queue.append(_PendingFrame(number, time, gap, holds))
+        self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
+        self.open.append(holds)
 
-    @property
-    def open(self) -> list[Needs]:
-        """Needs of frames that are still open, the earliest first."""
-        return [asked.holds for asked in self._queue]
-
-    def decide(
-        self, needs: list[Needs], hold: BoundHold | None, period: int, tolerance: int
-    ) -> None:
+    def decide(self, needs: list[Needs]) -> None:
         """Decide open frames: one that needs nothing any more is a place, or is none."""
-        for asked, need in zip(self._queue, needs, strict=True):
-            asked.holds = need
-        while self._queue and isinstance(self._queue[0].holds, bool):
-            asked = self._queue.popleft()
-            if self._run is not None and (asked.gap or not asked.holds):
-                self._end(hold, period, tolerance)
-            if asked.holds:
-                self._extend(asked, hold, period, tolerance)
+        self.open = deque(needs)
+        while self.open and isinstance(self.open[0], bool):
+            number, time, gap = self._queue.popleft()
+            holds = self.open.popleft()
+            if gap or not holds:
+                self._end()
+            if holds:
+                self._extend(number, time, gap=gap)
 
-    def _extend(
-        self, asked: _PendingFrame, hold: BoundHold | None, period: int, tolerance: int
-    ) -> None:
+    def _extend(self, number: int, time: int, *, gap: bool) -> None:
         if self._run is None:
-            self._run = Run(asked.number, asked.number)
-            self._start = asked.number, asked.time
-            self._fits = hold is None
-        self._run.last = asked.number
-        place = StepFrame(asked.number, asked.time, asked.gap, self._run)
+            self._run = Run(number, number)
+            self._start = number, time
+            self._fits = self._hold is None
+        self._run.last = number
+        self._waiting.append(StepFrame(number, time, gap, self._run))
+        growing = self._hold is not None and self._hold.comparison in {">=", ">"}
+        self._fits = self._fits or (growing and self._long())
         if self._fits:
-            self.places.append(place)
-            return
-        self._waiting.append(place)
-        if (
-            hold is not None
-            and hold.comparison in {">=", ">"}
-            and self._long(hold, period, tolerance)
-        ):
-            self._fits = True
             self._flush()
 
     def _flush(self) -> None:
         self.places += self._waiting
         self._waiting = []
 
-    def _long(self, hold: BoundHold, period: int, tolerance: int) -> bool:
+    def _long(self) -> bool:
         """Tell whether the run is as long as is asked."""
-        assert self._run is not None  # noqa: S101 - there is one
+        if self._hold is None:
+            return True
         last = self._waiting[-1]
-        length = last.time - self._start[1] + (period if hold.inclusive else 0)
-        if hold.length.frames:
+        length = last.time - self._start[1] + (self._pulse.period if self._hold.inclusive else 0)
+        if self._hold.length.frames:
             length = last.number - self._start[0] + 1
-        return hold.fits(length, tolerance)
+        return self._hold.fits(length, self._pulse.tick.tolerance)
 
-    def _end(self, hold: BoundHold | None, period: int, tolerance: int) -> None:
-        if self._waiting and hold is not None and self._long(hold, period, tolerance):
+    def _end(self) -> None:
+        if self._waiting and self._long():
             self._flush()
         self._waiting = []
         if self._run is not None:
             self._run.over = True
         self._run = None
 
-    def finish(self, hold: BoundHold | None, period: int, tolerance: int) -> None:
+    def finish(self) -> None:
         """The trace has ended."""
-        told = [n if isinstance(n, bool) else any(t.ended for _, t in n) for n in self.open]
-        self.decide([*told], hold, period, tolerance)
-        self._end(hold, period, tolerance)
+        self.decide([n if isinstance(n, bool) else any(t.ended for _, t in n) for n in self.open])
+        self._end()
 
 
 Binding = dict[str, int]
@@ -302,16 +288,16 @@ class SequenceMonitor:
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
         """A frame has come, and the questions were asked of it: what is known from it on."""
         self._conditions.step()
-        tick, gap = self._pulse.tick, self._pulse.gap and self._query.gaps != "bridge"
+        gap = self._pulse.gap and self._query.gaps != "bridge"
         for number in range(len(self._steps)):
             now = self._now(number)
             held = self._held[number]
             for key in now:
                 if key not in held:
-                    held[key] = StepState()
+                    held[key] = StepState(self._pulse, self._steps[number].hold)
                     self._names |= {n: people.name(n) for n in key if n in people}
             for key, one in held.items():
-                one.ask(tick.number, tick.time, gap=gap, holds=now.get(key, False))
+                one.ask(now.get(key, False), gap=gap)
             self._decide(number)
         return self._found(here)
 
@@ -334,12 +320,10 @@ class SequenceMonitor:
         return tuple(n for n in variables if n in self._named or n in self._edges)
 
     def _decide(self, number: int) -> None:
-        hold, period = self._steps[number].hold, self._pulse.period
-        tolerance = self._pulse.tick.tolerance
         for key, one in list(self._held[number].items()):
             *before, latest = one.open
             needs = [self._conditions.resolved(need) for need in before]
-            one.decide([*needs, latest], hold, period, tolerance)
+            one.decide([*needs, latest])
             if one.idle:
                 del self._held[number][key]
 
@@ -404,7 +388,7 @@ class SequenceMonitor:
             return (place,)
         link, absent = self._query.links[at], None
         if steps[following].absent:
-            absent = self._of(following, binding) or StepState()
+            absent = self._of(following, binding) or StepState(self._pulse)
             if following + 1 == len(steps):
                 return self._unfollowed(place, link, absent)
             link, following = self._query.links[following], following + 1
@@ -562,10 +546,9 @@ class SequenceMonitor:
     def finish(self, here: FrameTime) -> list[MonitorEvent]:
         """The trace has ended: what only that makes known."""
         self._ended = True
-        for number, held in enumerate(self._held):
+        for held in self._held:
             for one in held.values():
-                tick = self._pulse.tick
-                one.finish(self._steps[number].hold, self._pulse.period, tick.tolerance)
+                one.finish()
         return self._found(here)
 
 

@@ -8,7 +8,7 @@ side fails.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial, reduce
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -65,10 +65,17 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
     ValueError
         A proposition is missing, columns have different lengths, or times do not ascend.
     """
-    table = PropositionTable.of(formula, columns, times)
+    missing = sorted(propositions(formula) - set(columns))
+    if missing:
+        raise ValueError(f"no column for the proposition {missing[0]!r}")
+    for name in propositions(formula):
+        if columns[name].shape != times.shape:
+            raise ValueError(f"{name} has shape {columns[name].shape}, expected {times.shape}")
+    if np.any(np.diff(times) <= 0):
+        raise ValueError("the times of the frames must ascend")
     if not len(times):
         return np.zeros(0, np.bool_)
-    return table.whole(formula)
+    return PropositionTable(columns, times).whole(formula)
 
 
 def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
@@ -88,17 +95,17 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
     -------
     (B, F) bool
     """
-    last = np.full((rows, 1), len(times) - 1)
-    return PropositionTable(columns, times).value(formula, last)
+    found = PropositionTable(columns, times).value(formula)
+    return np.broadcast_to(found, (rows, len(times)))
 
 
 @dataclass(frozen=True, slots=True)
 class PropositionTable:
-    """The propositions of a trace. Values have a row for each end of it, ``last`` (R, 1); a column a frame.
+    """The propositions of a trace.
 
     Parameters
     ----------
-    columns : mapping of str to (F,) bool
+    columns : mapping of str to (F,) bool, or (B, F), or (1, F)
     times : (F,) int64
         Ascending; ns.
     """
@@ -106,72 +113,43 @@ class PropositionTable:
     columns: Mapping[str, Bools]
     times: Ints
 
-    @classmethod
-    def of(cls, formula: Formula, columns: Mapping[str, Bools], times: Ints) -> PropositionTable:
-        """The same, if it has what a formula asks; see :func:`evaluate`."""
-        missing = sorted(propositions(formula) - set(columns))
-        if missing:
-            raise ValueError(f"no column for the proposition {missing[0]!r}")
-        for name in propositions(formula):
-            if columns[name].shape != times.shape:
-                raise ValueError(f"{name} has shape {columns[name].shape}, expected {times.shape}")
-        if np.any(np.diff(times) <= 0):
-            raise ValueError("the times of the frames must ascend")
-        return cls(columns, times)
-
     def whole(self, formula: Formula) -> Bools:
         """(F,): the value at each frame of the whole trace, which has at least one."""
-        return self.value(formula, np.array([[len(self.times) - 1]]))[0]
+        return self.value(formula)[0]
 
-    def value(self, formula: Formula, last: Ints) -> Bools:  # noqa: PLR0911 - a case each
-        """(R, F): the value at each frame, for each end of the trace; meaningless behind the end."""
-        frames = len(self.times)
+    def value(self, formula: Formula) -> Bools:  # noqa: PLR0911 - a case each
+        """(B, F): the value at each frame; (1, F) if it is the same for all bindings."""
         match formula:
             case TruthConstant(value=value):
-                return np.full((len(last), frames), value)
+                return np.full((1, len(self.times)), value)
             case Proposition(name=name):
-                return np.broadcast_to(self.columns[name], (len(last), frames))
+                return np.atleast_2d(self.columns[name])
             case Not(operand=operand):
-                return ~self.value(operand, last)
+                return ~self.value(operand)
             case And(operands=operands):
-                return np.logical_and.reduce([self.value(operand, last) for operand in operands])
+                return reduce(np.logical_and, map(self.value, operands))
             case Or(operands=operands):
-                return np.logical_or.reduce([self.value(operand, last) for operand in operands])
+                return reduce(np.logical_or, map(self.value, operands))
             case Next(operand=operand, weak=weak):
-                shifted = np.full((len(last), frames), weak)
-                shifted[:, :-1] = self.value(operand, last)[:, 1:]
-                return np.where(np.arange(frames) < last, shifted, weak)
+                shifted = np.roll(self.value(operand), -1, axis=1)
+                shifted[:, -1] = weak
+                return shifted
             case Previous(operand=operand):
-                shifted = np.zeros((len(last), frames), np.bool_)
-                shifted[:, 1:] = self.value(operand, last)[:, :-1]
+                shifted = np.roll(self.value(operand), 1, axis=1)
+                shifted[:, 0] = False
                 return shifted
             case Until(left=left, right=right, bound=bound):
-                kept = None if left == TRUE else self.value(left, last)
-                return self._until(kept, self.value(right, last), bound, last)
+                start, end = self.window(bound, forward=True)
+                hit = _at(_next(self.value(right)), start)
+                true = hit <= np.minimum(
+                    len(self.times) - 1 if end is None else end, len(self.times) - 1
+                )
+                return true if left == TRUE else true & (hit <= _next(~self.value(left)))
             case Since(left=left, right=right, bound=bound):
-                kept = None if left == TRUE else self.value(left, last)
-                return self._since(kept, self.value(right, last), bound)
-
-    def _until(self, left: Bools | None, right: Bools, bound: Bound, last: Ints) -> Bools:
-        """``left`` is ``None`` where it is true always."""
-        frames = len(self.times)
-        behind = None if np.all(last == frames - 1) else np.arange(frames) > last
-        hit = _next(right if behind is None else right & ~behind)
-        start, end = self.window(bound, forward=True)
-        hit = hit if start is None else _at(hit, start)
-        true = hit <= (last if end is None else np.minimum(end, last))
-        if left is not None:
-            true &= hit <= _next(~left if behind is None else ~left & ~behind)
-        return true
-
-    def _since(self, left: Bools | None, right: Bools, bound: Bound) -> Bools:
-        hit = _last(right)
-        start, end = self.window(bound, forward=False)
-        hit = hit if start is None else _at(hit, start)
-        true = hit >= (0 if end is None else np.maximum(end, 0))
-        if left is not None:
-            true &= hit >= _last(~left)
-        return true
+                start, end = self.window(bound, forward=False)
+                hit = _at(_last(self.value(right)), start)
+                true = hit >= np.maximum(0 if end is None else end, 0)
+                return true if left == TRUE else true & (hit >= _last(~self.value(left)))
 
     def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
         """The first and the last frame that an operator looks at, from each frame, in its direction.
@@ -237,8 +215,10 @@ def _last(flags: Bools) -> Places:
     return np.maximum.accumulate(np.where(flags, here, here.dtype.type(-1)), axis=1)
 
 
-def _at(places: Places, frame: Places) -> Places:
+def _at(places: Places, frame: Places | None) -> Places:
     """The places told at other frames; F and -1 where these are out of the trace, behind and before it."""
+    if frame is None:
+        return places
     frames = places.shape[1]
     inside = (frame >= 0) & (frame < frames)
     told = places[:, np.clip(frame, 0, frames - 1)]
@@ -295,59 +275,49 @@ class Clock:
 
 
 class SignalValues:
-    """The value of a test for some bindings.
+    """Values of the tests of a plan, for some bindings; a subclass says what signals and propositions are.
 
     Parameters
     ----------
-    test : Test
     clock : Clock
-    signal : function
-        Gives the values of a signal: (B, F).
-    condition : function
-        Gives the value of a condition within the test: (B, F) bool.
-    present : function
-        Gives where the atom of that name is true: (B, F) bool.
     """
 
-    def __init__(
-        self,
-        test: Test,
-        clock: Clock,
-        signal: Callable[[Ask], Column],
-        condition: Callable[[b.Bound], Bools],
-        present: Callable[[str], Bools],
-    ) -> None:
-        self.test, self.clock = test, clock
-        self.signal, self.condition, self._present = signal, condition, present
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
 
-    def column(self, evaluate: Columns[SignalValues]) -> Column:
-        """Return the value of the test: (B, F), or of length 1 in an axis in which it is the same everywhere.
+    def signal(self, signal: Ask) -> Column:
+        """The values of a signal: (B, F)."""
+        raise NotImplementedError
 
-        ``evaluate`` is the evaluator of the test (:func:`evaluator_over_time`).
-        """
+    def condition(self, expression: b.Bound, test: Test) -> Bools:
+        """(B, F) where a condition within a test is true."""
+        raise NotImplementedError
+
+    def proposition(self, name: str) -> Bools:
+        """(B, F) where the atom, or the test, of that name is true."""
+        raise NotImplementedError
+
+    def test(self, test: Test) -> Column:
+        """Return the value of a test: (B, F), or of length 1 in an axis in which it is the same everywhere."""
         with np.errstate(all="ignore"):
-            found = evaluate(self)
+            found = _evaluator(test)(self)
         return Column(np.atleast_2d(found.values), found.known)
 
-    def course(self, course: b.SignalCall) -> Column:
+    def course(self, course: b.SignalCall, test: Test) -> Column:
         """The value of ``prev``, ``delta``, ``run_length``, ``since_true``, ``age`` or ``exists_now``."""
         match course.word:
             case "prev":
-                return self._back(self.signal(self.test.signals[course.operand]), 1)
+                return self._back(self.signal(test.signals[course.operand]), 1)
             case "delta":
-                return self._delta(course)
+                return self._delta(self.signal(test.signals[course.operand]), course)
             case "run_length":
-                return self._run_length(self.condition(course.operand), frames=course.frames)
+                return self._run_length(self.condition(course.operand, test), frames=course.frames)
             case "since_true":
-                return self._since(self.condition(course.operand), frames=course.frames)
-            case "age":
-                return self._age(self._seen(course))
-            case _:
-                return Column(self._seen(course))
-
-    def _seen(self, course: b.SignalCall) -> Bools:
-        (node,) = b.nodes_of(course.operand)
-        return self._present(self.test.presence[node])
+                return self._since(self.condition(course.operand, test), frames=course.frames)
+            case word:
+                (node,) = b.nodes_of(course.operand)
+                seen = self.proposition(test.presence[node])
+                return self._age(seen) if word == "age" else Column(seen)
 
     def _back(self, column: Column, by: int | Ints) -> Column:
         """The values some frames before, unknown where there are none or a gap lies between."""
@@ -361,8 +331,7 @@ class SignalValues:
         known = np.broadcast_to(column.known, (len(column.known), frames))
         return Column(values[:, inside], known[:, inside] & told)
 
-    def _delta(self, course: b.SignalCall) -> Column:
-        now = self.signal(self.test.signals[course.operand])
+    def _delta(self, now: Column, course: b.SignalCall) -> Column:
         times = self.clock.times
         by: int | Ints = course.by
         if not course.frames:
@@ -381,10 +350,10 @@ class SignalValues:
         there = np.arange(frames) - by if isinstance(by, int) else by
         there = np.clip(there, 0, None)
         both = now.known[:, 1:] & now.known[:, :-1]
-        steps = np.where(both, _wrapped(np.diff(np.where(now.known, now.values, 0.0))), 0.0)
+        steps = np.where(both, wrapped(np.diff(np.where(now.known, now.values, 0.0))), 0.0)
         sums, unseen = (_summed(part) for part in (steps, ~both))
         whole = unseen == unseen[:, there]
-        return np.where(whole, sums - sums[:, there], _wrapped(change))
+        return np.where(whole, sums - sums[:, there], wrapped(change))
 
     def _run_length(self, flags: Bools, *, frames: bool) -> Column:
         """Return the length of the run of a condition up to each frame: frames, or s from its first one."""
@@ -409,7 +378,8 @@ class SignalValues:
         return Column((times - times[first][:, None]) / NS, seen)
 
 
-def evaluator_over_time(test: Test) -> Columns[SignalValues]:
+@lru_cache(maxsize=256)
+def _evaluator(test: Test) -> Columns[SignalValues]:
     """Return the evaluator of the expression of a test."""
     return column_evaluator(test.expression, partial(_over_time, test=test))
 
@@ -420,9 +390,9 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
         return lambda at: at.signal(signal)
     match part:
         case b.SignalCall():
-            return lambda at: at.course(part)
+            return lambda at: at.course(part, test)
         case b.Tense():
-            return lambda at: Column(at.condition(part))
+            return lambda at: Column(at.condition(part, test))
         case b.Operation(word=word, operands=operands) if word in _TOLERANT and _of_time(part):
             compare = _TOLERANT[word]
             left, right = (column_evaluator(o, partial(_over_time, test=test)) for o in operands)
@@ -456,7 +426,8 @@ def _of_time(operation: b.Operation) -> bool:
 _TIMES: Final = frozenset({"run_length", "since_true", "age"})
 
 
-def _wrapped(degrees: Array) -> Array:
+def wrapped(degrees: Any) -> Any:
+    """Degrees from -180 to below 180."""
     return (degrees + 180.0) % 360.0 - 180.0
 
 

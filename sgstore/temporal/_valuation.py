@@ -22,7 +22,7 @@ from sgstore.errors import QueryError
 from sgstore.lang import FUTURE, Binding, Column, ScopeSearch, expression, unnumbered_text
 from sgstore.lang import ir as b
 from sgstore.temporal._formula import Progression, ProgressionFrame, Tick
-from sgstore.temporal._signals import NS, Clock, SignalValues, evaluator_over_time, is_angle
+from sgstore.temporal._signals import NS, Clock, SignalValues, is_angle, wrapped
 from sgstore.vocabulary import RELATIONS
 from sgstore.world import longest_step_ns, tolerance_ns
 
@@ -357,7 +357,6 @@ class SignalState:
         self.plan, self.pulse, self._bridge = plan, pulse, bridge
         self.places: dict[b.Bound, int] = {}
         self.conditions: dict[b.Bound, Progression] = {}
-        self.evaluators = {name: evaluator_over_time(test) for name, test in plan.tests.items()}
         for test in plan.tests.values():
             for part in b.walk(test.expression):
                 if isinstance(part, b.Tense) and part.word in FUTURE:
@@ -435,11 +434,10 @@ class SignalState:
         memories : list of B
         """
         now = _Now(self, memories, atom, signal)
-        tests = {name: now.test(test) for name, test in self.plan.tests.items()}
-        return tests, now.memories()
+        return {name: now.test(test) for name, test in self.plan.tests.items()}, now.memories()
 
 
-class _Now:
+class _Now(SignalValues):
     """One frame of some bindings, while it is worked out."""
 
     def __init__(
@@ -449,9 +447,10 @@ class _Now:
         atom: Callable[[str], Bools],
         signal: Callable[[Ask], Column],
     ) -> None:
-        self._all, self._atom, self.signal = courses, atom, signal
+        self._all, self._atom, self._signal = courses, atom, signal
         self._tick = courses.pulse.tick
-        self.tolerance = self._tick.tolerance
+        nothing = np.zeros(0, np.int64)
+        super().__init__(Clock(nothing, nothing, 0, self._tick.tolerance))
         places = len(courses.places)
         columns = list(zip(*memories, strict=True)) or [()] * len(courses.begun)
         self._old = dict(zip(courses.places, columns, strict=False))
@@ -470,24 +469,31 @@ class _Now:
         return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
 
     def test(self, test: Test) -> Column:
-        """The value of a test."""
+        """The value of a test, (B, 1); the memories change once for each."""
         if test.name not in self._tests:
-            evaluate = self._all.evaluators[test.name]
-            self._tests[test.name] = _Momentary(test, self).column(evaluate)
+            self._tests[test.name] = super().test(test)
         return self._tests[test.name]
 
-    def proposition(self, name: str) -> Bools:
-        """(B,) where an atom, or a test, is true."""
-        if name in self._all.plan.tests:
-            return np.broadcast_to(self.test(self._all.plan.tests[name]).true[:, 0], self._rows)
-        return self._atom(name)
+    def signal(self, signal: Ask) -> Column:
+        """The values of a signal: (B, 1)."""
+        return self._signal(signal)
 
-    def condition(self, condition: b.Bound) -> Bools:
-        """(B,) where a condition within a test is true."""
-        if condition in self._flags:
-            return self._flags[condition]
+    def proposition(self, name: str) -> Bools:
+        """(B, 1) where an atom, or a test, is true."""
+        if name in self._all.plan.tests:
+            found = self.test(self._all.plan.tests[name]).true
+            return np.broadcast_to(found, (self._rows, 1))
+        return self._atom(name)[:, None]
+
+    def condition(self, expression: b.Bound, test: Test) -> Bools:
+        """(B, 1) where a condition within a test is true."""
+        if expression not in self._flags:
+            self._flags[expression] = self._condition(expression)[:, None]
+        return self._flags[expression]
+
+    def _condition(self, condition: b.Bound) -> Bools:
         progression = self._all.conditions[condition]
-        letters = [self.proposition(name).tolist() for name in progression.names]
+        letters = [self.proposition(name)[:, 0].tolist() for name in progression.names]
         known: dict[tuple[Any, ...], tuple[bool, Any]] = {}
         found: list[tuple[bool, Any]] = []
         for past, *letter in zip(self._pasts[condition], *letters, strict=True):
@@ -499,8 +505,7 @@ class _Now:
                 known[key] = value, frame.past()
             found.append(known[key])
         self._kept[condition] = [past for _, past in found]
-        self._flags[condition] = np.array([value for value, _ in found], np.bool_)
-        return self._flags[condition]
+        return np.array([value for value, _ in found], np.bool_)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
         """The value of a course."""
@@ -516,25 +521,25 @@ class _Now:
                 values = np.broadcast_to(column.values[:, 0], self._rows).tolist()
                 now = [value if told else None for value, told in zip(values, known, strict=True)]
                 return (
-                    self._prev(course, now) if course.word == "prev" else self._delta(course, now)
+                    self._prev(course, now) if course.word == "prev" else self._changed(course, now)
                 )
             case "run_length" | "since_true":
-                flags = self.condition(course.operand).tolist()
+                flags = self.condition(course.operand, test)[:, 0].tolist()
                 if course.word == "run_length":
-                    return self._run_length(course, flags)
+                    return self._run_now(course, flags)
                 return self._since_true(course, flags)
             case word:
                 (node,) = b.nodes_of(course.operand)
-                seen = self.proposition(test.presence[node])
+                seen = self.proposition(test.presence[node])[:, 0].tolist()
                 first: list[int | None] = [
                     old if old is not None or not flag else self._tick.time
-                    for old, flag in zip(self._old[course], seen.tolist(), strict=True)
+                    for old, flag in zip(self._old[course], seen, strict=True)
                 ]
                 self._new[course] = first
                 if word == "exists_now":
-                    return column_of(seen.tolist())
+                    return column_of(seen)
                 now = self._tick.time
-                ages = zip(first, seen.tolist(), strict=True)
+                ages = zip(first, seen, strict=True)
                 return column_of(
                     [(now - f) / NS if flag and f is not None else None for f, flag in ages]
                 )
@@ -545,7 +550,7 @@ class _Now:
         known = (None if gap or o is None or o[0] != here - 1 else o[1] for o in self._old[course])
         return column_of(list(known))
 
-    def _delta(self, course: b.SignalCall, now: list[Any]) -> Column:
+    def _changed(self, course: b.SignalCall, now: list[Any]) -> Column:
         there, turns = self._all.there(course), is_angle(course.operand)
         told: list[float | None] = []
         kept: list[_Trail | None] = []
@@ -561,12 +566,12 @@ class _Now:
             change = value - before[1]
             if turns:
                 total, chain = trail[0][2:]
-                change = total - before[2] if chain <= there else _wrapped(change)
+                change = total - before[2] if chain <= there else wrapped(change)
             told.append(change)
         self._new[course] = kept
         return column_of(told)
 
-    def _run_length(self, course: b.SignalCall, flags: list[bool]) -> Column:
+    def _run_now(self, course: b.SignalCall, flags: list[bool]) -> Column:
         tick, gap = self._tick, self._all.gap
         self._new[course] = [
             (old if old is not None and not gap else tick) if flag else None
@@ -589,25 +594,6 @@ class _Now:
         return (self._tick.time - start.time) / NS
 
 
-class _Momentary(SignalValues):
-    """The value of a test in one frame."""
-
-    def __init__(self, test: Test, now: _Now) -> None:
-        def condition(expression: b.Bound) -> Bools:
-            return now.condition(expression)[:, None]
-
-        def present(name: str) -> Bools:
-            return now.proposition(name)[:, None]
-
-        nothing = np.zeros(0, np.int64)
-        clock = Clock(nothing, nothing, 0, now.tolerance)
-        super().__init__(test, clock, now.signal, condition, present)
-        self._now = now
-
-    def course(self, course: b.SignalCall) -> Column:
-        return self._now.course(course, self.test)
-
-
 _Point = tuple[int, float, float, int]
 """A frame in which a value was known: its number, the value, how far it had turned, since when it is known."""
 
@@ -626,13 +612,9 @@ def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _
     if old is not None:
         number, before, total, since = old[0]
         if number == here - 1:
-            total, chain = total + _wrapped(value - before), since
+            total, chain = total + wrapped(value - before), since
     point = here, value, total, chain
     return point, (*points, point)
-
-
-def _wrapped(degrees: float) -> float:
-    return (degrees + 180.0) % 360.0 - 180.0
 
 
 def column_of(values: list[Any]) -> Column:

@@ -95,102 +95,89 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
     TooDeep
         An operator looks at what others make of later frames, in a way that is not worked out at once.
     """
-    return _Endings(table).values(formula, 0)
+    return _at_first(formula, 0, table)
 
 
-class _Endings:
-    def __init__(self, table: PropositionTable) -> None:
-        self._table = table
-        self._frames = len(table.times)
-        self._here = table.frames
-        self._known: dict[Formula, Bools] = {}
+def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # noqa: PLR0911
+    """(F,) the value at one frame for each end from there on."""
+    frames = len(table.times)
+    if not looks_ahead(formula):
+        return np.full(frames, table.whole(formula)[at])
+    match formula:
+        case Not(operand=operand):
+            return ~_at_first(operand, at, table)
+        case And(operands=operands):
+            return np.logical_and.reduce([_at_first(one, at, table) for one in operands])
+        case Or(operands=operands):
+            return np.logical_or.reduce([_at_first(one, at, table) for one in operands])
+        case Next(operand=operand, weak=weak):
+            if at + 1 == frames:
+                return np.full(frames, weak)
+            return np.where(table.frames <= at, weak, _at_first(operand, at + 1, table))
+        case Until(left=left) if not looks_ahead(left):
+            return _shown(formula, at, table)
+        case _:
+            found = _course(formula, table)
+            one = PrefixVerdicts(found.start[at : at + 1], found.switches[:, at : at + 1])
+            return one.at(table.frames)
 
-    def _column(self, formula: Formula) -> Bools:
-        """The values of what does not look ahead."""
-        if formula not in self._known:
-            self._known[formula] = self._table.whole(formula)
-        return self._known[formula]
 
-    def values(self, formula: Formula, at: int) -> Bools:  # noqa: PLR0911 - a case each
-        """(F,) the value at one frame for each end from there on."""
-        if not looks_ahead(formula):
-            return np.full(self._frames, self._column(formula)[at])
-        match formula:
-            case Not(operand=operand):
-                return ~self.values(operand, at)
-            case And(operands=operands):
-                return np.logical_and.reduce([self.values(operand, at) for operand in operands])
-            case Or(operands=operands):
-                return np.logical_or.reduce([self.values(operand, at) for operand in operands])
-            case Next(operand=operand, weak=weak):
-                if at + 1 == self._frames:
-                    return np.full(self._frames, weak)
-                return np.where(self._here <= at, weak, self.values(operand, at + 1))
-            case Until(left=left) if not looks_ahead(left):
-                return self._shown(formula, at)
-            case _:
-                course = self.course(formula)
-                one = PrefixVerdicts(course.start[at : at + 1], course.switches[:, at : at + 1])
-                return one.at(self._here)
+def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
+    """An *until* at one frame: whether up to each end some frame shows its right side."""
+    near, far = table.window(formula.bound, forward=True)
+    frames = len(table.times)
+    first = at if near is None else int(near[at])
+    last = frames - 1 if far is None else min(int(far[at]), frames - 1)
+    if formula.left != TRUE:
+        failed = np.flatnonzero(~table.whole(formula.left)[at:])
+        last = min(last, at + int(failed[0])) if len(failed) else last
+    if first > last:
+        return np.zeros(frames, np.bool_)
+    found = _course(formula.right, table)
+    places = slice(first, last + 1)
+    # One more is true, or one less, from an end on.
+    change = np.zeros(frames + 1, np.int64)
+    true = found.start[places]
+    np.add.at(change, table.frames[places][true], 1)
+    for switch in found.switches:
+        np.add.at(change, switch[places], np.where(true, -1, 1))
+        true = ~true
+    return np.cumsum(change[:-1]) > 0
 
-    def _shown(self, formula: Until, at: int) -> Bools:
-        """An *until* at one frame: whether up to each end some frame shows its right side."""
-        near, far = self._table.window(formula.bound, forward=True)
-        first = at if near is None else int(near[at])
-        last = self._frames - 1 if far is None else min(int(far[at]), self._frames - 1)
-        if formula.left != TRUE:
-            failed = np.flatnonzero(~self._column(formula.left)[at:])
-            last = min(last, at + int(failed[0])) if len(failed) else last
-        if first > last:
-            return np.zeros(self._frames, np.bool_)
-        course = self.course(formula.right)
-        places = slice(first, last + 1)
-        # One more is true, or one less, from an end on.
-        change = np.zeros(self._frames + 1, np.int64)
-        true = course.start[places]
-        np.add.at(change, self._here[places][true], 1)
-        for switch in course.switches:
-            np.add.at(change, switch[places], np.where(true, -1, 1))
-            true = ~true
-        return np.cumsum(change[:-1]) > 0
 
-    def course(self, formula: Formula) -> PrefixVerdicts:
-        """Return the values of a formula at all frames for all ends.
+def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
+    """Return the values of a formula at all frames for all ends.
 
-        Raises
-        ------
-        TooDeep
-            As :func:`prefix_values`.
-        """
-        if not looks_ahead(formula):
-            return PrefixVerdicts(
-                self._column(formula), np.zeros((0, self._frames), self._here.dtype)
-            )
-        match formula:
-            case Not(operand=operand):
-                course = self.course(operand)
-                return PrefixVerdicts(~course.start, course.switches)
-            case And(operands=operands):
-                return _joined([self.course(one) for one in operands], np.logical_and.reduce)
-            case Or(operands=operands):
-                return _joined([self.course(one) for one in operands], np.logical_or.reduce)
-            case Next(operand=operand, weak=weak):
-                return self._next(self.course(operand), weak=weak)
-            case Until(left=left, right=right, bound=bound):
-                sides = None if left == TRUE else self.course(left).rising
-                true = met(self.course(right).rising, sides, bound, self._table)
-                start = true == self._here
-                return PrefixVerdicts(start, np.where(start, self._frames, true)[None])
-            case _:  # of the past, about the future
-                raise TooDeep
-
-    def _next(self, course: PrefixVerdicts, *, weak: bool) -> PrefixVerdicts:
-        never = np.full((len(course.switches), 1), self._frames)
-        later = np.concatenate((course.switches[:, 1:], never), axis=1)
-        following = np.append(course.start[1:], weak)
-        turns = np.where(following != weak, self._here + 1, self._frames)
-        switches = np.sort(np.concatenate((turns[None], later)), axis=0)
-        return PrefixVerdicts(np.full(self._frames, weak), switches)
+    Raises
+    ------
+    TooDeep
+        As :func:`prefix_values`.
+    """
+    frames, here = len(table.times), table.frames
+    if not looks_ahead(formula):
+        return PrefixVerdicts(table.whole(formula), np.zeros((0, frames), here.dtype))
+    match formula:
+        case Not(operand=operand):
+            found = _course(operand, table)
+            return PrefixVerdicts(~found.start, found.switches)
+        case And(operands=operands):
+            return _joined([_course(one, table) for one in operands], np.logical_and.reduce)
+        case Or(operands=operands):
+            return _joined([_course(one, table) for one in operands], np.logical_or.reduce)
+        case Next(operand=operand, weak=weak):
+            found = _course(operand, table)
+            never = np.full((len(found.switches), 1), frames)
+            later = np.concatenate((found.switches[:, 1:], never), axis=1)
+            turns = np.where(np.append(found.start[1:], weak) != weak, here + 1, frames)
+            switches = np.sort(np.concatenate((turns[None], later)), axis=0)
+            return PrefixVerdicts(np.full(frames, weak), switches)
+        case Until(left=left, right=right, bound=bound):
+            sides = None if left == TRUE else _course(left, table).rising
+            true = met(_course(right, table).rising, sides, bound, table)
+            start = true == here
+            return PrefixVerdicts(start, np.where(start, frames, true)[None])
+        case _:  # of the past, about the future
+            raise TooDeep
 
 
 def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
@@ -219,21 +206,11 @@ def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
 # greatest of numbers; chains of 2, 4, 8, … frames are put together for all frames, in O(n log n).
 
 
-@dataclass(frozen=True, slots=True)
-class DecidedFrom:
-    """From which frame on something is known of each frame, (F,); F: never.
-
-    Attributes
-    ----------
-    true, false : (F,) int32 or int64
-        That it is true, that it is false.
-    """
-
-    true: Places
-    false: Places
+Decided = tuple["Places", "Places"]
+"""From which frame on it is known of each frame, (F,), that something is true, and that it is not; F: never."""
 
 
-def known(formula: Formula, table: PropositionTable) -> DecidedFrom:
+def known(formula: Formula, table: PropositionTable) -> Decided:  # noqa: PLR0911 - a case each
     """Return the frame at which the value of a formula at each frame is certain.
 
     Parameters
@@ -242,90 +219,68 @@ def known(formula: Formula, table: PropositionTable) -> DecidedFrom:
     table : PropositionTable
         The trace.
     """
-    return _Knowing(table).of(formula)
+    here, frames = table.frames, len(table.times)
+    never = np.full_like(here, frames)
+    match formula:
+        case TruthConstant(value=value):
+            return (here, never) if value else (never, here)
+        case Proposition(name=name):
+            flags = table.columns[name]
+            return np.where(flags, here, never), np.where(flags, never, here)
+        case Not(operand=operand):
+            true, false = known(operand, table)
+            return false, true
+        case And(operands=operands):
+            true, false = zip(*(known(operand, table) for operand in operands), strict=True)
+            return np.maximum.reduce(true), np.minimum.reduce(false)
+        case Or(operands=operands):
+            true, false = zip(*(known(operand, table) for operand in operands), strict=True)
+            return np.minimum.reduce(true), np.maximum.reduce(false)
+        case Next(operand=operand):
+            true, false = known(operand, table)
+            return np.append(true[1:], never[:1]), np.append(false[1:], never[:1])
+        case Previous(operand=operand):
+            true, false = known(operand, table)
+            true, false = np.append(never[:1], true[:-1]), np.append(here[:1], false[:-1])
+            return np.maximum(true, here), np.maximum(false, here)
+        case Until():
+            return _known_until(formula, table)
+        case Since():
+            return _known_since(formula, table)
 
 
-class _Knowing:
-    def __init__(self, table: PropositionTable) -> None:
-        self._table = table
-        self._frames = len(table.times)
-        self._here = table.frames
-        self._found: dict[Formula, DecidedFrom] = {}
+def _known_until(formula: Until, table: PropositionTable) -> Decided:
+    here, bound = table.frames, formula.bound
+    left = (None, None) if formula.left == TRUE else known(formula.left, table)
+    right = known(formula.right, table)
+    true = met(right[0], left[0], bound, table)
+    start, end = _asked(bound, table)
+    # What is behind the bound is known to be nothing when a frame comes that is behind it.
+    closed = np.full_like(here, len(here)) if end is None else end
+    false = _chained(right[1], left[1], start, end, closed, least=False)
+    if left[1] is not None and bound.low:
+        false = np.minimum(false, -_most(-left[1], here, start))
+    return true, false
 
-    def of(self, formula: Formula) -> DecidedFrom:
-        if formula not in self._found:
-            self._found[formula] = self._of(formula)
-        return self._found[formula]
 
-    def _of(self, formula: Formula) -> DecidedFrom:  # noqa: PLR0911 - a case each
-        match formula:
-            case TruthConstant(value=value):
-                return self._now(np.full(self._frames, value))
-            case Proposition(name=name):
-                return self._now(self._table.columns[name])
-            case Not(operand=operand):
-                told = self.of(operand)
-                return DecidedFrom(told.false, told.true)
-            case And(operands=operands):
-                parts = [self.of(operand) for operand in operands]
-                true = np.maximum.reduce([part.true for part in parts])
-                return DecidedFrom(true, np.minimum.reduce([part.false for part in parts]))
-            case Or(operands=operands):
-                parts = [self.of(operand) for operand in operands]
-                true = np.minimum.reduce([part.true for part in parts])
-                return DecidedFrom(true, np.maximum.reduce([part.false for part in parts]))
-            case Next(operand=operand):
-                told = self.of(operand)
-                never = np.full_like(self._here[:1], self._frames)
-                return DecidedFrom(
-                    *(np.append(part[1:], never) for part in (told.true, told.false))
-                )
-            case Previous(operand=operand):
-                told = self.of(operand)
-                true = np.append(np.full_like(self._here[:1], self._frames), told.true[:-1])
-                false = np.append(self._here[:1], told.false[:-1])
-                return DecidedFrom(np.maximum(true, self._here), np.maximum(false, self._here))
-            case Until():
-                return self._until(formula)
-            case Since():
-                return self._since(formula)
-
-    def _now(self, flags: Bools) -> DecidedFrom:
-        """Return the values that are decided at the frame itself."""
-        never = self._here.dtype.type(self._frames)
-        return DecidedFrom(np.where(flags, self._here, never), np.where(flags, never, self._here))
-
-    def _until(self, formula: Until) -> DecidedFrom:
-        left = None if formula.left == TRUE else self.of(formula.left)
-        right = self.of(formula.right)
-        true = met(right.true, left and left.true, formula.bound, self._table)
-        start, end = _asked(formula.bound, self._table)
-        # What is behind the bound is known to be nothing when a frame comes that is behind it.
-        closed = np.full_like(self._here, self._frames) if end is None else end
-        false = _chained(right.false, left and left.false, start, end, closed, least=False)
-        if left is not None and formula.bound.low:
-            false = np.minimum(false, -_most(-left.false, self._here, start))
-        return DecidedFrom(true, false)
-
-    def _since(self, formula: Since) -> DecidedFrom:
-        """The same backwards; at the first frame everything before is known."""
-        frames, here = self._frames, self._here
-        last = frames - 1
-        left = None if formula.left == TRUE else self._turned(self.of(formula.left))
-        right = self._turned(self.of(formula.right))
-        near, far = self._table.window(formula.bound, forward=False)
-        start = here if near is None else last - np.maximum(near, -1)[::-1]
-        end = None if far is None else frames - np.maximum(far, 0)[::-1]
-        before, never = np.full_like(here, -1), np.full_like(here, frames)
-        true = _chained(right.true, left and left.true, start, end, never, least=True)
-        false = _chained(right.false, left and left.false, start, end, before, least=False)
-        if left is not None and near is not None:
-            true = np.maximum(true, _most(left.true, here, start))
-            false = np.minimum(false, -_most(-left.false, here, start))
-        return DecidedFrom(np.maximum(true[::-1], here), np.maximum(false[::-1], here))
-
-    def _turned(self, told: DecidedFrom) -> DecidedFrom:
-        return DecidedFrom(told.true[::-1], told.false[::-1])
+def _known_since(formula: Since, table: PropositionTable) -> Decided:
+    """The same backwards; at the first frame everything before is known."""
+    here, frames = table.frames, len(table.times)
+    left = (None, None)
+    if formula.left != TRUE:
+        true, false = known(formula.left, table)
+        left = true[::-1], false[::-1]
+    right = [one[::-1] for one in known(formula.right, table)]
+    near, far = table.window(formula.bound, forward=False)
+    start = here if near is None else frames - 1 - np.maximum(near, -1)[::-1]
+    end = None if far is None else frames - np.maximum(far, 0)[::-1]
+    before, never = np.full_like(here, -1), np.full_like(here, frames)
+    true = _chained(right[0], left[0], start, end, never, least=True)
+    false = _chained(right[1], left[1], start, end, before, least=False)
+    if left[0] is not None and near is not None:
+        true = np.maximum(true, _most(left[0], here, start))
+        false = np.minimum(false, -_most(-left[1], here, start))
+    return np.maximum(true[::-1], here), np.maximum(false[::-1], here)
 
 
 def met(right: Places, left: Places | None, bound: Bound, table: PropositionTable) -> Places:
@@ -433,21 +388,8 @@ STATUS: Final = ("false", "presumably_false", "presumably_true", "true")
 FALSE, PRESUMABLY_FALSE, PRESUMABLY_TRUE, CERTAINLY_TRUE = range(4)
 
 
-@dataclass(frozen=True, slots=True)
-class Violation:
-    """Frames in which a formula is violated.
-
-    Attributes
-    ----------
-    start, end : int
-        First and last.
-    at_end : bool
-        Whether only the end of the trace made it one.
-    """
-
-    start: int
-    end: int
-    at_end: bool = False
+Violation = tuple[int, int, bool]
+"""First and last frame in which a formula is violated, and whether only the end of the trace made it so."""
 
 
 class Settled:
@@ -472,12 +414,12 @@ class Settled:
         return self._table.whole(self.formula)
 
     @cached_property
-    def _known(self) -> DecidedFrom:
+    def _known(self) -> Decided:
         return known(self.formula, self._table)
 
     def trap(self, start: int) -> int | None:
         """The frame at which it is certain that the formula is false at ``start``; ``None``: at none."""
-        trap = int(self._known.false[start])
+        trap = int(self._known[1][start])
         return trap if trap < self._frames else None
 
     def statuses(self) -> NDArray[np.int8]:
@@ -487,15 +429,15 @@ class Settled:
         except TooDeep:
             ended = self._stepped()
         told = np.where(ended, PRESUMABLY_TRUE, PRESUMABLY_FALSE).astype(np.int8)
-        told[self._known.true[0] :] = CERTAINLY_TRUE
-        told[self._known.false[0] :] = FALSE
+        told[self._known[0][0] :] = CERTAINLY_TRUE
+        told[self._known[1][0] :] = FALSE
         return told
 
     def _stepped(self) -> Bools:
         """The value at the first frame if the trace ended at each frame, one after the other."""
         progression = Progression(self.formula)
         names, plain = progression.names, progression.untimed and not progression.past
-        end = min(int(self._known.true[0]), int(self._known.false[0]), self._frames - 1) + 1
+        end = min(int(self._known[0][0]), int(self._known[1][0]), self._frames - 1) + 1
         letters = np.array([self._table.columns[name][:end] for name in names], np.bool_)
         letters = letters.reshape(len(names), end)
         changes = np.ones(end, np.bool_)
@@ -534,11 +476,11 @@ class Settled:
         while start < frames and not self.value[start]:
             trap = self.trap(start)
             if trap is None:
-                found += [] if weak else [Violation(frames - 1, frames - 1, at_end=True)]
+                found += [] if weak else [(frames - 1, frames - 1, True)]
                 break
             after = int(np.searchsorted(resets, trap))
             end = int(resets[after]) if after < len(resets) else frames - 1
-            found.append(Violation(trap, end))
+            found.append((trap, end, False))
             start = end + 1
         return found
 
