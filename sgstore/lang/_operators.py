@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from sgstore.world import Bools
 
+    SqlOf = Callable[[Sequence[str]], str]
+
 
 @dataclass(frozen=True, slots=True)
 class Column:
@@ -80,7 +82,7 @@ class Operator:
         Whether it is written between its operands.
     """
 
-    sql: Callable[[Sequence[str]], str]
+    sql: SqlOf
     one: Callable[[Sequence[Callable[[Any], Any]]], Callable[[Any], Any]]
     columns: Callable[[Sequence[Column]], Column]
     infix: bool = False
@@ -111,16 +113,20 @@ def _is_call(text: str) -> bool:
     return False
 
 
-def _template(template: str) -> Callable[[Sequence[str]], str]:
-    return lambda parts: template.format(*map(operand_text, parts))
+def _sql(form: str | SqlOf) -> SqlOf:
+    """The function of the SQL of an operator, given its form.
 
-
-def _call(name: str) -> Callable[[Sequence[str]], str]:
-    return lambda parts: f"{name}({', '.join(parts)})"
-
-
-def _between(word: str) -> Callable[[Sequence[str]], str]:
-    return lambda parts: "(" + f" {word} ".join(map(operand_text, parts)) + ")"
+    ``abs(...)`` is a call, ``(... AND ...)`` stands between all operands, ``{0} = {1}`` has a place for each.
+    """
+    if not isinstance(form, str):
+        return form
+    if form.endswith("(...)"):
+        name = form.removesuffix("(...)")
+        return lambda parts: f"{name}({', '.join(parts)})"
+    if form.startswith("(... "):
+        word = form.removeprefix("(...").removesuffix("...)")
+        return lambda parts: f"({word.join(map(operand_text, parts))})"
+    return lambda parts: form.format(*map(operand_text, parts))
 
 
 def _odd(parts: Sequence[str]) -> str:
@@ -128,7 +134,7 @@ def _odd(parts: Sequence[str]) -> str:
     return reduce(lambda left, right: f"({left} <> {right})", map(operand_text, parts))
 
 
-def _if_all_known(name: str) -> Callable[[Sequence[str]], str]:
+def _if_all_known(name: str) -> SqlOf:
     def text(parts: Sequence[str]) -> str:
         known = " AND ".join(f"{operand_text(part)} IS NOT NULL" for part in parts)
         return f"CASE WHEN {known} THEN {name}({', '.join(parts)}) END"
@@ -145,7 +151,7 @@ def _member(parts: Sequence[str]) -> str:
 
 
 def _strict(
-    sql: Callable[[Sequence[str]], str],
+    sql: str | SqlOf,
     one: Callable[..., Any],
     columns: Callable[..., Any],
     *,
@@ -185,7 +191,7 @@ def _strict(
         known = all_known(parts)
         return Column(values, fits if known is True else known & fits)
 
-    return Operator(sql, of_one, of_some if partial else of_columns, infix)
+    return Operator(_sql(sql), of_one, of_some if partial else of_columns, infix)
 
 
 def _divided(a: float, by: float) -> float | None:
@@ -255,7 +261,7 @@ def _matches_columns(texts: Any, pattern: Any) -> Any:
 
 
 def _ruled(
-    sql: Callable[[Sequence[str]], str],
+    sql: str | SqlOf,
     one: Callable[[Iterable[Any]], Any],
     columns: Callable[[Sequence[Column]], Column],
     *,
@@ -266,7 +272,7 @@ def _ruled(
     def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
         return lambda at: one(part(at) for part in parts)
 
-    return Operator(sql, of_one, columns, infix)
+    return Operator(_sql(sql), of_one, columns, infix)
 
 
 def _and(values: Iterable[Any]) -> bool | None:
@@ -376,50 +382,38 @@ def _null_test(word: str, *, null: bool) -> Operator:
         known = parts[0].known
         return Column(np.logical_not(known) if null else np.asarray(known))
 
-    return Operator(_template(f"{{0}} {word}"), of_one, of_columns)
-
-
-def _comparison(word: str, one: Callable[..., Any], columns: Callable[..., Any]) -> Operator:
-    return _strict(_template(f"{{0}} {word} {{1}}"), one, columns, infix=True)
-
-
-def _arithmetic(word: str, one: Callable[..., Any], columns: Callable[..., Any]) -> Operator:
-    return _strict(_between(word), one, columns, infix=True)
-
-
-def _text_test(word: str, one: Callable[..., Any], columns: Callable[..., Any]) -> Operator:
-    return _strict(_call(word), one, _of_texts(columns), infix=True)
+    return Operator(_sql(f"{{0}} {word}"), of_one, of_columns)
 
 
 COMPARISONS: Final[Mapping[str, Operator]] = {
-    "=": _comparison("=", operator.eq, np.equal),
-    "<>": _comparison("<>", operator.ne, np.not_equal),
-    "<": _comparison("<", operator.lt, np.less),
-    "<=": _comparison("<=", operator.le, np.less_equal),
-    ">": _comparison(">", operator.gt, np.greater),
-    ">=": _comparison(">=", operator.ge, np.greater_equal),
+    "=": _strict("{0} = {1}", operator.eq, np.equal, infix=True),
+    "<>": _strict("{0} <> {1}", operator.ne, np.not_equal, infix=True),
+    "<": _strict("{0} < {1}", operator.lt, np.less, infix=True),
+    "<=": _strict("{0} <= {1}", operator.le, np.less_equal, infix=True),
+    ">": _strict("{0} > {1}", operator.gt, np.greater, infix=True),
+    ">=": _strict("{0} >= {1}", operator.ge, np.greater_equal, infix=True),
 }
 TEXT_TESTS: Final[Mapping[str, Operator]] = {
-    "STARTS WITH": _text_test("starts_with", str.startswith, np.char.startswith),
-    "ENDS WITH": _text_test("ends_with", str.endswith, np.char.endswith),
-    "CONTAINS": _text_test("contains", operator.contains, _contains),
-    "=~": _strict(_call("regexp_full_match"), _matches, _matches_columns, infix=True),
+    "STARTS WITH": _strict(
+        "starts_with(...)", str.startswith, _of_texts(np.char.startswith), infix=True
+    ),
+    "ENDS WITH": _strict("ends_with(...)", str.endswith, _of_texts(np.char.endswith), infix=True),
+    "CONTAINS": _strict("contains(...)", operator.contains, _of_texts(_contains), infix=True),
+    "=~": _strict("regexp_full_match(...)", _matches, _matches_columns, infix=True),
 }
 CONNECTIVES: Final[Mapping[str, Operator]] = {
-    "AND": _ruled(_between("AND"), _and, _and_columns, infix=True),
-    "OR": _ruled(_between("OR"), _or, _or_columns, infix=True),
-    "NOT": _ruled(_template("NOT {0}"), _not, _not_columns),
+    "AND": _ruled("(... AND ...)", _and, _and_columns, infix=True),
+    "OR": _ruled("(... OR ...)", _or, _or_columns, infix=True),
+    "NOT": _ruled("NOT {0}", _not, _not_columns),
     "XOR": _ruled(_odd, _xor, _xor_columns, infix=True),
-    "IMPLIES": _ruled(_template("(NOT {0} OR {1})"), _implies, _implies_columns, infix=True),
+    "IMPLIES": _ruled("(NOT {0} OR {1})", _implies, _implies_columns, infix=True),
 }
 NUMERIC: Final[Mapping[str, Operator]] = {
-    "abs": _strict(_call("abs"), abs, np.abs),
-    "sqrt": _strict(
-        _template("CASE WHEN {0} >= 0 THEN sqrt({0}) END"), _root, _root_columns, partial=True
-    ),
-    "floor": _strict(_call("floor"), math.floor, np.floor),
-    "ceil": _strict(_call("ceil"), math.ceil, np.ceil),
-    "round": _strict(_call("round"), _rounded, _rounded_columns),
+    "abs": _strict("abs(...)", abs, np.abs),
+    "sqrt": _strict("CASE WHEN {0} >= 0 THEN sqrt({0}) END", _root, _root_columns, partial=True),
+    "floor": _strict("floor(...)", math.floor, np.floor),
+    "ceil": _strict("ceil(...)", math.ceil, np.ceil),
+    "round": _strict("round(...)", _rounded, _rounded_columns),
 }
 """Functions of one number."""
 
@@ -430,8 +424,8 @@ EXTREMES: Final[Mapping[str, Operator]] = {
 """Functions of two numbers or more."""
 
 OF_TEXT: Final[Mapping[str, Operator]] = {
-    "lower": _strict(_call("lower"), str.lower, _of_texts(np.char.lower)),
-    "upper": _strict(_call("upper"), str.upper, _of_texts(np.char.upper)),
+    "lower": _strict("lower(...)", str.lower, _of_texts(np.char.lower)),
+    "upper": _strict("upper(...)", str.upper, _of_texts(np.char.upper)),
 }
 """Functions of one text."""
 
@@ -442,21 +436,19 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     **NUMERIC,
     **EXTREMES,
     **OF_TEXT,
-    "+": _arithmetic("+", operator.add, np.add),
-    "-": _arithmetic("-", operator.sub, np.subtract),
-    "*": _arithmetic("*", operator.mul, np.multiply),
-    "/": _strict(
-        _template("({0} / nullif({1}, 0))"), _divided, _divided_columns, infix=True, partial=True
-    ),
+    "+": _strict("(... + ...)", operator.add, np.add, infix=True),
+    "-": _strict("(... - ...)", operator.sub, np.subtract, infix=True),
+    "*": _strict("(... * ...)", operator.mul, np.multiply, infix=True),
+    "/": _strict("({0} / nullif({1}, 0))", _divided, _divided_columns, infix=True, partial=True),
     "%": _strict(
-        _template("({0} % nullif({1}, 0))"),
+        "({0} % nullif({1}, 0))",
         _remainder,
         _remainder_columns,
         infix=True,
         partial=True,
     ),
-    "negative": _strict(_template("(- {0})"), operator.neg, np.negative),
-    "coalesce": _ruled(_call("coalesce"), _first_known, _first_known_columns),
+    "negative": _strict("(- {0})", operator.neg, np.negative),
+    "coalesce": _ruled("coalesce(...)", _first_known, _first_known_columns),
     "IS NULL": _null_test("IS NULL", null=True),
     "IS NOT NULL": _null_test("IS NOT NULL", null=False),
     "IN": Operator(_member, _is_member, _is_member_columns, infix=True),
@@ -467,7 +459,7 @@ and, in memory, its choices as one."""
 INFIX: Final = frozenset(word for word, one in OPERATORS.items() if one.infix)
 
 COMPILER_SQL: Final = {
-    "name": _template("{0} || ' ' || CAST({1} AS VARCHAR)"),
-    "whose": _template("CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END"),
+    "name": _sql("{0} || ' ' || CAST({1} AS VARCHAR)"),
+    "whose": _sql("CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END"),
 }
 """SQL of operations that the compiler makes, and no query can say."""
