@@ -559,12 +559,9 @@ class Compiled:
         """Names of the traces that cannot answer it, because they know nothing of a relation."""
         return tuple(self.reasons)
 
-    def rows(self, window: Window | None = None) -> SqlStatement:
-        """The statement for its rows."""
-        return self._rows(self.query, window)
-
-    def _rows(self, query: Query, window: Window | None) -> SqlStatement:
-        query, writer, span = self._told(query, window)
+    def rows(self, window: Window | None = None, query: Query | None = None) -> SqlStatement:
+        """The statement for its rows, or for those of another query with the same pattern."""
+        query, writer, span = self._told(query or self.query, window)
         return results.rows(query, self.catalog, window, writer, span)
 
     def _told(
@@ -591,7 +588,7 @@ class Compiled:
 
     def bindings(self, window: Window | None = None) -> SqlStatement:
         """Frames and what the variables are bound to, whatever ``RETURN`` says."""
-        return self._rows(replace(self.query, result=Result()), window)
+        return self.rows(window, replace(self.query, result=Result()))
 
     def intervals(self, window: Window | None = None) -> SqlStatement:
         """Intervals in which what it returns stays the same; without ``RETURN``, what it binds.
@@ -604,7 +601,7 @@ class Compiled:
         elif result.form != "intervals":
             result = Result(form="intervals", columns=result.columns, whole=False)
             query = replace(query, result=result)
-        return self._rows(query, window)
+        return self.rows(window, query)
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
         """Clips around the frames that match; the offsets of ``RETURN CLIPS`` win over those given.
@@ -618,7 +615,7 @@ class Compiled:
         result = self.query.result
         if result.form != "clips":
             result = Result(form="clips", whole=False, before=-before_ns, after=after_ns)
-        return self._rows(replace(self.query, result=result), window)
+        return self.rows(window, replace(self.query, result=result))
 
     def limited(self, most: int) -> Compiled:
         """The query with no more rows than so many, as if it ended in ``LIMIT``."""

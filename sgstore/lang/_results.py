@@ -333,6 +333,11 @@ class _RowStatement:
         if self.result.whole:
             self.nodes = frozenset(k for k, n in scope.nodes.items() if n.role == "named")
             self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
+        # A row tells of several frames.
+        self.grouped = (self.result.distinct or self.result.aggregated) and not self.result.framed
+        self.owners = list[NodeAttribute]()  # of what samples are taken of
+        if (per := _sampled_by(self.result)) is not None:
+            self.owners = owners_of([per], query, writer.catalog)
 
     def statement(self) -> SqlStatement:
         values = [column.value for column in self.result.columns]
@@ -342,7 +347,9 @@ class _RowStatement:
             apart = owners_of(keys, self.query, self.writer.catalog)
         values += apart
         values += [key.value for key in self.result.order if not isinstance(key.value, str)]
-        values += self._per_values()
+        per = self.result.sample and self.result.sample.per
+        values += [] if per is None or isinstance(per, str) else [per]
+        values += self.owners
         values += [name for _, name in self._names()]
         wanted = [leaf for value in values for leaf in leaves(value)]
         relation = frames_of(self.writer, self.query.scope, None, self.nodes, self.edges, wanted)
@@ -392,7 +399,7 @@ class _RowStatement:
         """The statement in the order of the query, or else of traces, frames, bindings; as many as wanted."""
         keys = [_directed(self._key(k.value), k.descending) for k in self.result.order]
         frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
-        framed, grouped = self.result.framed, self._grouped
+        framed, grouped = self.result.framed, self.grouped
         if not grouped:
             keys.append(frame_key(select, frame, writer.catalog, writer.window, writer.values))
         if framed and keys[own] == frame:  # it is the first of the names
@@ -403,7 +410,7 @@ class _RowStatement:
         sample = self.result.sample
         if sample is not None:
             per = [] if sample.per is None else [self._key(sample.per)]
-            per += [self._text(owner) for owner in self._per_owners()]
+            per += [self._text(owner) for owner in self.owners]
             text = _sampled(select, names, sample.number, per, frame, keys, first=own)
             return _limited(text, self.result.limit)
         named = self._named_traces(keys, own) if grouped else []
@@ -416,12 +423,6 @@ class _RowStatement:
         select.order, select.limit = keys, self.result.limit
         return select.text()
 
-    @property
-    def _grouped(self) -> bool:
-        """Tell whether a row tells of several frames."""
-        result = self.result
-        return (result.distinct or result.aggregated) and not result.framed
-
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
         """Return the sort keys that are names of traces whose characters give another order."""
         known = [trace.name for trace in self.writer.catalog.traces]
@@ -429,16 +430,6 @@ class _RowStatement:
             return []
         told = {quoted(c.name) for c in self.result.columns if c.value == _TRACE_NAME}
         return [place for place in range(own, len(keys)) if keys[place] in told]
-
-    def _per_values(self) -> list[Bound]:
-        """Return the value of each match that samples are taken of."""
-        per = self.result.sample and self.result.sample.per
-        own = [] if per is None or isinstance(per, str) else [per]
-        return [*own, *self._per_owners()]
-
-    def _per_owners(self) -> list[NodeAttribute]:
-        per = _sampled_by(self.result)
-        return owners_of([per], self.query, self.writer.catalog) if per else []
 
     def _key(self, value: Bound | str) -> str:
         return quoted(value) if isinstance(value, str) else self._text(value)

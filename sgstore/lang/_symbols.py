@@ -193,10 +193,6 @@ class ScopeBuilder:
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
-        self._refuse_two_egos(pairs)
-        return frozenset(pairs)
-
-    def _refuse_two_egos(self, pairs: set[tuple[str, str]]) -> None:
         for a, other in sorted(pairs):
             if not self.kinds(a).other and not self.kinds(other).other:
                 self.session.refuse(
@@ -204,6 +200,7 @@ class ScopeBuilder:
                     self.nodes[a].span,
                     "a frame has one ego: use one variable, or USING NODES any",
                 )
+        return frozenset(pairs)
 
 
 @dataclass(slots=True)
