@@ -4,7 +4,7 @@ from ._charts import draw_curve as draw_curve
 from ._charts import draw_growth as draw_growth
 from ._charts import draw_matrix as draw_matrix
 from ._charts import draw_rank_sizes as draw_rank_sizes
-from ._links import Relations as Relations
+from ._view import Relations as Relations
 from ._picture import SheetFrame as SheetFrame
 from ._picture import draw_frame as draw_frame
 from ._picture import draw_map as draw_map

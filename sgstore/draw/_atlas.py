@@ -18,18 +18,25 @@ from matplotlib.patches import Circle
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
 from sgstore.draw._ground import GroundView, paint_compass, paint_ground, paint_scale, rings_of
-from sgstore.draw._labels import Placer
 from sgstore.draw._legend import Entry, ground_entries, paint_swatch
-from sgstore.draw._links import seen_from_ego, sentences
-from sgstore.draw._view import SCENERY, MapWindow, caption, clean, counted, distance
+from sgstore.draw._page import Placer
+from sgstore.draw._view import (
+    SCENERY,
+    MapWindow,
+    caption,
+    clean,
+    counted,
+    distance,
+    seen_from_ego,
+    sentences,
+)
 from sgstore.errors import ExportError
 from sgstore.vocabulary import ENTITY_KINDS, KINDS, MAP_KINDS, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from sgstore.draw._labels import Rect
-    from sgstore.draw._page import Page, Stage
+    from sgstore.draw._page import Page, Rect, Stage
     from sgstore.draw._scene import DrawnFrame
     from sgstore.roads import RoadMap
     from sgstore.world import Floats

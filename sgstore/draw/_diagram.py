@@ -17,19 +17,26 @@ import numpy as np
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
 import sgstore.draw._palette as palette
-from sgstore.draw._labels import Placer
 from sgstore.draw._legend import Entry
-from sgstore.draw._links import ego_lane, linked
-from sgstore.draw._view import SCENERY, clean, counted, distance
+from sgstore.draw._page import Placer
+from sgstore.draw._view import (
+    ALONG,
+    RANK,
+    SCENERY,
+    clean,
+    counted,
+    distance,
+    ego_lane,
+    linked,
+)
 from sgstore.vocabulary import ENTITY_KINDS, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sgstore.draw._labels import Rect
-    from sgstore.draw._links import Relations
-    from sgstore.draw._page import Page
+    from sgstore.draw._page import Page, Rect
     from sgstore.draw._scene import DrawnFrame, Point
+    from sgstore.draw._view import Relations
     from sgstore.graph import SceneGraph
     from sgstore.world import Floats
 
@@ -46,7 +53,6 @@ MOST_WORDS: Final = 2
 """Relations that are written on a line, each way; the most telling come first."""
 
 _TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction"}
-_ALONG: Final = ("leads", "follows", "overlaps")
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +162,7 @@ def _close(graph: SceneGraph) -> set[int]:
     for src, relation, dst, _ in graph.edges:
         if dst == graph.ego and src >= 0:
             any_way.add(src)
-            if relation in PROXIMITY or relation in _ALONG:
+            if relation in PROXIMITY or relation in ALONG:
                 near.add(src)
     return near or any_way
 
@@ -412,7 +418,6 @@ _QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
     "map": (palette.DIAGRAM_TINTS["lane"], 0.7, {}),
     "part": (palette.DIAGRAM_TINTS["road"], 0.7, {"alpha": 0.8}),
 }
-_RANK: Final = {name: rank for rank, name in enumerate(PROXIMITY)}
 
 
 def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations) -> str:
@@ -635,7 +640,7 @@ class _Diagram:
 def _pen(line: DiagramLine, scene: DrawnFrame) -> tuple[str, float, dict[str, Any]]:
     """Colour, width in points, and what else of its look."""
     if line.family in {"ego", "matched"}:
-        close = min((r for r in line.relations if r in _RANK), key=_RANK.__getitem__, default=None)
+        close = min((r for r in line.relations if r in RANK), key=RANK.__getitem__, default=None)
         colour, width = palette.CLOSENESS[close] if close else (palette.FAR_EDGE, 0.9)
         return colour, 0.7 * width + 0.3, {}
     if line.family == "light":

@@ -19,8 +19,7 @@ from sgstore.vocabulary import KINDS
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from sgstore.draw._labels import Rect
-    from sgstore.draw._page import Stage
+    from sgstore.draw._page import Rect, Stage
     from sgstore.draw._view import MapWindow
     from sgstore.roads import MapNodes, RoadMap
     from sgstore.world import Floats

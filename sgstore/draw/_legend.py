@@ -10,9 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle, RegularPolygon
 
 import sgstore.draw._palette as palette
-from sgstore.draw._bodies import ROUND_KINDS, lamps
-from sgstore.draw._links import ego_lane, seen_from_ego
-from sgstore.draw._view import ARROW_SECONDS, SCENERY, clean
+from sgstore.draw._scene import ROUND_KINDS, lamps
+from sgstore.draw._view import ARROW_SECONDS, SCENERY, clean, ego_lane, seen_from_ego
 from sgstore.relations import relations
 from sgstore.vocabulary import KINDS, PROXIMITY, SIGNALS
 

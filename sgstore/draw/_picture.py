@@ -17,17 +17,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from sgstore.draw._links import Relations
-from sgstore.draw._view import clean, counted, number, view_of
+from sgstore.draw._view import Relations, clean, counted, number, view_of
 from sgstore.errors import MissingExtraError
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
     from pathlib import Path
 
-    from sgstore.draw._labels import Rect
     from sgstore.draw._legend import Entry
-    from sgstore.draw._page import Page
+    from sgstore.draw._page import Page, Rect
     from sgstore.draw._scene import DrawnFrame
     from sgstore.graph import SceneGraph
     from sgstore.roads import RoadMap

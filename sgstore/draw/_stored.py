@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from sgstore.draw._legend import Entry
-    from sgstore.draw._links import Relations
+    from sgstore.draw._view import Relations
     from sgstore.graph import SceneGraph
     from sgstore.matches import Matches
     from sgstore.query import Store

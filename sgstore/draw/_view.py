@@ -9,11 +9,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from sgstore.vocabulary import ENTITY_KINDS, SIGNALS
+from sgstore.vocabulary import (
+    DIRECTIONS,
+    ENTITY_KINDS,
+    MAP_KINDS,
+    PROXIMITY,
+    RELATIONS,
+    SIDES,
+    SIGNALS,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -269,3 +277,144 @@ def _places(graph: SceneGraph, *, entities: bool) -> Floats:
 
 def _or(value: float, other: float) -> float:
     return other if math.isnan(value) else value
+
+
+# Relations that are drawn of a graph, and their texts -------------------------------------------
+# A frame of forty entities has thousands of edges. Drawn is what a person asks first: what is close to
+# the ego, and how the matched nodes stand to one another. Everything else on demand.
+
+Relations = Literal["ego", "all", "none"]
+Family = Literal["ego", "matched", "entity", "road", "mixed", "light"]
+
+RANK: Final[dict[str, int]] = {name: rank for rank, name in enumerate(PROXIMITY)}
+ALONG: Final = ("leads", "follows", "overlaps")
+_UNMET: Final = frozenset(MAP_KINDS) | SCENERY
+"""What the ego does not meet: parts of the map, and what stands beside the road."""
+_ORDER: Final = (*PROXIMITY, *ALONG, *DIRECTIONS, *SIDES)
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnLink:
+    """Edges between two nodes, drawn as one line.
+
+    Attributes
+    ----------
+    a, b : int
+        Node ids. The ego is ``a``.
+    there : tuple of str
+        Relations from ``b`` to ``a``: ``near, inDFrontOf`` reads *b is near and in front of a*.
+    back : tuple of str
+        Relations from ``a`` to ``b``, without those that are also in ``there``.
+    family : str
+        What the line is of: ``ego``, ``matched``, ``light`` (a signal and the ego's lane), or the
+        quiet ones ``entity``, ``road`` and ``mixed``.
+    """
+
+    a: int
+    b: int
+    there: tuple[str, ...]
+    back: tuple[str, ...]
+    family: Family
+
+    @property
+    def closeness(self) -> str | None:
+        """The closest proximity relation of the two, or ``None``."""
+        close = [r for r in (*self.there, *self.back) if r in RANK]
+        return min(close, key=RANK.__getitem__, default=None)
+
+
+def links_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[DrawnLink]:
+    """The links to draw, the quiet ones first, then the ego's, then those of matched nodes.
+
+    ``ego``: the ego's proximity to all but what stands about (its other relations, where the graph has
+    no proximity at all), signals that control the ego's lane, and every edge among matched nodes.
+    ``all``: every edge. ``none``: none.
+    """
+    if relations == "none":
+        return []
+    pairs = _pairs(graph)
+    close_matters = any(RANK.keys() & set(there + back) for there, back in pairs.values())
+    asked = frozenset(PROXIMITY + ALONG if close_matters else RELATIONS)
+    lane = ego_lane(graph)
+    links: dict[Family, list[DrawnLink]] = {
+        f: [] for f in ("road", "mixed", "entity", "light", "ego", "matched")
+    }
+    for (a, b), (there, back) in pairs.items():
+        kinds = (graph.nodes[a].get("kind"), graph.nodes[b].get("kind"))
+        family = _quiet_family(*kinds) if relations == "all" else None
+        if a in matched and b in matched:
+            family = "matched"
+        elif "controlsTrafficOf" in there + back and lane is not None and lane in (a, b):
+            family = "light"
+        elif a == graph.ego and kinds[1] not in _UNMET and asked & set(there + back):
+            family = "ego"
+        if family is not None:
+            links[family].append(
+                DrawnLink(a, b, _most_telling(there), _most_telling(back, there), family)
+            )
+    return [link for family in links.values() for link in family]
+
+
+def _quiet_family(a: object, b: object) -> Family:
+    entities = (a in ENTITY_KINDS) + (b in ENTITY_KINDS)
+    return ("road", "mixed", "entity")[entities]
+
+
+def ego_lane(graph: SceneGraph) -> int | None:
+    """The lane that the ego is in above all, or ``None``."""
+    lanes = [
+        (not attributes.get("is_primary", False), dst)
+        for src, relation, dst, attributes in graph.edges
+        if src == graph.ego
+        and relation == "isIn"
+        and graph.nodes.get(dst, {}).get("kind") == "lane"
+    ]
+    return min(lanes)[1] if lanes else None
+
+
+def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
+    """Each entity's relations to the ego, most telling first, for those that have any."""
+    if graph.ego is None:
+        return {}
+    return {
+        b: _most_telling(there)
+        for (a, b), (there, _) in _pairs(graph).items()
+        if a == graph.ego and there and graph.nodes[b].get("kind") in ENTITY_KINDS
+    }
+
+
+def sentences(link: DrawnLink, names: Mapping[int, str]) -> list[str]:
+    """A link's relations as they read, by the names of its nodes: ``p near, inDFrontOf v``."""
+    a, b = (clean(names.get(node) or node, 16) for node in (link.a, link.b))
+    there = [f"{b} {', '.join(link.there)} {a}"] if link.there else []
+    return there + ([f"{a} {', '.join(link.back)} {b}"] if link.back else [])
+
+
+def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Relations of each pair of nodes ``(a, b)``, most telling first: those from b to a, and those from a to b.
+
+    The ego is ``a``.
+    """
+    return {
+        ends: (_most_telling(there), _most_telling(back))
+        for ends, (there, back) in _pairs(graph).items()
+    }
+
+
+def _pairs(graph: SceneGraph) -> dict[tuple[int, int], tuple[list[str], list[str]]]:
+    """Relations of each pair of nodes ``(a, b)``: those from b to a, and those from a to b."""
+    pairs: dict[tuple[int, int], tuple[list[str], list[str]]] = {}
+    for src, relation, dst, _ in graph.edges:
+        if src == dst or src not in graph.nodes or dst not in graph.nodes:
+            continue
+        ahead = dst == graph.ego or (src != graph.ego and dst < src)
+        there, back = pairs.setdefault((dst, src) if ahead else (src, dst), ([], []))
+        (there if ahead else back).append(relation)
+    return pairs
+
+
+def _most_telling(relations: list[str], without: list[str] | None = None) -> tuple[str, ...]:
+    kept = sorted(set(relations) - set(without or ()))
+    return tuple(
+        sorted(kept, key=lambda name: _ORDER.index(name) if name in _ORDER else len(_ORDER))
+    )

@@ -6,26 +6,30 @@ The file is written aside and takes its name when it is finished; memory does no
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
 import sgstore.exporters._foxglove as foxglove
-import sgstore.exporters._osi_messages as osi_messages
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import tool
-from sgstore.readers import SensorCloud, SensorPicture
+from sgstore.readers import SensorCloud, SensorPicture, descriptors
+from sgstore.step import NUMBERS
+from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS, VEHICLES
 
 if TYPE_CHECKING:
     from sgstore.readers import SensorReading
-    from sgstore.step import Frame
+    from sgstore.step import Entity, Frame
 
 
 TRUTH: Final = "ground_truth"
-ROAD_MAP: Final = "ground_truth_map"
+MAP_TOPIC: Final = "ground_truth_map"
 """Topics of the frames and of the road map, as other producers have them."""
 
 PROTOBUF: Final = "protobuf"
@@ -104,7 +108,7 @@ class Recorder:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
-        self._osi = osi_messages.OsiFrames()
+        self._osi = OsiFrames()
         self._map = (map_text, map_name)
         self._times: tuple[int, int] | None = None
         self._frames = 0
@@ -130,10 +134,10 @@ class Recorder:
         if self._times is None:
             text, name = self._map
             if text:
-                data = osi_messages.map_message(text, name)
-                schema = (osi_messages.ROAD_MAP, PROTOBUF, osi_messages.types()[3])
-                self._write(ROAD_MAP, schema, time_ns, data)
-        schema = (osi_messages.SENSOR_VIEW, PROTOBUF, osi_messages.types()[2])
+                data = map_message(text, name)
+                schema = (ROAD_MAP, PROTOBUF, types()[3])
+                self._write(MAP_TOPIC, schema, time_ns, data)
+        schema = (SENSOR_VIEW, PROTOBUF, types()[2])
         self._write(TRUTH, schema, time_ns, self._osi.message(frame))
         self._times = (self._times[0] if self._times else time_ns, time_ns)
         self._frames += 1
@@ -179,7 +183,7 @@ class Recorder:
         self.written = Written(self._to, self._frames, dict(self._counts), start, end)
 
     def _describe(self, sensors: dict[str, str]) -> None:
-        version = ".".join(map(str, osi_messages.VERSION))
+        version = ".".join(map(str, VERSION))
         names = ("version", "min_osi_version", "max_osi_version")
         self._writer.add_metadata("net.asam.osi.trace", dict.fromkeys(names, version))
         self._writer.add_metadata("sgstore.record", {f"sensor.{k}": v for k, v in sensors.items()})
@@ -210,8 +214,293 @@ class Recorder:
             self._schemas[name] = self._writer.register_schema(name, schema_encoding, data)
         about: dict[str, str] = {}
         if name.startswith("osi3."):
-            version = ".".join(map(str, osi_messages.VERSION))
+            version = ".".join(map(str, VERSION))
             about = {"net.asam.osi.trace.channel.osi_version": version}
         number = self._writer.register_channel(topic, encoding, self._schemas[name], about)
         self._channels[topic] = number
         return number
+
+
+# Frames → messages of ASAM OSI: an ``osi3.SensorView`` with the ground truth in it --------------
+# A sensor view and not a bare ground truth, because only that has the pedals of the host vehicle. What
+# OSI has no word for is not written: the steering input, taxis and electric vehicles as special kinds,
+# subkinds of its own.
+#
+# * What stands is written when it is first seen, as several producers do, and never again.
+# * A traffic light is three bulbs, each on or off, tied to the signal of the map by its id.
+# * OSI's ids are numbers: an id that is one is kept, and any other gets a number of its own and is written
+#   as the object's name.
+#
+# Source: open-simulation-interface 3.8.0; omega-prime specification (``MapAsamOpenDrive``).
+
+VERSION: Final = (3, 8, 0)
+SENSOR_VIEW: Final = "osi3.SensorView"
+ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
+OPENDRIVE: Final = "net.asam.opendrive"
+"""Type of a reference to the road map."""
+
+FIRST_NUMBER: Final = 1 << 40
+"""Numbers from here on are given to what has none; those of simulators are smaller."""
+
+_VEHICLE_TYPES: Final = {
+    "car": "TYPE_CAR",
+    "truck": "TYPE_HEAVY_TRUCK",
+    "van": "TYPE_DELIVERY_VAN",
+    "bus": "TYPE_BUS",
+    "motorcycle": "TYPE_MOTORBIKE",
+    "bicycle": "TYPE_BICYCLE",
+    "trailer": "TYPE_TRAILER",
+    "train": "TYPE_TRAIN",
+    "vehicle": "TYPE_OTHER",
+}
+_ROLES: Final = {
+    "emergency": "ROLE_POLICE",
+    "public_transport": "ROLE_PUBLIC_TRANSPORT",
+    "service": "ROLE_ROAD_ASSISTANCE",
+}
+_MOVING_TYPES: Final = {"person": "TYPE_PEDESTRIAN", "animal": "TYPE_ANIMAL"}
+_SIGN_TYPES: Final = {
+    "stop_sign": "TYPE_STOP",
+    "yield_sign": "TYPE_GIVE_WAY",
+    "speed_limit": "TYPE_SPEED_LIMIT_BEGIN",
+}
+_STATIONARY_TYPES: Final = {
+    "building": "TYPE_BUILDING",
+    "pole": "TYPE_POLE",
+    "barrier": "TYPE_BARRIER",
+    "vegetation": "TYPE_VEGETATION",
+    "prop": "TYPE_OTHER",
+    "building bridge": "TYPE_BRIDGE",
+    "barrier wall": "TYPE_WALL",
+    "barrier curb": "TYPE_CURBSTONE",
+    "vegetation tree": "TYPE_TREE",
+    "prop cone": "TYPE_PYLON",
+    "prop speed_bump": "TYPE_SPEED_BUMP",
+    "prop construction": "TYPE_CONSTRUCTION_SITE_ELEMENT",
+}
+"""Kind, or kind and subkind, of what stands → its type."""
+_BULBS: Final = (("red", "COLOR_RED"), ("yellow", "COLOR_YELLOW"), ("green", "COLOR_GREEN"))
+_LIT: Final = {
+    "red": {"red"},
+    "yellow": {"yellow"},
+    "green": {"green"},
+    "red_yellow": {"red", "yellow"},
+}
+_LAMPS: Final = {
+    "light_reverse": "reversing_light",
+    "light_low_beam": "head_light",
+    "light_high_beam": "high_beam",
+    "light_fog": "front_fog_light",
+    "light_special1": "emergency_vehicle_illumination",
+    "light_special2": "service_vehicle_illumination",
+}
+_INDICATORS: Final = ("OFF", "LEFT", "RIGHT", "WARNING")
+
+
+@cache
+def types() -> tuple[type[Any], type[Any], bytes, bytes]:
+    """Classes of a sensor view and of a road map, and the descriptors that an MCAP file carries for them."""
+    view_schema = descriptors()
+    field = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(
+        name="osi3/osi_mapasamopendrive.proto", package="osi3", syntax="proto2"
+    )
+    message = file.message_type.add(name=ROAD_MAP.partition(".")[2])
+    for number, name in enumerate(("map_reference", "open_drive_xml_content"), start=1):
+        message.field.add(
+            name=name, number=number, type=field.TYPE_STRING, label=field.LABEL_OPTIONAL
+        )
+    map_schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    pool = descriptor_pool.DescriptorPool()
+    for schema in (view_schema, map_schema):
+        for each in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
+            pool.Add(each)
+    view, road_map = (
+        message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+        for name in (SENSOR_VIEW, ROAD_MAP)
+    )
+    return view, road_map, view_schema, map_schema
+
+
+def map_message(text: str, name: str) -> bytes:
+    """The message that carries a road map."""
+    message = types()[1](map_reference=name, open_drive_xml_content=text)
+    return message.SerializeToString()
+
+
+class OsiFrames:
+    """Frames of one run → serialised ``osi3.SensorView``."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, int] = {}
+        self._given = FIRST_NUMBER
+        self._bulbs: dict[str, tuple[int, ...]] = {}
+        self._standing: set[str] = set()
+
+    def message(self, frame: Frame) -> bytes:
+        """The message of the next frame."""
+        out = types()[0]()
+        ground = out.global_ground_truth
+        for part in (out, ground):
+            part.version.version_major, part.version.version_minor, part.version.version_patch = (
+                VERSION
+            )
+            part.timestamp.seconds, part.timestamp.nanos = divmod(frame.time_ns, 1_000_000_000)
+        for entity in frame.entities:
+            self._write(ground, entity)
+            if entity.ident == frame.ego and not entity.static:
+                number = self._number(entity.ident)
+                out.host_vehicle_id.value = ground.host_vehicle_id.value = number
+                _write_pedals(out.host_vehicle_data, _values(entity))
+        return out.SerializeToString()
+
+    def _write(self, ground: Any, entity: Entity) -> None:
+        kind = KINDS[entity.kind]
+        if kind == "traffic_light":
+            self._write_light(ground, entity)
+        elif not entity.static:
+            self._write_moving(ground.moving_object.add(), entity, kind)
+        elif entity.ident not in self._standing:
+            self._standing.add(entity.ident)
+            if kind.endswith("sign") or kind == "speed_limit":
+                self._write_sign(ground.traffic_sign.add(), entity, kind)
+            else:
+                self._write_standing(ground.stationary_object.add(), entity, kind)
+
+    def _number(self, ident: str) -> int:
+        """The number of an entity: its id if that is one."""
+        number = self._numbers.get(ident)
+        if number is None:
+            plain = ident.isascii() and ident.isdecimal() and str(int(ident)) == ident
+            number = int(ident) if plain and int(ident) < FIRST_NUMBER else self._fresh()
+            self._numbers[ident] = number
+        return number
+
+    def _fresh(self) -> int:
+        self._given += 1
+        return self._given
+
+    def _name(self, thing: Any, entity: Entity) -> None:
+        """Write an entity's number, its own id where that is none, its type, and what of the map it is."""
+        number = self._number(entity.ident)
+        thing.id.value = number
+        if str(number) != entity.ident:
+            own = thing.source_reference.add(type="net.sgstore")
+            own.identifier.append(f"entity_name:{entity.ident}")
+        if entity.map_ref:
+            key = "traffic_sign_id" if hasattr(thing, "main_sign") else "object_id"
+            thing.source_reference.add(type=OPENDRIVE).identifier.append(f"{key}:{entity.map_ref}")
+
+    def _write_moving(self, out: Any, entity: Entity, kind: str) -> None:
+        values = _values(entity)
+        self._name(out, entity)
+        out.model_reference = entity.type_name
+        _write_base(out.base, values)
+        for part, names in _MOTION.items():
+            _write_vector(getattr(out.base, part), names, values)
+        out.type = _number_of(out, "type", _MOVING_TYPES.get(kind, "TYPE_OTHER"))
+        if kind in VEHICLES:
+            out.type = _number_of(out, "type", "TYPE_VEHICLE")
+            vehicle = out.vehicle_classification
+            vehicle.type = _number_of(vehicle, "type", _VEHICLE_TYPES[kind])
+            vehicle.role = _number_of(vehicle, "role", _ROLES.get(entity.special, "ROLE_CIVIL"))
+            if entity.whole[0] >= 0:
+                _write_lamps(vehicle.light_state, entity.whole[0])
+
+    def _write_standing(self, out: Any, entity: Entity, kind: str) -> None:
+        self._name(out, entity)
+        out.model_reference = entity.type_name
+        _write_base(out.base, _values(entity))
+        word = _STATIONARY_TYPES.get(f"{kind} {entity.subkind}") or _STATIONARY_TYPES.get(kind)
+        out.classification.type = _number_of(out.classification, "type", word or "TYPE_UNKNOWN")
+
+    def _write_sign(self, out: Any, entity: Entity, kind: str) -> None:
+        self._name(out, entity)
+        out.main_sign.model_reference = entity.type_name
+        _write_base(out.main_sign.base, _values(entity))
+        about = out.main_sign.classification
+        about.type = _number_of(about, "type", _SIGN_TYPES.get(kind, "TYPE_OTHER"))
+
+    def _write_light(self, ground: Any, entity: Entity) -> None:
+        """Three bulbs, one above another, that make up the box of the light."""
+        numbers = self._bulbs.get(entity.ident)
+        if numbers is None:
+            numbers = (self._number(entity.ident), self._fresh(), self._fresh())
+            self._bulbs[entity.ident] = numbers
+        values, code = _values(entity), entity.whole[1]
+        state = LIGHT_STATES[code] if code >= 0 else "unknown"
+        third = values["height"] / 3
+        for place, (number, (word, colour)) in enumerate(zip(numbers, _BULBS, strict=True)):
+            up = 0.0 if math.isnan(third) else (1 - place) * third
+            bulb = ground.traffic_light.add()
+            bulb.id.value = number
+            _write_base(bulb.base, values | {"z": values["z"] + up, "height": third})
+            about = bulb.classification
+            about.color = _number_of(about, "color", colour)
+            about.icon = _number_of(about, "icon", "ICON_NONE")
+            about.mode = _number_of(about, "mode", _mode(state, word))
+            if entity.map_ref:
+                reference = bulb.source_reference.add(type=OPENDRIVE)
+                reference.identifier.append(f"traffic_light_id:{entity.map_ref}")
+
+
+_MOTION: Final = {
+    "velocity": {"x": "vx", "y": "vy", "z": "vz"},
+    "acceleration": {"x": "ax", "y": "ay", "z": "az"},
+    "orientation_rate": {"yaw": "yaw_rate"},
+}
+_PLACE: Final = {name: name for name in ("x", "y", "z")}
+_TURN: Final = {"yaw": "heading", "pitch": "pitch", "roll": "roll"}
+_SIZE: Final = {name: name for name in ("length", "width", "height")}
+
+
+def _values(entity: Entity) -> dict[str, float]:
+    return dict(zip(NUMBERS, entity.numbers, strict=True))
+
+
+def _write_base(base: Any, values: dict[str, float]) -> None:
+    for part, names in (("position", _PLACE), ("orientation", _TURN), ("dimension", _SIZE)):
+        _write_vector(getattr(base, part), names, values)
+
+
+def _write_vector(out: Any, names: dict[str, str], values: dict[str, float]) -> None:
+    """Write what is known of a vector; the first of its numbers decides whether it is there at all.
+
+    In OSI a number that is missing from a vector is 0, and a vector that is missing is not known.
+    """
+    if math.isnan(values[next(iter(names.values()))]):
+        return
+    for name, column in names.items():
+        setattr(out, name, 0.0 if math.isnan(values[column]) else values[column])
+
+
+def _write_pedals(data: Any, values: dict[str, float]) -> None:
+    if not math.isnan(values["throttle"]):
+        data.vehicle_powertrain.pedal_position_acceleration = values["throttle"]
+    if not math.isnan(values["brake"]):
+        data.vehicle_brake_system.pedal_position_brake = values["brake"]
+
+
+def _write_lamps(out: Any, mask: int) -> None:
+    on = {name for bit, name in enumerate(VEHICLE_LIGHTS) if mask >> bit & 1}
+    turning = _INDICATORS[("light_left" in on) + 2 * ("light_right" in on)]
+    out.indicator_state = _number_of(out, "indicator_state", f"INDICATOR_STATE_{turning}")
+    brake = "NORMAL" if "light_brake" in on else "OFF"
+    out.brake_light_state = _number_of(out, "brake_light_state", f"BRAKE_LIGHT_STATE_{brake}")
+    for name, field in _LAMPS.items():
+        word = "ON" if name in on else "OFF"
+        setattr(out, field, _number_of(out, field, f"GENERIC_LIGHT_STATE_{word}"))
+
+
+def _mode(state: str, bulb: str) -> str:
+    """Mode of a bulb when its light shows a state."""
+    if state == "flashing":
+        return "MODE_FLASHING" if bulb == "yellow" else "MODE_OFF"
+    if state == "unknown":
+        return "MODE_UNKNOWN"
+    return "MODE_CONSTANT" if bulb in _LIT.get(state, set()) else "MODE_OFF"
+
+
+def _number_of(message: Any, field: str, name: str) -> int:
+    """The number of an enumeration's value, by its name."""
+    return message.DESCRIPTOR.fields_by_name[field].enum_type.values_by_name[name].number
