@@ -86,27 +86,9 @@ class DiagramLine:
         return there if back in {"", there} else f"{there} ⇄ {back}"
 
 
-@dataclass(frozen=True, slots=True)
-class Excerpt:
-    """Part of a graph that is shown.
-
-    Attributes
-    ----------
-    nodes : dict
-        Node id → tier; the ego first, then those nearest to it.
-    lines : list of DiagramLine
-        Those that matter most at the end.
-    """
-
-    nodes: dict[int, Tier]
-    lines: list[DiagramLine]
-
-    def edges(self) -> int:
-        """Number of edges that are shown."""
-        return sum(len(line.relations) + len(line.back) for line in self.lines)
-
-
-def excerpt_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> Excerpt:
+def excerpt_of(
+    graph: SceneGraph, matched: frozenset[int], relations: Relations
+) -> tuple[dict[int, Tier], list[DiagramLine]]:
     """Choose what of a graph is shown.
 
     Parameters
@@ -117,6 +99,13 @@ def excerpt_of(graph: SceneGraph, matched: frozenset[int], relations: Relations)
     relations : {"ego", "all", "none"}
         ``ego``: of entities those that the ego is related to by distance, and only their relations to it;
         ``all``: all entities and all their relations; ``none``: no relations among entities.
+
+    Returns
+    -------
+    nodes : dict
+        Node id → tier; the ego first, then those nearest to it.
+    lines : list of DiagramLine
+        Those that matter most at the end.
     """
     entities = _entities(graph, matched, relations)
     lanes, inside = _lanes(graph, entities, matched)
@@ -124,7 +113,7 @@ def excerpt_of(graph: SceneGraph, matched: frozenset[int], relations: Relations)
     parts = _parts(graph, [*lanes, *(n for n in matched if n < 0)])
     shown = [*entities, *lights, *lanes, *inside, *parts, *sorted(matched)]
     tiers: dict[int, Tier] = {n: tier_of(graph, n) for n in shown if n in graph.nodes}
-    return Excerpt(tiers, _lines(graph, tiers, matched, relations))
+    return tiers, _lines(graph, tiers, matched, relations)
 
 
 def tier_of(graph: SceneGraph, node: int) -> Tier:
@@ -437,15 +426,14 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
         (left, bottom), right - left, top - bottom, facecolor=palette.GROUND, linewidth=0
     )
     page.sheet.add_artist(ground)
-    excerpt = excerpt_of(scene.graph, frozenset(scene.matched), relations)
-    diagram = _Diagram(page, box, scene, excerpt)
-    diagram.paint()
-    graph, shown = scene.graph, excerpt.edges()
-    told = [
-        f"shown: {len(excerpt.nodes)} of {counted(len(graph.nodes), 'node')},",
-        f"{shown} of {counted(len(graph.edges), 'edge')}",
-    ]
-    return " ".join(told)
+    graph = scene.graph
+    nodes, lines = excerpt_of(graph, frozenset(scene.matched), relations)
+    _Diagram(page, box, scene, nodes, lines).paint()
+    edges = sum(len(line.relations) + len(line.back) for line in lines)
+    return (
+        f"shown: {len(nodes)} of {counted(len(graph.nodes), 'node')},"
+        f" {edges} of {counted(len(graph.edges), 'edge')}"
+    )
 
 
 def diagram_entries() -> list[Entry]:
@@ -461,19 +449,26 @@ def diagram_entries() -> list[Entry]:
 class _Diagram:
     """A window with its nodes in their places."""
 
-    def __init__(self, page: Page, box: Rect, scene: DrawnFrame, excerpt: Excerpt) -> None:
+    def __init__(
+        self,
+        page: Page,
+        box: Rect,
+        scene: DrawnFrame,
+        nodes: dict[int, Tier],
+        lines: list[DiagramLine],
+    ) -> None:
         self._page = page
         self._scene = scene
-        self._lines = excerpt.lines
-        self._texts = {node: self._text(node) for node in excerpt.nodes}
+        self._lines = lines
+        self._texts = {node: self._text(node) for node in nodes}
         self._sizes = {
             node: np.add(page.text_size(text, _SIZE, "bold"), _PAD)
             for node, text in self._texts.items()
         }
         self._box = box
-        self._spots = self._placed(excerpt.nodes)
+        self._spots = self._placed(nodes)
         self._placer = Placer(box)
-        for node in excerpt.nodes:
+        for node in nodes:
             left, bottom, right, top = self._rect(node)
             self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
 
