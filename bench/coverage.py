@@ -193,7 +193,7 @@ def made(path: Path, frames: int, seed: int, library: Library, road_map: RoadMap
             path=Path(f"/made/up/{path.stem}-{number}.mcap"),
             size=1,
             mtime_ns=1,
-            digest=f"{seed:032x}{number:032x}",
+            digest=f"{seed:032x}{number:032x}"[::-1],
             flavour="made up",
             channels=(Channel(1, "/camera", "", "", "", length, "payload"),),
             ego="0",

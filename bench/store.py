@@ -60,7 +60,7 @@ class Made:
 
     def into(self, store: StoreFile, number: int = 0) -> float:
         """Bring the graphs into a store as a trace of its own; seconds."""
-        info = replace(self.info, digest=f"{number:064x}")
+        info = replace(self.info, digest=f"{number:064x}"[::-1])
         start = time.perf_counter()
         with store.segment(info, Config(), road_map=self.road_map, answers=self.answers) as segment:
             for graph in self.graphs:

@@ -9,18 +9,22 @@
 --     frame_id = bucket · 64 + seq % 60              so trace_id = frame_id >> 24, bucket = frame_id >> 6
 -- A node_id names a node within its trace: 0 and above are entities of the trace, below zero parts of its map
 -- (-1 is off_road). A mask holds 60 frames of a bucket: bit i is the frame with seq % 60 = i.
+-- A recording, a road map and a set of settings are known by their digests (SHA-256): recording_id, map_id and config_id are
+-- the first 60 bits of them, so they are the same in every store, too, and rows of one store can be put into another as they are.
+-- Two of a million have the same 60 bits with a chance of 4 in 10 million; the second one is refused by name.
 --
 -- Enumerations are those of vocabulary.py, in its order (a test holds the two together). When a trace comes with a kind or a
 -- state of lights, or can answer a relation, that the type does not have, it is added behind the others, in place.
 --
 -- Changes
---   * Version 4: tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
+--   * Version 4: recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
+--     Tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     Columns that are always known are NOT NULL; store_info holds a digest of these statements.
 --   * Version 3: bucket.joined; the states of the ego lie together (state, lane_state).
 --   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; lane_dists, by lane_state.is_own and map_reach. roles, by lane_role.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
 --     (a join of 10 million states costs a second, the two columns cost nothing: they are dictionaries).
---   * map_id, channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
+--   * channel_id, section, lane are INTEGER: the numbers come from files, and cost the same space.
 --   * What may be missing is NULL everywhere: texts too (never the empty string).
 
 CREATE TYPE kind AS ENUM (
@@ -42,23 +46,30 @@ USE inside;
 
 CREATE TABLE store_info (key VARCHAR NOT NULL, value VARCHAR NOT NULL); -- schema_version, created_by
 
-CREATE TABLE config (config_id INTEGER NOT NULL, digest VARCHAR NOT NULL, settings JSON NOT NULL); -- one row for each set of settings in use
+-- The digest: of the settings and, of flavours that need one, of the mapping by which a recording is understood.
+CREATE TABLE config (config_id BIGINT NOT NULL, digest VARCHAR NOT NULL, settings JSON NOT NULL); -- one row for each set of settings in use
 
 -- Traces ----------------------------------------------------------------------------------------------------------
+
+CREATE TABLE recording (                                       -- a file, or a bag of several: one row, whatever the number of egos
+  recording_id BIGINT NOT NULL,
+  digest     VARCHAR NOT NULL,     -- SHA-256 of the whole file
+  uri        VARCHAR NOT NULL,     -- absolute path when it was ingested
+  place      VARCHAR,              -- the same from the folder of the store, where it lies below it, else NULL: both may be moved together
+  size       BIGINT NOT NULL,      -- with mtime_ns it tells that the file was replaced
+  mtime_ns   BIGINT NOT NULL
+);
 
 CREATE TABLE trace (
   trace_id   BIGINT NOT NULL,      -- 39 bits of sha256(digest, ego)
   name       VARCHAR NOT NULL,     -- unique; the file's name without its ending
-  uri        VARCHAR NOT NULL,     -- absolute path of the file when it was ingested
-  size       BIGINT NOT NULL,      -- of the file; with mtime_ns it tells that the file was replaced
-  mtime_ns   BIGINT NOT NULL,
-  digest     VARCHAR NOT NULL,     -- SHA-256 of the whole file
+  recording_id BIGINT NOT NULL,
   flavour    VARCHAR NOT NULL,     -- the reader: 'osi'
   ego        VARCHAR,              -- the simulator's id of the ego, NULL without one
   since      DOUBLE,               -- seconds of the recording from which on its frames were read, NULL: from the first
   until      DOUBLE,               -- and up to which, included, NULL: to the last
-  map_id     INTEGER,              -- NULL without a map
-  config_id  INTEGER NOT NULL,
+  map_id     BIGINT,               -- NULL without a map
+  config_id  BIGINT NOT NULL,
   frames     INTEGER NOT NULL,
   start_ns   BIGINT NOT NULL,      -- simulation time of the first and of the last frame
   end_ns     BIGINT NOT NULL,
@@ -72,6 +83,9 @@ CREATE TABLE trace (
   version    VARCHAR NOT NULL      -- of sgstore
 );
 
+-- Channels, context and payloads are the trace's, not the recording's: the role of a channel, the part that was read and the
+-- tolerance with which messages are joined are settings, which may differ from ego to ego; a trace can be taken out of a store,
+-- and put into another, with all that is its own; and payloads meet frames by bucket, so that a window over frames reaches them.
 CREATE TABLE channel (                                         -- channels of the traces' files
   trace_id BIGINT NOT NULL, channel_id INTEGER NOT NULL, topic VARCHAR, schema VARCHAR, schema_encoding VARCHAR, message_encoding VARCHAR,
   role VARCHAR);                                               -- ground_truth, map, payload
@@ -86,12 +100,12 @@ CREATE TABLE entity (                                          -- what does not 
 
 -- Frames ----------------------------------------------------------------------------------------------------------
 
-CREATE TABLE bucket (bucket BIGINT NOT NULL, trace_id BIGINT NOT NULL, map_id INTEGER,
+CREATE TABLE bucket (bucket BIGINT NOT NULL, trace_id BIGINT NOT NULL, map_id BIGINT,
   valid BIGINT NOT NULL,                                       -- mask of its frames
   joined BIGINT NOT NULL);                                     -- mask of those at most 2.5 periods after the one before
 
 CREATE TABLE frame (                                           -- ordered by frame_id
-  frame_id BIGINT NOT NULL, bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, map_id INTEGER, seq INTEGER NOT NULL,
+  frame_id BIGINT NOT NULL, bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, map_id BIGINT, seq INTEGER NOT NULL,
   time_ns BIGINT NOT NULL, log_time_ns BIGINT NOT NULL, ego INTEGER); -- ego: node_id, NULL where it is absent
 
 CREATE TABLE state (                                           -- ordered by is_ego (first), kind, bucket, node_id, frame_id
@@ -100,7 +114,9 @@ CREATE TABLE state (                                           -- ordered by is_
   heading FLOAT, pitch FLOAT, roll FLOAT,                      -- rad
   speed FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, ax FLOAT, ay FLOAT, az FLOAT, yaw_rate FLOAT,
   length FLOAT, width FLOAT, height FLOAT,
-  lights SMALLINT, light_state light_state, steer FLOAT, throttle FLOAT, brake FLOAT, derived TINYINT,
+  lights SMALLINT, light_state light_state, steer FLOAT, throttle FLOAT, brake FLOAT,
+  gear TINYINT, hand_brake BOOLEAN,                            -- gear: below 0 backwards, 0 neutral
+  derived TINYINT,
   special VARCHAR, subkind VARCHAR);                           -- as in entity
 
 CREATE TABLE node (kind kind NOT NULL, bucket BIGINT NOT NULL, node_id INTEGER NOT NULL, mask BIGINT NOT NULL); -- presence of static nodes
@@ -159,25 +175,26 @@ CREATE TABLE attribute (                                       -- of a client's 
 
 -- Maps: once each, whatever the number of traces on them ----------------------------------------------------------
 
-CREATE TABLE map (map_id INTEGER NOT NULL, digest VARCHAR NOT NULL, name VARCHAR NOT NULL, text VARCHAR);
+CREATE TABLE map (map_id BIGINT NOT NULL, digest VARCHAR NOT NULL, name VARCHAR NOT NULL, text VARCHAR);
 
 CREATE TABLE map_node (
-  map_id INTEGER NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, name VARCHAR, -- name: 'road/section/lane' of a lane, else the id in the map
+  map_id BIGINT NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, name VARCHAR, -- name: 'road/section/lane' of a lane, else the id in the map
   x DOUBLE, y DOUBLE, z DOUBLE, heading DOUBLE,                -- a point on it, and its direction there
   lane_type VARCHAR, road VARCHAR, section INTEGER, lane INTEGER, junction VARCHAR, turn VARCHAR,
   length DOUBLE, width DOUBLE, speed_limit DOUBLE, curvature DOUBLE);   -- m, m (mean), m/s, 1/m
 
 CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
-  map_id INTEGER NOT NULL, relation relation NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL);
+  map_id BIGINT NOT NULL, relation relation NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL);
 
 CREATE TABLE map_reach (                                       -- for each two lanes that a way of up to 200 m joins
-  map_id INTEGER NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, -- lanes, a lane and itself among them
+  map_id BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, -- lanes, a lane and itself among them
   start DOUBLE NOT NULL);                                      -- of dst, from the start of src; below 0: one drives back to src; m
 
 -- For sgstore verify ------------------------------------------------------------------------------------------------
 
-CREATE TABLE manifest (                                        -- what was published: rows of a trace, or of a map
-  trace_id BIGINT, map_id INTEGER, "table" VARCHAR NOT NULL, rows BIGINT NOT NULL, checksum BIGINT NOT NULL); -- store/checksums.py says how
+CREATE TABLE manifest (                                        -- what was published: rows of a trace, a recording, a map, or settings
+  owner VARCHAR NOT NULL, id BIGINT NOT NULL,                  -- 'trace' and its trace_id, 'recording', 'map', 'config'
+  "table" VARCHAR NOT NULL, rows BIGINT NOT NULL, checksum BIGINT NOT NULL); -- store/_staging.py says how
 
 -- For the compiler ------------------------------------------------------------------------------------------------
 
@@ -206,7 +223,7 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.lights & 1) <> 0 AS light_left, (s.lights & 2) <> 0 AS light_right, (s.lights & 4) <> 0 AS light_brake,
        (s.lights & 8) <> 0 AS light_reverse, (s.lights & 16) <> 0 AS light_position, (s.lights & 32) <> 0 AS light_low_beam,
        (s.lights & 64) <> 0 AS light_high_beam, (s.lights & 128) <> 0 AS light_fog, (s.lights & 256) <> 0 AS light_interior,
-       (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake,
+       (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake, s.gear, s.hand_brake,
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
        NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit, NULL::DOUBLE AS curvature
@@ -214,7 +231,7 @@ FROM inside.state s JOIN inside.trace t ON t.trace_id = s.frame_id >> 24
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
        NULL, NULL, n.still, n.still, n.still, n.still, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
-       NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
+       NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
        n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature
 FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
@@ -227,7 +244,7 @@ FROM inside.frame f JOIN (
   FROM inside.node k JOIN inside.trace t ON t.trace_id = k.bucket >> 18 JOIN inside.entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
 
 CREATE VIEW main.edges AS
 SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego
@@ -305,10 +322,11 @@ FROM inside.entity e JOIN inside.trace t ON t.trace_id = e.trace_id;
 COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
 
 CREATE VIEW main.payloads AS
-SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, t.uri AS file,
+SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, r.uri AS file,
        p.chunk_offset, p."offset" AS message_offset, p.length
 FROM inside.frame f JOIN inside.payload p ON p.bucket = f.bucket AND p.bit = f.bit
-     JOIN inside.channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN inside.trace t ON t.trace_id = f.trace_id;
+     JOIN inside.channel c ON c.trace_id = f.trace_id AND c.channel_id = p.channel_id JOIN inside.trace t ON t.trace_id = f.trace_id
+     JOIN inside.recording r ON r.recording_id = t.recording_id;
 
 COMMENT ON VIEW main.payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';
 

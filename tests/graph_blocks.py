@@ -65,7 +65,7 @@ def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
     return MapStub(
         name=name,
         text=f"<OpenDRIVE seed='{seed}'/>",
-        digest=f"map{seed}",
+        digest=f"{seed:064x}"[::-1],
         nodes=MapNodes(
             kind=np.array([KIND_CODE[kind] for kind in kinds], np.int8),
             name=tuple(f"{i}/0/-1" if kind == "lane" else str(i) for i, kind in enumerate(kinds)),
@@ -141,7 +141,7 @@ class RandomTrace:
         self.rng = np.random.default_rng(seed)
         self.frames = frames
         self.road_map = road_map
-        self.info = trace_info(**({"digest": f"{seed:064x}"} | info))
+        self.info = trace_info(**({"digest": f"{seed:064x}"[::-1]} | info))
         self.moving = moving or int(self.rng.integers(2, 9))
         self.standing = int(self.rng.integers(0, 4))
         self.kinds = self.rng.integers(0, len(OWN_ENTITY_KINDS), self.moving + self.standing)

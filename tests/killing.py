@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _PAUSE_S = 0.002
 """How often files are looked at; s."""
 
-NOT_COMPARED = {"trace": "EXCLUDE (ingested_at)"}
+NOT_COMPARED = {"trace": "EXCLUDE (ingested_at)", "recording": "EXCLUDE (place)"}
 
 
 def content(path: Path) -> dict[str, list[tuple[Any, ...]]]:

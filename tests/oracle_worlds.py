@@ -452,14 +452,11 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
         "end_ns": times[-1],
         "period_ns": 100_000_000,
     }
-    row |= {"answers": list(trace.answers), "flavour": "osi", "uri": f"/{trace.name}.mcap"}
-    row |= {
-        "config_id": 1,
-        "report": "{}",
-        "size": 1,
-        "mtime_ns": 1,
-        "digest": f"t{trace.trace_id}",
-    }
+    row |= {"answers": list(trace.answers), "flavour": "osi", "recording_id": trace.trace_id}
+    row |= {"config_id": 1, "report": "{}"}
+    recording = {"recording_id": trace.trace_id, "digest": f"t{trace.trace_id}"}
+    recording |= {"uri": f"/{trace.name}.mcap", "size": 1, "mtime_ns": 1}
+    insert(connection, "recording", [recording])
     row |= {"ingested_at": "2026-01-01", "version": "test"}
     row |= dict(zip(("origin_x", "origin_y", "origin_z"), ORIGIN, strict=True))
     insert(connection, "trace", [row])

@@ -447,7 +447,7 @@ def store_of(
             path=Path(f"/scenes/{name}.mcap"),
             size=1,
             mtime_ns=1,
-            digest=f"{number:064x}",
+            digest=f"{number:064x}"[::-1],
             flavour="scene",
             channels=(),
             ego="ego",

@@ -506,8 +506,9 @@ KNOWN = (
     ("UPDATE inside.config SET settings = '7'", 0),
     ("UPDATE inside.config SET config_id = 2147483647", 5),
     ("UPDATE inside.trace SET report = '[]'", 0),
-    ("UPDATE inside.trace SET uri = '/dev/zero'", 7),
-    ("UPDATE inside.trace SET uri = '/dev/zero'", 1),
+    ("UPDATE inside.recording SET uri = '/dev/zero'", 7),
+    ("UPDATE inside.recording SET uri = '/dev/zero'", 1),
+    ("UPDATE inside.recording SET place = '../../etc/passwd'", 1),
     ("DELETE FROM inside.bits", 2),
 )
 
@@ -536,7 +537,7 @@ def test_rows_that_were_changed_give_an_answer_or_a_reason_and_no_traceback(
 def test_a_recording_that_has_become_no_file_is_refused_at_once(
     run: Any, store: Any, special: Any, what: Any
 ) -> None:
-    change(store, f"UPDATE inside.trace SET uri = '{special[what]}', size = 0")
+    change(store, f"UPDATE inside.recording SET uri = '{special[what]}', size = 0")
     start = time.perf_counter()
 
     verified = run("verify", store, "--payloads")

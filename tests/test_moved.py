@@ -63,6 +63,61 @@ def test_a_variable_of_the_environment_says_the_root_to_every_verb(
     assert sgstore.open(moved).sql("SELECT * FROM nodes ORDER BY ALL").values == before
 
 
+def test_a_store_that_is_moved_together_with_its_recordings_finds_them(tmp_path: Path) -> None:
+    for day in ("mon", "tue"):
+        (tmp_path / "old" / day).mkdir(parents=True)
+        drive(tmp_path / "old" / day / "a.mcap", frames=12 if day == "mon" else 14)
+    places = sorted((tmp_path / "old").rglob("*.mcap"))
+    ingest(tmp_path / "old" / "s.sgstore", places)
+    shutil.move(tmp_path / "old", tmp_path / "new")
+    path = tmp_path / "new" / "s.sgstore"
+    store = sgstore.open(path)
+
+    assert store.payload("a#3", "camera")
+    assert not store.file.verify(recordings=True).faults
+    assert [trace.path.parent for trace in store.traces()] == [
+        tmp_path / "new" / "mon",
+        tmp_path / "new" / "tue",
+    ]
+    again = ingest(path, sorted((tmp_path / "new").rglob("*.mcap")))
+    assert [one.status for one in again] == ["present", "present"]
+    rebuild(path)
+    files = sgstore.open(path).sql("SELECT DISTINCT file FROM payloads ORDER BY ALL").values
+    assert files == [(str(trace.path),) for trace in store.traces()], "an absolute path"
+
+
+def test_a_copy_of_a_store_alone_finds_the_recordings_where_they_were(tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    ingest(tmp_path / "old" / "s.sgstore", [drive(tmp_path / "old" / "a.mcap", frames=12)])
+    (tmp_path / "copy").mkdir()
+    shutil.copy(tmp_path / "old" / "s.sgstore", tmp_path / "copy")
+
+    assert sgstore.open(tmp_path / "copy" / "s.sgstore").payload("a#3", "camera")
+    drive(tmp_path / "copy" / "a.mcap", frames=3)  # another recording, of the same name
+    assert sgstore.open(tmp_path / "copy" / "s.sgstore").payload("a#3", "camera")
+
+
+def test_a_recording_is_one_row_whoever_was_the_ego(tmp_path: Path) -> None:
+    path = tmp_path / "s.sgstore"
+    ingest(path, [drive(tmp_path / "a.mcap", frames=12)])
+    (tmp_path / "b").mkdir()
+    shutil.move(tmp_path / "a.mcap", tmp_path / "b" / "a.mcap")
+    ingest(path, [tmp_path / "b" / "a.mcap"], egos=["3"])
+    store = sgstore.open(path)
+
+    assert [trace.ego for trace in store.traces()] == ["Ego", "3"]
+    assert store.file.rows("SELECT place FROM recording").values == [("b/a.mcap",)]
+    assert {trace.path for trace in store.traces()} == {tmp_path / "b" / "a.mcap"}
+    assert not store.file.verify(recordings=True).faults
+    store.file.remove(*(trace.name for trace in store.traces()[1:]))
+    assert not store.file.verify(recordings=True).faults
+    store.file.remove(store.traces()[0].name)
+    assert [
+        store.file.rows(f"SELECT count(*) FROM {table}").values
+        for table in ("recording", "map", "config", "manifest")
+    ] == [[(0,)]] * 4
+
+
 def test_another_file_of_the_same_name_is_passed_over(moved: Path) -> None:
     town = moved.parent / "new" / "disk" / "town"
     drive(town / "a.mcap", frames=3)

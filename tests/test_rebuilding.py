@@ -42,7 +42,7 @@ class Made:
 
 
 def held(path: Path) -> dict[str, Any]:
-    """All rows of a store, but for times, and for numbers that it gives to settings and maps."""
+    """All rows of a store, but for times, and for where recordings lie from its folder."""
     found: dict[str, Any] = dict(content(path))
     store = StoreFile(path)
     found["derived"] = store.rows(
@@ -118,16 +118,30 @@ def change(store: Path, *statements: str) -> None:
 
 
 TABLES = re.findall(r"^CREATE TABLE (\w+)", schema_sql(), re.MULTILINE)
+OWN_RECORDINGS = (
+    "CREATE OR REPLACE TABLE inside.trace AS SELECT t.* EXCLUDE (recording_id), r.uri, r.size,"
+    " r.mtime_ns, r.digest FROM inside.trace t JOIN inside.recording r ON r.recording_id = t.recording_id",
+    "DROP VIEW payloads",
+    "DROP TABLE inside.recording",
+    "UPDATE inside.trace SET config_id = (SELECT n FROM (SELECT config_id, row_number() OVER () AS n"
+    " FROM inside.config) c WHERE c.config_id = trace.config_id)",
+    "CREATE OR REPLACE TABLE inside.config AS"
+    " SELECT row_number() OVER ()::INTEGER AS config_id, digest, settings FROM inside.config",
+    "UPDATE inside.store_info SET value = 'before' WHERE key = 'schema_digest'",
+)
+"""So stores were made when each trace had the place of its recording, and settings were 1, 2, 3."""
+
 AMONG_THE_VIEWS = (
     *(f"CREATE TABLE main.{table} AS FROM inside.{table}" for table in TABLES),
     "DROP SCHEMA inside CASCADE",
-    "UPDATE store_info SET value = 'before' WHERE key = 'schema_digest'",
+    "UPDATE main.store_info SET value = 'before' WHERE key = 'schema_digest'",
 )
 """So stores were made before their tables had a schema of their own."""
 
 HOW = {
     "as it is": (),
     "of tables among the views": AMONG_THE_VIEWS,
+    "of recordings in traces": OWN_RECORDINGS,
     "of an older version": (
         *AMONG_THE_VIEWS,
         "DELETE FROM store_info WHERE key = 'schema_digest'",
@@ -200,7 +214,10 @@ def test_what_an_older_version_did_not_keep_is_left_out_when_that_is_said(
 def test_traces_whose_recordings_are_gone_can_be_left_out_of_an_old_store(
     few: Made, small: Path
 ) -> None:
-    gone = "UPDATE trace SET uri = uri || '.gone' WHERE name IN ('part', 'other')"
+    gone = (
+        "UPDATE recording SET uri = uri || '.gone', place = NULL WHERE recording_id IN"
+        " (SELECT recording_id FROM trace WHERE name IN ('part', 'other'))"
+    )
     change(small, *HOW["of an older version"], gone)
 
     with pytest.raises(StoreError, match=r"(?s)2 of 4 recordings cannot be .*--leave-out TRACE"):
@@ -293,7 +310,8 @@ def test_tables_of_others_are_not_lost(store: Path) -> None:
         ("DELETE FROM inside.config", "cannot be read"),
         ("UPDATE inside.trace SET name = 'same'", "two traces have the same name or id"),
         ("UPDATE inside.trace SET report = '7'", "cannot be read"),
-        ("UPDATE inside.trace SET uri = '/dev/zero', size = 0, mtime_ns = 0", "/dev/zero"),
+        ("UPDATE inside.recording SET uri = '/dev/zero', size = 0, mtime_ns = 0", "/dev/zero"),
+        ("DELETE FROM inside.recording", "cannot be read"),
         ("UPDATE inside.trace SET since = 'nan'", "cannot be read"),
     ],
 )

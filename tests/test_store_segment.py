@@ -20,7 +20,18 @@ from sgstore.errors import StoreError
 from sgstore.store import StoreFile, trace_id_of
 from sgstore.world import TraceReport
 
-TABLES = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
+TABLES = (
+    "trace",
+    "recording",
+    "channel",
+    "context",
+    "entity",
+    "bucket",
+    "frame",
+    "state",
+    "node",
+    "edge",
+)
 TABLES += ("event", "lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "config")
 
 
@@ -209,6 +220,60 @@ def test_maps_of_one_name_are_numbered_and_equal_maps_are_one(store: Any) -> Non
     assert store.rows("SELECT count(*) FROM inside.map_node").values == [
         (2 * len(map_stub(1).nodes),)
     ]
+
+
+def test_recordings_maps_and_settings_have_the_same_numbers_in_every_store(tmp_path: Path) -> None:
+    """The first 60 bits of their digests, whatever came before them; and so have frames that refer to them."""
+    traces = [
+        RandomTrace(seed, frames=3, road_map=map_stub(seed), path=f"d{seed}") for seed in (1, 2, 3)
+    ]
+    settings = [Config(), Config(range=RangeSettings(20.0)), Config(range=RangeSettings(30.0))]
+    told = {
+        "recording": "recording_id, digest, uri",
+        "config": "config_id, digest, settings",
+        "map": "map_id, digest",
+        "map_node": "*",
+        "frame": "*",
+        "bucket": "*",
+    }
+    found: list[Any] = []
+    for name, order in (("one", (0, 1, 2)), ("other", (2, 0, 1))):
+        store = StoreFile.create(tmp_path / f"{name}.db")
+        for number in order:
+            publish(store, traces[number], settings[number])
+        found.append(
+            {
+                table: store.rows(f"SELECT {columns} FROM {table} ORDER BY ALL").values
+                for table, columns in told.items()
+            }
+        )
+
+    assert found[0] == found[1]
+    for table in ("recording", "config", "map"):
+        assert len(found[0][table]) == 3
+        assert all(number == int(digest[:15], 16) for number, digest, *_ in found[0][table])
+    assert {row[0] for row in found[0]["map"]} == {row[0] for row in found[0]["map_node"]}
+
+
+@pytest.mark.parametrize("what", ["recording", "set of settings", "road map"])
+def test_two_of_one_number_are_not_mixed(store: Any, what: str) -> None:
+    """Of a digest the first 60 bits count: one that has them, and is another, is refused by name."""
+    publish(store, RandomTrace(1, frames=3, road_map=map_stub(1), path="first"))
+    table = {"set of settings": "config", "road map": "map"}.get(what, what)
+    (digest,) = store.rows(f"SELECT digest FROM {table}").values[0]
+    other = digest[:15] + "".join("0" if digit != "0" else "1" for digit in digest[15:])
+    change = f"UPDATE inside.{table} SET digest = '{other}'"
+    import duckdb
+
+    with duckdb.connect(str(store.path)) as connection:
+        connection.execute(change)
+    before = store.path.read_bytes()
+
+    second = RandomTrace(1 if what == "recording" else 2, frames=3, road_map=map_stub(1), path="b")
+    second.info = replace(second.info, ego="7")
+    with pytest.raises(StoreError, match=f"(?s)b: its {what} .*{other}.*by chance"):
+        publish(store, second)
+    assert store.path.read_bytes() == before
 
 
 def test_two_traces_with_one_id_are_not_mixed(store: Any) -> None:

@@ -110,6 +110,13 @@ CHANGES = {
     "a lane that is not in the map": ("UPDATE inside.lane_state SET lane = -9999", "references"),
     "an ego that is nobody": ("UPDATE inside.frame SET ego = 9999", "references"),
     "settings that are gone": ("DELETE FROM inside.config", None),
+    "a recording that is gone": ("DELETE FROM inside.recording", None),
+    "another place of a recording": ("UPDATE inside.recording SET uri = '/other.mcap'", "rows"),
+    "another number of a map": ("UPDATE inside.map SET map_id = map_id + 1", "references"),
+    "a digest that is not of the number": (
+        "UPDATE inside.config SET digest = '1' || digest",
+        "references",
+    ),
     "a channel that is gone": (
         "INSERT INTO inside.payload SELECT bucket, bit, trace_id, 99, 0, 0, 0, 1 FROM inside.frame",
         "references",
@@ -118,7 +125,7 @@ CHANGES = {
     "a lane of a map": ("UPDATE inside.map_node SET x = x + 1 WHERE node_id = -2", "map"),
     "an edge of a map to nowhere": ("UPDATE inside.map_edge SET dst = -9999", "map"),
     "a way along lanes to nowhere": ("UPDATE inside.map_reach SET dst = -9999", "map"),
-    "a manifest that is gone": ("DELETE FROM inside.manifest WHERE trace_id IS NOT NULL", "rows"),
+    "a manifest that is gone": ("DELETE FROM inside.manifest WHERE owner = 'trace'", "rows"),
     "a trace that says otherwise": ("UPDATE inside.trace SET frames = 7", "frames"),
 }
 
@@ -265,7 +272,7 @@ def test_removing_takes_everything_of_a_trace_and_its_checksums(store: Any, tmp_
     for table in ("state", "lane_state"):
         sql = f"SELECT count(*) FROM {table} WHERE frame_id BETWEEN {low} AND {high}"
         assert store.rows(sql).values == [(0,)]
-    assert store.rows("SELECT DISTINCT trace_id FROM inside.manifest").values == [
+    assert store.rows("SELECT DISTINCT id FROM inside.manifest WHERE owner = 'trace'").values == [
         (store.trace("two").trace_id,)
     ]
     assert faults(store) == []

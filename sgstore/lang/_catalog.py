@@ -100,6 +100,8 @@ class DisplayUnit(StrEnum):
     """An attribute of a client's own, frame by frame: in the view ``attributes``."""
     span = "span"
     """A length of time in nanoseconds; seen in seconds."""
+    recording = "recording"
+    """What stands in the table of recordings; the column is there."""
 
 
 class Type(StrEnum):
@@ -193,9 +195,8 @@ def _repeated(name: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
     return Attribute(name, Type.text, homes, meaning, own_kinds=_ENTITIES, values=values)
 
 
-def _control(name: str, meaning: str) -> Attribute:
-    kinds = frozenset(VEHICLES)
-    return Attribute(name, Type.number, {Home.state: name}, meaning, own_kinds=kinds)
+def _control(name: str, meaning: str, unit: DisplayUnit = DisplayUnit.plain) -> Attribute:
+    return Attribute(name, Type.number, {Home.state: name}, meaning, unit, frozenset(VEHICLES))
 
 
 def _of_map(
@@ -315,6 +316,14 @@ NODE_ATTRIBUTES: Final = _named(
         _control("steer", "steering input, -1 … 1, positive to the left"),
         _control("throttle", "0 … 1"),
         _control("brake", "0 … 1"),
+        _control("gear", "1, 2, …; 0: neutral; below 0: backwards", DisplayUnit.whole),
+        Attribute(
+            "hand_brake",
+            Type.boolean,
+            {Home.state: "hand_brake"},
+            "whether it is on",
+            own_kinds=frozenset(VEHICLES),
+        ),
         _of_map("lane_type", Type.text, "type of a lane in OpenDRIVE", _LANES),
         _of_map("road", Type.text, "id of the road", _ON_ROADS),
         _of_map(
@@ -509,7 +518,13 @@ TRACE_ATTRIBUTES: Final = _named(
     (
         _plain("id", Type.number, "trace_id", "unique in every store"),
         _plain("name", Type.text, "name", "the file's name without its ending"),
-        _plain("uri", Type.text, "uri", "path of the file when it was ingested"),
+        Attribute(
+            "uri",
+            Type.text,
+            {Home.state: "uri"},
+            "path of the file when it was ingested",
+            DisplayUnit.recording,
+        ),
         _plain("flavour", Type.text, "flavour", "the reader: osi"),
         _plain("ego", Type.text, "ego", "the simulator's id of the ego"),
         _plain("frames", Type.number, "frames", "number of frames"),

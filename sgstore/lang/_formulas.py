@@ -318,6 +318,10 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
         return f"({rows.text()})"
     alias = map_ if home is Home.map else frame if isinstance(leaf, FrameAttribute) else trace
     value = f"{alias}.{quoted(column)}"
+    if attribute.unit is DisplayUnit.recording:
+        on = [f'"r"."recording_id" = {trace}."recording_id"']
+        of = Select([f'"r".{quoted(column)}'], ['"recording" AS "r"'], on)
+        value = f"({of.text()})"
     match attribute.unit:
         case DisplayUnit.seconds:
             return f"(CAST({value} - {trace}.{quoted('start_ns')} AS DOUBLE) / 1e9)"

@@ -566,7 +566,7 @@ _TEXTS_OF: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
     "junction": (("junction", "map_node"), ("name", "map_node", "kind = 'junction'")),
     "role": (("role", "lane_role"),),
     "trace.name": (("name", "trace"),),
-    "trace.uri": (("uri", "trace"),),
+    "trace.uri": (("uri", "recording"),),
     "trace.flavour": (("flavour", "trace"),),
     "trace.ego": (("ego", "trace"),),
     "trace.map": (("name", "map"),),

@@ -37,6 +37,7 @@ from sgstore.store._traces import (
     already_stored,
     frame_named,
     located,
+    place_below,
     stored_name,
     stored_traces,
     trace_named,
@@ -310,7 +311,7 @@ class StoreFile:
     def traces(self) -> tuple[StoredTrace, ...]:
         """All traces, in the order in which they came."""
         with self.access.reading() as connection:
-            return stored_traces(connection, self.access.root)
+            return stored_traces(connection, self.path, self.access.root)
 
     def trace(self, ref: int | str) -> StoredTrace:
         """A trace by its name, its id, or a unique beginning of its name.
@@ -322,9 +323,8 @@ class StoreFile:
         """
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(ref))
-            found = [
-                t for t in stored_traces(connection, self.access.root) if t.trace_id == trace_id
-            ]
+            known = stored_traces(connection, self.path, self.access.root)
+            found = [one for one in known if one.trace_id == trace_id]
             if not found:
                 raise StoreError(
                     f"{self.path}: the settings of {ref!r} are gone; see 'sgstore verify'"
@@ -450,17 +450,22 @@ class StoreFile:
         with self.access.reading() as connection:
             frame = frame_named(connection, ref)
             found = payload_place(connection, frame, channel)
-            sql = "SELECT uri, size, mtime_ns, digest FROM trace WHERE trace_id = ?"
+            sql = (
+                "SELECT r.uri, r.place, r.size, r.mtime_ns, r.digest FROM trace t"
+                " JOIN recording r ON r.recording_id = t.recording_id WHERE t.trace_id = ?"
+            )
             (recording,) = connection.execute(sql, [frame.trace_id]).fetchall()
         channel_id, chunk_offset, offset, length = found
         place = {"chunk_offset": chunk_offset, "offset": offset, "length": length}
         return self._unchanged(*recording), channel_id, place
 
-    def _unchanged(self, uri: str, size: int, mtime_ns: int, digest: str) -> Path:
+    def _unchanged(
+        self, uri: str, place: str | None, size: int, mtime_ns: int, digest: str
+    ) -> Path:
         """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
         from sgstore.mcap import digest_of, mark_of
 
-        path = located(uri, size, self.access.root)
+        path = located(uri, place, size, self.path, self.access.root)
         try:
             mark = (str(path), *mark_of(path))
         except OSError as error:
@@ -565,9 +570,13 @@ class StoreFile:
             mark = mark_of(path)
         except (OSError, TraceError):
             return ""
-        sql = "SELECT any_value(digest) FROM trace WHERE uri = ? AND size = ? AND mtime_ns = ?"
+        sql = (
+            "SELECT any_value(digest) FROM recording WHERE (uri = ? OR place = ?)"
+            " AND size = ? AND mtime_ns = ?"
+        )
+        places = plain(str(path.resolve())), place_below(self.path, path)
         with self.access.reading() as connection:
-            found = connection.execute(sql, [plain(str(path.resolve())), *mark]).fetchone()
+            found = connection.execute(sql, [*places, *mark]).fetchone()
         return str(found[0]) if found and found[0] else ""
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:

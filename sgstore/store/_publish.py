@@ -18,7 +18,7 @@ from sgstore.quoting import literal, quoted
 from sgstore.store._locking import spill_folder
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP, plain
 from sgstore.store._staging import Checksum, Staging, columns_of, expressions, scratch
-from sgstore.store._traces import already_stored, free_name, stored_name
+from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
 from sgstore.vocabulary import NAMES
 from sgstore.world import BUCKET_FRAMES
 
@@ -34,14 +34,18 @@ if TYPE_CHECKING:
     from sgstore.world import TraceInfo
 
 
-MAP_TABLES: Final = ("map", "map_node", "map_edge", "map_reach")
-"""Tables of a road map; they come into a store once, whatever the number of traces on it."""
+SHARED: Final = {
+    "recording": ("recording",),
+    "config": ("config",),
+    "map": ("map", "map_node", "map_edge", "map_reach"),
+}
+"""Tables of what many traces may have: it comes into a store once, and is known there by its digest."""
 
 _TRACE: Final = f"""
 INSERT INTO trace BY NAME
 WITH steps AS (SELECT time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
-SELECT $trace_id AS trace_id, $uri AS uri, $size AS size, $mtime_ns AS mtime_ns,
-       $digest AS digest, $flavour AS flavour, nullif($ego, '') AS ego, $since AS since, $until AS until,
+SELECT $trace_id AS trace_id, $recording_id AS recording_id, $config_id AS config_id, $map_id AS map_id,
+       $flavour AS flavour, nullif($ego, '') AS ego, $since AS since, $until AS until,
        count(*) AS frames,
        arg_min(time_ns, frame_id) AS start_ns, arg_max(time_ns, frame_id) AS end_ns,
        coalesce((SELECT quantile_disc(step, 0.5) FROM steps), 0) AS period_ns,
@@ -51,7 +55,7 @@ FROM frame;
 INSERT INTO bucket BY NAME
 WITH steps AS (
   SELECT bucket, 1::BIGINT << bit AS one, time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
-SELECT bucket, $trace_id AS trace_id, bit_or(one) AS valid,
+SELECT bucket, $trace_id AS trace_id, $map_id AS map_id, bit_or(one) AS valid,
        bit_or(CASE WHEN step BETWEEN 0 AND {LONGEST_STEP} THEN one ELSE 0 END) AS joined
 FROM steps CROSS JOIN trace GROUP BY bucket;
 """
@@ -67,12 +71,9 @@ def fill_trace(
     values : dict
         Columns of table ``trace`` that the segment knows.
     """
-    about = values | {
+    about = {"map_id": None} | identity.numbers | values
+    about |= {
         "trace_id": identity.trace_id,
-        "uri": plain(str(info.path.resolve())),
-        "size": info.size,
-        "mtime_ns": info.mtime_ns,
-        "digest": info.digest,
         "flavour": info.flavour,
         "ego": identity.ego,
         "since": identity.since,
@@ -87,11 +88,11 @@ def fill_trace(
 def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
     """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
     with scratch(spill_folder()) as connection, access.writing(connection, sealed.folder):
-        return _publish(connection, sealed, replace=replace)
+        return _publish(connection, access.path, sealed, replace=replace)
 
 
-def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -> str:
-    """Copy the files of a trace into the attached store; the name of the trace there."""
+def _publish(connection: DuckDBPyConnection, path: Path, sealed: Sealed, *, replace: bool) -> str:
+    """Copy the files of a trace into the attached store at a path; the name of the trace there."""
     identity = sealed.identity
     taken = connection.execute("SELECT name FROM store.inside.trace").fetchall()
     if not replace and already_stored(connection, identity, catalog="store.inside."):
@@ -103,79 +104,82 @@ def _publish(connection: DuckDBPyConnection, sealed: Sealed, *, replace: bool) -
     else:
         _delete(connection, identity.trace_id)
     shape.widen(connection, "store", sealed.words)
-    given: dict[str, Any] = {"name": name, "ingested_at": datetime.now(UTC).replace(tzinfo=None)}
-    given["map_id"] = _map_id(connection, sealed)
-    given["config_id"] = _config_id(connection, identity)
-    for table in sealed.files:
-        if table not in MAP_TABLES:
-            _insert(connection, sealed, table, given)
-    _note(connection, sealed.checksums, trace_id=identity.trace_id)
-    connection.execute(_ORPHANS)  # of a trace that was replaced
+    for table, digest in identity.shared.items():
+        _publish_shared(connection, path, sealed, table, digest)
+    now = datetime.now(UTC).replace(tzinfo=None)
+    shared = {table for tables in SHARED.values() for table in tables}
+    own = [table for table in sealed.files if table not in shared]
+    for table in own:
+        given = {"name": name, "ingested_at": now} if table == "trace" else {}
+        _insert(connection, sealed, table, given)
+    _note(connection, sealed, "trace", identity.trace_id, own)
+    connection.execute(ORPHANS)  # of a trace that was replaced
     return name
+
+
+def _publish_shared(
+    connection: DuckDBPyConnection, path: Path, sealed: Sealed, owner: str, digest: str
+) -> None:
+    """Insert a recording, settings or a map, if the store does not have it; of a recording, its place now.
+
+    Raises
+    ------
+    StoreError
+        The store has another one that has its number by chance.
+    """
+    number, place = id_of(digest), f"store.inside.{owner}"
+    sql = f"SELECT digest FROM {place} WHERE {owner}_id = ?"
+    for (known,) in connection.execute(sql, [number]).fetchall():
+        if known != digest:
+            raise StoreError(
+                f"{sealed.path}: its {_CALLED[owner]} ({digest}) and another in the store ({known}) have the"
+                f" same number {number} by chance; put it into a store of its own"
+            )
+        if owner != "recording":
+            return
+        connection.execute(f"DELETE FROM {place} WHERE recording_id = ?", [number])
+        forgotten = "DELETE FROM store.inside.manifest WHERE owner = 'recording' AND id = ?"
+        connection.execute(forgotten, [number])
+    tables = [table for table in SHARED[owner] if table in sealed.files]
+    given: dict[str, Any] = {}
+    if owner == "recording":
+        given = {"place": place_below(path, sealed.path) or None}
+    elif owner == "map":
+        taken = connection.execute("SELECT name FROM store.inside.map").fetchall()
+        wanted = plain(sealed.identity.map_name) or "map"
+        given = {"name": free_name(wanted, {name for (name,) in taken})}
+    for table in tables:
+        _insert(connection, sealed, table, given if table == owner else {})
+    _note(connection, sealed, owner, number, tables)
+
+
+_CALLED: Final = {"recording": "recording", "config": "set of settings", "map": "road map"}
 
 
 def _insert(
     connection: DuckDBPyConnection, sealed: Sealed, table: str, given: dict[str, Any]
 ) -> None:
     """Insert the files of a table, with the values that only the store can give."""
-    columns = {name for name, _ in columns_of(connection, table, "store")}
-    values = {name: value for name, value in given.items() if name in columns}
-    replaced = ", ".join(f"${name} AS {name}" for name in values)
+    replaced = ", ".join(f"${name} AS {name}" for name in given)
     select = f"SELECT * REPLACE ({replaced})" if replaced else "SELECT *"
     for name in sealed.files[table]:
         # Reading takes a pattern, and a folder may be called anything.
         file = literal(escape(str(sealed.folder / name)))
         connection.execute(
-            f"INSERT INTO store.inside.{table} BY NAME {select} FROM read_parquet({file})", values
+            f"INSERT INTO store.inside.{table} BY NAME {select} FROM read_parquet({file})", given
         )
 
 
 def _note(
-    connection: DuckDBPyConnection,
-    checksums: dict[str, Checksum],
-    *,
-    trace_id: int | None = None,
-    map_id: int | None = None,
+    connection: DuckDBPyConnection, sealed: Sealed, owner: str, number: int, tables: Iterable[str]
 ) -> None:
     """Take down the checksums of what was inserted."""
-    for table, checksum in checksums.items():
+    for table in tables:
+        checksum = sealed.checksums[table]
         connection.execute(
             "INSERT INTO store.inside.manifest VALUES (?, ?, ?, ?, ?)",
-            [trace_id, map_id, table, checksum.rows, checksum.value],
+            [owner, number, table, checksum.rows, checksum.value],
         )
-
-
-def _config_id(connection: DuckDBPyConnection, identity: Identity) -> int:
-    """The number of the settings in the store, where they are now if they were not before."""
-    rows = connection.execute("SELECT config_id, digest FROM store.inside.config").fetchall()
-    for number, digest in rows:
-        if digest == identity.settings_digest:
-            return number
-    new = max((number for number, _ in rows), default=0) + 1
-    connection.execute(
-        "INSERT INTO store.inside.config VALUES (?, ?, ?)",
-        [new, identity.settings_digest, identity.settings],
-    )
-    return new
-
-
-def _map_id(connection: DuckDBPyConnection, sealed: Sealed) -> int | None:
-    """The number of the map in the store, where it is now with its nodes and edges if it was not before."""
-    digest = sealed.identity.map_digest
-    if not digest:
-        return None
-    rows = connection.execute("SELECT map_id, digest, name FROM store.inside.map").fetchall()
-    for number, known, _ in rows:
-        if known == digest:
-            return number
-    new = max((number for number, _, _ in rows), default=0) + 1
-    wanted = plain(sealed.identity.map_name) or "map"
-    given = {"map_id": new, "name": free_name(wanted, {name for _, _, name in rows})}
-    for table in MAP_TABLES:
-        if table in sealed.files:
-            _insert(connection, sealed, table, given if table == "map" else {"map_id": new})
-    _note(connection, sealed.map_checksums, map_id=new)
-    return new
 
 
 _OWNED: Final = {
@@ -185,16 +189,17 @@ _OWNED: Final = {
 }
 """Column → condition on the rows of a trace; of a table that has several, the first counts."""
 
-_ORPHANS: Final = """
-DELETE FROM store.inside.config WHERE config_id NOT IN (SELECT config_id FROM store.inside.trace);
-DELETE FROM store.inside.map
-WHERE map_id NOT IN (SELECT map_id FROM store.inside.trace WHERE map_id IS NOT NULL);
-DELETE FROM store.inside.map_node WHERE map_id NOT IN (SELECT map_id FROM store.inside.map);
-DELETE FROM store.inside.map_edge WHERE map_id NOT IN (SELECT map_id FROM store.inside.map);
-DELETE FROM store.inside.map_reach WHERE map_id NOT IN (SELECT map_id FROM store.inside.map);
-DELETE FROM store.inside.manifest
-WHERE map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM store.inside.map);
-"""
+ORPHANS: Final = "".join(
+    f"DELETE FROM store.inside.{table} WHERE {owner}_id NOT IN"
+    f" (SELECT {owner}_id FROM store.inside.trace WHERE {owner}_id IS NOT NULL);\n"
+    for owner, tables in SHARED.items()
+    for table in tables
+) + "".join(
+    f"DELETE FROM store.inside.manifest WHERE owner = '{owner}' AND id NOT IN"
+    f" (SELECT {owner}_id FROM store.inside.{owner});\n"
+    for owner in (*SHARED, "trace")
+)
+"""Statements that delete what no trace has any more."""
 
 
 def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
@@ -216,10 +221,13 @@ def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, 
 def remove(connection: DuckDBPyConnection, trace_id: int) -> None:
     """Delete a trace from the attached store, with the settings and the map that no other trace has."""
     _delete(connection, trace_id)
-    connection.execute(_ORPHANS)
+    connection.execute(ORPHANS)
 
 
 def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
+    connection.execute(
+        "DELETE FROM store.inside.manifest WHERE owner = 'trace' AND id = ?", [trace_id]
+    )
     for table, condition in list(owned(connection, "store")):
         connection.execute(
             f"DELETE FROM store.inside.{table} WHERE {condition}", {"trace_id": trace_id}
@@ -291,12 +299,12 @@ def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -
     for table in tables:
         checksum = checksum_of(connection, "store", table, trace_id, frames)
         connection.execute(
-            'DELETE FROM store.inside.manifest WHERE trace_id = ? AND "table" = ?',
+            """DELETE FROM store.inside.manifest WHERE owner = 'trace' AND id = ? AND "table" = ?""",
             [trace_id, table],
         )
         if checksum.rows:
             connection.execute(
-                "INSERT INTO store.inside.manifest VALUES (?, NULL, ?, ?, ?)",
+                "INSERT INTO store.inside.manifest VALUES ('trace', ?, ?, ?, ?)",
                 [trace_id, table, checksum.rows, checksum.value],
             )
 

@@ -2,8 +2,9 @@
 
 What is known of a store's traces, however old or altered it is: enough to make it anew.
 
-Only the tables that say which recordings there are, and with which settings they were read, are looked at; they
-have not changed since version 2. They must be tables, because a view could read anything.
+Only the tables that say which recordings there are, and with which settings they were read, are looked at. They
+have not changed since version 2, but for that of recordings, which came with version 4. They must be tables,
+because a view could read anything.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Rem
     reader = _TableReader(connection, database, path)
     try:
         return Remains(
-            traces=_traces(reader),
+            traces=_traces(reader, path),
             maps={
                 row["map_id"]: _map(row) for row in reader.rows("map", "map_id name digest text")
             },
@@ -167,6 +168,10 @@ class _TableReader:
             ).fetchall()
         )
 
+    def has(self, table: str) -> bool:
+        """Tell whether there is such a table."""
+        return (table,) in self._tables
+
     def rows(self, table: str, columns: str, *, needed: bool = False) -> list[dict[str, Any]]:
         """All rows of a table; none if there is no such table and it is not needed."""
         return self._asked(table, columns, "SELECT", needed=needed)
@@ -176,7 +181,7 @@ class _TableReader:
         return self._asked(table, columns, "SELECT DISTINCT", needed=False)
 
     def _asked(self, table: str, columns: str, how: str, *, needed: bool) -> list[dict[str, Any]]:
-        if (table,) not in self._tables:
+        if not self.has(table):
             if needed:
                 raise StoreError(
                     f"{self._path}: has no table {table!r}, so nothing is known of its recordings;"
@@ -192,19 +197,27 @@ class _TableReader:
 
 
 _TRACE: Final = (
-    "trace_id name uri size mtime_ns digest ego since until map_id config_id"
-    " period_ns answers report ingested_at"
+    "trace_id name ego since until map_id config_id period_ns answers report ingested_at"
 )
+_RECORDING: Final = "uri size mtime_ns digest"
 
 
-def _traces(reader: _TableReader) -> tuple[OldTrace, ...]:
+def _traces(reader: _TableReader, path: Path) -> tuple[OldTrace, ...]:
     settings = {
         row["config_id"]: _object(row["settings"])
         for row in reader.rows("config", "config_id settings", needed=True)
     }
-    rows = reader.rows("trace", _TRACE, needed=True)
+    recordings = {
+        row["recording_id"]: row
+        for row in reader.rows("recording", f"recording_id place {_RECORDING}")
+    }
+    if reader.has("recording"):
+        rows = reader.rows("trace", f"{_TRACE} recording_id", needed=True)
+        rows = [row | recordings[row["recording_id"]] for row in rows]
+    else:  # a store of before, where each trace has its own
+        rows = reader.rows("trace", f"{_TRACE} {_RECORDING}", needed=True)
     rows.sort(key=lambda row: (row["ingested_at"].isoformat(), str(row["name"])))
-    found = tuple(_trace(row, settings) for row in rows)
+    found = tuple(_trace(row, settings, path) for row in rows)
     if len({one.name for one in found}) < len(found) or len({t.trace_id for t in found}) < len(
         found
     ):
@@ -212,13 +225,13 @@ def _traces(reader: _TableReader) -> tuple[OldTrace, ...]:
     return found
 
 
-def _trace(row: dict[str, Any], settings: dict[int, dict[str, Any]]) -> OldTrace:
+def _trace(row: dict[str, Any], settings: dict[int, dict[str, Any]], store: Path) -> OldTrace:
     report = _object(row["report"])
     form = report.get("imported")
     return OldTrace(
         trace_id=int(row["trace_id"]),
         name=_text(row["name"]),
-        path=located(_text(row["uri"]), int(row["size"])),
+        path=located(_text(row["uri"]), _text(row.get("place") or ""), int(row["size"]), store),
         size=int(row["size"]),
         mtime_ns=int(row["mtime_ns"]),
         digest=_text(row["digest"]),

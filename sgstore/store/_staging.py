@@ -52,8 +52,13 @@ _SECOND: Final = np.uint64(0x94D049BB133111EB)
 _MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
 """What stands for NULL."""
 
-_ASSIGNED: Final = {"map_id", "config_id", "name", "ingested_at"}
-"""Columns that a store gives a value of its own."""
+_ASSIGNED: Final = {
+    ("trace", "name"),
+    ("trace", "ingested_at"),
+    ("map", "name"),
+    ("recording", "place"),
+}
+"""Tables and columns to which a store gives a value of its own."""
 
 _TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP", "UUID"}
 
@@ -121,7 +126,7 @@ def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -
             value = code_sql(value, kind)
         elif kind in _TEXTS:
             value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
-        if name not in _ASSIGNED:
+        if (table, name) not in _ASSIGNED:
             listed.append(f'{value} AS "{name}"')
     return ", ".join(listed)
 
@@ -466,8 +471,6 @@ class Sealed:
         Table → names of its Parquet files in the folder, in the order in which they are published.
     checksums : dict
         Table → checksum of its rows.
-    map_checksums : dict
-        The same of the tables of the map, which may be in the store already.
     words : dict
         Enumeration → values in it that are not those of ``schema.sql``, or may not be: a store takes them, too.
     """
@@ -477,7 +480,6 @@ class Sealed:
     identity: Identity
     files: dict[str, list[str]]
     checksums: dict[str, Checksum]
-    map_checksums: dict[str, Checksum]
     words: dict[str, list[str]]
 
     def write(self) -> None:
@@ -513,6 +515,5 @@ class Sealed:
             identity=Identity.from_dict(values["identity"]),
             files=values["files"],
             checksums={name: Checksum(**one) for name, one in values["checksums"].items()},
-            map_checksums={name: Checksum(**one) for name, one in values["map_checksums"].items()},
             words=values["words"],
         )

@@ -86,6 +86,17 @@ class Identity:
             until=part[1],
         )
 
+    @property
+    def shared(self) -> dict[str, str]:
+        """Digests of what other traces may have, too, by its table; without a map none of it."""
+        found = {"recording": self.digest, "config": self.settings_digest}
+        return found | ({"map": self.map_digest} if self.map_digest else {})
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """Columns by which a trace refers to that: ``recording_id``, ``config_id`` and ``map_id``."""
+        return {f"{table}_id": id_of(digest) for table, digest in self.shared.items()}
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
         """The identity that plain values describe."""
@@ -93,6 +104,11 @@ class Identity:
 
         payloads: Any = Payloads(**values["payloads"])
         return cls(**(values | {"payloads": payloads}))
+
+
+def id_of(digest: str) -> int:
+    """The first 60 bits of a digest in hexadecimal digits: the number of a recording, a map or settings."""
+    return int(digest[:15], 16)
 
 
 def trace_id_of(digest: str, ego: str) -> int:
@@ -195,10 +211,11 @@ class FrameRef:
 
 
 _TRACES: Final = """
-SELECT t.trace_id, t.name, t.uri AS path, t.size, t.mtime_ns, t.digest, t.flavour,
+SELECT t.trace_id, t.name, r.uri AS path, r.place, r.size, r.mtime_ns, r.digest, t.flavour,
        coalesce(t.ego, '') AS ego, t.since, t.until, coalesce(m.name, '') AS map,
        t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, t.config_id, t.ingested_at, t.version
-FROM trace t JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
+FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c ON c.config_id = t.config_id
+     LEFT JOIN map m ON m.map_id = t.map_id
 """
 
 
@@ -206,42 +223,61 @@ ROOT: Final = "SGSTORE_ROOT"
 """Variable of the environment: a folder in which recordings are looked for first."""
 
 
-def located(uri: str, size: int, root: str | Path | None = None) -> Path:
-    """The place of a recording now: beneath the root if it is found there, else where it was ingested.
+def place_below(store: Path, path: Path) -> str:
+    """The place of a recording from the folder of a store; empty where it does not lie below it."""
+    with suppress(ValueError):
+        return plain(path.resolve().relative_to(store.resolve().parent).as_posix())
+    return ""
+
+
+def located(
+    uri: str, place: str | None, size: int, store: Path | None, root: str | Path | None = None
+) -> Path:
+    """The place of a recording now: beneath the root, below the folder of the store, or where it was ingested.
 
     Parameters
     ----------
     uri : str
         Where it was ingested: ``/data/town/a.mcap``.
+    place : str or None
+        The same from the folder of the store, if it was below it.
     size : int
         Of the recording; another one of the same name is passed over.
+    store : Path or None
+        The store; ``None``: nothing is looked for, it is where it was ingested.
     root : str or Path, optional
         Where the data set is now; by default what :data:`ROOT` says. It may stand for any of the folders on the
         way: ``ROOT/data/town/a.mcap``, ``ROOT/town/a.mcap`` and ``ROOT/a.mcap`` are looked at, in this order.
     """
+    path = Path(uri)
+    if store is None:
+        return path
     from sgstore.mcap import mark_of
 
-    path, root = Path(uri), root or os.environ.get(ROOT)
+    candidates: list[Path] = []
     parts = path.parts[1:] if path.is_absolute() else path.parts
-    if root and ".." not in parts:
-        for first in range(len(parts)):
-            with suppress(OSError, SgstoreError):
-                found = Path(root, *parts[first:]).resolve()
-                if mark_of(found)[0] == size:
-                    return found
+    if (root := root or os.environ.get(ROOT)) and ".." not in parts:
+        candidates += [Path(root, *parts[first:]) for first in range(len(parts))]
+    if place and ".." not in Path(place).parts:
+        candidates.append(store.absolute().parent / place)
+    for one in candidates:
+        with suppress(OSError, SgstoreError):
+            found = one.resolve()
+            if found == path or mark_of(found)[0] == size:
+                return found
     return path
 
 
 def stored_traces(
-    connection: DuckDBPyConnection, root: str | Path | None = None
+    connection: DuckDBPyConnection, store: Path | None = None, root: str | Path | None = None
 ) -> tuple[StoredTrace, ...]:
-    """All traces of a store, by name in natural order; ``root`` as :func:`located` takes it."""
+    """All traces of a store, by name in natural order; recordings are looked for as :func:`located` does."""
     found = run(connection, _TRACES).dicts()
     texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
     try:
         settings = {config_id: _object(text) for config_id, text in texts}
         for row in found:
-            row["path"] = located(row["path"], row["size"], root)
+            row["path"] = located(row["path"], row.pop("place"), row["size"], store, root)
             row["answers"] = tuple(map(str, row["answers"]))
             row["report"] = _object(row["report"])
             row["settings"] = settings[row.pop("config_id")]
@@ -267,7 +303,10 @@ def stored_name(
     StoreError
         It has another trace under its id.
     """
-    sql = f"SELECT name, digest, coalesce(ego, '') FROM {catalog}trace WHERE trace_id = ?"
+    sql = (
+        f"SELECT t.name, r.digest, coalesce(t.ego, '') FROM {catalog}trace t"
+        f" JOIN {catalog}recording r ON r.recording_id = t.recording_id WHERE t.trace_id = ?"
+    )
     found = connection.execute(sql, [identity.trace_id]).fetchone()
     if found is None:
         return None

@@ -16,7 +16,7 @@ from sgstore.config import from_dict
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.store._locking import Access, translated
 from sgstore.store._packing import LONGEST_STEP
-from sgstore.store._publish import MAP_TABLES, checksum_of, owned
+from sgstore.store._publish import SHARED, checksum_of, owned
 from sgstore.store._staging import Checksum, expressions
 from sgstore.store._traces import stored_traces
 from sgstore.world import BUCKET_FRAMES
@@ -123,11 +123,20 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "references",
-        "settings or a map that are not in the store",
+        "a recording, settings or a map that are not in the store",
         """
         SELECT trace_id FROM trace
         WHERE config_id NOT IN (SELECT config_id FROM config)
+           OR recording_id NOT IN (SELECT recording_id FROM recording)
            OR (map_id IS NOT NULL AND map_id NOT IN (SELECT map_id FROM map))""",
+    ),
+    *(
+        (
+            "references",
+            f"the number of a {table} is not that of its digest",
+            f"SELECT NULL FROM {table} WHERE {table}_id <> ('0x' || digest[:15])::BIGINT",
+        )
+        for table in SHARED
     ),
     (
         "references",
@@ -248,7 +257,7 @@ def verify_store(access: Access, *, recordings: bool = False) -> Verification:
     with access.reading() as connection:
         found = verify(connection, access.path)
         if recordings:
-            again = verify_recordings(connection, digest_of, access.root)
+            again = verify_recordings(connection, digest_of, access.path, access.root)
             found.recordings = again.recordings
             found.faults += again.faults
     return found
@@ -279,7 +288,7 @@ def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
     found.faults += attempt(partial(_odd, connection))
     for trace in traces.values():
         found.faults += attempt(partial(_rows, connection, trace, published, found))
-    found.faults += attempt(partial(_maps, connection, published, found))
+    found.faults += attempt(partial(_shared, connection, published, found))
     names = {trace_id: trace.name for trace_id, trace in traces.items()}
     for rule in _RULES:
         found.faults += attempt(partial(_broken, connection, names, *rule))
@@ -305,8 +314,7 @@ def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
     for table, column in (
         ("trace", "name"),
         ("trace", "trace_id"),
-        ("config", "config_id"),
-        ("map", "map_id"),
+        *((table, f"{table}_id") for table in SHARED),
     ):
         sql = f"SELECT {column} FROM {table} GROUP BY {column} HAVING count(*) > 1"
         for (value,) in connection.execute(sql).fetchall():
@@ -319,12 +327,13 @@ def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
 def verify_recordings(
     connection: DuckDBPyConnection,
     digest_of: Callable[[Path], str],
+    store: Path | None = None,
     root: str | Path | None = None,
 ) -> Verification:
     """Hash the recordings of all traces again."""
     found = Verification()
     known: dict[Path, str | SgstoreError] = {}
-    traces = stored_traces(connection, root)
+    traces = stored_traces(connection, store, root)
     for trace in traces:
         if trace.path not in known:
             try:
@@ -345,12 +354,11 @@ _Published = dict[tuple[str, int], dict[str, Checksum]]
 
 
 def _published(connection: DuckDBPyConnection) -> _Published:
-    """The manifest: ("trace" or "map", id) → table → checksum."""
-    sql = 'SELECT trace_id, map_id, "table", rows, checksum FROM manifest'
+    """The manifest: whose ("trace", "map", …) and its number → table → checksum."""
+    sql = 'SELECT owner, id, "table", rows, checksum FROM manifest'
     published: _Published = {}
-    for trace_id, map_id, table, rows, value in connection.execute(sql).fetchall():
-        key = ("map", map_id) if trace_id is None else ("trace", trace_id)
-        published.setdefault(key, {})[table] = Checksum(rows, value)
+    for owner, number, table, rows, value in connection.execute(sql).fetchall():
+        published.setdefault((owner, number), {})[table] = Checksum(rows, value)
     return published
 
 
@@ -378,21 +386,28 @@ def _difference(table: str, now: Checksum, then: Checksum | None) -> str:
     return f"table {table} holds other values than were published"
 
 
-def _maps(
+_NAMED: Final = {"recording": "uri", "config": "config_id", "map": "name"}
+
+
+def _shared(
     connection: DuckDBPyConnection, published: _Published, found: Verification
 ) -> Iterator[Fault]:
-    """Road maps that are not those that were published."""
-    for map_id, name in connection.execute("SELECT map_id, name FROM map").fetchall():
-        manifest = published.get(("map", map_id), {})
-        for table in MAP_TABLES:
-            checksum = Checksum()
-            select = expressions(connection, table, _database(connection))
-            sql = f"SELECT {select} FROM {table} WHERE map_id = ?"
-            checksum.add(connection.execute(sql, [map_id]).fetchnumpy())
-            found.rows += checksum.rows
-            if checksum != manifest.get(table, Checksum()):
-                difference = _difference(table, checksum, manifest.get(table))
-                yield Fault("", "map", f"map {name!r}: {difference}")
+    """Recordings, settings and road maps that are not those that were published."""
+    database = _database(connection)
+    for owner, tables in SHARED.items():
+        sql = f"SELECT {owner}_id, {_NAMED[owner]} FROM {owner}"
+        for number, name in connection.execute(sql).fetchall():
+            manifest = published.get((owner, number), {})
+            for table in tables:
+                checksum = Checksum()
+                select = expressions(connection, table, database)
+                sql = f"SELECT {select} FROM {table} WHERE {owner}_id = ?"
+                checksum.add(connection.execute(sql, [number]).fetchnumpy())
+                found.rows += checksum.rows
+                if checksum != manifest.get(table, Checksum()):
+                    difference = _difference(table, checksum, manifest.get(table))
+                    check = "map" if owner == "map" else "rows"
+                    yield Fault("", check, f"{owner} {name!r}: {difference}")
 
 
 def _broken(

@@ -18,7 +18,7 @@ from sgstore.store._classes import IngestedClasses
 from sgstore.store._locking import translated
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store._payloads import Happenings
-from sgstore.store._publish import MAP_TABLES, fill_trace, publish_in
+from sgstore.store._publish import fill_trace, publish_in
 from sgstore.store._staging import Sealed, Staging
 from sgstore.world import BUCKET_FRAMES, Origin, origin_of, quantize
 
@@ -250,15 +250,29 @@ class Segment:
             }
             fill_trace(staging.connection, self._info, identity, values)
             files, checksums = staging.seal()
-        of_map = {name: checksums.pop(name) for name in MAP_TABLES if name in checksums}
         words = staging.words(self._answers)
-        sealed = Sealed(staging.folder, self._info.path, identity, files, checksums, of_map, words)
+        sealed = Sealed(staging.folder, self._info.path, identity, files, checksums, words)
         sealed.write()
         return sealed
 
     def _insert_about(self) -> None:
-        """Insert channels, context and map, which are known before the first frame."""
-        insert, channels = self._staging.insert, self._info.channels
+        """Insert all that is known before the first frame: recording, settings, channels, context and map."""
+        insert, info, identity = self._staging.insert, self._info, self._identity
+        recording = {
+            "recording_id": np.array([identity.numbers["recording_id"]]),
+            "digest": texts([info.digest]),
+            "uri": texts([str(info.path.resolve())]),
+            "size": np.array([info.size], np.int64),
+            "mtime_ns": np.array([info.mtime_ns], np.int64),
+        }
+        config = {
+            "config_id": np.array([identity.numbers["config_id"]]),
+            "digest": texts([identity.settings_digest]),
+            "settings": texts([identity.settings]),
+        }
+        insert("recording", recording)
+        insert("config", config)
+        channels = info.channels
         names = ("topic", "schema", "schema_encoding", "message_encoding", "role")
         columns: Columns = {name: texts(getattr(c, name) for c in channels) for name in names}
         insert("channel", self._owned(columns | {"channel_id": self._channel_ids}))
@@ -267,13 +281,18 @@ class Segment:
         insert("context", self._owned(context))
         if self._road_map is not None:
             for table, columns in _map_tables(self._road_map).items():
-                insert(table, columns)
+                count = len(next(iter(columns.values())))
+                map_id = np.full(count, identity.numbers["map_id"])
+                insert(table, columns | {"map_id": map_id})
 
     def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
         kinds, insert = self._kinds, self._staging.insert
         # First of all, while little waits: of a crowd what is made on the way takes most.
         abstracted = self._classes.tables(graph, trace_id, kinds.entities)
-        insert("frame", self._owned(packing.frame_columns(graph, trace_id)))
+        of_frames = packing.frame_columns(graph, trace_id)
+        if self._road_map is not None:
+            of_frames["map_id"] = np.full(len(graph.frames), self._identity.numbers["map_id"])
+        insert("frame", self._owned(of_frames))
         insert("entity", self._owned(packing.entity_columns(graph, origin)))
         insert("state", packing.state_columns(graph, trace_id, kinds, origin))
         insert("node", packing.node_columns(graph, trace_id, kinds))
