@@ -35,6 +35,7 @@ from sgstore.vocabulary import (
     suggestion,
 )
 from sgstore.world import (
+    INPUTS,
     POSE,
     Entities,
     FrameBlock,
@@ -61,7 +62,7 @@ __all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities
 
 
 _NAN: Final = math.nan
-NUMBERS: Final = (*POSE, "steer", "throttle", "brake")
+NUMBERS: Final = (*POSE, *INPUTS)
 WHOLE: Final = ("lights", "light_state", "derived")
 """Columns of :attr:`Entity.numbers` and of :attr:`Entity.whole`, as :class:`sgstore.world.States` has them."""
 _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
@@ -161,6 +162,8 @@ class Frame:
         steer: float = _NAN,
         throttle: float = _NAN,
         brake: float = _NAN,
+        gear: float | None = None,
+        hand_brake: bool | None = None,
         special: str = "",
         subkind: str = "",
         type_name: str = "",
@@ -191,6 +194,10 @@ class Frame:
             Lights of a vehicle that are on, of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; ``None``: not known.
         steer, throttle, brake : float
             Control inputs; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+        gear : int, optional
+            1, 2, …; 0: neutral; below 0: backwards.
+        hand_brake : bool, optional
+            Whether it is on.
         special, subkind, type_name : str
             Special kind, subkind, the simulator's own type name; see :class:`sgstore.world.Entities`.
         static : bool
@@ -212,6 +219,8 @@ class Frame:
         numbers = (
             *(x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate),
             *(length, width, height, steer, throttle, brake),
+            _NAN if gear is None else gear,
+            _NAN if hand_brake is None else float(hand_brake),
         )
         self.entities.append(
             Entity(
@@ -313,7 +322,6 @@ _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _STILL: Final = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
 """What stands for ever has velocity 0."""
-_INPUTS: Final = ("steer", "throttle", "brake")
 _DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
 _MAP_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
 _MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
@@ -422,7 +430,7 @@ def _map_node(road_map: RoadMap, node: int) -> Attributes:
 def _moving(states: States) -> list[Attributes]:
     """Attributes of states, in outward units: of whole columns first, then row by row."""
     columns: dict[str, Floats] = {
-        name: getattr(states, name) for name in (*_BOX, *_MOTION, *_INPUTS)
+        name: getattr(states, name) for name in (*_BOX, *_MOTION, *INPUTS[:3])
     }
     columns["heading"] = np.degrees(wrapped(states.heading))
     columns |= {name: np.degrees(getattr(states, name)) for name in ("pitch", "roll", "yaw_rate")}
@@ -432,9 +440,8 @@ def _moving(states: States) -> list[Attributes]:
     names = tuple(columns)
     table = np.stack([columns[name] for name in names], axis=1)
     known = np.isfinite(table).tolist()
-    codes = zip(
-        states.lights.tolist(), states.light_state.tolist(), states.derived.tolist(), strict=True
-    )
+    whole = [states.lights, states.light_state, states.derived, states.gear, states.hand_brake]
+    codes = zip(*(column.tolist() for column in whole), strict=True)
     return [
         {name: value for name, value, told in zip(names, row, is_known, strict=True) if told}
         | _coded(*whole)
@@ -442,13 +449,17 @@ def _moving(states: States) -> list[Attributes]:
     ]
 
 
-def _coded(lights: int, light: int, derived: int) -> Attributes:
-    """Attributes that are kept as codes: lights of a vehicle, state of a traffic light, derived flags."""
+def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float) -> Attributes:
+    """Attributes that are no plain numbers: lights, derived flags, gear and hand brake."""
     about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
     if light >= 0:
         about["light_state"] = LIGHT_STATES[light]
+    if not math.isnan(gear):
+        about["gear"] = int(gear)
+    if not math.isnan(hand_brake):
+        about["hand_brake"] = bool(hand_brake)
     return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(_DERIVED)}
 
 

@@ -85,6 +85,12 @@ POSE: Final = (
 )
 """Columns of :class:`States` that say where a body is, how it moves and how large it is, in order."""
 
+INPUTS: Final = ("steer", "throttle", "brake", "gear", "hand_brake")
+"""Columns of :class:`States` that say how a vehicle is driven, in order."""
+
+HIGHEST_GEAR: Final = 127
+"""A gear beyond it, forwards or backwards, is none; a store keeps 8 bits."""
+
 
 @dataclass(frozen=True, slots=True)
 class Entities:
@@ -144,6 +150,10 @@ class States:
         What a traffic light shows: code of :data:`sgstore.vocabulary.LIGHT_STATES`; -1: no light.
     steer, throttle, brake : float64
         Control inputs, where the trace tells them; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+    gear : float64
+        1, 2, …; 0: neutral; below 0: backwards.
+    hand_brake : float64
+        1: on, 0: off.
     derived : int64
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
     """
@@ -170,6 +180,8 @@ class States:
     steer: Floats
     throttle: Floats
     brake: Floats
+    gear: Floats
+    hand_brake: Floats
     derived: Ints
 
     def __post_init__(self) -> None:
@@ -443,11 +455,13 @@ _LARGEST: Final = np.nextafter(np.float32(np.pi), np.float32(0))
 
 KEPT: Final = (
     *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
-    *("length", "width", "height", "steer", "throttle", "brake"),
+    *("length", "width", "height", *INPUTS),
 )
 """Columns of :class:`States` that a store keeps as they are, cut to float32."""
 
 _VELOCITY: Final = slice(KEPT.index("vx"), KEPT.index("vz") + 1)
+_GEAR: Final = KEPT.index("gear")
+_HAND_BRAKE: Final = KEPT.index("hand_brake")
 
 
 @dataclass(frozen=True, slots=True)
@@ -507,6 +521,9 @@ def _as_kept(states: States, origin: Origin) -> States:
     # A traffic light changes, so it has states; but it stands for ever.
     velocity = kept[_VELOCITY]
     kept[_VELOCITY] = np.where((states.light_state >= 0) & np.isnan(velocity), 0.0, velocity)
+    gear, hand_brake = np.rint(kept[_GEAR]), kept[_HAND_BRAKE]
+    kept[_GEAR] = np.where(np.abs(gear) <= HIGHEST_GEAR, gear, np.nan)
+    kept[_HAND_BRAKE] = np.where(np.isnan(hand_brake), np.nan, hand_brake != 0)
     kept[-3:] += shift[-3:]
     return replace(states, **dict(zip(names, kept, strict=True)))
 

@@ -277,19 +277,23 @@ class Bridge:
         throttle: float = 0.0,
         brake: float = 0.0,
         role: str = "hero",
+        **more: Any,
     ) -> None:
+        """``more``: other fields of the control."""
         told = {
             "header": header(time),
             "velocity": 0.0,
             "acceleration": {"linear": xyz(), "angular": xyz()},
             "orientation": turned(0),
-            "control": control(steer, throttle, brake),
+            "control": control(steer, throttle, brake) | more,
         }
         topic = f"/carla/{role}/vehicle_status"
         self.write(topic, "carla_msgs/CarlaEgoVehicleStatus", told, time + 0.003)
 
-    def command(self, time: float, *, steer: float, throttle: float, brake: float) -> None:
-        told = control(steer, throttle, brake) | {"header": header(time)}
+    def command(
+        self, time: float, *, steer: float, throttle: float, brake: float, **more: Any
+    ) -> None:
+        told = control(steer, throttle, brake) | {"header": header(time)} | more
         topic = "/carla/hero/vehicle_control_cmd"
         self.write(topic, "carla_msgs/CarlaEgoVehicleControl", told, time)
 

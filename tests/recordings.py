@@ -65,7 +65,7 @@ TYPES = {
     " stationary_object=4:StationaryObject* moving_object=5:MovingObject*"
     " traffic_sign=6:TrafficSign* traffic_light=7:TrafficLight* lane=10:Lane*"
     " environmental_conditions=12:EnvironmentalConditions map_reference=15:string",
-    "VehiclePowertrain": "pedal_position_acceleration=1:double",
+    "VehiclePowertrain": "pedal_position_acceleration=1:double gear_transmission=3:int32",
     "VehicleBrakeSystem": "pedal_position_brake=1:double",
     "HostVehicleData": "vehicle_powertrain=4:VehiclePowertrain"
     " vehicle_brake_system=5:VehicleBrakeSystem",
@@ -97,6 +97,7 @@ _SCALARS = {
     "uint64": _FIELD.TYPE_UINT64,
     "int64": _FIELD.TYPE_INT64,
     "uint32": _FIELD.TYPE_UINT32,
+    "int32": _FIELD.TYPE_INT32,
     "double": _FIELD.TYPE_DOUBLE,
     "string": _FIELD.TYPE_STRING,
     "bool": _FIELD.TYPE_BOOL,

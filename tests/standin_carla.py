@@ -252,7 +252,7 @@ def at_red() -> StandInWorld:
         *(24, "vehicle.tesla.model3", transform(-1.75, -28.0, 0.0, yaw=90.0)),
         box(4.7, 2.1, 1.5, z=0.75),
         {"role_name": "hero"},
-        control=carla.VehicleControl(throttle=0.0, steer=0.25, brake=1.0),
+        control=carla.VehicleControl(throttle=0.0, steer=0.25, brake=1.0, gear=2, hand_brake=True),
         light_state=carla.VehicleLightState(
             carla.VehicleLightState.Brake | carla.VehicleLightState.LeftBlinker
         ),

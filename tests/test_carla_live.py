@@ -59,6 +59,7 @@ def test_positions_velocities_and_inputs_are_in_our_axes() -> None:
     assert (hero["vx"], hero["vy"], hero["vz"]) == (1.0, -2.0, 0.5)
     assert hero["yaw_rate"] == pytest.approx(-12.0)
     assert (hero["steer"], hero["throttle"], hero["brake"]) == (-0.25, 0.0, 1.0)
+    assert (hero["gear"], hero["hand_brake"]) == (2, True)
     assert (hero["length"], hero["width"], hero["height"]) == pytest.approx((4.7, 2.1, 1.5))
     assert "steer" not in by_ident(graph_of(LiveWorld(world)))["25"]
 

@@ -23,6 +23,7 @@ from carla_recordings import (
 from clipping import Source, write_clips
 from opendrive_maps import a_map, a_road, element, lane, line, link, section
 
+import sgstore
 from sgstore.doctor import examine
 from sgstore.ingest import ingest
 from sgstore.opendrive import read_map
@@ -36,7 +37,15 @@ from sgstore.world import Clip, Event
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from sgstore.query import Store
     from sgstore.roads import RoadMap
+
+
+def kept(path: Path) -> Store:
+    """A store of a recording."""
+    (outcome,) = ingest(path.with_suffix(".sgstore"), [path])
+    assert outcome.error is None
+    return sgstore.open(path.with_suffix(".sgstore"))
 
 
 @pytest.fixture
@@ -89,6 +98,58 @@ def test_commands_stand_in_for_controls_that_were_not_recorded(path: Path) -> No
     (frame,) = states(read(path)[1])
 
     assert (frame["1"]["steer"], frame["1"]["throttle"]) == (0.5, 0.75)
+
+
+def test_a_status_tells_the_gear_that_is_in_and_the_hand_brake(path: Path) -> None:
+    told = [
+        ({"gear": 1}, (1, 0)),
+        ({"gear": 3, "hand_brake": True}, (3, 1)),
+        ({"gear": 0, "manual_gear_shift": True}, (0, 0)),
+        ({"gear": -1, "reverse": True}, (-1, 0)),
+        ({"gear": 1, "reverse": True}, (-1, 0)),
+        ({"gear": 1000}, (math.nan, 0)),  # no gearbox has it
+    ]
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        for i, (more, _) in enumerate(told):
+            bridge.status(i * 0.1, **more)
+            bridge.objects(i * 0.1, [vehicle(1), vehicle(2)])
+
+    store = kept(path)
+
+    rows = store.sql("SELECT gear, hand_brake FROM nodes WHERE is_ego ORDER BY frame_id").values
+    np.testing.assert_equal(
+        [(math.nan if gear is None else gear, brake) for gear, brake in rows],
+        [wanted for _, wanted in told],
+    )
+    others = store.sql("SELECT DISTINCT gear, hand_brake FROM nodes WHERE NOT is_ego").values
+    assert others == [(None, None)]
+    assert len(store.find("MATCH (e:Ego) WHERE e.gear < 0").rows()) == 2
+    assert len(store.find("MATCH (e:Ego) WHERE e.hand_brake").rows()) == 1
+    (fault,) = store.check("CHECK c: ALWAYS NOT (ego.hand_brake AND ego.gear = 3)")
+    assert str(fault.verdict) == "false"
+    about = [store.graph(f"drive#{i}").nodes[0] for i in range(6)]
+    assert [(node.get("gear"), node["hand_brake"]) for node in about] == rows
+    assert type(about[0]["gear"]) is int
+    assert about[0]["hand_brake"] is False
+
+
+def test_a_command_tells_a_gear_only_where_gears_are_shifted_by_hand(path: Path) -> None:
+    told = [
+        ({"gear": 1}, math.nan),
+        ({"gear": 1, "reverse": True}, -1),
+        ({"gear": 2, "manual_gear_shift": True}, 2),
+    ]
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        for i, (more, _) in enumerate(told):
+            bridge.command(i * 0.1, steer=0, throttle=1, brake=0, hand_brake=i == 2, **more)
+            bridge.objects(i * 0.1, [vehicle(1)])
+
+    frames = states(read(path)[1])
+
+    np.testing.assert_equal([f["1"]["gear"] for f in frames], [gear for _, gear in told])
+    assert [f["1"]["hand_brake"] for f in frames] == [0, 0, 1]
 
 
 def test_every_vehicle_has_its_own_controls(path: Path) -> None:

@@ -305,7 +305,9 @@ def plain_world(i: int) -> dict[str, Any]:
     body = {"length": 4.5, "width": 1.9, "height": 1.5}
     drives = still | body | {"kind": "car", "vx": 10.0, "heading": 5.0, "y": 0.0, "z": 0.75}
     entities = [
-        drives | {"ident": "ego", "x": i, "lights": ["light_brake"], "throttle": i / 100},
+        drives
+        | {"ident": "ego", "x": i, "lights": ["light_brake"], "throttle": i / 100}
+        | {"gear": i % 4 - 1, "hand_brake": i < 3},
         drives | {"ident": "lead", "x": i + 9.5, "yaw_rate": 1.5, "special": "taxi", "brake": 0.5},
         still
         | {"ident": "lamp", "kind": "traffic_light", "x": 30.0, "y": 5.0, "light_state": "red"},

@@ -83,6 +83,8 @@ def test_a_client_gets_a_graph_with_its_own_ids_and_outward_units() -> None:
         yaw_rate=3.0,
         lights=["light_brake"],
         throttle=0.25,
+        gear=-1,
+        hand_brake=True,
         special="taxi",
         type_name="vehicle.ford.crown",
     )
@@ -102,6 +104,8 @@ def test_a_client_gets_a_graph_with_its_own_ids_and_outward_units() -> None:
     assert ego["light_brake"]
     assert not ego["light_left"]
     assert ego["throttle"] == 0.25
+    assert (ego["gear"], ego["hand_brake"]) == (-1, True)
+    assert not {"gear", "hand_brake"} & person.keys()
     assert ego["special"] == "taxi"
     assert person["kind"] == "person"
     assert not {"heading", "speed", "light_left", "light_state", "length"} & person.keys()

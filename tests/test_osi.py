@@ -1162,6 +1162,24 @@ def test_what_another_channel_tells_between_frames_is_not_lost_in_silence(tmp_pa
     assert "moving object 2 is told only between the frames" in loss.reason
 
 
+def test_the_gear_is_that_of_the_egos_gearbox_and_osi_has_no_hand_brake(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i, gear in enumerate((0, 1, None, -1, 6)):
+            data = OSI.HostVehicleData()
+            data.vehicle_brake_system.pedal_position_brake = 0.5
+            if gear is not None:
+                data.vehicle_powertrain.gear_transmission = gear
+            channel = recorder.channel("host", "osi3.HostVehicleData")
+            recorder.write(channel, i * 0.1, data.SerializeToString())
+            recorder.ground_truth(i * 0.1, [car(0), car(1)], host=0)
+    _, blocks, _ = read(path)
+
+    assert of(blocks, "0").gear == pytest.approx([0, 1, np.nan, -1, 6], nan_ok=True)
+    assert np.isnan(of(blocks, "0").hand_brake).all()
+    assert np.isnan(of(blocks, "1").gear).all()
+
+
 def test_pedals_on_a_channel_of_their_own_are_the_egos(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path) as recorder:

@@ -479,6 +479,8 @@ def _write_pedals(data: Any, values: dict[str, float]) -> None:
         data.vehicle_powertrain.pedal_position_acceleration = values["throttle"]
     if not math.isnan(values["brake"]):
         data.vehicle_brake_system.pedal_position_brake = values["brake"]
+    if not math.isnan(values["gear"]):
+        data.vehicle_powertrain.gear_transmission = round(values["gear"])
 
 
 def _write_lamps(out: Any, mask: int) -> None:

@@ -39,6 +39,7 @@ from sgstore.vocabulary import (
     type_meanings,
     vague_kind,
 )
+from sgstore.world import HIGHEST_GEAR, INPUTS, POSE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -397,10 +398,9 @@ def _no_kind(what: str, kind: str) -> str:
 _RADIANS: Final = frozenset({"heading", "pitch", "roll", "yaw_rate", "heading_error"})
 """Numbers that are degrees outside."""
 
-STATE_NUMBERS: Final = (
-    *("x", "y", "z", "heading", "pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
-    *("length", "width", "height", "steer", "throttle", "brake"),
-)
+STATE_NUMBERS: Final = (*POSE, *INPUTS[:3])
+_SHIFTED: Final = {"gear": range(-HIGHEST_GEAR, HIGHEST_GEAR + 1), "hand_brake": (False, True)}
+"""Values of these that their columns take; others (``"D"``) are attributes of a client's own."""
 PART_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
 PART_TEXTS: Final = ("lane_type", "road", "junction", "turn")
 PART_WHOLE: Final = ("section", "lane")
@@ -452,6 +452,8 @@ def state_of(
             continue
         if name in STATE_NUMBERS:
             found[name] = _number(path, where, name, value)
+        elif name in _SHIFTED and value in _SHIFTED[name]:
+            found[name] = float(value)
         elif name == "light_state":
             found[name] = _light_state(path, where, value, any_state=any_state)
         elif name in VEHICLE_LIGHTS or name in _DERIVED:

@@ -213,7 +213,8 @@ MOTION: Final = frozenset({"speed", "vx", "vy", "vz", "accel", "ax", "ay", "az",
 
 MEASURED: Final = MOTION | {
     *("heading", "pitch", "roll", "length", "width", "height"),
-    *("steer", "throttle", "brake", "light_state", "parked", "speed_limit", "curvature"),
+    *("steer", "throttle", "brake", "gear", "hand_brake", "light_state", "parked"),
+    *("speed_limit", "curvature"),
     *VEHICLE_LIGHTS,
 }
 """Attributes of nodes that are unknown where nobody told them."""

@@ -689,14 +689,10 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         )
 
 
-def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, float, float]]:
-    """Node id → steer, throttle, brake, of those that have any."""
-    driven: dict[int, tuple[float, float, float]] = {}
-    for node, entity in moving.items():
-        steer, throttle, brake = entity.numbers[len(POSE) :]
-        if not np.isnan([steer, throttle, brake]).all():
-            driven[node] = steer, throttle, brake
-    return driven
+def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:
+    """Node id → how it is driven, of those of which anything is told."""
+    told = ((node, entity.numbers[len(POSE) :]) for node, entity in moving.items())
+    return {node: inputs for node, inputs in told if not np.isnan(inputs).all()}
 
 
 def _channels(

@@ -18,7 +18,7 @@ import numpy as np
 from sgstore.columns import chained, taken
 from sgstore.mcap import IDS, Loss
 from sgstore.vocabulary import KIND_CODE
-from sgstore.world import POSE, Entities, FrameBlock, MessageRefs, States
+from sgstore.world import INPUTS, POSE, Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -50,6 +50,10 @@ MOST_EVENTS: Final = 10_000
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = 0, 3, 6, 9, 12
 
 
+NO_INPUTS: Final = (NAN,) * len(INPUTS)
+"""Controls of whom the recording tells none."""
+
+
 @dataclass(frozen=True, slots=True)
 class FrameRows:
     """One frame, decoded.
@@ -65,7 +69,7 @@ class FrameRows:
     values : (n, 16) float64
         Columns :data:`POSE`.
     controls : tuple of float
-        Steer, throttle, brake of the ego; NaN where the recording has none.
+        :data:`sgstore.world.INPUTS` of the ego; NaN where the recording has none.
     driven : mapping
         Node id → the same, of other vehicles than the ego.
     """
@@ -77,10 +81,8 @@ class FrameRows:
     values: Floats
     lights: Ints
     light_state: Ints
-    controls: tuple[float, float, float] = (NAN, NAN, NAN)
-    driven: Mapping[int, tuple[float, float, float]] = field(
-        default_factory=dict[int, tuple[float, float, float]]
-    )
+    controls: tuple[float, ...] = NO_INPUTS
+    driven: Mapping[int, tuple[float, ...]] = field(default_factory=dict[int, "tuple[float, ...]"])
 
     def __len__(self) -> int:
         return len(self.node)
@@ -501,7 +503,7 @@ def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> 
         for node, told in driven.items():
             columns[start + np.flatnonzero(nodes[start : start + count] == node)] = told
         start += count
-    return {"steer": columns[:, 0], "throttle": columns[:, 1], "brake": columns[:, 2]}
+    return {name: columns[:, column] for column, name in enumerate(INPUTS)}
 
 
 def _states(node: Ints, values: Floats, **more: NDArray[np.generic]) -> States:

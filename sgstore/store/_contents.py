@@ -56,6 +56,13 @@ _TABLES: Final = {
 }
 """Views, and the columns of them that a graph is made of. Changing them changes every digest."""
 
+_LATER: Final = {
+    "(SELECT * FROM nodes WHERE gear IS NOT NULL OR hand_brake IS NOT NULL)": (
+        *("node_id", "gear", "hand_brake"),
+    ),
+}
+"""The same of columns that came later. Where they are not known, digests are what they were without them."""
+
 _MESSAGES: Final = f"""
 SELECT p.frame_id, p.channel, p.log_time_ns, p.chunk_offset, p.message_offset, p.length
 FROM payloads p JOIN {_WANTED} ON w.frame_id = p.frame_id
@@ -106,10 +113,10 @@ def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> Iterator[str]:
             groups = frames[low:high]
             hashes = [hashlib.blake2b(digest_size=DIGEST_BYTES) for _ in groups]
             wanted = np.unique(np.concatenate(groups))
-            for view, columns in _TABLES.items():
+            for view, columns in (_TABLES | _LATER).items():
                 rows = _rows(file, view, columns, wanted)
                 for number, group in enumerate(groups):
-                    _add(hashes[number], rows, group)
+                    _add(hashes[number], rows, group, always=view in _TABLES)
             yield from (one.hexdigest() for one in hashes)
 
 
@@ -173,13 +180,15 @@ def _word(text: str) -> int:
     return int.from_bytes(whole, "little")
 
 
-def _add(digest: Any, rows: tuple[Ints, Words], group: Ints) -> None:
+def _add(digest: Any, rows: tuple[Ints, Words], group: Ints, *, always: bool) -> None:
     frame_id, words = rows
     low = int(np.searchsorted(frame_id, group[0]))
     high = int(np.searchsorted(frame_id, group[-1], side="right"))
     own = words[low:high]
     if len(group) < group[-1] - group[0] + 1:  # others may lie between
         own = own[np.isin(frame_id[low:high], group)]
+    if not len(own) and not always:
+        return
     digest.update(np.array([len(own)], "<u8").tobytes())
     digest.update(np.ascontiguousarray(own, "<u8").tobytes())
 

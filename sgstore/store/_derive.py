@@ -24,7 +24,16 @@ from sgstore.store._rows import run
 from sgstore.store._staging import Staging
 from sgstore.store._traces import trace_named
 from sgstore.vocabulary import normalize_name
-from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, Origin, States
+from sgstore.world import (
+    BUCKET_FRAMES,
+    INPUTS,
+    POSE,
+    Entities,
+    FrameBlock,
+    MessageRefs,
+    Origin,
+    States,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -44,10 +53,7 @@ TABLES: Final = ("derived", "derived_node", "derived_edge", "derived_gap")
 _BUCKETS: Final = 2
 """Buckets of a block: as many as at ingest."""
 
-_NUMBERS: Final = (
-    *("x", "y", "z", "heading", "pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
-    *("length", "width", "height", "steer", "throttle", "brake"),
-)
+_NUMBERS: Final = (*POSE, *INPUTS)
 _POSE: Final = ("x", "y", "z", "heading", "length", "width", "height")
 
 _FRAMES: Final = """

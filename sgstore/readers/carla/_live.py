@@ -469,7 +469,13 @@ def _controls(actor: _Actor) -> dict[str, Any]:
     if not actor.type_name.startswith("vehicle."):
         return {}
     control = actor.handle.get_control()
-    return {"steer": 0.0 - control.steer, "throttle": control.throttle, "brake": control.brake}
+    return {
+        "steer": 0.0 - control.steer,
+        "throttle": control.throttle,
+        "brake": control.brake,
+        "gear": control.gear,
+        "hand_brake": control.hand_brake,
+    }
 
 
 def _shown(light: Any) -> str:

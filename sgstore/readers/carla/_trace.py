@@ -32,7 +32,7 @@ import numpy as np
 from sgstore.errors import MapError, TraceError
 from sgstore.opendrive import read_map
 from sgstore.readers._base import SurveyedTrace
-from sgstore.readers._blocks import FAR, NAN, UPRIGHT, FrameRows, MessageDecoder
+from sgstore.readers._blocks import FAR, NAN, NO_INPUTS, UPRIGHT, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
 from sgstore.readers.carla._signals import Lights, signals_of
 from sgstore.readers.carla._survey import (
@@ -55,7 +55,7 @@ from sgstore.readers.carla._survey import (
 from sgstore.world import POSE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from sgstore.mcap import Messages, Recording
     from sgstore.roads import RoadMap
@@ -75,7 +75,9 @@ COLUMNS: Final = (
 )
 """Numbers that are read of every ``derived_object_msgs/Object``."""
 STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
-CONTROLS: Final = ("steer", "throttle", "brake")
+CONTROLS: Final = (
+    *("steer", "throttle", "brake", "gear", "hand_brake", "reverse", "manual_gear_shift"),
+)
 ODOMETRY_COLUMNS: Final = (
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
     *(f"pose.pose.orientation.{part}" for part in "xyzw"),
@@ -94,10 +96,8 @@ _SPHERE, _CYLINDER, _CONE = 2, 3, 4
 _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
 """Bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS` → bit of ``carla.VehicleLightState``. These are: position 0,
 low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
-_NO_CONTROLS: Final = (NAN, NAN, NAN)
-
-Controls = tuple[float, float, float]
-"""Steer, throttle, brake, as :class:`sgstore.world.States` has them; NaN: not told."""
+Controls = tuple[float, ...]
+""":data:`sgstore.world.INPUTS`; NaN: not told."""
 
 
 @dataclass(slots=True)
@@ -114,7 +114,7 @@ class CarlaRawFrame:
     light_states : (m,) int64
         Of the traffic lights.
     controls : dict
-        Actor id → steer, throttle, brake.
+        Actor id → :data:`sgstore.world.INPUTS`.
     vehicle_lights : mapping
         Actor id → mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`.
     odometry : (11,) float64 or None
@@ -295,7 +295,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             values=values,
             lights=self._lights_of(frame, node),
             light_state=np.full(len(node), -1, np.int64),
-            controls=driven.pop(ego, _NO_CONTROLS),
+            controls=driven.pop(ego, NO_INPUTS),
             driven=driven,
         )
         return rows.with_heads((self._lights.nodes, self._lights.values, frame.light_states))
@@ -347,8 +347,9 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
     def _take_controls(self, channel: int, _log_time: int, data: memoryview) -> None:
         told = self._fields[channel].read(data)[1][0]
         stamp, ident = stamp_from(told[:2]), self._drivers[channel]
-        steer, throttle, brake = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
-        self._controls[ident] = stamp, (0.0 - steer, throttle, brake)
+        controls = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
+        applied = self._survey.contents[channel] == STATUS
+        self._controls[ident] = stamp, _inputs(controls, applied=applied)
         if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
             self._frame.controls[ident] = self._controls[ident][1]
 
@@ -559,3 +560,17 @@ class CarlaTrace(SurveyedTrace):
             return read_map(self._survey.map_text, self._survey.map_name)
         except MapError:  # whoever reads the map for its lanes says so
             return None
+
+
+def _inputs(told: Sequence[float], *, applied: bool) -> Controls:
+    """Columns :data:`CONTROLS` as :data:`sgstore.world.INPUTS`.
+
+    A control that was applied says the gear that is in. One that asks says a gear only if gears are shifted by
+    hand; else the simulator chooses one, of which no more is known than that it goes backwards.
+    """
+    steer, throttle, brake, gear, hand_brake, reverse, manual = told
+    if not applied and manual != 1:
+        gear = NAN
+    if reverse == 1 and not gear < 0:
+        gear = -1.0
+    return 0.0 - steer, throttle, brake, gear, hand_brake

@@ -131,7 +131,7 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
 
 HOST_DATA_FIELDS: Final[dict[str, Any]] = {
     "host_vehicle_id": {"value": None},
-    "vehicle_powertrain": {"pedal_position_acceleration": None},
+    "vehicle_powertrain": {"pedal_position_acceleration": None, "gear_transmission": None},
     "vehicle_brake_system": {"pedal_position_brake": None},
 }
 

@@ -21,13 +21,12 @@ from google.protobuf import message_factory
 
 from sgstore.mcap import Loss
 from sgstore.readers._base import SurveyedTrace
-from sgstore.readers._blocks import NAN, FrameRows, LossTally, MessageDecoder
+from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally, MessageDecoder
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
     LATEST_NS,
-    NO_VECTOR,
     SENSOR_VIEW,
     enum_name,
     ground_truth_of,
@@ -177,7 +176,7 @@ class OsiRawFrame:
     time_ns: int
     log_time_ns: int
     heads: tuple[Ints, Floats, Ints]
-    controls: tuple[float, float, float] = NO_VECTOR
+    controls: tuple[float, ...] = NO_INPUTS
     nodes: list[int] = field(default_factory=list[int])
     objects: list[bytes] = field(default_factory=list[bytes])
 
@@ -205,7 +204,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         self._open: OsiRawFrame | None = None
         self._ahead: dict[int, list[bytes]] = {}
         self._aside: dict[int, int] = {}
-        self._controls = NO_VECTOR
+        self._controls = NO_INPUTS
         lead = survey.leads[survey.leading]
         self._class = lead.objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
@@ -314,13 +313,12 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
                     frame.objects.append(content)
         frame.heads = self._lights.rows()
         data = getattr(message, "host_vehicle_data", None)
-        if data is None and self._controls is NO_VECTOR:
+        if data is None and self._controls is NO_INPUTS:
             return
         known = zip(frame.controls, controls_of(data), self._controls, strict=True)
-        steer, throttle, brake = (
+        frame.controls = tuple(
             next((value for value in three if not math.isnan(value)), NAN) for three in known
         )
-        frame.controls = (steer, throttle, brake)
 
     def _take_aside(self, message: Any, ground: Any, time_ns: int) -> None:
         """Take a message of another channel: it tells of the last frame, of one to come, or of none."""
@@ -454,22 +452,25 @@ def time_of(message: Any, ground: Any) -> int | None:
     return None
 
 
-def controls_of(data: Any) -> tuple[float, float, float]:
-    """Steer, throttle and brake in an ``osi3.HostVehicleData``; NaN what it does not tell.
+def controls_of(data: Any) -> tuple[float, ...]:
+    """Controls (:data:`sgstore.world.INPUTS`) in an ``osi3.HostVehicleData``; NaN what it does not tell.
 
-    The angle of a steering wheel is no normalised steer, and how far the wheel turns is not told: that is
-    always NaN.
+    The angle of a steering wheel is no normalised steer, and how far the wheel turns is not told; nor has OSI a
+    hand brake: these are always NaN.
     """
     return (
         NAN,
         _number(data, "vehicle_powertrain", "pedal_position_acceleration"),
         _number(data, "vehicle_brake_system", "pedal_position_brake"),
+        _number(data, "vehicle_powertrain", "gear_transmission"),
+        NAN,
     )
 
 
 def _number(message: Any, part: str, name: str) -> float:
     inner = getattr(message, part, None)
-    return float(getattr(inner, name)) if inner is not None and inner.HasField(name) else NAN
+    told = inner is not None and name in inner.DESCRIPTOR.fields_by_name and inner.HasField(name)
+    return float(getattr(inner, name)) if told else NAN
 
 
 # The recording ------------------------------------------------------------------------------------
