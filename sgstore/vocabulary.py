@@ -15,7 +15,8 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore import plugins
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Generator, Iterable, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -213,9 +214,6 @@ def normalize_name(name: str) -> str:
     return name.replace("_", "").lower()
 
 
-_RELATIONS_FOLDED: Final = {normalize_name(name): name for name in RELATIONS} | {
-    normalize_name(alias): name for alias, name in RELATION_ALIASES.items()
-}
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _growing: Final = Lock()
 
@@ -225,34 +223,92 @@ MOST_RELATIONS: Final = 63
 MOST_KINDS: Final = 127
 """Kinds, and states of lights, that one process can know: a code is an 8-bit number."""
 
-_KINDS_FOLDED: Final = {normalize_name(name): name for name in KINDS}
-_LABELS_FOLDED: Final[dict[str, Sequence[str]]] = {
-    **{normalize_name(name): (name,) for name in KINDS},
+_OWN_RELATIONS_FOLDED: Final[Mapping[str, str]] = {
+    normalize_name(name): name for name in OWN_RELATIONS
+} | {normalize_name(alias): name for alias, name in RELATION_ALIASES.items()}
+_OWN_LABELS_FOLDED: Final[Mapping[str, Sequence[str]]] = {
+    **{normalize_name(name): (name,) for name in OWN_KINDS},
     **{normalize_name(name): kinds for name, kinds in SUPER_KINDS.items()},
     **{normalize_name(alias): (name,) for alias, name in LABEL_ALIASES.items()},
 }
+_OWN_FOLDED: Final[Mapping[str, Mapping[str, str]]] = {
+    "kind": {normalize_name(name): name for name in OWN_KINDS},
+    "relation": _OWN_RELATIONS_FOLDED,
+    "light_state": {normalize_name(name): name for name in OWN_LIGHT_STATES},
+}
+
+# Codes are the process's, names are not: a name that a store has is one for who asks that store. Those of this
+# package, and those that other packages, settings, readers and imports made known, are names for everybody.
+
+NAMES: Final[Mapping[str, Sequence[str]]] = {
+    "kind": KINDS,
+    "relation": RELATIONS,
+    "light_state": LIGHT_STATES,
+}
+"""Enumerations of a store, by the names of their types: all their values so far, by their codes."""
+
+_OWN: Final = {
+    "kind": OWN_KINDS,
+    "relation": OWN_RELATIONS,
+    "light_state": OWN_LIGHT_STATES,
+}
+_CODES: Final = {
+    "kind": (_kinds, _kind_code, MOST_KINDS, "kinds"),
+    "relation": (_relations, _relation_code, MOST_RELATIONS, "relations"),
+    "light_state": (_light_states, _light_state_code, MOST_KINDS, "states of lights"),
+}
+_made_known: Final[dict[tuple[str, str], None]] = {}
+_asked: Final[ContextVar[Mapping[str, Sequence[str]] | None]] = ContextVar("asked", default=None)
 
 
-def add_relation(name: str) -> int:
-    """Make a relation known in this process, and return its code.
+def learn(enum: str, name: str) -> int:
+    """Return the code of a name that a store has, whatever other names look like it.
+
+    Parameters
+    ----------
+    enum : str
+        One of :data:`NAMES`.
+    name : str
 
     Raises
     ------
     ValueError
-        It is no name, it is that of a label or, but for case and underscores, of another relation; or there are
-        too many.
+        It is no name, or there are too many.
     """
     with _growing:
-        if name in _relation_code:
-            return _relation_code[name]
-        _check_new("relation", name, MOST_RELATIONS, _relations)
-        _RELATIONS_FOLDED[normalize_name(name)] = name
-        _relations.append(name)
-        return _relation_code.setdefault(name, len(_relations) - 1)
+        return _coded(enum, name)
+
+
+def _coded(enum: str, name: str) -> int:
+    names, codes, most, what = _CODES[enum]
+    if name not in codes:
+        if not _NAME.fullmatch(name):
+            raise ValueError(
+                f"{name!r} is no name: letters, digits and _, a letter first, 40 at most"
+            )
+        if len(names) >= most:
+            raise ValueError(f"there are {most} {what}, and no room for {name!r}")
+        if enum == "kind":
+            _entity_kinds.append(name)
+        names.append(name)
+        codes[name] = len(names) - 1
+    return codes[name]
+
+
+def add_relation(name: str) -> int:
+    """Make a relation known to everybody in this process, and return its code.
+
+    Raises
+    ------
+    ValueError
+        It is no name, it is that of a label or, but for case and underscores, of another relation of this
+        package; or there are too many.
+    """
+    return _made("relation", name)
 
 
 def add_kind(name: str) -> int:
-    """Make a kind of entities known in this process, and return its code.
+    """Make a kind of entities known to everybody in this process, and return its code.
 
     Parameters
     ----------
@@ -262,74 +318,89 @@ def add_kind(name: str) -> int:
     Raises
     ------
     ValueError
-        It is no name, it is that of a relation or, but for case and underscores, of another label; or there are
-        too many.
+        It is no name, it is that of a relation or, but for case and underscores, of another label of this
+        package; or there are too many.
     """
-    with _growing:
-        if name in _kind_code:
-            return _kind_code[name]
-        _check_new("kind", name, MOST_KINDS, _kinds)
-        _KINDS_FOLDED[normalize_name(name)] = name
-        _LABELS_FOLDED[normalize_name(name)] = (name,)
-        _entity_kinds.append(name)
-        _kinds.append(name)
-        return _kind_code.setdefault(name, len(_kinds) - 1)
+    return _made("kind", name)
 
 
 def add_light_state(name: str) -> int:
-    """Make a state of traffic lights known in this process, and return its code.
+    """Make a state of traffic lights known to everybody in this process, and return its code.
 
     Raises
     ------
     ValueError
-        It is no name or, but for case and underscores, that of another state; or there are too many.
+        It is no name or, but for case and underscores, that of another state of this package; or there are
+        too many.
     """
+    return _made("light_state", name)
+
+
+def _made(enum: str, name: str) -> int:
     with _growing:
-        if name in _light_state_code:
-            return _light_state_code[name]
-        _check_name(name)
-        like = {normalize_name(known): known for known in _light_states}.get(normalize_name(name))
-        if like:
-            raise ValueError(f"{name!r} would be taken for the state {like!r}")
-        _check_room("states of lights", name, MOST_KINDS, _light_states)
-        _light_states.append(name)
-        return _light_state_code.setdefault(name, len(_light_states) - 1)
+        if name not in _OWN[enum] and (enum, name) not in _made_known:
+            like = _like_own(enum, normalize_name(name), name)
+            if like:
+                raise ValueError(f"{name!r} would be taken for {like}")
+            _coded(enum, name)
+            _made_known[enum, name] = None
+        return _coded(enum, name)
 
 
-def _check_new(what: str, name: str, most: int, known: Sequence[str]) -> None:
-    """Refuse what cannot be the name of a new relation or kind."""
-    _check_name(name)
-    relation = _RELATIONS_FOLDED.get(normalize_name(name))
-    label = normalize_name(name) == "ego" or kinds_labelled(name) is not None
-    if relation or label:
-        like = f"the relation {relation!r}" if relation else f"the label {name!r}"
-        raise ValueError(f"{name!r} would be taken for {like}")
-    _check_room(f"{what}s", name, most, known)
+def _like_own(enum: str, folded: str, name: str) -> str:
+    """Name of this package for which a new one would be taken; empty if there is none."""
+    if enum == "light_state":
+        state = _OWN_FOLDED[enum].get(folded)
+        return f"the state {state!r}" if state else ""
+    if folded in _OWN_RELATIONS_FOLDED:
+        return f"the relation {_OWN_RELATIONS_FOLDED[folded]!r}"
+    return f"the label {name!r}" if folded == "ego" or folded in _OWN_LABELS_FOLDED else ""
 
 
-def _check_name(name: str) -> None:
-    if not _NAME.fullmatch(name):
-        raise ValueError(f"{name!r} is no name: letters, digits and _, a letter first, 40 at most")
+@contextmanager
+def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
+    """Let only the names of one store count, beside those that are for everybody.
+
+    Parameters
+    ----------
+    names : mapping or None
+        Enumeration → values that the store has beside those of this package; ``None``: those of all stores
+        that the process has met.
+    """
+    before = _asked.set(names)
+    try:
+        yield
+    finally:
+        _asked.reset(before)
 
 
-def _check_room(what: str, name: str, most: int, known: Sequence[str]) -> None:
-    if len(known) >= most:
-        raise ValueError(f"there are {most} {what}, and no room for {name!r}")
+def known_names(enum: str) -> tuple[str, ...]:
+    """Return all names of an enumeration that count here, those of this package first."""
+    return (*_OWN[enum], *_others(enum))
 
 
-ADD: Final[Mapping[str, Callable[[str], int]]] = {
-    "kind": add_kind,
-    "relation": add_relation,
-    "light_state": add_light_state,
-}
-"""Enumerations of a store, by the name of their type, and what makes one more of its values known."""
+def _others(enum: str) -> Sequence[str]:
+    """Names that count and are not of this package, those of the store that is asked first."""
+    asked = _asked.get()
+    if asked is None:
+        return NAMES[enum][len(_OWN[enum]) :]
+    everybody = (name for what, name in _made_known if what == enum)
+    return tuple(dict.fromkeys((*asked.get(enum, ()), *everybody)))
 
-NAMES: Final[Mapping[str, Sequence[str]]] = {
-    "kind": KINDS,
-    "relation": RELATIONS,
-    "light_state": LIGHT_STATES,
-}
-"""Their values, by their codes."""
+
+def _meant(enum: str, word: str) -> str | None:
+    """The name that a word means: the same one, else one of this package, else another that is like it."""
+    others, folded = _others(enum), normalize_name(word)
+    if word in others:
+        return word
+    if folded in _OWN_FOLDED[enum]:
+        return _OWN_FOLDED[enum][folded]
+    alike = [name for name in others if normalize_name(name) == folded]
+    return next((name for name in alike if _camel(name) == word), alike[0] if alike else None)
+
+
+def _camel(name: str) -> str:
+    return "".join(part.capitalize() for part in name.split("_"))
 
 
 def entity_kinds() -> frozenset[str]:
@@ -354,15 +425,20 @@ def _add_plugins() -> None:
 
 def relation_named(name: str) -> str | None:
     """The relation that a user's name means, or ``None``."""
-    if normalize_name(name) not in _RELATIONS_FOLDED:
+    found = _meant("relation", name)
+    if found is None:
         _add_plugins()  # looking for them takes a while
-    return _RELATIONS_FOLDED.get(normalize_name(name))
+        found = _meant("relation", name)
+    return found
 
 
 def kinds_labelled(label: str) -> tuple[str, ...] | None:
     """The kinds that a label stands for, or ``None``. ``Ego`` is a mark, not a label of kinds."""
-    kinds = _LABELS_FOLDED.get(normalize_name(label))
-    return None if kinds is None else tuple(kinds)
+    own = _OWN_LABELS_FOLDED.get(normalize_name(label))
+    if own is not None and label not in _others("kind"):
+        return tuple(own)
+    kind = _meant("kind", label)
+    return None if kind is None else (kind,)
 
 
 def kind_named(word: str) -> str | None:
@@ -370,7 +446,7 @@ def kind_named(word: str) -> str | None:
 
     ``vehicle`` is the kind of that name here, although the label stands for every vehicle.
     """
-    exact = _KINDS_FOLDED.get(normalize_name(word))
+    exact = _meant("kind", word)
     if exact is not None:
         return exact
     kinds = kinds_labelled(word) or ()
@@ -389,8 +465,8 @@ def vague_kind(type_name: str) -> str:
 
 def labels() -> tuple[str, ...]:
     """Every label that a pattern may use, in CamelCase, ``Ego`` first."""
-    names = dict.fromkeys((*KINDS, *SUPER_KINDS, *LABEL_ALIASES))
-    return ("Ego", *("".join(part.capitalize() for part in name.split("_")) for name in names))
+    names = dict.fromkeys((*known_names("kind"), *SUPER_KINDS, *LABEL_ALIASES))
+    return ("Ego", *map(_camel, names))
 
 
 def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:

@@ -119,9 +119,9 @@ def own_names() -> Iterator[None]:
     from sgstore import vocabulary
 
     growing = (
-        *("_entity_kinds", "_kinds", "_kind_code", "_KINDS_FOLDED", "_LABELS_FOLDED"),
+        *("_entity_kinds", "_kinds", "_kind_code", "_made_known"),
         *("_light_states", "_light_state_code"),
-        *("_relations", "_relation_code", "_RELATIONS_FOLDED"),
+        *("_relations", "_relation_code"),
     )
     held: list[Any] = [getattr(vocabulary, name) for name in growing]
     before = [one.copy() for one in held]

@@ -308,3 +308,89 @@ def test_a_store_whose_kinds_are_no_names_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(StoreError, match="a kind: 'a b' is no name"):
         StoreFile(path)
+
+
+def with_names(path: Path, **names: list[str]) -> Path:
+    """A store of the sample whose enumerations have more names, as another process may have made it."""
+    import duckdb
+
+    from sgstore.store._schema import widen
+
+    ingest(path, [sgstore.__path__[0] + "/sample/town.mcap"], until=1.0)
+    with duckdb.connect() as connection:
+        connection.execute(f"ATTACH '{path}' AS other")
+        widen(connection, "other", names)
+    return path
+
+
+def test_a_store_opens_whatever_its_names_look_like_and_exact_text_decides(tmp_path: Path) -> None:
+    vocabulary.add_relation("danger")
+    vocabulary.add_kind("wheel_chair")
+    path = with_names(tmp_path / "x.sgstore", relation=["Danger"], kind=["wheelchair"])
+    relation = "UPDATE inside.edge SET relation = 'Danger' WHERE relation = 'near'"
+    import duckdb
+
+    with duckdb.connect(str(path)) as connection:
+        (near,) = connection.execute(
+            "SELECT count(*) FROM edges WHERE relation = 'near'"
+        ).fetchall()
+        connection.execute(relation)
+        connection.execute(
+            "UPDATE inside.trace SET answers = list_append(list_append(answers, 'Danger'), 'danger')"
+        )
+        of_edges = (("edge", "src_kind"), ("edge", "dst_kind"))
+        for table, column in (*((t, "kind") for t in ("entity", "state", "lane_state")), *of_edges):
+            connection.execute(
+                f"UPDATE inside.{table} SET {column} = 'wheelchair' WHERE {column} = 'person'"
+            )
+    store = sgstore.open(path)
+    people = store.sql("SELECT count(*) FROM nodes WHERE kind = 'wheelchair'").values[0]
+
+    asked = "MATCH (a)-[r:{}]->(b) RETURN COUNT(*) AS n"
+    assert near[0] > 0
+    assert list(store.find(asked.format("Danger"))) == [near]
+    assert list(store.find(asked.format("DANGER"))) == [near], (
+        "the store's, before others that look alike"
+    )
+    assert list(store.find(asked.format("danger"))) == [(0,)], "another name"
+    typed = "MATCH (a)-[r]->(b) WHERE type(r) = '{}' RETURN COUNT(*) AS n"
+    assert list(store.find(typed.format("Danger"))) == [near]
+    assert list(store.find(typed.format("danger"))) == [(0,)]
+    assert people[0] > 0
+    for word, count in (("wheelchair", people), ("Wheelchair", people), ("WheelChair", (0,))):
+        assert list(store.find(f"MATCH (x:{word}) RETURN COUNT(*) AS n")) == [count], word
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (x:Unicorn)",
+        "MATCH (x:Unicron)",
+        "MATCH (x)-[:charms]->(y)",
+        "MATCH (x)-[:charm]->(y)",
+        "MATCH (x) WHERE x.kind = 'unicorn'",
+        "MATCH (x)-[r]->(y) WHERE type(r) = 'charms'",
+        "MATCH (x:TrafficLight) WHERE x.light_state = 'purple'",
+        "MATCH (a:charms)-[:unicorn]->(b)",
+    ],
+)
+def test_names_that_one_store_brought_change_no_error_of_another(tmp_path: Path, text: str) -> None:
+    plain = with_names(tmp_path / "plain.sgstore")
+    names = {"relation": ["charms"], "kind": ["unicorn"], "light_state": ["purple"]}
+    other = with_names(tmp_path / "other.sgstore", **names)
+
+    def error() -> str:
+        with pytest.raises(QueryError) as raised:
+            sgstore.open(plain).find(text).count()
+        return f"{raised.value} {raised.value.hint}"
+
+    before = error()
+    store = sgstore.open(other)
+    known = [
+        "MATCH (x:Unicorn)",
+        "MATCH (x)-[:charms]->(y)",
+        "MATCH (x:TrafficLight) WHERE x.light_state = 'purple'",
+    ]
+    assert [store.find(one).count() for one in known] == [0, 0, 0]
+
+    assert error() == before

@@ -57,11 +57,8 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """The relations that are known, as if nothing had been added to those of this package."""
     own = list(vocabulary.OWN_RELATIONS)
     codes = {name: code for code, name in enumerate(own)}
-    folded = {k: v for k, v in vocabulary._RELATIONS_FOLDED.items() if v in codes}
-    kept = [
-        (held, held.copy())
-        for held in (vocabulary._relations, vocabulary._relation_code, vocabulary._RELATIONS_FOLDED)
-    ]
+    held: tuple[Any, ...] = (vocabulary._relations, vocabulary._relation_code)
+    kept = [(one, one.copy()) for one in (*held, vocabulary._made_known)]
 
     def put(values: list[Any]) -> None:
         for (held, _), value in zip(kept, values, strict=True):
@@ -71,7 +68,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         vocabulary._add_plugins.cache_clear()
 
     monkeypatch.setattr(plugins, "entry_points", lambda group: [])
-    put([own, codes, folded])
+    put([own, codes, {}])
     yield vocabulary._relations
     put([before for _, before in kept])
 
@@ -116,7 +113,7 @@ def test_a_store_answers_about_a_relation_that_nothing_here_knows(
     abreast = Store(path).sql(ABREAST).values
     del names[len(vocabulary.OWN_RELATIONS) :]
     vocabulary._relation_code.pop("besides")
-    vocabulary._RELATIONS_FOLDED.pop("besides")
+    vocabulary._made_known.pop(("relation", "besides"))
     installed(monkeypatch, None)
     monkeypatch.setattr(plugins, "entry_points", lambda group: [])
     vocabulary.add_relation("comes_first")  # codes here are others than in the store

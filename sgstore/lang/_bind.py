@@ -30,9 +30,9 @@ from sgstore.lang.syntax import CheckClause as WrittenCheck
 from sgstore.lang.syntax import Define, MatchClause
 from sgstore.vocabulary import (
     RELATION_ALIASES,
-    RELATIONS,
     entity_kinds,
     kinds_labelled,
+    known_names,
     labels,
     normalize_name,
     relation_named,
@@ -486,7 +486,9 @@ def _related(label: s.Label, session: Session) -> frozenset[str]:
                 label.span,
                 f"write (x:{label.name})",
             )
-        session.unknown("relation", label.name, label.span, (*RELATIONS, *RELATION_ALIASES))
+        session.unknown(
+            "relation", label.name, label.span, (*known_names("relation"), *RELATION_ALIASES)
+        )
     session.relations.add(relation)
     return frozenset({relation})
 

@@ -37,9 +37,11 @@ from sgstore.lang._symbols import (
 from sgstore.vocabulary import (
     KINDS,
     LANE_TYPES,
+    NAMES,
     entity_kinds,
     kind_named,
     kinds_labelled,
+    known_names,
     labels,
     normalize_name,
     relation_named,
@@ -375,8 +377,9 @@ def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTabl
     known = _vocabulary(other)
     if not known or not isinstance(value, b.Value) or not isinstance(value.value, str):
         return value
-    by_folded = {normalize_name(word): word for word in known}
-    word = by_folded.get(normalize_name(value.value))
+    by_folded = {normalize_name(word): word for word in reversed(known)}
+    exact = value.value if value.value in known else None
+    word = exact or by_folded.get(normalize_name(value.value))
     if word is None and isinstance(other, b.NodeAttribute) and other.attribute.name == "kind":
         word = _kind(value.value, span, names)
     if word is None:
@@ -388,9 +391,10 @@ def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTabl
 def _vocabulary(expression: b.Bound) -> Sequence[str]:
     match expression:
         case b.NodeAttribute(attribute=attribute) | b.FrameAttribute(attribute=attribute):
-            return attribute.values
+            enum = {id(values): enum for enum, values in NAMES.items()}.get(id(attribute.values))
+            return known_names(enum) if enum else attribute.values
         case b.EdgeRelation():
-            return tuple(sorted(b.any_relation()))
+            return sorted(known_names("relation"))
         case _:
             return ()
 

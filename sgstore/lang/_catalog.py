@@ -669,6 +669,9 @@ class Catalog:
         The abstractions that a query can name: what makes the catalog of each from this one.
     own : mapping of str to Type
         Attributes of a client's own that nodes have, by their names.
+    names : mapping or None
+        Kinds, relations and states of lights that the store has beside those of this package; ``None``: those
+        of all stores that the process has met.
     unknowing : frozenset of int
         Traces that do not know what a query needs (:mod:`sgstore.lang._needs`): it leaves them out.
     lacks : dict
@@ -691,6 +694,7 @@ class Catalog:
         default_factory=dict[str, "Callable[[Catalog], Catalog]"]
     )
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    names: Mapping[str, Sequence[str]] | None = None
     unknowing: frozenset[int] = frozenset()
     lacks: dict[Any, frozenset[int]] = field(
         default_factory=dict[Any, frozenset[int]], compare=False, repr=False

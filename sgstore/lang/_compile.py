@@ -61,7 +61,7 @@ from sgstore.lang.ir import (
     any_relation,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
-from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds, normalize_name
+from sgstore.vocabulary import KINDS, RELATIONS, asking, entity_kinds, normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -688,9 +688,10 @@ def compile_query(
     QueryError
         Its types do not fit together.
     """
-    statements = parse(text)
-    seen = _seen(statements, catalog, parameters or {})
-    bound = bind_query(text, statements, seen, parameters or {})
+    with asking(catalog.names):
+        statements = parse(text)
+        seen = _seen(statements, catalog, parameters or {})
+        bound = bind_query(text, statements, seen, parameters or {})
     whole = Layout.of(bound).query if bound.result.form == "subgraphs" else bound
     query = whole if whole.steps else rewritten(whole, seen)
     return Compiled(text, bound, query, seen, catalog)
@@ -714,7 +715,8 @@ def compile_checks(
         As in :func:`compile_query`; or there is no check.
     """
     given = parameters or {}
-    return bind_checks(text, parse(text), lambda one: _seen([one], catalog, given), given)
+    with asking(catalog.names):
+        return bind_checks(text, parse(text), lambda one: _seen([one], catalog, given), given)
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:

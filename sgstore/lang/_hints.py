@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import NODE_ATTRIBUTES, Type
 from sgstore.vocabulary import (
-    KINDS,
     LANE_TYPES,
-    LIGHT_STATES,
+    OWN_KINDS,
+    OWN_LIGHT_STATES,
     SPECIALS,
     normalize_name,
     relation_named,
@@ -197,7 +197,7 @@ def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
 
 
 _WORDS: Final = frozenset(
-    normalize_name(w) for w in (*KINDS, *LIGHT_STATES, *SPECIALS, *LANE_TYPES)
+    normalize_name(w) for w in (*OWN_KINDS, *OWN_LIGHT_STATES, *SPECIALS, *LANE_TYPES)
 )
 
 

@@ -14,8 +14,9 @@ from sgstore.abstractions import SUBSETS
 from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
 from sgstore.quoting import literal
 from sgstore.store._derive import sets_of
+from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
-from sgstore.vocabulary import RELATIONS
+from sgstore.vocabulary import NAMES, RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -59,6 +60,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
             for t in stored_traces(connection)
         ),
         classed=tuple(sorted(name for (name,) in classed)),
+        names={enum: others_of(connection, enum) for enum in NAMES},
         own=_own(connection),
     )
     sets: dict[str, Callable[[Catalog], Catalog]] = {

@@ -25,7 +25,7 @@ import numpy as np
 from sgstore.errors import StoreError
 from sgstore.pair_numbers import pairs_view
 from sgstore.quoting import literal, quoted
-from sgstore.vocabulary import ADD, NAMES
+from sgstore.vocabulary import NAMES, learn
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -285,10 +285,16 @@ def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple
     return tuple(rows[0][0] or ()) if rows else ()
 
 
+def others_of(connection: DuckDBPyConnection, enum: str) -> tuple[str, ...]:
+    """Return the values of an enumeration of an open store beside those of ``schema.sql``."""
+    ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
+    return tuple(labels[len(own_labels(enum)) :])
+
+
 def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
     """Return the codes in this process of the values of an enumeration of a store, by their codes there."""
     ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
-    return np.array([ADD[enum](label) for label in labels], np.int8)
+    return np.array([learn(enum, label) for label in labels], np.int8)
 
 
 def widen(
@@ -336,7 +342,7 @@ def _strange(labels: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
     for enum, some in labels.items():
         for label in some[len(own_labels(enum)) :]:
             try:
-                ADD[enum](label)
+                learn(enum, label)
             except ValueError as error:
                 yield f"a {enum.replace('_', ' ')}: {error}"
 
