@@ -72,6 +72,14 @@ def test_what_is_counted_is_counted_with_distinct_as_without() -> None:
     assert sql(query.format("DISTINCT")) == sql(query.format(""))
 
 
+def test_only_a_value_can_have_been_another_one_before() -> None:
+    error = refused("MATCH (v:Vehicle) WHERE prev(v) = 3")
+
+    assert error.reason == "prev() takes a value, not a node"
+    assert error.span is not None
+    assert error.span.start == len("MATCH (v:Vehicle) WHERE prev(")
+
+
 @pytest.mark.parametrize("form", ["INTERVALS", "CLIPS(-1s, +1s)", "p.id, INTERVALS"])
 def test_intervals_are_distinct_as_they_are(form: str) -> None:
     query = "MATCH (e:Ego)-[:near]->(p:Person) RETURN {} {} SAMPLE 3"

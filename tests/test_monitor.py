@@ -301,10 +301,3 @@ def test_sequences_joined_in_parts_are_those_joined_at_once(
 
     assert list(town.store.find(text)) == at_once
     assert len(at_once) > 1
-
-
-def test_only_values_have_been_before() -> None:
-    with pytest.raises(QueryError, match=r"prev\(\) takes a value, not a node") as caught:
-        Monitor("CHECK a: FORALL (v:Vehicle) ALWAYS prev(v) = 3")
-
-    assert caught.value.span is not None
