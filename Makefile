@@ -66,7 +66,7 @@ test: $(VENV)/.dev
 	@$(MAKE) --no-print-directory -j2 lint tests
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
-# (tests/conftest.py), so that no process is left alone with one of them.
+# (tests/slow.py), so that no process is left alone with one of them.
 tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import typer.main
+from slow import seconds
 
 try:
     from hypothesis import HealthCheck, settings
@@ -24,6 +26,8 @@ else:
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from duckdb import DuckDBPyConnection
 
     from sgstore.query import Store
 
@@ -50,18 +54,24 @@ typer.main.get_command = _command
 
 REPOSITORY = Path(__file__).parents[1]
 
-LONGEST = (
-    *("cli_streams", "rebuilding", "fuzz", "cli_ending", "ingest_hardship", "importing", "crowds"),
-    *("library", "monitor", "ingest_many", "exports", "ingest_data", "ingest", "over_time"),
-    *("export_graphs", "online", "mutants", "carla_cut", "outputs", "selection_docs", "frozen"),
-)
-"""Files of tests that take longest, in this order; where each runs in a process of its own they come first."""
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files that take longest first; within a file nothing changes its place."""
-    place = {f"test_{name}.py": number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+    """Put the files that take longest first: where each runs in one process, none is left alone with one.
+
+    Within a file nothing changes its place.
+    """
+    items.sort(key=lambda item: -seconds(item.path.stem.removeprefix("test_")))
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector thousands of tests that live as long as the process."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    """Let all of it be collected where the process ends: extension modules tell of what they think was lost."""
+    gc.unfreeze()
 
 
 collect_ignore = ["learning.py"]  # a program that needs torch: make pyg
@@ -74,6 +84,29 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data folder at {folder} (set SGSTORE_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _empty_stores_are_copied() -> Iterator[None]:
+    """Run the statements of the schema once in a process: tests make hundreds of stores."""
+    from sgstore.store import _rebuild
+
+    made: dict[str, bytes] = {}
+    make = _rebuild.attach_empty
+
+    def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
+        schema = _rebuild.schema_sql()
+        if schema in made:
+            place.write_bytes(made[schema])
+            connection.execute(f"ATTACH {_rebuild.literal(str(place.absolute()))} AS fresh")
+            return
+        make(connection, place)
+        connection.execute("CHECKPOINT fresh")
+        made[schema] = place.read_bytes()
+
+    _rebuild.attach_empty = attach_empty
+    yield
+    _rebuild.attach_empty = make
 
 
 @pytest.fixture(scope="session")
