@@ -52,7 +52,7 @@ demo: $(VENV)/.base
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/basedpyright
+	$(BIN)/python tests/typed.py
 
 format: $(VENV)/.dev
 	$(BIN)/ruff format .
@@ -61,7 +61,7 @@ format: $(VENV)/.dev
 check: $(VENV)/.dev
 	@$(BIN)/python tests/check.py
 
-# Types take one processor a minute or more: the tests run beside them.
+# Types take one processor a minute or more, unless nothing changed that they are of: the tests run beside them.
 test: $(VENV)/.dev
 	@$(MAKE) --no-print-directory -j2 lint tests
 
