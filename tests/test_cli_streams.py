@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import typer
+from thorough import LONG
 from verb_lines import LINES, verbs
 
 from sgstore.cli import application, run
@@ -24,7 +25,11 @@ name = "ego"
 values = { stands = "MATCH (e:Ego) WHERE e.speed < 0.1", fast = "MATCH (e:Ego) WHERE e.speed > 8" }
 """
 TALKING = {"find", "check", "ingest", "export", "record", "lock union"}
-"""Verbs that say much on stderr: they are tried without one, too."""
+"""Verbs that say much on stderr: they are tried without one, too, and with a stdout that is closed.
+
+Where stdout is closed and where it is full the same stream of ours refuses what a verb writes, with another
+word: so full it is for every verb, closed for these, and for all of them in ``make oracle``.
+"""
 WITHOUT_OUTPUT = {"record", "lock union", "lock intersect", "lock minus"}
 """Verbs that print nothing on stdout here: no simulator runs, and locks are files."""
 
@@ -60,14 +65,22 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     )
 
 
+def is_tried(verb: str, condition: str) -> bool:
+    """Whether a verb is run so."""
+    if condition == "stdout closed" and LONG:
+        return True
+    return verb in TALKING or condition not in {"stdout closed", "stderr full", "stderr closed"}
+
+
 @pytest.fixture(scope="module")
 def ended(files: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[Any, Any]:
-    """Of each verb and condition: exit code, length of stdout, and stderr."""
+    """Of each verb and condition that is tried: exit code, length of stdout, and stderr."""
     folder = tmp_path_factory.mktemp("ended")
     asked, keys = [], []
-    for verb, line in LINES.items():
-        for number, condition in enumerate(CONDITIONS):
-            if condition.startswith("stderr") and verb not in TALKING:
+    for number, condition in enumerate(CONDITIONS):
+        asked.append([])  # a process for each condition
+        for verb, line in LINES.items():
+            if not is_tried(verb, condition):
                 continue
             if verb == "demo" and not condition:  # it is run as a whole elsewhere
                 continue
@@ -78,14 +91,14 @@ def ended(files: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> di
                     shutil.copy(files[source], new[name])
             words = [*verb.split(), *(part.format(**files, **new) for part in line)]
             keys.append((verb, condition))
-            asked.append((words, condition))
+            asked[-1].append((words, condition))
     program = Path(__file__).with_name("verb_lines.py")
     temporary = folder / "tmp"
     temporary.mkdir()
     done = subprocess.run(
         [sys.executable, program],
         input=json.dumps(asked),
-        capture_output=True,
+        stdout=subprocess.PIPE,
         text=True,
         check=True,
         cwd=folder,
@@ -109,6 +122,8 @@ def test_no_verb_ends_in_a_traceback_whatever_its_streams_are(verb: str, ended) 
     assert usual in ({0, 4} if verb != "record" else {1}), told
     assert (size == 0) == (verb in WITHOUT_OUTPUT)
     for condition, said in (("stdout full", "No space left"), ("stdout closed", "Bad file")):
+        if not is_tried(verb, condition):
+            continue
         code, _, err = found[condition]
         if size:
             assert (code, f"stdout: {said}" in err) == (1, True)

@@ -1,12 +1,13 @@
 """A command line for every verb, and a process that runs many of them with streams of all kinds.
 
-As a program it reads a list of ``[arguments, condition]`` as JSON and answers for each, a line of JSON: exit
-code, length of stdout, and stderr. Each runs in a process of its own, forked from one that imported all.
+As a program it reads lists of ``[arguments, condition]`` as JSON and answers for each, a line of JSON: exit
+code, length of stdout, and stderr. Each list runs in a process of its own, forked from one that imported all.
 """
 
 from __future__ import annotations
 
 import atexit
+import fcntl
 import importlib
 import io
 import json
@@ -105,7 +106,8 @@ def _take(condition: str, kept: Path) -> None:
         sys.stdin = None
 
 
-def _child(arguments: list[str], condition: str, kept: Path) -> int:
+def _ended(arguments: list[str], condition: str, kept: Path) -> int:
+    """Run a command line, and end as Python does; the exit code."""
     from sgstore import cli
 
     _take(condition, kept)
@@ -124,6 +126,15 @@ def _child(arguments: list[str], condition: str, kept: Path) -> int:
             Path(f"{kept}.err").write_text(traceback.format_exc())
             return 120
     return code if isinstance(code, int) else 0
+
+
+def _child(asked: list[tuple[list[str], str]], kept: Path, answers: int) -> None:
+    """Run command lines one after the other, each with streams of its own; tell how each ended."""
+    for arguments, condition in asked:
+        code = _ended(arguments, condition, kept)
+        out, err = (Path(f"{kept}{end}").read_bytes() for end in ("", ".err"))
+        told = json.dumps([code, len(out), err.decode(errors="replace")])
+        os.write(answers, f"{told}\n".encode())
 
 
 def _warm() -> None:
@@ -147,18 +158,19 @@ def main() -> None:
     """Run what stdin says."""
     _warm()
     kept = Path(tempfile.mkdtemp()) / "out"
-    for arguments, condition in json.load(sys.stdin):
+    answers = fcntl.fcntl(1, fcntl.F_DUPFD, 10)  # stays what it is, whatever becomes of stdout
+    for asked in json.load(sys.stdin):
         child = os.fork()
         if not child:
             code = 98
             try:
-                code = _child(arguments, condition, kept)
+                _child(asked, kept, answers)
+                code = 0
             finally:
                 atexit._run_exitfuncs()
                 os._exit(code)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        out, err = (Path(f"{kept}{end}").read_bytes() for end in ("", ".err"))
-        print(json.dumps([code, len(out), err.decode(errors="replace")]), flush=True)
+        ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        assert (ended, "Traceback" in Path(f"{kept}.err").read_text()) == (0, False), asked
 
 
 if __name__ == "__main__":
