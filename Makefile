@@ -106,14 +106,16 @@ pyg: $(VENV)/.base
 	@build/pyg/bin/python -m pip install -q --disable-pip-version-check -e '.[pyg]'
 	build/pyg/bin/python tests/learning.py
 
+# Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
+LONG := temporal ttc pair_numbers crowds cli_ending cli_streams fuzz carla carla_cut mcap_file lang_counting lang_oracle \
+  doors sgg_traces store_transactions tolerance
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000
 	$(BIN)/python tests/oracle.py 100000 0 2
 	$(BIN)/python tests/oracle_over_time.py 3000
 	$(BIN)/python tests/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces
-	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/test_temporal.py tests/test_ttc.py tests/test_geometry.py tests/test_pair_numbers.py \
-	  tests/test_crowds.py tests/test_cli_ending.py
+	SGSTORE_LONG=1 $(BIN)/python -m pytest $(foreach name,$(LONG) geometry,tests/test_$(name).py)
 	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
 	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py

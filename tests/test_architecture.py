@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import networkx
 import pytest
+from slow import SECONDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -244,6 +245,16 @@ def code_lines(function: ast.FunctionDef) -> int:
     if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
         lines -= (first.end_lineno or 0) - first.lineno + 1
     return lines
+
+
+def test_tests_that_are_called_slow_or_long_are_there() -> None:
+    tests = {path.stem.removeprefix("test_"): path for path in Path(__file__).parent.glob("test_*")}
+    makefile = (PACKAGE.parent / "Makefile").read_text(encoding="utf-8").replace("\\\n", " ")
+    listed = re.findall(r"^LONG := (.*)$", makefile, re.MULTILINE)[0].split()
+    asking = re.compile(r"^(?:from|import) thorough\b", re.MULTILINE)
+
+    assert set(SECONDS) <= set(tests)
+    assert sorted(name for name in tests if asking.search(source_of(tests[name]))) == sorted(listed)
 
 
 def test_masks_are_a_secret_of_the_store() -> None:

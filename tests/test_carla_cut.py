@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from carla_recordings import HERO, Bridge, vehicle, walker
+from thorough import some
 
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
@@ -46,7 +47,7 @@ def test_a_recording_cut_at_any_byte_keeps_every_whole_frame(tmp_path: Path) -> 
     cut = tmp_path / "cut.mcap"
     lossless = 0
 
-    for length in range(len(whole) + 1):
+    for length in some(range(len(whole) + 1), 7):
         cut.write_bytes(whole[:length])
         expected = sum(end <= length for end in ends)
         try:
@@ -73,7 +74,7 @@ def test_a_compressed_recording_cut_at_any_byte_keeps_every_whole_chunk(tmp_path
     cut = tmp_path / "cut.mcap"
     found = []
 
-    for length in range(len(whole) + 1):
+    for length in some(range(len(whole) + 1), 7):
         cut.write_bytes(whole[:length])
         try:
             with open_trace(cut, digest="x") as trace:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
+import thorough
 import typer
 from test_cli_streams import SLOTS
 from verb_lines import LINES, verbs
@@ -521,7 +522,7 @@ SENT = [(verb, signal.SIGTERM) for verb in LONG] + [
     ("find", signal.SIGHUP),
 ]
 """Each kind of run is ended once, one process is sent each signal, and one with processes below it two."""
-if os.environ.get("SGSTORE_LONG"):  # make oracle
+if thorough.LONG:  # make oracle
     SENT += [("ingest --jobs", signal.SIGHUP), ("show", signal.SIGINT)]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,6 +13,7 @@ import pytest
 from builders import Recording, edges, thing
 from carla_recordings import HERO, TOWN, Bridge, vehicle
 from scenes import crossroads
+from thorough import LONG
 
 import sgstore
 import sgstore.relations._pairs as crowds
@@ -134,10 +134,7 @@ assert generator.class_of("RSV")
 """
 
 
-LONG = bool(os.environ.get("SGSTORE_LONG"))
-"""``make oracle`` asks more; four egos share their memory in the test of ingest above, always."""
-
-
+# Four egos share their memory in the test of ingest above, always.
 @pytest.mark.parametrize("egos", [1, 4] if LONG else [1])
 def test_steps_with_as_many_pairs_as_there_may_be_take_little_memory(
     tmp_path: Path, egos: int

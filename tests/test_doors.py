@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import duckdb
 import pytest
 from recordings import drive
+from thorough import LONG
 
 import sgstore
 import sgstore.store._schema as shape
@@ -513,7 +514,7 @@ KNOWN = (
 )
 
 
-@pytest.mark.parametrize("number", range(40))
+@pytest.mark.parametrize("number", range(40 if LONG else 20))
 def test_rows_that_were_changed_give_an_answer_or_a_reason_and_no_traceback(
     run: Any, made: Any, store: Any, tmp_path: Path, number: Any
 ) -> None:

@@ -26,7 +26,7 @@ def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path: Path)
     # All of them take minutes: ``make kill``.
     verbs = ["derive", "export clips", "lock union"]
 
-    done = killed_and_resumed(tmp_path, kills=4, seed=5, frames=20, verbs=verbs)
+    done = killed_and_resumed(tmp_path, kills=3, seed=5, frames=20, verbs=verbs)
 
     assert all(one.kills.total() >= 1 for one in done.values())
 
@@ -166,7 +166,7 @@ def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(
 
 
 def test_readers_and_a_writer_meet_no_lock_and_no_half_trace(tmp_path: Path) -> None:
-    soaked = soak(tmp_path, seconds=2)
+    soaked = soak(tmp_path, seconds=1)
 
     assert soaked.written > 0
 

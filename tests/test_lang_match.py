@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -76,9 +77,14 @@ def test_random_patterns_find_in_memory_what_exhaustive_search_finds(first: int)
     assert matched > 10
 
 
+@cache
+def small_world() -> World:
+    return random_world(2, frames=5, static=True)
+
+
 @pytest.mark.parametrize("text", QUERIES)
 def test_queries_find_in_memory_what_exhaustive_search_finds(text: str) -> None:
-    world = random_world(2, frames=5, static=True)
+    world = small_world()
 
     assert found(text, world) == answer(text, world)[0]
 

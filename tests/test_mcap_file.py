@@ -19,6 +19,7 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Header, Message, Schema
 from mcap.stream_reader import StreamReader
 from recordings import OSI, Recorder, bulb, car, drive, ground_truth, house, person, sign
+from thorough import LONG, some
 
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
@@ -237,7 +238,7 @@ def test_a_file_cut_at_any_byte_keeps_every_whole_message(tmp_path: Path, chunke
     whole, ends = path.read_bytes(), whole_messages(path)
     cut = tmp_path / "cut.mcap"
 
-    for length in range(len(whole)):
+    for length in some(range(len(whole)), 2):
         cut.write_bytes(whole[:length])
         kept = [data for end, data in ends if end <= length]
         try:
@@ -256,7 +257,7 @@ def test_an_osi_recording_cut_at_any_byte_ends_in_frames_or_an_error(tmp_path: P
     cut = tmp_path / "cut.mcap"
     frames: list[int] = []
 
-    for length in [*range(0, ends[0], 97), *range(ends[0], len(whole), 11), len(whole)]:
+    for length in some([*range(0, ends[0], 97), *range(ends[0], len(whole), 11), len(whole)], 4):
         cut.write_bytes(whole[:length])
         try:
             with open_trace(cut, digest="x") as trace:
@@ -617,7 +618,7 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     ]
 
 
-@settings(max_examples=250, deadline=5000, suppress_health_check=list(HealthCheck))
+@settings(max_examples=250 if LONG else 80, deadline=5000, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 4), changes=mutations)
 @example(seed=2, changes=[("set", 0.5, 0, 1)])
 def test_whatever_is_done_to_a_recording_it_ends_in_frames_or_an_error(
@@ -629,7 +630,7 @@ def test_whatever_is_done_to_a_recording_it_ends_in_frames_or_an_error(
     assert survived(path)
 
 
-@settings(max_examples=150, deadline=5000, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150 if LONG else 60, deadline=5000, suppress_health_check=list(HealthCheck))
 @given(changes=mutations)
 def test_whatever_is_done_to_the_descriptors_it_ends_in_frames_or_an_error(
     tmp_path: Path, changes: list[tuple[str, float, int, int]]
@@ -647,7 +648,7 @@ def test_whatever_is_done_to_the_descriptors_it_ends_in_frames_or_an_error(
     assert survived(path)
 
 
-@settings(max_examples=200, deadline=5000, suppress_health_check=list(HealthCheck))
+@settings(max_examples=200 if LONG else 70, deadline=5000, suppress_health_check=list(HealthCheck))
 @given(changes=mutations, which=st.integers(0, 3))
 def test_whatever_is_done_to_the_messages_it_ends_in_frames_or_an_error(
     tmp_path: Path, changes: list[tuple[str, float, int, int]], which: int

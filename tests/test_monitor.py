@@ -92,7 +92,7 @@ def test_edges_watched_go_over_time_as_in_a_store(town: Drive) -> None:
     for number, (pattern, _, asked) in enumerate(edge_questions(random.Random(4))):
         conditions = [one.removeprefix("ONCE[0frames, 0frames] ") for one in asked]
         conditions = [one for one in conditions if one.startswith("(")]
-        made.setdefault(pattern, []).extend(conditions[number % 8 :: 8])
+        made.setdefault(pattern, []).extend(conditions[number % 16 :: 16])
     changes = ["delta(r.offset, 1s) > 0.5", "prev(r.heading_error) < r.heading_error"]
     made["(v:Vehicle)-[r:isIn]->(e:Lane)"] = [*changes, "ALWAYS[0s, 1s] r.primary"]
 

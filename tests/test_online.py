@@ -304,10 +304,10 @@ def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
         gc.collect()
         return tracemalloc.get_traced_memory()[0]
 
-    run(0, 200)
+    run(0, 120)  # more names than are remembered
     tracemalloc.start()
     try:
-        sizes = [run(100 * k, 100) for k in range(2, 7)]
+        sizes = [run(60 * k, 60) for k in range(2, 8)]
     finally:
         tracemalloc.stop()
     assert max(sizes[3:]) < 1.1 * max(sizes[:3])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cmath
 import math
-import os
 from typing import TYPE_CHECKING
 
 import duckdb
@@ -13,6 +12,7 @@ import pytest
 import shapely
 from contacts import COLUMNS, disagreements, random_movers
 from test_geometry import random_boxes
+from thorough import LONG
 
 from sgstore.geometry import corners
 from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers, gap, pairs_view
@@ -118,7 +118,7 @@ def test_pair_numbers_that_do_not_exist_are_missing() -> None:
     assert same_place["gap"][0] == 0
 
 
-@pytest.mark.parametrize("seed", range(100 if os.environ.get("SGSTORE_LONG") else 1))
+@pytest.mark.parametrize("seed", range(100 if LONG else 1))
 def test_the_time_to_collision_is_when_sampled_boxes_first_touch(seed: int) -> None:
     a, b = random_movers(10_000, seed)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from thorough import some
 
 from sgstore.config import Config, RangeSettings
 from sgstore.opendrive import read_map
@@ -102,7 +103,7 @@ def test_frame_by_frame_gives_the_same_graphs(data: Path, name: str) -> None:
     online = SceneGraphGenerator(road_map, Config())
 
     for block, graph in zip(blocks, graphs(path), strict=True):
-        for frame in range(len(block)):
+        for frame in some(range(len(block)), 3):  # two of them are neighbours where a block ends
             assert rows(online.block(alone(block, frame)), 0) == rows(graph, frame)
 
 

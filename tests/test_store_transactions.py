@@ -8,6 +8,7 @@ import duckdb
 import numpy as np
 import pytest
 from graph_blocks import PERIOD_NS, RandomTrace, map_stub, publish
+from thorough import LONG
 
 import sgstore.store._locking as access
 import sgstore.store._publish as publishing
@@ -81,7 +82,7 @@ def sealed(store: StoreFile, trace: RandomTrace, config: Config | None = None) -
     return segment.seal(TraceReport(frames=trace.frames))
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 3, 5, 8, 13, 20, 25])
+@pytest.mark.parametrize("number", [0, 1, 2, 3, 5, 8, 13, 20, 25] if LONG else [0, 2, 8, 20])
 def test_an_interrupt_inside_publishing_publishes_nothing(
     tmp_path: Path, interrupted: Any, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
@@ -101,7 +102,7 @@ def test_an_interrupt_inside_publishing_publishes_nothing(
     assert store.verify().faults == []
 
 
-@pytest.mark.parametrize("number", [0, 4, 9, 17, 24])
+@pytest.mark.parametrize("number", [0, 4, 9, 17, 24] if LONG else [0, 9, 24])
 def test_an_interrupt_inside_replacing_leaves_the_old_trace(
     tmp_path: Path, interrupted: Any, number: int
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import tarfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from formulas import OnlineFormula, formula_of, prefix_verdicts
 from oracle_temporal import try_formulas
+from thorough import LONG
 
 from sgstore.errors import QueryError
 from sgstore.temporal import evaluate
@@ -191,10 +191,18 @@ def published(data: Path) -> Iterator[tuple[str, str, dict[str, np.ndarray], np.
             yield system.split("_")[0], Path(member.name).stem, columns, verdicts
 
 
+Published = tuple[str, str, dict[str, np.ndarray], np.ndarray]
+
+
+def part_of(files: Iterator[Published]) -> Iterator[Published]:
+    """Each property of every fifth route; of all in a long run."""
+    return (one for number, one in enumerate(files) if LONG or number // 15 % 5 == 0)
+
+
 @pytest.mark.data
 def test_every_verdict_that_sgsm_published_is_met_online(data: Path) -> None:
     violated, verdicts, files = {"LAV": 0, "TCP": 0}, 0, 0
-    for system, name, columns, published_verdicts in published(data):
+    for system, name, columns, published_verdicts in part_of(published(data)):
         engine, told = OnlineFormula(property_named(name)), []
         letters = zip(*(flags.tolist() for flags in columns.values()), strict=True)
         for t, letter in enumerate(letters):
@@ -205,14 +213,15 @@ def test_every_verdict_that_sgsm_published_is_met_online(data: Path) -> None:
         verdicts += len(told)
         files += 1
 
-    assert (files, verdicts, violated) == (300, 336_911, VIOLATED)
+    if LONG:
+        assert (files, verdicts, violated) == (300, 336_911, VIOLATED)
+    assert files >= 60
+    assert all(violated.values())
 
 
 @pytest.mark.data
 def test_verdicts_that_sgsm_published_are_met_by_columns(data: Path) -> None:
-    every = (
-        1 if os.environ.get("SGSTORE_LONG") else 15
-    )  # each property of two routes; all in a minute
+    every = 1 if LONG else 15  # each property of two routes; all in a minute
     verdicts = 0
     for number, (system, name, columns, published_verdicts) in enumerate(published(data)):
         if number // 15 % every:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from contacts import COLUMNS, disagreements
+from thorough import LONG
 
 from sgstore.ingest import ingest
 from sgstore.query import Store
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-LONG = bool(os.environ.get("SGSTORE_LONG"))
 HORIZON = 15.0
 RECORDINGS = ("esmini/*", "sumo/*", "omega_prime/*", "carla/*") if LONG else ("esmini/cut-in.mcap",)
 
