@@ -14,16 +14,19 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from _typeshed import DataclassInstance
     from numpy.typing import NDArray
 
-Table = TypeVar("Table", bound="DataclassInstance")
+Table = TypeVar("Table")
 
 
 def taken(table: Table, rows: NDArray[Any]) -> Table:
     """Some of the rows of a table, in the order given: indices, or a mask of arrays."""
-    columns = (getattr(table, field.name) for field in fields(table))
+    columns = (getattr(table, name) for name in _names(table))
     return type(table)(*(_taken(column, rows) for column in columns))
+
+
+def _names(table: Any) -> list[str]:
+    return [field.name for field in fields(table)]
 
 
 def _taken(column: Any, rows: NDArray[Any]) -> Any:
@@ -34,7 +37,7 @@ def _taken(column: Any, rows: NDArray[Any]) -> Any:
 
 def chained(tables: Sequence[Table]) -> Table:
     """The rows of tables of one type, one table after another."""
-    columns = ([getattr(one, field.name) for one in tables] for field in fields(tables[0]))
+    columns = ([getattr(one, name) for one in tables] for name in _names(tables[0]))
     return type(tables[0])(*map(_chained, columns))
 
 
