@@ -223,8 +223,8 @@ class Recorder:
 
 # Frames → messages of ASAM OSI: an ``osi3.SensorView`` with the ground truth in it --------------
 # A sensor view and not a bare ground truth, because only that has the pedals of the host vehicle. What
-# OSI has no word for is not written: the steering input, taxis and electric vehicles as special kinds,
-# subkinds of its own.
+# OSI has no word for is not written: the steering input, the hand brake, taxis and electric
+# vehicles as special kinds, subkinds of its own.
 #
 # * What stands is written when it is first seen, as several producers do, and never again.
 # * A traffic light is three bulbs, each on or off, tied to the signal of the map by its id.
