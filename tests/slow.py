@@ -1,6 +1,6 @@
 """Seconds of processor that files of tests take: which come first in a run, and which the edit loop can afford.
 
-Measured on one quiet core of the machine that the targets are about; what is not listed takes less than five.
+Rough: some were measured, under load and before later changes, others estimated. Not listed: about three.
 """
 
 from __future__ import annotations
