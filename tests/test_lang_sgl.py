@@ -295,3 +295,11 @@ def test_a_wrong_number_of_arguments_is_told(value: str, says: str, tmp_path: Pa
 
     assert says in str(raised.value)
     assert run(["translate", str(file)]) == 2
+
+
+def test_a_set_in_a_set_is_refused_and_not_warned_of() -> None:
+    red = 'P.filterByAttr("Ego", "light_state", "[[a]")'
+    text = f'import SG_Primitives as P\nProperty("a", "G(p)", [("p", P.gt(P.size({red}), 0))])\n'
+
+    with pytest.raises(QueryError, match="a set in a set"):
+        translated(text)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError, TextSpan
-from sgstore.lang import parse
+from sgstore.lang import parse, regex
 from sgstore.vocabulary import KINDS, LIGHT_STATES, normalize_name, relation_named
 
 if TYPE_CHECKING:
@@ -330,7 +330,7 @@ class _Translation:
     def _resembling(self, node: str, name: str, test: ast.Constant) -> str:
         """Return the values that SGL finds by searching a text for a regular expression."""
         try:
-            wanted = re.compile(str(test.value))
+            wanted = regex(str(test.value))
         except re.error as error:
             raise self._refused(f"no regular expression: {error}", test) from None
         if name in {"name", "base_class"}:

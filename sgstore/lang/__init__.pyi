@@ -139,3 +139,4 @@ __all__ = [
     "why_not",
     "with_places",
 ]
+from ._symbols import regex as regex

@@ -8,6 +8,7 @@ in a scope further in becomes an outer node of every scope between.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -468,12 +469,30 @@ def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable
     return b.Operation(e.word, (left, right), Type.boolean)
 
 
+def regex(text: str) -> re.Pattern[str]:
+    """Compile a regular expression that Python and the database read alike.
+
+    Raises
+    ------
+    re.error
+        It is none, or a set in it may hold a set, which they read differently: ``[[:alpha:]]``, ``[a&&b]``.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", FutureWarning)
+        try:
+            return re.compile(text)
+        except FutureWarning:
+            raise re.error(
+                "a set in a set; write a backslash before [, -, &, | or ~ in a set"
+            ) from None
+
+
 def _check_regex(pattern: b.Bound, span: TextSpan, names: SymbolTable) -> None:
     if not isinstance(pattern, b.Value):
         names.session.refuse("the pattern after =~ must be a constant", span)
     text = str(pattern.value)
     try:
-        re.compile(text)
+        regex(text)
     except re.error as error:
         names.session.refuse(f"not a regular expression: {error}", span)
     if _NOT_RE2.search(text):
