@@ -262,7 +262,7 @@ _asked: Final[ContextVar[Mapping[str, Sequence[str]] | None]] = ContextVar("aske
 
 
 def learn(enum: str, name: str) -> int:
-    """Return the code of a name that a store has, whatever other names look like it.
+    """Return the code of a name that a store has, whatever names of other stores look like it.
 
     Parameters
     ----------
@@ -273,9 +273,10 @@ def learn(enum: str, name: str) -> int:
     Raises
     ------
     ValueError
-        It is no name, or there are too many.
+        It is no name, but for case and underscores it is one of this package, or there are too many.
     """
     with _growing:
+        _refuse_like_own(enum, name)
         return _coded(enum, name)
 
 
@@ -339,12 +340,16 @@ def add_light_state(name: str) -> int:
 def _made(enum: str, name: str) -> int:
     with _growing:
         if name not in _OWN[enum] and (enum, name) not in _made_known:
-            like = _like_own(enum, normalize_name(name), name)
-            if like:
-                raise ValueError(f"{name!r} would be taken for {like}")
+            _refuse_like_own(enum, name)
             _coded(enum, name)
             _made_known[enum, name] = None
         return _coded(enum, name)
+
+
+def _refuse_like_own(enum: str, name: str) -> None:
+    like = "" if name in _OWN[enum] else _like_own(enum, normalize_name(name), name)
+    if like:
+        raise ValueError(f"{name!r} would be taken for {like}")
 
 
 def _like_own(enum: str, folded: str, name: str) -> str:

@@ -245,7 +245,7 @@ NAMED: Final = (
     (
         "orphans of a replaced trace are kept",
         "sgstore/store/_publish.py",
-        "connection.execute(_ORPHANS)  # of a trace that was replaced",
+        "connection.execute(ORPHANS)  # of a trace that was replaced",
         "pass",
     ),
     (

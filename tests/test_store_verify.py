@@ -54,7 +54,7 @@ def test_what_was_published_is_without_fault(store: Any) -> None:
     assert found.traces == 2
     tables = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
     tables += ("lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "map_reach")
-    tables += ("frame_class", "lane_role")
+    tables += ("frame_class", "lane_role", "recording", "config")
     count = sum(store.rows(f"SELECT count(*) FROM {table}").values[0][0] for table in tables)
     assert found.rows == count
 
