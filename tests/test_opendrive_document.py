@@ -448,6 +448,14 @@ def test_a_map_of_too_many_points_is_refused(monkeypatch: pytest.MonkeyPatch) ->
         read_map(a_map(*(a_road(str(i), line(100.0)) for i in range(20))), "large")
 
 
+def test_a_road_whose_bend_is_no_number_is_refused_by_name() -> None:
+    bad = a_road("bad", line(100), spiral(1e-300, 0.015, 0, s=100, x=100), length=120)
+
+    road_map = read_map(a_map(GOOD, bad), "bent")
+
+    assert "road 'bad', <road>: so bent" in road_map.warnings[0]
+
+
 def test_a_crowd_of_lanes_and_a_crowd_of_crossings_are_refused_by_name() -> None:
     crowd = a_map(GOOD, a_road("bad", line(9.0), sections=many_lanes(1100)))
     knot = HEAVY["a junction in which everything crosses"]()

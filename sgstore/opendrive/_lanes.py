@@ -582,19 +582,21 @@ def _pieces(
     at = length[borders.interval][:, None] * np.array([0.0, 0.5, 1.0])
     kappa = curvature[borders.interval][:, [0, _SAMPLES // 2, -1]]
     sharpest = np.abs(curvature).max(axis=1)[borders.interval][:, None]
-    bend = np.zeros(len(length))
-    for side in (borders.inner, borders.outer):
-        cubics = side[:, None, :]
-        t, slope = cubic(cubics, at), np.abs(cubic_slope(cubics, at))
-        # |p''| of p = r + t n, with r'' = κ n and n' = -κ r', is at most
-        # |κ (1 - κ t)| + 2 |κ t'| + |κ' t| + |t''|.
-        bound = sharpest * np.abs(1 - kappa * t) + 2 * sharpest * slope
-        bound += rate[borders.interval][:, None] * np.abs(t) + np.abs(cubic_bend(cubics, at))
-        np.maximum.at(bend, borders.interval, bound.max(axis=1))
-    rise = np.abs(cubic_bend(heights[:, None, :], length[:, None] * np.array([0.0, 1.0])))
-    steepest = np.maximum(bend / (8 * SAGITTA), rise.max(axis=1) / (8 * RISE))
-    steepest = np.maximum(steepest, 1 / MAX_STEP**2)
-    wanted = np.ceil(length * np.sqrt(steepest))
+    # What is too large for a number is endless: such roads are refused below.
+    with np.errstate(over="ignore", invalid="ignore"):
+        bend = np.zeros(len(length))
+        for side in (borders.inner, borders.outer):
+            cubics = side[:, None, :]
+            t, slope = cubic(cubics, at), np.abs(cubic_slope(cubics, at))
+            # |p''| of p = r + t n, with r'' = κ n and n' = -κ r', is at most
+            # |κ (1 - κ t)| + 2 |κ t'| + |κ' t| + |t''|.
+            bound = sharpest * np.abs(1 - kappa * t) + 2 * sharpest * slope
+            bound += rate[borders.interval][:, None] * np.abs(t) + np.abs(cubic_bend(cubics, at))
+            np.maximum.at(bend, borders.interval, bound.max(axis=1))
+        rise = np.abs(cubic_bend(heights[:, None, :], length[:, None] * np.array([0.0, 1.0])))
+        steepest = np.maximum(bend / (8 * SAGITTA), rise.max(axis=1) / (8 * RISE))
+        steepest = np.maximum(steepest, 1 / MAX_STEP**2)
+        wanted = np.ceil(length * np.sqrt(steepest))
     wanted = np.where(np.isfinite(wanted), np.clip(wanted, 1, MAX_STATIONS), MAX_STATIONS)
     _bound(document, lanes, intervals, wanted)
     return wanted.astype(np.int64), record
