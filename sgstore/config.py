@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
@@ -746,7 +747,7 @@ def _value(hint: Any, value: Any, name: str, default: Any = None) -> Any:
         return {str(key): _value(inner, one, f'{name}."{key}"') for key, one in value.items()}
     if hint is float:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        check(number and math.isfinite(value), name, value, "a number")
+        check(number and abs(value) <= sys.float_info.max, name, value, "a number")
         return float(value)
     if hint is Any:
         return value

@@ -105,6 +105,7 @@ def test_a_config_survives_json_and_toml(tmp_path: Path, config: Config) -> None
         ("[range]\nradius = '50'", "setting 'range.radius' is '50'; expected a number"),
         ("[range]\nradius = true", "setting 'range.radius' is True; expected a number"),
         ("[range]\nradius = nan", "setting 'range.radius' is nan; expected a number"),
+        (f"[range]\nradius = {10**400}", "expected a number"),
         ("[range]\nradius = -1", "setting 'range.radius' is -1.0; expected a length above 0"),
         ("[pairs]\nego = 1", "setting 'pairs.ego' is 1; expected true or false"),
         ("[pairs]\nwithin = -1", "setting 'pairs.within' is -1.0; expected a length of 0 or more"),
