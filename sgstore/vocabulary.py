@@ -275,25 +275,21 @@ def learn(enum: str, name: str) -> int:
     ValueError
         It is no name, but for case and underscores it is one of this package, or there are too many.
     """
-    with _growing:
-        _refuse_like_own(enum, name)
-        return _coded(enum, name)
-
-
-def _coded(enum: str, name: str) -> int:
     names, codes, most, what = _CODES[enum]
-    if name not in codes:
-        if not _NAME.fullmatch(name):
-            raise ValueError(
-                f"{name!r} is no name: letters, digits and _, a letter first, 40 at most"
-            )
-        if len(names) >= most:
-            raise ValueError(f"there are {most} {what}, and no room for {name!r}")
-        if enum == "kind":
-            _entity_kinds.append(name)
-        names.append(name)
-        codes[name] = len(names) - 1
-    return codes[name]
+    with _growing:
+        if name not in codes:
+            _refuse_like_own(enum, name)
+            if not _NAME.fullmatch(name):
+                raise ValueError(
+                    f"{name!r} is no name: letters, digits and _, a letter first, 40 at most"
+                )
+            if len(names) >= most:
+                raise ValueError(f"there are {most} {what}, and no room for {name!r}")
+            if enum == "kind":
+                _entity_kinds.append(name)
+            names.append(name)
+            codes[name] = len(names) - 1
+        return codes[name]
 
 
 def add_relation(name: str) -> int:
@@ -338,28 +334,23 @@ def add_light_state(name: str) -> int:
 
 
 def _made(enum: str, name: str) -> int:
-    with _growing:
-        if name not in _OWN[enum] and (enum, name) not in _made_known:
-            _refuse_like_own(enum, name)
-            _coded(enum, name)
-            _made_known[enum, name] = None
-        return _coded(enum, name)
+    code = learn(enum, name)
+    if name not in _OWN[enum]:
+        _made_known[enum, name] = None
+    return code
 
 
 def _refuse_like_own(enum: str, name: str) -> None:
-    like = "" if name in _OWN[enum] else _like_own(enum, normalize_name(name), name)
+    """Refuse a new name that would be taken for one of this package."""
+    folded, like = normalize_name(name), ""
+    if enum == "light_state" and folded in _OWN_FOLDED[enum]:
+        like = f"the state {_OWN_FOLDED[enum][folded]!r}"
+    elif enum != "light_state" and folded in _OWN_RELATIONS_FOLDED:
+        like = f"the relation {_OWN_RELATIONS_FOLDED[folded]!r}"
+    elif enum != "light_state" and (folded == "ego" or folded in _OWN_LABELS_FOLDED):
+        like = f"the label {name!r}"
     if like:
         raise ValueError(f"{name!r} would be taken for {like}")
-
-
-def _like_own(enum: str, folded: str, name: str) -> str:
-    """Name of this package for which a new one would be taken; empty if there is none."""
-    if enum == "light_state":
-        state = _OWN_FOLDED[enum].get(folded)
-        return f"the state {state!r}" if state else ""
-    if folded in _OWN_RELATIONS_FOLDED:
-        return f"the relation {_OWN_RELATIONS_FOLDED[folded]!r}"
-    return f"the label {name!r}" if folded == "ego" or folded in _OWN_LABELS_FOLDED else ""
 
 
 @contextmanager
