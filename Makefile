@@ -4,13 +4,14 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api
+.PHONY: help demo check test tests test-edges test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
 	@echo "make check   the edit loop: lint, types and tests of the rooms that differ from main"
-	@echo "make test    format, lint, types and tests"
-	@echo "make tests   the tests only"
+	@echo "make test    format, lint, types and the tests of the core: from a recording to an answer"
+	@echo "make tests   the tests of the core only"
+	@echo "make test-edges  the other tests: what is made of answers, pages, other formats, programs that run long"
 	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
 	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
 	@echo "make lint    format, lint and types only"
@@ -65,10 +66,24 @@ check: $(VENV)/.dev
 test: $(VENV)/.dev
 	@$(MAKE) --no-print-directory -j2 lint tests
 
+# Files of tests beside the way from a recording to an answer: sets, measures and locks made of answers, pictures, exports,
+# graphs and simulators of others, plug-ins of other programs, pages of the docs, and parts of the long programs below.
+# A file that is not listed is of the core.
+EDGES := coverage coverage_docs like locks selection selection_docs selection_overlapping \
+  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap exports exports_docs timeline \
+  carla_live importing junit lang_sgl pytest_plugin record sample \
+  docs_house docs_queries lang_docs packaging views_page \
+  fuzz mutants
+tests-of = $(foreach name,$(1),tests/test_$(name).py)
+
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
 # (tests/slow.py), so that no process is left alone with one of them.
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
 tests: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
+	$(PYTEST) $(addprefix --ignore=,$(call tests-of,$(EDGES)))
+
+test-edges: $(VENV)/.dev
+	$(PYTEST) $(call tests-of,$(EDGES))
 
 test-wheel: $(VENV)/.dev
 	$(BIN)/python tests/packages.py wheel
@@ -108,7 +123,7 @@ pyg: $(VENV)/.base
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := temporal ttc pair_numbers crowds cli_ending cli_streams fuzz carla carla_cut mcap_file lang_counting lang_oracle \
-  doors sgg_traces store_transactions tolerance
+  doors ingest_hardship monitor sgg_traces store_transactions tolerance
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000

@@ -15,6 +15,7 @@ from opendrive_maps import a_map, a_road
 from opendrive_maps import line as straight
 from recordings import drive
 from soaking import soak
+from thorough import LONG
 
 from sgstore.cli import run as sgstore
 from sgstore.errors import StoreError
@@ -25,8 +26,9 @@ from sgstore.store import StoreFile
 def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path: Path) -> None:
     # All of them take minutes: ``make kill``.
     verbs = ["derive", "export clips", "lock union"]
+    kills = 12 if LONG else 3
 
-    done = killed_and_resumed(tmp_path, kills=3, seed=5, frames=20, verbs=verbs)
+    done = killed_and_resumed(tmp_path, kills, seed=5, frames=20, verbs=verbs)
 
     assert all(one.kills.total() >= 1 for one in done.values())
 
@@ -166,7 +168,7 @@ def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(
 
 
 def test_readers_and_a_writer_meet_no_lock_and_no_half_trace(tmp_path: Path) -> None:
-    soaked = soak(tmp_path, seconds=1)
+    soaked = soak(tmp_path, seconds=10 if LONG else 1)
 
     assert soaked.written > 0
 

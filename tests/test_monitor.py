@@ -15,6 +15,7 @@ from mcap.writer import Writer
 from oracle_monitor import try_states
 from oracle_over_time import edge_questions
 from oracle_watched import CHECKS, SEQUENCES, Drive, library_checks
+from thorough import LONG
 
 import sgstore.temporal._matches as joins
 from sgstore.demo import RECORDING
@@ -86,13 +87,14 @@ def test_sequences_are_found_when_they_complete_as_a_store_finds_them(town: Driv
     assert all("UNTIL" in text for text, many in zip(SEQUENCES, often, strict=True) if not many)
 
 
-def test_edges_watched_go_over_time_as_in_a_store(town: Drive) -> None:
+@pytest.mark.parametrize("share", range(16) if LONG else [0])
+def test_edges_watched_go_over_time_as_in_a_store(share: int, town: Drive) -> None:
     # Every attribute and every operator, each with some of the others.
     made: dict[str, list[str]] = {}
     for number, (pattern, _, asked) in enumerate(edge_questions(random.Random(4))):
         conditions = [one.removeprefix("ONCE[0frames, 0frames] ") for one in asked]
         conditions = [one for one in conditions if one.startswith("(")]
-        made.setdefault(pattern, []).extend(conditions[number % 16 :: 16])
+        made.setdefault(pattern, []).extend(conditions[(number + share) % 16 :: 16])
     changes = ["delta(r.offset, 1s) > 0.5", "prev(r.heading_error) < r.heading_error"]
     made["(v:Vehicle)-[r:isIn]->(e:Lane)"] = [*changes, "ALWAYS[0s, 1s] r.primary"]
 
