@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 from importlib import import_module
 
 from bench.measure import show
@@ -15,11 +15,17 @@ TITLES = {
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
     "patterns": "Patterns over a million frames",
+    "real": "Real traffic: replicas of recordings of simulators",
     "temporal": "Time: formulas over columns, and frame by frame",
     "coverage": "Coverage of a million frames",
     "selection": "Small parts of a million frames that keep every class",
 }
 
-names = [name for name in sys.argv[1:] if not name.startswith("-")] or list(TITLES)
-for name in names:
-    show(TITLES[name], import_module(f"bench.{name}").run("--quick" in sys.argv))
+parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+parser.add_argument("name", nargs="*", help=f"of {', '.join(TITLES)}; without a name all")
+parser.add_argument("--quick", action="store_true", help="a small version")
+options = parser.parse_args()
+if unknown := ", ".join(sorted({*options.name} - {*TITLES})):
+    parser.error(f"there is no bench {unknown}; there are {', '.join(TITLES)}")
+for name in options.name or TITLES:
+    show(TITLES[name], import_module(f"bench.{name}").run(options.quick))

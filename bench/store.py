@@ -26,7 +26,6 @@ from sgstore.opendrive import read_map
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.store._schema import tables_sql
 from sgstore.vocabulary import KINDS, RELATIONS
 from sgstore.world import TraceReport
 
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.world import TraceInfo
 
-TABLES = ("edge", "node", "frame", "state", "lane_state", "payload")
 BASELINE_FRAMES = 20
 
 
@@ -96,24 +94,32 @@ def by_rows(graph: GraphBlock, frames: int, path: Path) -> tuple[float, int]:
 
 
 def sizes(store: Path, folder: Path) -> Iterator[tuple[str, int, int]]:
-    """Bytes and rows of each large table, in a file of its own less an empty one."""
-    types = tables_sql().partition("-- What the store is")[0]
-    for table in ("", *TABLES):
-        path = folder / f"alone-{table}.db"
+    """Bytes and rows of each table, in a file of its own less an empty one."""
+
+    def alone(source: str | None) -> tuple[int, int]:
+        path = folder / f"alone-{source}.db"
         with duckdb.connect() as connection:
-            connection.execute(types)
             connection.execute(f"ATTACH '{store}' AS store (READ_ONLY)")
             connection.execute(f"ATTACH '{path}' AS alone (STORAGE_VERSION 'v1.5.0')")
             rows = 0
-            if table:
-                connection.execute(f"CREATE TABLE alone.t AS FROM store.{table}")
+            if source is not None:
+                connection.execute(f"CREATE TABLE alone.t AS FROM store.inside.{source}")
                 (rows,) = connection.execute("SELECT count(*) FROM alone.t").fetchone()
             connection.execute("CHECKPOINT alone")
             connection.execute("DETACH alone")
-        if not table:
-            empty = path.stat().st_size
-        else:
-            yield table, path.stat().st_size - empty, rows
+        size = path.stat().st_size
+        path.unlink()
+        return size, rows
+
+    with duckdb.connect(str(store), read_only=True) as connection:
+        names = connection.execute(
+            "SELECT table_name FROM duckdb_tables() WHERE schema_name = 'inside' ORDER BY table_name"
+        ).fetchall()
+    empty, _ = alone(None)
+    for (name,) in names:
+        size, rows = alone(name)
+        if rows:
+            yield name, size - empty, rows
 
 
 def filled(folder: Path, traces: int, minutes: int) -> tuple[StoreFile, int]:
