@@ -1,7 +1,8 @@
 """Matches of a query: rows, frames, intervals, clips.
 
 Results are streams: they come window by window over the buckets of the store, in windows that grow, so that the
-first rows come at once and memory does not grow with their number.
+first rows come at once and memory does not grow with their number. Who wants all rows gets them in windows of a
+million frames: each window costs a statement, which looks into most of the tables.
 """
 
 from __future__ import annotations
@@ -17,15 +18,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.graph import graph_of_records
 from sgstore.lang import (
-    EXTENTS,
     TRACE_OF_BUCKET,
     Compiled,
     Layout,
     Window,
     compared_in_query,
     compile_query,
+    extents,
     for_people,
-    in_order,
     notes_on,
     rewritten,
 )
@@ -54,19 +54,19 @@ if TYPE_CHECKING:
 SHOWN: Final = 80
 """Characters of a query that the repr of its matches shows."""
 
-FIRST_WINDOW: Final = 64
-"""Buckets of the first window: 3,840 frames."""
+FIRST_WINDOW: Final = 1024
+"""Buckets of the first window, for who may stop early: 61,440 frames, some 30 ms of real traffic."""
 
 BUCKET_SHIFT: Final = 6
 """``frame_id >> 6`` is the bucket of a frame."""
 
-GROWTH: Final = 4
+GROWTH: Final = 16
 """How many times as long a window is as the one before, if that had few rows."""
 
 LAST_WINDOW: Final = 16_384
-"""Buckets of the largest window: a million frames."""
+"""Buckets of the largest window, and of the first one of who wants all rows: a million frames."""
 
-ROWS: Final = 200_000
+ROWS: Final = 1_000_000
 """Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
 
 
@@ -203,14 +203,17 @@ class Matches(Tabular):
             return notes_in(self._file, compared, self._text, self._parameters)
 
     def __iter__(self) -> Iterator[Row]:
+        return self._rows(whole=False)
+
+    def _rows(self, *, whole: bool) -> Iterator[Row]:
         with self._compiled() as compiled:
-            layout, rows = compiled.layout, self._stream(Compiled.rows)
+            layout, rows = compiled.layout, self._stream(Compiled.rows, whole=whole)
             row = _row_type(self.columns)
             yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[Row]:
         """All rows at once."""
-        return list(self)
+        return list(self._rows(whole=True))
 
     def count(self) -> int:
         """The number of distinct frames."""
@@ -325,7 +328,7 @@ class Matches(Tabular):
             return None
         with self._compiled() as compiled:
             most, found = compiled.query.result.limit, list[Any]()
-            for ready, windows in self._statements(compiled, Compiled.rows):
+            for ready, windows in self._statements(compiled, Compiled.rows, whole=True):
                 given = self._given(ready)
                 table = self._file.table(ready.sql, ready.values, given=given)
                 if table is None:
@@ -349,14 +352,16 @@ class Matches(Tabular):
         self,
         statement: Callable[[Compiled, Window | None], SqlStatement],
         form: str | None = None,
+        *,
+        whole: bool = False,
     ) -> Iterator[tuple[Any, ...]]:
         """Rows of a statement, window by window; all windows see the same state of the store.
 
         ``form`` is that of the statement: rows, intervals, clips or frames; ``None``: what the query asks
-        for. Only for that do its order and its limit hold.
+        for. Only for that do its order and its limit hold. ``whole``: all rows will be read.
         """
         with self._compiled() as compiled:
-            rows = self._rows_of(self._statements(compiled, statement, form))
+            rows = self._rows_of(self._statements(compiled, statement, form, whole=whole))
             asked = form in {None, compiled.query.result.form}
             yield from islice(rows, compiled.query.result.limit if asked else None)
 
@@ -375,19 +380,19 @@ class Matches(Tabular):
         compiled: Compiled,
         statement: Callable[[Compiled, Window | None], SqlStatement],
         form: str | None = None,
+        *,
+        whole: bool = False,
     ) -> Iterator[tuple[SqlStatement, Windows]]:
         """A statement for each window; whoever reads its rows counts them in ``Windows.rows``."""
-        asked = form in {None, compiled.query.result.form}
-        form = form or compiled.query.result.form
-        at_once = asked and not compiled.in_windows
-        whole = form in {"intervals", "clips"} or bool(compiled.query.steps)
-        windows = Windows([] if at_once else self._extents(), whole_traces=whole)
+        result, form = compiled.query.result, form or compiled.query.result.form
+        at_once = form == result.form and not compiled.in_windows
+        windows = Windows(
+            [] if at_once else extents(compiled.catalog),
+            first=LAST_WINDOW if whole and result.limit is None else None,
+            whole_traces=form in {"intervals", "clips"} or bool(compiled.query.steps),
+        )
         for window in windows:
             yield statement(compiled, window), windows
-
-    def _extents(self) -> list[tuple[int, int]]:
-        """First bucket and number of buckets of each trace, in the order in which they are told."""
-        return in_order(self._file.rows(EXTENTS).values, self._ready.catalog)
 
     def _given(self, statement: SqlStatement) -> list[GivenTable]:
         """Return the table that a statement is given of external matches."""
@@ -397,7 +402,7 @@ class Matches(Tabular):
         ]
 
     def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
-        steps = Windows(self._extents(), whole_traces=True)
+        steps = Windows(extents(self._ready.catalog), whole_traces=True)
         for window in steps:
             block = gathered.block(window)
             steps.rows = len(block[0])
@@ -421,6 +426,8 @@ class Windows:
     ----------
     extents : iterable of (int, int)
         First bucket and number of buckets of each trace, in the order in which they are to come.
+    first : int, optional
+        Buckets of the first range; by default :data:`FIRST_WINDOW`.
     whole_traces : bool
         Whether no range may end within a trace.
 
@@ -430,14 +437,20 @@ class Windows:
         Rows of the range that came last; who reads them counts them.
     """
 
-    def __init__(self, extents: Iterable[tuple[int, int]], *, whole_traces: bool = False) -> None:
+    def __init__(
+        self,
+        extents: Iterable[tuple[int, int]],
+        *,
+        first: int | None = None,
+        whole_traces: bool = False,
+    ) -> None:
         self._extents = list(extents)
         self._whole_traces = whole_traces
-        self._size = FIRST_WINDOW
+        self._size = first or FIRST_WINDOW
         self.rows = 0
 
     def __iter__(self) -> Iterator[Window | None]:
-        if sum(buckets for _, buckets in self._extents) <= FIRST_WINDOW:
+        if sum(buckets for _, buckets in self._extents) <= self._size:
             yield None
             return
         group, used = list[tuple[int, int]](), 0

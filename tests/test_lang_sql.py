@@ -14,9 +14,9 @@ from oracle_worlds import World, random_world
 
 import sgstore.lang._rewrite as rewrite
 from sgstore.errors import QueryError
-from sgstore.lang import EXTENTS, SqlStatement, Window, compile_query
+from sgstore.lang import SqlStatement, Window, compile_query
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
-from sgstore.matches import FIRST_WINDOW, Windows
+from sgstore.matches import FIRST_WINDOW, LAST_WINDOW, Windows
 from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers
 
 if TYPE_CHECKING:
@@ -327,7 +327,9 @@ def test_windows_together_give_the_whole(text: str, world: World) -> None:
 
 def test_windows_by_traces_give_all_intervals(world: World) -> None:
     compiled = compile_query("MATCH (a:Car)-[:near]->(b) RETURN a, INTERVALS", world.catalog)
-    extents = world.connection.execute(EXTENTS).fetchall()
+    extents = world.connection.execute(
+        "SELECT min(bucket), max(bucket) - min(bucket) + 1 FROM inside.bucket GROUP BY trace_id ORDER BY 1"
+    ).fetchall()
 
     parts = [compiled.rows(Window(first, first + count)) for first, count in extents]
 
@@ -373,7 +375,12 @@ def test_windows_grow_while_rows_are_few_and_shrink_where_they_are_many() -> Non
         lengths.append(length(window))
         steps.rows = rows
 
-    assert lengths == [64, 256, 1024, 4096, 81, 1, 4]
+    assert lengths == [1024, 16384, 16384, 16384, 1638, 163, 2608]
+
+
+def test_who_wants_all_rows_gets_them_in_one_window() -> None:
+    assert list(Windows([(0, 100), (1000, 60)], first=LAST_WINDOW)) == [None]
+    assert len(list(Windows([(0, 100), (1000, 60)], first=100))) == 2
 
 
 def length(window: Window | None) -> int:

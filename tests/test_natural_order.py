@@ -51,8 +51,14 @@ def windowed(
     store: Store, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Store:
     """The store, looked at in windows: parts of traces, some traces, or all at once."""
-    monkeypatch.setattr(streams, "FIRST_WINDOW", request.param)
+    in_windows(monkeypatch, request.param)
     return store
+
+
+def in_windows(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
+    """Every answer comes in windows, the first of which is so long."""
+    for name in ("FIRST_WINDOW", "LAST_WINDOW"):
+        monkeypatch.setattr(streams, name, first)
 
 
 def in_order(rows: list[Any], ego: bool = False) -> None:
@@ -132,7 +138,7 @@ def test_the_same_is_found_in_windows_of_any_size(
     whole = [store.find(text).rows() for text in texts]
 
     for size, rows in ((1, 200_000), (1, 40), (4, 200_000), (7, 3_000), (9, 10)):
-        monkeypatch.setattr(streams, "FIRST_WINDOW", size)
+        in_windows(monkeypatch, size)
         monkeypatch.setattr(streams, "ROWS", rows)
         assert [store.find(text).rows() for text in texts] == whole
 

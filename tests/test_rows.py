@@ -123,8 +123,8 @@ QUERIES = [
 def test_tables_of_matches_are_those_of_their_rows(
     store: Store, query: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sgstore.matches, "FIRST_WINDOW", 2)
-    monkeypatch.setattr(sgstore.matches, "GROWTH", 1)
+    for name in ("FIRST_WINDOW", "LAST_WINDOW"):
+        monkeypatch.setattr(sgstore.matches, name, 2)
     matches = store.find(query)
     few = matches.limit(7)
     ours = (matches.arrow(), matches.polars(), few.arrow())

@@ -52,10 +52,9 @@ from ._patterns import pattern_of as pattern_of
 from ._plan import TRACE_OF_BUCKET as TRACE_OF_BUCKET
 from ._plan import Gathered as Gathered
 from ._plan import Window as Window
-from ._plan import in_order as in_order
+from ._plan import extents as extents
 from ._plan import traces_of as traces_of
 from ._results import CONSTANTS as CONSTANTS
-from ._results import EXTENTS as EXTENTS
 from ._results import SqlStatement as SqlStatement
 from ._results import about_frame as about_frame
 from ._rewrite import rewritten as rewritten
@@ -83,7 +82,6 @@ __all__ = [
     "Catalog",
     "Compared",
     "Compiled",
-    "EXTENTS",
     "Evaluate",
     "ExternalRelation",
     "FUTURE",
@@ -116,8 +114,8 @@ __all__ = [
     "compile_query",
     "entities",
     "expression",
+    "extents",
     "for_people",
-    "in_order",
     "ir",
     "joined",
     "looked_up",

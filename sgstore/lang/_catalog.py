@@ -599,6 +599,8 @@ class TraceFacts:
         Which pairs of entities are related in it; ``None`` where that is not known.
     period_ns : int
         Median time between two frames.
+    extent : (int, int)
+        Its first bucket, and how many follow from there on.
     """
 
     trace_id: int
@@ -607,6 +609,7 @@ class TraceFacts:
     answers: frozenset[str]
     reach: RelationScope | None = None
     period_ns: int = 0
+    extent: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from sgstore.lang.ir import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from sgstore.lang._catalog import Catalog
     from sgstore.lang._formulas import BoundValues, Select
@@ -266,11 +266,9 @@ TRACE_OF_FRAME: Final = 24
 """``frame_id >> 24`` is the trace of a frame; the bits below are its place in the trace."""
 
 
-def in_order(extents: Iterable[Sequence[int]], catalog: Catalog) -> list[tuple[int, int]]:
-    """First bucket and number of buckets of each trace, put in the order of the traces."""
-    place = {trace.trace_id: number for number, trace in enumerate(catalog.traces)}
-    found = [(first, buckets) for first, buckets in extents]
-    return sorted(found, key=lambda one: place.get(one[0] >> TRACE_OF_BUCKET, len(place)))
+def extents(catalog: Catalog) -> list[tuple[int, int]]:
+    """First bucket and number of buckets of each trace, in the order of the traces."""
+    return [trace.extent for trace in catalog.traces]
 
 
 def frame_key(

@@ -183,12 +183,6 @@ def _first_of(mask: str) -> str:
 # maximal run of consecutive frames of one trace in which the same binding holds; a gap of more than 2.5
 # median periods ends it.
 
-EXTENTS: Final = """
-SELECT min(bucket) AS first, max(bucket) - min(bucket) + 1 AS buckets FROM bucket
-GROUP BY trace_id ORDER BY first
-"""
-"""First bucket and number of buckets of each trace, by its id."""
-
 CONSTANTS: Final = "SELECT node_id, ident, type_name, parked FROM entities WHERE trace_id = ?"
 """What does not change about the entities of a trace, and stands in no frame."""
 

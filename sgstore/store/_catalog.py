@@ -42,6 +42,10 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
     classed = connection.execute(
         "SELECT DISTINCT abstraction FROM frame_class UNION SELECT DISTINCT abstraction FROM later_class"
     ).fetchall()
+    rows = connection.execute(
+        "SELECT trace_id, min(bucket), max(bucket) - min(bucket) + 1 FROM bucket GROUP BY trace_id"
+    ).fetchall()
+    extents = {trace: (first, buckets) for trace, first, buckets in rows}
     whole = Catalog(
         edges=_counted(connection, "edge"),
         map_edges=_counted(connection, "map_edge"),
@@ -56,6 +60,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
                 frozenset(t.answers),
                 RelationScope.of(t.settings),
                 t.period_ns,
+                extents.get(t.trace_id, (0, 0)),
             )
             for t in stored_traces(connection)
         ),

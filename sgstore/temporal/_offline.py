@@ -14,11 +14,10 @@ import numpy as np
 from sgstore.lang import (
     CLOCK,
     CLOCK_OF_TRACES,
-    EXTENTS,
     TRACE_OF_BUCKET,
     TRACES,
     Column,
-    in_order,
+    extents,
     relation,
     traces_of,
 )
@@ -269,10 +268,10 @@ def traces(
     within : Window, optional
         Buckets of whole traces; by default all.
     """
-    extents = in_order(file.rows(EXTENTS).values, catalog)
+    asked = extents(catalog)
     if within is not None:
-        extents = [one for one in extents if _lies_in(one[0], within)]
-    steps = Windows(extents, whole_traces=True)
+        asked = [one for one in asked if _lies_in(one[0], within)]
+    steps = Windows(asked, whole_traces=True)
     for window in steps:
         found, steps.rows = read(file, catalog, whole, asks, window or within, gaps=gaps)
         yield from found
