@@ -232,9 +232,9 @@ KINDS: Final[tuple[Callable[[ast.AST], ast.AST | None], ...]] = (
 NAMED: Final = (
     (
         "frames of equal time do not go on",
-        "sgstore/store/_publish.py",
-        "WHEN step BETWEEN 0 AND",
-        "WHEN step BETWEEN 1 AND",
+        "sgstore/store/_write.py",
+        "joined = (seq > 0) & (step >= 0)",
+        "joined = (seq > 0) & (step > 0)",
     ),
     (
         "the gate is not closed",
@@ -245,8 +245,8 @@ NAMED: Final = (
     (
         "orphans of a replaced trace are kept",
         "sgstore/store/_publish.py",
-        "connection.execute(ORPHANS)  # of a trace that was replaced",
-        "pass",
+        "if known:\n        connection.execute(ORPHANS)",
+        "if known:\n        pass",
     ),
     (
         "what failed is committed",

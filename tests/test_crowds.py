@@ -347,7 +347,7 @@ def test_a_recording_that_is_read_in_pieces_gives_the_same_store(
     derive(tmp_path / "whole.sgstore", other, "other")
     monkeypatch.setattr(crowds, "AT_ONCE", 150)
     monkeypatch.setattr(staging, "MERGE_ROWS", 300)
-    monkeypatch.setattr(staging, "SUMMED_ROWS", 100)
+    monkeypatch.setattr(staging, "PIECE_ROWS", 100)
 
     ingest(tmp_path / "pieces.sgstore", [path], config=config)
     derive(tmp_path / "pieces.sgstore", other, "other")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-import duckdb
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,8 +17,6 @@ from sgstore.config import Config, Payloads
 from sgstore.errors import StoreError, TraceError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
-from sgstore.store._schema import tables_sql
-from sgstore.store._staging import MESSAGES
 from sgstore.world import Channel
 
 if TYPE_CHECKING:
@@ -40,32 +37,28 @@ TIMES = st.lists(st.integers(0, 60), min_size=1, max_size=8)
 SAID = st.lists(st.tuples(st.sampled_from([2, 5, 6]), st.integers(-5, 70)), max_size=14)
 
 
-@pytest.fixture(scope="module")
-def segment() -> duckdb.DuckDBPyConnection:
-    connection = duckdb.connect()
-    connection.execute(tables_sql())
-    connection.execute(MESSAGES)
-    return connection
-
-
-def joined(
-    connection: duckdb.DuckDBPyConnection, frames: list[int], said: list[Any], how: Payloads
-) -> set[tuple[int, int, int, int]]:
+def joined(frames: list[int], said: list[Any], how: Payloads) -> set[tuple[int, int, int, int]]:
     """Frame, channel, log time and offset of the messages that belong to frames."""
-    for table in ("frame", "message", "payload"):
-        connection.execute(f"DELETE FROM {table}")
     periods = payloads.Periods()
     periods.see(payloads.FRAMES, np.array(frames))
-    for i, time in enumerate(frames):
-        sql = "INSERT INTO inside.frame BY NAME SELECT ? AS frame_id, 0 AS bucket, ? AS bit, ? AS log_time_ns"
-        connection.execute(sql, [i, i, time])
-        connection.execute("INSERT INTO message VALUES (1, ?, 0, ?, 1)", [time, i])
+    messages = [(1, time, 0, i, 1) for i, time in enumerate(frames)]
     for offset, (channel, time) in enumerate(said):
-        connection.execute("INSERT INTO message VALUES (?, ?, 0, ?, 1)", [channel, time, offset])
+        messages.append((channel, time, 0, offset, 1))
         periods.see(channel, np.array([time]))
-    payloads.join(connection, "SELECT * FROM message", CHANNELS, periods, how)
-    found = connection.execute('SELECT bit, channel_id, log_time_ns, "offset" FROM inside.payload')
-    return set(found.fetchall())
+    names = ("channel", "log_time_ns", "chunk_offset", "offset", "length")
+
+    def pieces() -> Iterator[dict[str, Any]]:
+        for first in range(0, len(messages), 3):
+            rows = np.array(messages[first : first + 3], np.int64)
+            yield dict(zip(names, rows.T, strict=True))
+
+    times = payloads.FrameTimes(np.array(frames, np.int64))
+    found: list[tuple[int, int, int, int]] = []
+    for columns in payloads.joined(times, pieces, CHANNELS, periods, how):
+        of = [columns[name].tolist() for name in ("seq", "channel_id", "log_time_ns", "offset")]
+        found += zip(*of, strict=True)
+    assert found == sorted(found, key=lambda row: (row[1], row[0]))
+    return set(found)
 
 
 def tried(frames: list[int], said: list[Any], how: Payloads) -> set[tuple[int, int, int, int]]:
@@ -95,20 +88,23 @@ def period(mine: list[Any], frames: list[int]) -> float:
     return max(float(np.median(s)) if len(s) else 0.0 for s in steps)
 
 
+@pytest.mark.parametrize("together", [1, 250_000])
 @pytest.mark.parametrize("join", ["nearest", "latest"])
 @pytest.mark.parametrize("tolerance_ns", [0, 3, 1000])
 @given(frames=TIMES, said=SAID)
 @settings(max_examples=25, deadline=None)
 def test_a_message_belongs_to_a_frame_as_trying_them_all_says(
-    segment: Any, join: Any, tolerance_ns: Any, frames: Any, said: Any
+    together: int, join: Any, tolerance_ns: Any, frames: Any, said: Any
 ) -> None:
     how = Payloads(join=join, tolerance=tolerance_ns / 1e9)
 
-    assert joined(segment, frames, said, how) == tried(frames, said, how)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(payloads, "_AT_ONCE", together)
+        assert joined(frames, said, how) == tried(frames, said, how)
 
 
-def test_of_frames_of_one_time_each_is_its_own_message(segment: Any) -> None:
-    assert {row for row in joined(segment, [5, 5, 5], [], Payloads()) if row[1] == 1} == {
+def test_of_frames_of_one_time_each_is_its_own_message() -> None:
+    assert {row for row in joined([5, 5, 5], [], Payloads()) if row[1] == 1} == {
         (0, 1, 5, 0),
         (1, 1, 5, 1),
         (2, 1, 5, 2),

@@ -14,7 +14,7 @@ import sgstore.store._publish as publishing
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
-from sgstore.store._staging import Checksum
+from sgstore.store._columns import Checksum
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,7 +22,7 @@ from sgstore.abstractions import (
 )
 from sgstore.store._graphs import Graphs
 from sgstore.store._packing import SEQ_BITS, frames_of, masks_of, texts, trace_bucket
-from sgstore.store._publish import add_files, note, writing
+from sgstore.store._publish import add, note, writing
 from sgstore.store._staging import Staging
 from sgstore.store._traces import frame_named, trace_named
 from sgstore.world import BUCKET_FRAMES
@@ -157,11 +157,11 @@ class Abstracted:
                 for seq, seen in self._graphs.of_trace(connection, trace_id):
                     staging.settle(whole=True)
                     staging.insert(_LATER, classes.columns(seen, trace_id, seq))
-            files, _ = staging.seal()
-            with writing(self._access, staging.folder) as connection:
+            staging.seal()
+            with writing(self._access) as connection:
                 # Another process may have been faster, or have removed the trace.
                 if trace_id in _missing(connection, name, "store.inside."):
-                    add_files(connection, staging, files)
+                    add(connection, self._path, staging)
                     note(connection, trace_id, [_LATER])
         finally:
             staging.close()

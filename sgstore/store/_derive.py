@@ -19,7 +19,7 @@ from sgstore.errors import AbstractionError, StoreError
 from sgstore.graph import SceneGraph
 from sgstore.store._graphs import Graphs, filled
 from sgstore.store._packing import FRAME_BITS, NodeKinds, as_json, texts
-from sgstore.store._publish import add_files, note, writing
+from sgstore.store._publish import add, note, widen, writing
 from sgstore.store._rows import run
 from sgstore.store._staging import Staging
 from sgstore.store._traces import trace_named
@@ -345,16 +345,16 @@ class Building:
         StoreError
             The trace was removed meanwhile, or others keep the store for too long.
         """
-        files, _ = self._staging.seal()
-        with writing(self._access, self._staging.folder) as connection:
+        self._staging.seal()
+        with writing(self._access) as connection:
             there = connection.execute(
                 "SELECT 1 FROM store.inside.trace WHERE trace_id = ?", [self._trace_id]
             ).fetchone()
             if there is None:
                 raise StoreError("the trace was removed from the store meanwhile")
             _delete(connection, self._name, self._trace_id)
-            shape.widen(connection, "store", self._staging.words(answers))
-            add_files(connection, self._staging, files)
+            widen(connection, self._staging.words(answers))
+            add(connection, self._access.path, self._staging)
             connection.execute(
                 "INSERT INTO store.inside.derived BY NAME SELECT $name AS name, $trace AS trace_id,"
                 " $settings AS settings, $digest AS digest, $answers AS answers,"

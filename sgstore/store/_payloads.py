@@ -15,7 +15,7 @@ from sgstore.store._packing import frame_ids, texts
 from sgstore.vocabulary import suggestion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from duckdb import DuckDBPyConnection
 
@@ -27,43 +27,6 @@ if TYPE_CHECKING:
 
 _SAMPLE: Final = 8192
 """Messages from which the period of a channel is told: its first ones, so that memory stays bounded."""
-
-JOIN: Final = """
-WITH wanted AS (
-  SELECT f.bucket, f.bit, f.log_time_ns, c.channel_id, c.tolerance_ns
-  FROM frame f CROSS JOIN tolerance c),
-said AS (  -- of messages of one time the last one in the file
-  SELECT channel, log_time_ns,
-         max(struct_pack(chunk_offset := chunk_offset, "offset" := "offset", length := length)) AS place
-  FROM {messages} GROUP BY ALL),
-found AS (
-  SELECT w.*, b.log_time_ns AS before_ns, b.place AS before, a.log_time_ns AS after_ns, a.place AS after
-  FROM wanted w
-    ASOF LEFT JOIN said b ON b.channel = w.channel_id AND b.log_time_ns <= w.log_time_ns
-    ASOF LEFT JOIN said a ON a.channel = w.channel_id AND a.log_time_ns >= w.log_time_ns),
-chosen AS (
-  SELECT *, $nearest
-         AND coalesce(after_ns - log_time_ns < log_time_ns - before_ns, after_ns IS NOT NULL) AS later
-  FROM found),
-joined AS (
-  SELECT bucket, bit, channel_id, log_time_ns AS frame_ns, tolerance_ns,
-         CASE WHEN later THEN after_ns ELSE before_ns END AS log_time_ns,
-         CASE WHEN later THEN after ELSE before END AS place
-  FROM chosen)
-SELECT bucket, bit, bucket >> 18 AS trace_id, channel_id, log_time_ns,
-       place.chunk_offset AS chunk_offset, place."offset" AS "offset", place.length AS length
-FROM joined WHERE abs(log_time_ns - frame_ns) <= tolerance_ns
-"""
-"""Messages of sensors: the nearest in log time, the earlier of two that are equally near; or the latest."""
-
-OWN: Final = """
-SELECT f.bucket, f.bit, f.bucket >> 18, m.channel, m.log_time_ns, m.chunk_offset, m."offset", m.length
-FROM (SELECT *, row_number() OVER (PARTITION BY log_time_ns ORDER BY frame_id) AS turn FROM frame) f
-JOIN (SELECT *, row_number() OVER (PARTITION BY log_time_ns ORDER BY chunk_offset, "offset") AS turn
-      FROM {messages} WHERE channel IN (SELECT unnest($leading))) m
-  ON m.log_time_ns = f.log_time_ns AND m.turn = f.turn
-"""
-"""The messages that frames are: of frames of one time the first is the first message, and so on."""
 
 
 @dataclass(slots=True)
@@ -99,28 +62,144 @@ FRAMES: Final = -1
 """The frames themselves, as a channel of :class:`Periods`."""
 
 
-def join(
-    connection: DuckDBPyConnection,
-    messages: str,
+_AT_ONCE: Final = 250_000
+"""Messages of a channel that are in memory together."""
+
+_PLACE: Final = ("log_time_ns", "chunk_offset", "offset", "length")
+
+
+def joined(
+    frames: FrameTimes,
+    messages: Callable[[], Iterable[Columns]],
     channels: tuple[Channel, ...],
     periods: Periods,
     settings: Payloads,
-) -> None:
-    """Fill the table ``payload`` of a trace; ``messages`` is a statement that gives all that were seen."""
-    nearest, said = settings.join == "nearest", f"({messages})"
-    connection.execute(
-        "CREATE OR REPLACE TEMP TABLE tolerance (channel_id INTEGER, tolerance_ns BIGINT)"
-    )
-    leading = [c.id for c in channels if c.role == "ground_truth"]
-    sensors = [c.id for c in channels if c.role == "payload"]
-    if sensors:
-        for channel in sensors:
-            allowed = tolerance_ns(periods, channel, settings)
-            connection.execute("INSERT INTO tolerance VALUES (?, ?)", [channel, allowed])
-        connection.execute(
-            f"INSERT INTO payload BY NAME {JOIN.format(messages=said)}", {"nearest": nearest}
-        )
-    connection.execute(f"INSERT INTO payload {OWN.format(messages=said)}", {"leading": leading})
+) -> Iterator[Columns]:
+    """Table ``payload`` of a trace, but for whose it is: the rows of one channel after another, in order.
+
+    Parameters
+    ----------
+    frames : FrameTimes
+    messages : callable
+        Gives all that were seen, some at a time.
+    """
+    own = _own(frames, messages, [c.id for c in channels if c.role == "ground_truth"])
+    rows_of = {
+        number: np.flatnonzero(own["channel"] == number)
+        for number in np.unique(own["channel"]).tolist()
+    }
+    sensors = {c.id for c in channels if c.role == "payload"}
+    for number in sorted({*rows_of, *sensors}):
+        if number in sensors:
+            allowed = tolerance_ns(periods, number, settings)
+            nearest = settings.join == "nearest"
+            found = _chosen(frames, _messages_of(messages, [number]), allowed, nearest=nearest)
+        else:
+            found = {name: values[rows_of[number]] for name, values in own.items()}
+        count = len(found["frame"])
+        yield {
+            "seq": found["frame"],
+            "channel_id": np.full(count, number),
+            **{name: found[name] for name in _PLACE},
+        }
+
+
+class FrameTimes:
+    """Log times of the frames of a trace, and the order in which they ascend.
+
+    Parameters
+    ----------
+    log_time_ns : (F,) int64
+    """
+
+    def __init__(self, log_time_ns: Ints) -> None:
+        self.order = np.argsort(log_time_ns, kind="stable")
+        self.time = log_time_ns[self.order]
+
+
+def _messages_of(
+    messages: Callable[[], Iterable[Columns]], numbers: list[int]
+) -> Iterator[Columns]:
+    """Messages of some channels, so many together as memory is for."""
+    waiting: list[Columns] = []
+    for some in messages():
+        rows = np.flatnonzero(np.isin(some["channel"], numbers))
+        if len(rows):
+            waiting.append({name: values[rows] for name, values in some.items()})
+        if sum(len(one["channel"]) for one in waiting) >= _AT_ONCE:
+            yield _together(waiting)
+            waiting = []
+    if waiting:
+        yield _together(waiting)
+
+
+def _together(parts: Sequence[Columns]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _own(
+    frames: FrameTimes, messages: Callable[[], Iterable[Columns]], leading: list[int]
+) -> Columns:
+    """The messages that frames are: of frames of one time the first is the first message, and so on."""
+    parts = list(_messages_of(messages, leading))
+    if not parts:
+        return {name: np.zeros(0, np.int64) for name in ("frame", "channel", *_PLACE)}
+    said = _together(parts)
+    order = np.lexsort((said["offset"], said["chunk_offset"], said["log_time_ns"]))
+    said = {name: values[order] for name, values in said.items()}
+    turn = np.arange(len(frames.time)) - np.searchsorted(frames.time, frames.time)
+    at = np.searchsorted(said["log_time_ns"], frames.time) + turn
+    there = np.flatnonzero(at < len(order))
+    there = there[said["log_time_ns"][at[there]] == frames.time[there]]
+    frame = frames.order[there]
+    ascending = np.argsort(frame)
+    found = {name: values[at[there]][ascending] for name, values in said.items()}
+    return found | {"frame": frame[ascending]}
+
+
+def _chosen(
+    frames: FrameTimes, messages: Iterable[Columns], allowed: int, *, nearest: bool
+) -> Columns:
+    """For each frame the nearest message in log time, of two as near the earlier; or the latest.
+
+    Of messages of one time the last one in the file counts.
+    """
+    before = after = _none(len(frames.time))
+    for some in messages:
+        order = np.lexsort(tuple(some[name] for name in reversed(_PLACE)))
+        said = np.stack([some[name][order] for name in _PLACE])
+        last = np.append(said[0, 1:] != said[0, :-1], True)
+        said = np.hstack([said[:, last], _none(1)])  # and one that stands for none
+        time = said[0, :-1]
+        below = np.searchsorted(time, frames.time, side="right") - 1
+        above = np.searchsorted(time, frames.time)
+        before = _better(before, said[:, below], later=True)
+        after = _better(after, said[:, above], later=False)
+    known, coming = before[3] >= 0, after[3] >= 0
+    late = coming & (~known | (after[0] - frames.time < frames.time - before[0])) & nearest
+    chosen = np.where(late, after, before)
+    rows = np.flatnonzero((chosen[3] >= 0) & (np.abs(chosen[0] - frames.time) <= allowed))
+    frame = frames.order[rows]
+    ascending = np.argsort(frame)
+    places = chosen[:, rows[ascending]]
+    return {"frame": frame[ascending]} | dict(zip(_PLACE, places, strict=True))
+
+
+def _none(count: int) -> Ints:
+    """Columns of messages that are none: their length is below zero."""
+    return np.full((len(_PLACE), count), -1, np.int64)
+
+
+def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
+    """Of two messages for each frame the later, or the earlier; of one time the one further on in the file."""
+    further = np.zeros(one.shape[1], np.bool_)
+    same = np.ones(one.shape[1], np.bool_)
+    for mine, theirs in zip(one[1:], other[1:], strict=True):
+        further |= same & (theirs > mine)
+        same &= theirs == mine
+    sooner = other[0] > one[0] if later else other[0] < one[0]
+    wins = sooner | ((other[0] == one[0]) & further)
+    return np.where((other[3] >= 0) & ((one[3] < 0) | wins), other, one)
 
 
 def tolerance_ns(periods: Periods, channel: int, settings: Payloads) -> int:

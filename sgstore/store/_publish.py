@@ -7,31 +7,39 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from glob import escape
-from importlib.metadata import version
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 import sgstore.store._schema as shape
 from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
+from sgstore.store._columns import (
+    MASKS,
+    ORDERS,
+    Checksum,
+    columns_of,
+    expressions,
+    missing_of,
+)
 from sgstore.store._locking import spill_folder
-from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, LONGEST_STEP, plain
-from sgstore.store._staging import Checksum, Staging, columns_of, expressions, scratch
+from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, MISSING, plain
+from sgstore.store._staging import FILE, PIECE_ROWS, Staging, TableFile, chained, scratch
 from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
 from sgstore.vocabulary import NAMES
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Iterator
+    from collections.abc import Generator, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
 
     from sgstore.store._locking import Access
+    from sgstore.store._packing import Columns
     from sgstore.store._staging import Sealed
-    from sgstore.store._traces import Identity
-    from sgstore.world import TraceInfo
 
 
 SHARED: Final = {
@@ -41,84 +49,72 @@ SHARED: Final = {
 }
 """Tables of what many traces may have: it comes into a store once, and is known there by its digest."""
 
-_TRACE: Final = f"""
-INSERT INTO trace BY NAME
-WITH steps AS (SELECT time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
-SELECT $trace_id AS trace_id, $recording_id AS recording_id, $config_id AS config_id, $map_id AS map_id,
-       $flavour AS flavour, nullif($ego, '') AS ego, $since AS since, $until AS until,
-       count(*) AS frames,
-       arg_min(time_ns, frame_id) AS start_ns, arg_max(time_ns, frame_id) AS end_ns,
-       coalesce((SELECT quantile_disc(step, 0.5) FROM steps), 0) AS period_ns,
-       $origin_x AS origin_x, $origin_y AS origin_y, $origin_z AS origin_z, $answers AS answers,
-       $report AS report, $version AS version
-FROM frame;
-INSERT INTO bucket BY NAME
-WITH steps AS (
-  SELECT bucket, 1::BIGINT << bit AS one, time_ns - lag(time_ns) OVER (ORDER BY frame_id) AS step FROM frame)
-SELECT bucket, $trace_id AS trace_id, $map_id AS map_id, bit_or(one) AS valid,
-       bit_or(CASE WHEN step BETWEEN 0 AND {LONGEST_STEP} THEN one ELSE 0 END) AS joined
-FROM steps CROSS JOIN trace GROUP BY bucket;
-"""
-
-
-def fill_trace(
-    connection: DuckDBPyConnection, info: TraceInfo, identity: Identity, values: dict[str, Any]
-) -> None:
-    """Complete the tables of a trace: its own row, and its buckets.
-
-    Parameters
-    ----------
-    values : dict
-        Columns of table ``trace`` that the segment knows.
-    """
-    about = {"map_id": None} | identity.numbers | values
-    about |= {
-        "trace_id": identity.trace_id,
-        "flavour": info.flavour,
-        "ego": identity.ego,
-        "since": identity.since,
-        "until": identity.until,
-        "version": version("sgstore"),
-    }
-    for statement in _TRACE.split(";\n")[:-1]:
-        used = {key: value for key, value in about.items() if f"${key}" in statement}
-        connection.execute(statement, used)
-
 
 def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
     """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
-    with scratch(spill_folder()) as connection, access.writing(connection, sealed.folder):
+    with writing(access) as connection:
         return _publish(connection, access.path, sealed, replace=replace)
 
 
 def _publish(connection: DuckDBPyConnection, path: Path, sealed: Sealed, *, replace: bool) -> str:
-    """Copy the files of a trace into the attached store at a path; the name of the trace there."""
+    """Bring a trace into the attached store at a path; the name of the trace there."""
+    tables = TableFile(sealed.folder / FILE, path)
+    try:
+        return _put(connection, path, sealed, tables, replace=replace)
+    finally:
+        tables.close()
+
+
+def _put(
+    connection: DuckDBPyConnection, path: Path, sealed: Sealed, tables: TableFile, *, replace: bool
+) -> str:
     identity = sealed.identity
     taken = connection.execute("SELECT name FROM store.inside.trace").fetchall()
     if not replace and already_stored(connection, identity, catalog="store.inside."):
         name = stored_name(connection, identity, catalog="store.inside.")
         raise StoreError(f"{sealed.path}: came into the store meanwhile, as {name!r}")
     name = stored_name(connection, identity, catalog="store.inside.")
+    known = name is not None
     if name is None:
         name = free_name(plain(sealed.path.stem), {name for (name,) in taken})
     else:
         _delete(connection, identity.trace_id)
-    shape.widen(connection, "store", sealed.words)
+    widen(connection, sealed.words)
     for table, digest in identity.shared.items():
-        _publish_shared(connection, path, sealed, table, digest)
-    now = datetime.now(UTC).replace(tzinfo=None)
+        _publish_shared(connection, path, sealed, tables, table, digest)
     shared = {table for tables in SHARED.values() for table in tables}
-    own = [table for table in sealed.files if table not in shared]
+    own = [table for table in sealed.checksums if table not in shared]
     for table in own:
-        given = {"name": name, "ingested_at": now} if table == "trace" else {}
-        _insert(connection, sealed, table, given)
-    _note(connection, sealed, "trace", identity.trace_id, own)
-    connection.execute(ORPHANS)  # of a trace that was replaced
+        insert(connection, tables, table)
+    now = datetime.now(UTC).replace(tzinfo=None)
+    row = sealed.trace | {"name": name, "ingested_at": now}
+    values = ", ".join(f"${column} AS {column}" for column in row)
+    connection.execute(f"INSERT INTO store.inside.trace BY NAME SELECT {values}", row)
+    noted = {table: sealed.checksums[table] for table in own}
+    noted["trace"] = checksum_of(connection, "store", "trace", identity.trace_id, 0)
+    _note(connection, "trace", identity.trace_id, noted)
+    if known:
+        connection.execute(ORPHANS)
     return name
 
 
+def widen(connection: DuckDBPyConnection, words: Mapping[str, Iterable[str]]) -> None:
+    """Let the attached store hold values of enumerations that it may not have."""
+    # Every store has those of ``schema.sql``; to look which others it has takes a while.
+    new = {
+        enum: [name for name in names if name not in shape.own_labels(enum)]
+        for enum, names in words.items()
+    }
+    shape.widen(connection, "store", {enum: names for enum, names in new.items() if names})
+
+
 def _publish_shared(
-    connection: DuckDBPyConnection, path: Path, sealed: Sealed, owner: str, digest: str
+    connection: DuckDBPyConnection,
+    path: Path,
+    sealed: Sealed,
+    tables: TableFile,
+    owner: str,
+    digest: str,
 ) -> None:
     """Insert a recording, settings or a map, if the store does not have it; of a recording, its place now.
 
@@ -140,7 +136,6 @@ def _publish_shared(
         connection.execute(f"DELETE FROM {place} WHERE recording_id = ?", [number])
         forgotten = "DELETE FROM store.inside.manifest WHERE owner = 'recording' AND id = ?"
         connection.execute(forgotten, [number])
-    tables = [table for table in SHARED[owner] if table in sealed.files]
     given: dict[str, Any] = {}
     if owner == "recording":
         given = {"place": place_below(path, sealed.path) or None}
@@ -148,37 +143,86 @@ def _publish_shared(
         taken = connection.execute("SELECT name FROM store.inside.map").fetchall()
         wanted = plain(sealed.identity.map_name) or "map"
         given = {"name": free_name(wanted, {name for (name,) in taken})}
-    for table in tables:
-        _insert(connection, sealed, table, given if table == owner else {})
-    _note(connection, sealed, owner, number, tables)
+    noted = {table: sealed.checksums[table] for table in SHARED[owner] if table in sealed.checksums}
+    for table in noted:
+        insert(connection, tables, table, given if table == owner else {})
+    _note(connection, owner, number, noted)
 
 
 _CALLED: Final = {"recording": "recording", "config": "set of settings", "map": "road map"}
 
 
-def _insert(
-    connection: DuckDBPyConnection, sealed: Sealed, table: str, given: dict[str, Any]
+def insert(
+    connection: DuckDBPyConnection,
+    tables: TableFile,
+    table: str,
+    given: Mapping[str, object] | None = None,
 ) -> None:
-    """Insert the files of a table, with the values that only the store can give."""
-    replaced = ", ".join(f"${name} AS {name}" for name in given)
-    select = f"SELECT * REPLACE ({replaced})" if replaced else "SELECT *"
-    for name in sealed.files[table]:
-        # Reading takes a pattern, and a folder may be called anything.
-        file = literal(escape(str(sealed.folder / name)))
+    """Insert the staged rows of a table, with the values that only the store can give."""
+    given = given or {}
+    for columns in _batches(tables, table):
+        listed = [f"${name} AS {name}" for name in given]
+        listed += [
+            f'{_value(table, name, values)} AS "{name}"'
+            for name, values in columns.items()
+            if name not in given
+        ]
+        connection.register("staged", columns)
         connection.execute(
-            f"INSERT INTO store.inside.{table} BY NAME {select} FROM read_parquet({file})", given
+            f"INSERT INTO store.inside.{table} BY NAME SELECT {', '.join(listed)} FROM staged",
+            given,
         )
+        connection.unregister("staged")
+
+
+def _batches(tables: TableFile, table: str) -> Iterator[Columns]:
+    """Staged rows of a table, pieces together as far as memory is for them."""
+    waiting: list[Columns] = []
+    rows = 0
+    for piece in tables.pieces(table):
+        if waiting and rows + piece.rows > PIECE_ROWS:
+            yield chained(table, waiting)
+            waiting, rows = [], 0
+        columns = tables.read(piece)
+        for name, about in piece.columns.items():
+            if "texts" in about:
+                columns[name] = np.array([*about["texts"], ""], object)[columns[name]]
+        waiting.append(columns)
+        rows += piece.rows
+    if waiting:
+        yield chained(table, waiting)
+
+
+def _value(table: str, name: str, values: NDArray[Any]) -> str:
+    """SQL of a staged column: enumerations by their codes, NULL for what is missing; NaN is NULL anyway."""
+    if values.dtype.kind == "O":
+        return f"nullif(\"{name}\", '')"
+    enum = shape.enums_of(table).get(name)
+    if enum is not None:
+        codes = [code for code in np.unique(values).tolist() if code >= 0]
+        cases = " ".join(
+            f"WHEN {code} THEN {literal(str(NAMES[enum][code]))}::store.main.{enum}"
+            for code in codes
+        )
+        return f'CASE "{name}" {cases} END' if codes else "NULL"
+    if missing_of(table, name, values) is not None:
+        return f'nullif("{name}", {MISSING})'
+    return f'"{name}"'
 
 
 def _note(
-    connection: DuckDBPyConnection, sealed: Sealed, owner: str, number: int, tables: Iterable[str]
+    connection: DuckDBPyConnection, owner: str, number: int, checksums: Mapping[str, Checksum]
 ) -> None:
     """Take down the checksums of what was inserted."""
-    for table in tables:
-        checksum = sealed.checksums[table]
+    values = [
+        (owner, number, table, checksum.rows, checksum.value)
+        for table, checksum in checksums.items()
+        if checksum.rows
+    ]
+    places = ", ".join(["(?, ?, ?, ?, ?)"] * len(values))
+    if values:
         connection.execute(
-            "INSERT INTO store.inside.manifest VALUES (?, ?, ?, ?, ?)",
-            [owner, number, table, checksum.rows, checksum.value],
+            f"INSERT INTO store.inside.manifest VALUES {places}", [*chain.from_iterable(values)]
         )
 
 
@@ -234,23 +278,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
         )
 
 
-_SORTED: Final = {
-    "state": "SELECT * FROM store.inside.state ORDER BY is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
-    "lane_state": "SELECT * FROM store.inside.lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
-    "lane_gap": "SELECT * FROM store.inside.lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
-    "node": """
-SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM store.inside.node GROUP BY ALL ORDER BY ALL""",
-    "edge": """
-SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
-FROM store.inside.edge GROUP BY ALL ORDER BY ALL""",
-    "frame": "SELECT * FROM store.inside.frame ORDER BY frame_id",
-    "frame_class": "SELECT * FROM store.inside.frame_class ORDER BY ALL",
-    "lane_role": "SELECT * FROM store.inside.lane_role ORDER BY ALL",
-    "later_class": "SELECT * FROM store.inside.later_class ORDER BY ALL",
-    "derived_node": "SELECT * FROM store.inside.derived_node ORDER BY ALL",
-    "derived_edge": "SELECT * FROM store.inside.derived_edge ORDER BY ALL",
-    "derived_gap": "SELECT * FROM store.inside.derived_gap ORDER BY ALL",
-}
+_SCATTERED: Final = ("state", "lane_state", "lane_gap", "frame", *MASKS, "derived_gap")
 """The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
 
 
@@ -262,9 +290,11 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
     words = {enum: shape.labels_of(connection, "store", enum) for enum in NAMES}
     shape.widen(connection, "fresh", words)
     for (table,) in tables:
-        select = _SORTED.get(table, f"SELECT * FROM store.inside.{table}")
+        order = f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in _SCATTERED else ""
         connection.execute(f"DELETE FROM fresh.inside.{table}")
-        connection.execute(f"INSERT INTO fresh.inside.{table} BY NAME {select}")
+        connection.execute(
+            f"INSERT INTO fresh.inside.{table} BY NAME SELECT * FROM store.inside.{table}{order}"
+        )
 
 
 # What is added to traces that are in a store already: built aside, brought in by one transaction, noted ----
@@ -274,22 +304,20 @@ STEP: Final = 64
 
 
 @contextmanager
-def writing(access: Access, *folders: Path) -> Generator[DuckDBPyConnection]:
-    """One transaction on a store, attached as ``store``; of files it sees those in the folders."""
-    with scratch(spill_folder()) as connection, access.writing(connection, *folders):
+def writing(access: Access) -> Generator[DuckDBPyConnection]:
+    """One transaction on a store, attached as ``store``."""
+    with scratch(spill_folder()) as connection, access.writing(connection):
         yield connection
 
 
-def add_files(
-    connection: DuckDBPyConnection, staging: Staging, files: dict[str, list[str]]
-) -> None:
-    """Insert the files that a staging sealed."""
-    for table, names in files.items():
-        for name in names:
-            file = literal(escape(str(staging.folder / name)))
-            connection.execute(
-                f"INSERT INTO store.inside.{table} BY NAME SELECT * FROM read_parquet({file})"
-            )
+def add(connection: DuckDBPyConnection, path: Path, staging: Staging) -> None:
+    """Insert all that a staging sealed into the attached store at a path."""
+    tables = TableFile(staging.folder / FILE, path)
+    try:
+        for table in staging.checksums:
+            insert(connection, tables, table)
+    finally:
+        tables.close()
 
 
 def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -> None:
@@ -302,11 +330,7 @@ def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -
             """DELETE FROM store.inside.manifest WHERE owner = 'trace' AND id = ? AND "table" = ?""",
             [trace_id, table],
         )
-        if checksum.rows:
-            connection.execute(
-                "INSERT INTO store.inside.manifest VALUES ('trace', ?, ?, ?, ?)",
-                [trace_id, table, checksum.rows, checksum.value],
-            )
+        _note(connection, "trace", trace_id, {table: checksum})
 
 
 def checksum_of(

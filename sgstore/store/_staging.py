@@ -1,291 +1,324 @@
-"""Staged tables of a trace, with checksums, until they are published.
+"""Staged tables of a trace: arrays that wait in a file beside the store until they are published.
 
-Checksums of rows: the same for the same rows in any order, in any version of the database.
-
-A row becomes 64 bits, mixed from the bits of its values, and the checksum is their sum modulo 2⁶⁴. So rows can
-come in parts and be stored in any order. The mixing is SplitMix64's (Steele, Lea, Flood: Fast splittable
-pseudorandom number generators, 2014): it is no cipher, and tells what happens by chance, not by intent.
+The tables that grow with a trace are cut into parts of some ten thousand rows, each sorted as the store is and
+written behind the others, so that memory does not grow. In the end all tables are in one file, with a checksum
+of the rows of each.
 """
 
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from dataclasses import asdict, dataclass
-from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import duckdb
 import numpy as np
 
 from sgstore.errors import StoreError
-from sgstore.quoting import literal, quoted
-from sgstore.store._locking import Folder, memory_setting, translated
-from sgstore.store._packing import MISSING
-from sgstore.store._schema import (
-    INSIDE,
-    code_sql,
-    database_of,
-    enums_of,
-    own_labels,
-    tables_sql,
-    widen,
+from sgstore.store._columns import (
+    TEXTS,
+    Checksum,
+    as_summed,
+    blank,
+    in_order,
+    kept,
+    types_of,
 )
+from sgstore.store._locking import Folder, memory_setting
+from sgstore.store._schema import enums_of, own_labels
 from sgstore.store._traces import Identity
 from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Mapping
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
     from sgstore.store._packing import Columns
-    from sgstore.world import Codes
-
-    Words = NDArray[np.uint64]
 
 
-_STEP: Final = 0x9E3779B97F4A7C15
-_FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
-_SECOND: Final = np.uint64(0x94D049BB133111EB)
-_MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
-"""What stands for NULL."""
+# A file of tables: pieces one behind the other, each a line that says what it is, and its columns -------------
 
-_ASSIGNED: Final = {
-    ("trace", "name"),
-    ("trace", "ingested_at"),
-    ("map", "name"),
-    ("recording", "place"),
-}
-"""Tables and columns to which a store gives a value of its own."""
+FILE: Final = "tables"
 
-_TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP", "UUID"}
+_ALIGNED: Final = 8
+_HEAD: Final = 8
+"""Bytes that say how long the line is."""
+_PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
 
 
-@dataclass(slots=True)
-class Checksum:
-    """Checksum of some rows.
+class Piece(NamedTuple):
+    """Some rows of a table in a file.
 
     Attributes
     ----------
+    table : str
     rows : int
-    value : int
-        0 … 2⁶³ - 1.
+    columns : dict
+        Column → its type and its place behind ``at``, or its value in all rows; what is added to each value;
+        its texts.
+    at : int
+        Where the columns begin in the file.
     """
 
-    rows: int = 0
-    value: int = 0
-
-    def add(self, columns: dict[str, NDArray[Any]]) -> None:
-        """Add rows, as columns of numbers and truth values, masked where they are missing."""
-        hashes: Words = np.zeros(len(next(iter(columns.values()))), np.uint64)
-        for number, name in enumerate(sorted(columns)):
-            salt = np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
-            hashes = _mixed(hashes + (_words(columns[name]) ^ salt))
-        self.rows += len(hashes)
-        self.value = (self.value + int(hashes.sum(dtype=np.uint64))) & 0x7FFFFFFFFFFFFFFF
+    table: str
+    rows: int
+    columns: dict[str, dict[str, Any]]
+    at: int
 
 
-def _mixed(words: Words) -> Words:
-    words = (words ^ (words >> np.uint64(30))) * _FIRST
-    words = (words ^ (words >> np.uint64(27))) * _SECOND
-    return words ^ (words >> np.uint64(31))
+class TableFile:
+    """Rows of tables in a file that only this package writes and reads; nothing in it is trusted to be code.
 
-
-def _words(values: NDArray[Any]) -> Words:
-    """The bits of values as words of 64."""
-    plain = np.ma.getdata(values)
-    if plain.dtype.kind == "f":
-        plain = plain + plain.dtype.type(0)  # one zero: DuckDB 1.5 does not keep the sign of it
-        words = plain.view(np.uint32 if plain.dtype.itemsize == 4 else np.uint64)
-    else:
-        words = plain.astype(np.int64).view(np.uint64)
-    missing = np.ma.getmaskarray(values)
-    return np.where(missing, _MISSING, words.astype(np.uint64))
-
-
-def columns_of(
-    connection: DuckDBPyConnection, table: str, catalog: str = ""
-) -> list[tuple[str, str]]:
-    """Names and types of the columns of a table of the schema; ``duckdb_columns()`` would bind every view."""
-    place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
-    rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
-    return [(name, kind) for name, kind, *_ in rows]
-
-
-def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
-    """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them.
-
-    Numbers are as they are, enumerations their codes, texts 60 bits of their MD5.
+    Parameters
+    ----------
+    path : Path
+    store : Path
+        The store that it is meant for: that is what errors name.
+    new : bool
+        Whether it is made, and written to.
     """
-    listed: list[str] = []
-    for name, kind in columns_of(connection, table, catalog):
-        value = f'"{name}"'
-        if kind.startswith("ENUM"):  # words in a file
-            value = code_sql(value, kind)
-        elif kind in _TEXTS:
-            value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
-        if (table, name) not in _ASSIGNED:
-            listed.append(f'{value} AS "{name}"')
-    return ", ".join(listed)
+
+    def __init__(self, path: Path, store: Path, *, new: bool = False) -> None:
+        self._store = store
+        self._pieces: list[Piece] = []
+        try:
+            self._file = path.open("w+b" if new else "rb", buffering=0)
+            self._size = 0 if new else path.stat().st_size
+        except OSError as error:
+            raise self._wrong("cannot be opened", error) from error
+        if not new:
+            self._look()
+
+    def _wrong(self, what: str, error: OSError | None = None) -> StoreError:
+        reason = f": {error.strerror}" if error else ""
+        return StoreError(f"{self._store}: what waits beside it {what}{reason}")
+
+    def close(self) -> None:
+        """Close the file. What is in it stays."""
+        self._file.close()
+
+    def append(
+        self, table: str, columns: Columns, texts: Mapping[str, list[str]] | None = None
+    ) -> Piece:
+        """Write rows behind the others; ``texts`` are those that indices stand for, by column."""
+        rows = len(next(iter(columns.values())))
+        about: dict[str, dict[str, Any]] = {}
+        body: list[NDArray[Any]] = []
+        place = 0
+        for name, values in columns.items():
+            about[name], array = _narrowed(values)
+            if array is not None:
+                about[name]["at"] = place
+                body.append(array)
+                place += -(-array.nbytes // _ALIGNED) * _ALIGNED
+            if texts and name in texts:
+                about[name]["texts"] = texts[name]
+        said = {"table": table, "rows": rows, "columns": about, "bytes": place}
+        line = json.dumps(said, ensure_ascii=False).encode()
+        line += b" " * (-len(line) % _ALIGNED)
+        parts = [len(line).to_bytes(_HEAD, "little"), line]
+        for array in body:
+            parts += [array.tobytes(), bytes(-array.nbytes % _ALIGNED)]
+        self._write(b"".join(parts))
+        piece = Piece(table, rows, about, self._size + _HEAD + len(line))
+        self._size = piece.at + place
+        self._pieces.append(piece)
+        return piece
+
+    def _write(self, data: bytes) -> None:
+        view = memoryview(data)
+        try:
+            self._file.seek(self._size)
+            while view:
+                view = view[self._file.write(view) or 0 :]
+        except OSError as error:
+            raise self._wrong("cannot be written", error) from error
+
+    def pieces(self, table: str) -> list[Piece]:
+        """The pieces of a table, in the order in which they were written."""
+        return [piece for piece in self._pieces if piece.table == table]
+
+    def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
+        """Columns of some rows of a piece.
+
+        Raises
+        ------
+        StoreError
+            They are not in the file, or cannot be read.
+        """
+        return {name: self.column(piece, name, first, end) for name in piece.columns}
+
+    def column(
+        self, piece: Piece, name: str, first: int = 0, end: int | None = None
+    ) -> NDArray[Any]:
+        """One of these columns."""
+        about, end = piece.columns[name], piece.rows if end is None else end
+        if about["type"] not in _PLAIN:
+            raise self._wrong("is none of ours")
+        kind = np.dtype(about["type"])
+        if "value" in about:
+            value = np.nan if about["value"] is None else about["value"]
+            values = np.full(end - first, value, kind)
+        else:
+            data = self._bytes(
+                piece.at + about["at"] + first * kind.itemsize, (end - first) * kind.itemsize
+            )
+            values = np.frombuffer(data, kind)
+        return values.astype(np.int64) + about["base"] if "base" in about else values
+
+    def _bytes(self, at: int, count: int) -> bytes:
+        try:
+            self._file.seek(at)
+            data = self._file.read(count)
+        except OSError as error:
+            raise self._wrong("cannot be read", error) from error
+        if data is None or len(data) != count:
+            raise self._wrong("ends before its rows do")
+        return data
+
+    def _look(self) -> None:
+        """Read the lines of a file that is there."""
+        at = 0
+        while at < self._size:
+            length = int.from_bytes(self._bytes(at, _HEAD), "little")
+            if length > self._size:
+                raise self._wrong("is none of ours")
+            said = json.loads(self._bytes(at + _HEAD, length))
+            at += _HEAD + length
+            self._pieces.append(Piece(said["table"], said["rows"], said["columns"], at))
+            at += said["bytes"]
+        if at != self._size:
+            raise self._wrong("ends before its rows do")
 
 
-# Where the tables of a trace wait to be published: a little in memory, the rest in files beside the store
-# ------------------------------------------------------------------------------------------------
-# The tables that grow with a trace are cut into parts of some ten thousand rows, each sorted as the store is
-# and written as a Parquet file into a folder beside the store, so that memory does not grow. In the end all of
-# them are in files, with a checksum of the rows of each table.
+def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
+    """Values with as few bytes as are easily had: what is said of them, and what is written."""
+    kind = values.dtype.newbyteorder("<").str
+    values = np.ascontiguousarray(values)
+    if values.dtype.kind == "f":
+        bits = values.view(f"i{values.itemsize}")
+        if bits[0] == bits[-1] and (bits == bits[0]).all():
+            return {"type": kind, "value": None if np.isnan(values[0]) else float(values[0])}, None
+        return {"type": kind}, values
+    low, high = values.min(), values.max()
+    if low == high:
+        return {"type": kind, "value": bool(low) if kind == "|b1" else int(low)}, None
+    if values.dtype.itemsize == 8 and int(high) - int(low) < 1 << 31:
+        return {"type": "<i4", "base": int(low)}, (values - low).astype(np.int32)
+    return {"type": kind}, values
 
-MEMORY: Final = 48 << 20
-"""Most memory of a database that publishes; bytes. Beyond it its tables spill to disk."""
 
-MOST_MEMORY: Final = 64 << 20
-"""The same where blocks are larger than usual; bytes."""
-
-LEAST_MEMORY: Final = 24 << 20
-"""The same where many wait beside one another, to begin with; bytes."""
-
-_ROOM: Final = 8
-"""How often the rows in memory must fit into it: to be copied, sorted and compressed."""
+# Tables in memory, and in the file ----------------------------------------------------------------------------
 
 PART_ROWS: Final = 20_000
 """Rows of all growing tables together that are kept in memory."""
 
-SUMMED_ROWS: Final = 250_000
-"""Rows of which the checksum is computed together."""
+PIECE_ROWS: Final = 60_000
+"""Most rows of a table that are read and inserted together."""
 
-MERGE_ROWS: Final = 1_000_000
-"""Rows of these tables at which the pieces of masks within a bucket are merged before it is whole."""
+MERGE_ROWS: Final = 1 << 19
+"""Rows of a table with masks at which the pieces of masks are merged before a bucket is whole."""
 
-MESSAGES: Final = (
-    "CREATE TABLE message (channel INTEGER, log_time_ns BIGINT, chunk_offset BIGINT, "
-    '"offset" BIGINT, length BIGINT)'
+_GROWING: Final = (
+    *("state", "lane_state", "lane_gap", "node", "edge", "frame_class", "lane_role"),
+    *("later_class", "derived_node", "derived_edge", "derived_gap", "message"),
 )
+"""The tables that grow with a trace."""
 
-_GROWING: Final = {
-    "state": """
-SELECT s.* REPLACE (e.special AS special, e.subkind AS subkind)
-FROM state s JOIN entity e ON e.node_id = s.node_id
-ORDER BY s.is_ego DESC, s.kind, s.frame_id >> 6, s.node_id, s.frame_id""",
-    "lane_state": "SELECT * FROM lane_state ORDER BY kind, frame_id >> 6, node_id, frame_id, lane",
-    "lane_gap": "SELECT * FROM lane_gap ORDER BY frame_id >> 6, src, dst, frame_id",
-    "node": "SELECT kind, bucket, node_id, mask FROM node ORDER BY ALL",
-    "edge": """
-SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask FROM edge ORDER BY ALL""",
-    "frame_class": "SELECT * FROM frame_class ORDER BY ALL",
-    "lane_role": "SELECT * FROM lane_role ORDER BY ALL",
-    "later_class": "SELECT * FROM later_class ORDER BY ALL",
-    "derived_node": "SELECT * FROM derived_node ORDER BY ALL",
-    "derived_edge": "SELECT * FROM derived_edge ORDER BY ALL",
-    "derived_gap": "SELECT * FROM derived_gap ORDER BY ALL",
-    "message": "SELECT * FROM message",
+_ALONG: Final = ("frame", "imported", "attribute")
+"""Tables that grow, too, and by which is not told whether there are many rows."""
+
+_CUT: Final = frozenset({*_GROWING, *_ALONG})
+"""All tables that are cut into parts."""
+
+_RUNS: Final = {
+    "node": "kind",
+    "edge": "relation",
+    "derived_node": "moves",
+    "derived_edge": "relation",
 }
-"""The tables that grow with a trace, sorted as they are published."""
-
-_MERGED: Final = {
-    "node": "SELECT kind, bucket, node_id, bit_or(mask) AS mask FROM node GROUP BY ALL ORDER BY ALL",
-    "edge": """
-SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
-FROM edge GROUP BY ALL ORDER BY ALL""",
-    "frame_class": """
-SELECT abstraction, class, bucket, bit_or(mask) AS mask FROM frame_class GROUP BY ALL ORDER BY ALL""",
-    "lane_role": "SELECT role, bucket, node_id, bit_or(mask) AS mask FROM lane_role GROUP BY ALL ORDER BY ALL",
-    "derived_node": """
-SELECT set_name, moves, kind, bucket, node_id, bit_or(mask) AS mask FROM derived_node
-GROUP BY ALL ORDER BY ALL""",
-    "derived_edge": """
-SELECT set_name, relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_or(mask) AS mask
-FROM derived_edge GROUP BY ALL ORDER BY ALL""",
-}
-"""The same where blocks split buckets: the pieces of a mask become one row again."""
-
-
-_ORDERS: Final = {"payload": "channel_id, bucket, bit", "map_node": "node_id DESC"}
-"""How the others are sorted, where not by all their columns."""
-
-_NOT_SEALED: Final = {"bits", "store_info"}
-"""Tables that belong to no trace."""
+"""Tables whose pieces of masks may be too many for memory; and the first column that tells their rows apart."""
 
 
 class Staging:
-    """The tables of one trace. ``connection`` has them in memory, under the names that they have in a store.
+    """The tables of one trace.
 
     Parameters
     ----------
     store : Path
         The store that they are meant for.
     place : tuple, optional
-        The folder where the files are written, which the caller removes; and how many wait at a time, this one
+        The folder where the file is written, which the caller removes; and how many wait at a time, this one
         included: those of several egos share the memory. By default a folder beside the store, removed with
         this.
+
+    Attributes
+    ----------
+    checksums : dict
+        Table → checksum of its rows, as far as they are in the file; once sealed, of all.
     """
 
     def __init__(self, store: Path, place: tuple[Path, int] | None = None) -> None:
         folder, beside = place or (None, 1)
         self._store = store
-        self._rows = 0
-        self._bytes = 0
-        self._memory = max(min(MEMORY, 2 * MEMORY // beside), LEAST_MEMORY)
-        self._most = MOST_MEMORY if self._memory == MEMORY else self._memory
-        self._merge_at = MERGE_ROWS
-        self._parts = 0
-        self._files: dict[str, list[str]] = {}
-        self._written: dict[str, int] = {}
-        self._known = dict.fromkeys(NAMES, 0)
+        self._waiting: dict[str, list[Columns]] = defaultdict(list)
+        self._rows: dict[str, int] = defaultdict(int)
+        self._runs: dict[str, list[Piece]] = defaultdict(list)
+        self._texts = {growing: {"": -1} for growing in (True, False)}
+        self._most = MERGE_ROWS // beside
+        self.checksums: dict[str, Checksum] = defaultdict(Checksum)
         self._new: dict[str, list[str]] = {}
-        self.merge = False
         self._own = Folder(store) if folder is None else None
         self.folder = folder or (self._own.path if self._own else store)
         try:
-            with translated(store):
-                self.connection = scratch(self.folder / "spill", memory=self._memory)
-                self._known = {enum: len(names) for enum, names in NAMES.items()}
-                self.connection.execute(tables_sql())
-                listed = self.connection.execute(
-                    "SELECT table_name FROM duckdb_tables() WHERE NOT internal"
-                ).fetchall()
-                self._tables = {name for (name,) in listed} - _NOT_SEALED
-                self.connection.execute(MESSAGES)
+            self._file = TableFile(self.folder / FILE, store, new=True)
         except BaseException:
             if self._own is not None:
                 self._own.remove()
             raise
 
     def close(self) -> None:
-        """Forget the tables in memory, and the files if the folder is its own."""
-        self.connection.close()
+        """Forget the tables in memory, and the file if the folder is its own."""
+        self._waiting.clear()
+        self._file.close()
         if self._own is not None:
             self._own.remove()
 
     def insert(self, table: str, columns: Columns) -> None:
-        """Append columns to a table; DuckDB finds them by the name of the variable."""
+        """Append rows to a table. What is missing is not finite, :data:`MISSING`, or empty."""
         rows = len(next(iter(columns.values())))
         if not rows:
             return
-        with translated(self._store):
-            self._bytes += sum(values.nbytes for values in columns.values())
-            wanted = min(self._bytes * _ROOM, self._most)
-            if wanted > self._memory:  # blocks that are larger than usual need more
-                self._allow(wanted)
-            for column, enum in enums_of(table).items():
-                if column in columns:
-                    self._learn(enum, columns[column])
-            insert = f"INSERT INTO {table} BY NAME SELECT {_values(table, columns)} FROM columns"
-            self._run(insert, columns)
-        if table in _GROWING:
-            self._rows += rows
+        types, enums = types_of(table), enums_of(table)
+        staged: Columns = {}
+        for name, values in columns.items():
+            if types[name] in TEXTS:
+                staged[name] = self._indices(table, values)
+            else:
+                staged[name] = kept(table, name, values)
+            if name in enums:
+                self._learn(enums[name], values)
+        self._waiting[table].append(staged)
+        self._rows[table] += rows
+        if table in _RUNS and self._rows[table] >= self._most:
+            self._merge(table)
+
+    def _indices(self, table: str, values: NDArray[Any]) -> NDArray[np.int32]:
+        known = self._texts[table in _CUT]
+        found = [known.setdefault(text, len(known) - 1) for text in values.tolist()]
+        return np.array(found, np.int32)
 
     def _learn(self, enum: str, codes: NDArray[Any]) -> None:
         """Take note of values of an enumeration that ``schema.sql`` has not."""
-        if codes.max() < len(own_labels(enum)):
+        own = len(own_labels(enum))
+        if codes.max() < own:
             return
-        names = NAMES[enum]
-        if len(names) > self._known[enum]:
-            self._known[enum] = len(names)
-            widen(self.connection, database_of(self.connection), {enum: names})
         noted = self._new.setdefault(enum, [])
-        found = [names[code] for code in np.unique(codes).tolist() if code >= len(own_labels(enum))]
+        found = [NAMES[enum][code] for code in np.unique(codes).tolist() if code >= own]
         noted += [name for name in found if name not in noted]
 
     def words(self, answers: Iterable[str]) -> dict[str, list[str]]:
@@ -293,30 +326,13 @@ class Staging:
         relations = sorted({*answers, *self._new.get("relation", ())})
         return {**self._new, "relation": relations}
 
-    def _allow(self, memory: int) -> None:
-        self._memory = memory
-        self.connection.execute(f"SET memory_limit = '{memory_setting(memory)}'")
-
-    def _run(self, sql: str, columns: Columns | None = None) -> DuckDBPyConnection:
-        """Run a statement; if its share of memory is too little for it, with more.
-
-        ``columns`` are a table of that name for the statement: DuckDB looks for it among the variables here.
-        """
-        while True:
-            try:
-                return self.connection.execute(sql)
-            except duckdb.OutOfMemoryException:
-                if self._memory >= MOST_MEMORY:
-                    raise
-                self._allow(min(2 * self._memory, MOST_MEMORY))
-
-    def mark_parked(self, parked: Codes) -> None:
-        """Tell of the entities, by node id, whether they are parked: 1 or 0; -1: not known."""
-        for value in (0, 1):
-            self.connection.execute(
-                "UPDATE entity SET parked = $value WHERE list_contains($nodes, node_id)",
-                {"value": bool(value), "nodes": np.flatnonzero(parked == value).tolist()},
-            )
+    def mark(self, table: str, name: str, values: NDArray[Any]) -> None:
+        """Add a column to the rows of a table that does not grow."""
+        first = 0
+        for staged in self._waiting[table]:
+            rows = len(next(iter(staged.values())))
+            staged[name] = kept(table, name, values[first : first + rows])
+            first += rows
 
     def settle(self, *, whole: bool) -> None:
         """Make room if the tables have grown; called between blocks.
@@ -327,107 +343,108 @@ class Staging:
             Whether the rows so far end with a bucket. Only then they can become a part: the pieces of a mask
             are merged within one.
         """
-        self.merge = self.merge or not whole
-        if whole and self._rows >= PART_ROWS:
-            self._write_part()
-        elif not whole and self._rows >= self._merge_at:
-            self._merge()
+        rows = sum(self._rows[table] for table in _GROWING)
+        if whole and (rows >= PART_ROWS or any(self._runs.values())):
+            for table in (*_GROWING, *_ALONG):
+                self.write(table)
+            self._texts[True] = {"": -1}
 
-    def _merge(self) -> None:
-        """Make one row of the pieces of a mask: blocks of crowded frames are small, and their edges many."""
-        left = self._rows
-        with translated(self._store):
-            for table, select in _MERGED.items():
-                plain = select.replace(" ORDER BY ALL", "").replace("\nORDER BY ALL", "")
-                left -= self._count(table)
-                self._run(f"CREATE OR REPLACE TABLE {table} AS {plain}")
-                left += self._count(table)
-        self._bytes = self._bytes * left // max(self._rows, 1)
-        self._rows, self._merge_at = left, max(MERGE_ROWS, 2 * left)
+    def _merge(self, table: str) -> None:
+        """Make one row of the pieces of a mask; if these are many still, they wait in the file."""
+        merged = self._gathered(table)
+        rows = len(merged["mask"])
+        self._waiting[table], self._rows[table] = [merged], rows
+        if rows > self._most // 2:
+            self._runs[table].append(self._file.append(f"{table} run", merged))
+            self._waiting[table].clear()
+            self._rows[table] = 0
 
-    def _count(self, table: str) -> int:
-        (count,) = self.connection.execute(f"SELECT count(*) FROM {table}").fetchone() or (0,)
-        return int(count)
+    def _gathered(self, table: str) -> Columns:
+        """The rows of a table that are in memory, sorted."""
+        return in_order(table, chained(table, self._waiting.pop(table)), self._texts_of(table))
 
-    def _write_part(self) -> None:
-        with translated(self._store):
-            for table in _GROWING:
-                self._write(table, self._sorted(table), f"{table}-{self._parts:06}")
-                self.connection.execute(f"CREATE OR REPLACE TABLE {table} AS FROM {table} LIMIT 0")
-        self._parts += 1
-        self._rows = self._bytes = 0
-        self._merge_at = MERGE_ROWS
+    def _texts_of(self, table: str) -> list[str]:
+        return list(self._texts[table in _CUT])[1:]
 
-    def _write(self, table: str, select: str, name: str) -> None:
-        file = self.folder / f"{name}.parquet"
-        copy = f"COPY ({select}) TO {literal(str(file))} (FORMAT parquet)"
-        (self._written[file.name],) = self._run(copy).fetchone() or (0,)
-        self._files.setdefault(table, []).append(file.name)
+    def write(self, table: str) -> None:
+        """Write the rows of a table that wait, and forget them."""
+        texts = self._texts_of(table)
+        if self._runs[table]:
+            if self._waiting[table]:
+                self._runs[table].append(self._file.append(f"{table} run", self._gathered(table)))
+            for columns in self._merged_runs(table, self._runs.pop(table)):
+                self._put(table, columns, texts)
+        elif self._waiting[table]:
+            self._put(table, self._gathered(table), texts)
+        self._waiting.pop(table, None)
+        self._rows[table] = 0
 
-    def all_messages(self) -> str:
-        """A statement that gives all messages, in no order."""
-        if not self._parts:
-            return "SELECT * FROM message"
-        files = literal(f"{escape(str(self.folder))}/message-*.parquet")
-        return f"SELECT * FROM read_parquet({files}) UNION ALL SELECT * FROM message"
+    def _put(self, table: str, columns: Columns, texts: list[str]) -> None:
+        self.checksums[table].add(as_summed(table, columns, texts))
+        count = len(next(iter(columns.values())))
+        of_text = [name for name in columns if types_of(table)[name] in TEXTS]
+        for first in range(0, count, PIECE_ROWS):
+            some = {name: values[first : first + PIECE_ROWS] for name, values in columns.items()}
+            said: dict[str, list[str]] = {}
+            for name in of_text:
+                used = np.unique(some[name])
+                used = used[used >= 0]
+                said[name] = [texts[index] for index in used.tolist()]
+                at = np.searchsorted(used, some[name]).astype(np.int32)
+                some[name] = np.where(some[name] < 0, np.int32(-1), at)
+            self._file.append(table, some, said)
 
-    def seal(self) -> tuple[dict[str, list[str]], dict[str, Checksum]]:
-        """Write everything into files.
+    def _merged_runs(self, table: str, runs: list[Piece]) -> Iterator[Columns]:
+        """The rows of sorted runs, sorted: those with one value in the first column at a time."""
+        name, texts = _RUNS[table], self._texts_of(table)
+        firsts = [self._file.column(run, name) for run in runs]
+        for value in np.unique(np.concatenate([np.unique(first) for first in firsts])).tolist():
+            found: list[Columns] = []
+            for run, first in zip(runs, firsts, strict=True):
+                low, high = np.searchsorted(first, [value, value + 1]).tolist()
+                if low < high:
+                    found.append(self._file.read(run, low, high))
+                if sum(len(one["mask"]) for one in found) > 2 * self._most:
+                    found = [in_order(table, chained(table, found), texts)]
+            yield in_order(table, chained(table, found), texts)
 
-        Returns
-        -------
-        files : dict
-            Table → names of its files in the folder, in order; no table without rows.
-        checksums : dict
-            Table → checksum of its rows.
-        """
-        with translated(self._store):
-            for table in sorted(self._tables):
-                if not self.connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone():
-                    continue
-                if table in _GROWING:
-                    self._write(table, self._sorted(table), f"{table}-{self._parts:06}")
-                else:
-                    order = _ORDERS.get(table, "ALL")
-                    self._write(table, f"SELECT * FROM {table} ORDER BY {order}", table)
-            files = {
-                table: self._files[table] for table in sorted(self._files.keys() & self._tables)
-            }
-            return files, {table: self._checksum(table, names) for table, names in files.items()}
+    def messages(self) -> Iterator[Columns]:
+        """All messages, some at a time."""
+        for piece in self._file.pieces("message"):
+            yield self._file.read(piece)
+        yield from self._waiting["message"]
 
-    def _checksum(self, table: str, names: list[str]) -> Checksum:
-        """The checksum of the rows in files, as many at a time as fit into memory."""
-        checksum = Checksum()
-        select = expressions(self.connection, table)
-        for name in names:
-            file = literal(escape(str(self.folder / name)))
-            from_file = f"SELECT {select} FROM read_parquet({file}, file_row_number = true)"
-            for first in range(0, self._written[name], SUMMED_ROWS):
-                part = (
-                    f" WHERE file_row_number >= {first} AND file_row_number < {first + SUMMED_ROWS}"
-                )
-                whole = self._written[name] <= SUMMED_ROWS
-                rows = self._run(from_file + ("" if whole else part))
-                checksum.add(rows.fetchnumpy())
-        return checksum
-
-    def _sorted(self, table: str) -> str:
-        return _MERGED[table] if self.merge and table in _MERGED else _GROWING[table]
+    def seal(self) -> None:
+        """Write everything into the file; nothing can be added then."""
+        for table in [*self._waiting, *self._runs]:
+            self.write(table)
+        self._file.close()
+        self.checksums.pop("message", None)
+        self.checksums = dict(sorted(self.checksums.items()))
 
 
-def _values(table: str, columns: Columns) -> str:
-    """SQL that selects columns: enumerations by their codes, and NULL for missing values."""
-    enums = enums_of(table)
-    listed: list[str] = []
-    for name, values in columns.items():
-        missing = {"i": str(MISSING), "O": "''"}.get(values.dtype.kind)
-        known = f'nullif("{name}", {missing})' if missing else f'"{name}"'
-        if values.dtype.kind == "f":
-            known = f'CASE WHEN isfinite("{name}") THEN "{name}" END'
-        elif name in enums:
-            known = f"enum_range(NULL::{enums[name]})[{known} + 1]::{enums[name]}"
-        listed.append(f'{known} AS "{name}"')
-    return ", ".join(listed)
+def chained(table: str, blocks: list[Columns]) -> Columns:
+    """Staged rows of a table one behind the other, with all columns that any of them has."""
+    if len(blocks) == 1:
+        return blocks[0]
+    found: Columns = {}
+    for name in dict.fromkeys(name for block in blocks for name in block):
+        parts: list[NDArray[Any]] = []
+        texts = any(name in block and block[name].dtype.kind == "O" for block in blocks)
+        for block in blocks:
+            count = len(next(iter(block.values())))
+            if name in block:
+                parts.append(block[name])
+            else:
+                parts.append(np.full(count, "", object) if texts else blank(table, name, count))
+        found[name] = np.concatenate(parts)
+    return found
+
+
+# Databases in memory ------------------------------------------------------------------------------------------
+
+MEMORY: Final = 48 << 20
+"""Most memory of a database that publishes; bytes. Beyond it its tables spill to disk."""
 
 
 def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnection:
@@ -452,9 +469,9 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
     return connection
 
 
-# A trace that is ready to be published: files in a folder, and what is said of them -------------
+# A trace that is ready to be published: a file of tables in a folder, and what is said of them ----------------
 
-_FILE: Final = "sealed.json"
+_SAID: Final = "sealed.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -464,11 +481,12 @@ class Sealed:
     Attributes
     ----------
     folder : Path
+        Where its :class:`TableFile` is.
     path : Path
         The recording.
     identity : Identity
-    files : dict
-        Table → names of its Parquet files in the folder, in the order in which they are published.
+    trace : dict
+        Its row in table ``trace``, but for what the store gives it.
     checksums : dict
         Table → checksum of its rows.
     words : dict
@@ -478,7 +496,7 @@ class Sealed:
     folder: Path
     path: Path
     identity: Identity
-    files: dict[str, list[str]]
+    trace: dict[str, Any]
     checksums: dict[str, Checksum]
     words: dict[str, list[str]]
 
@@ -492,7 +510,7 @@ class Sealed:
         """
         values = asdict(self) | {"folder": "", "path": str(self.path)}
         try:
-            (self.folder / _FILE).write_text(json.dumps(values), encoding="utf-8")
+            (self.folder / _SAID).write_text(json.dumps(values), encoding="utf-8")
         except OSError as error:
             raise StoreError(f"{self.folder}: cannot be written: {error.strerror}") from error
 
@@ -506,14 +524,14 @@ class Sealed:
             There is nothing.
         """
         try:
-            values = json.loads((folder / _FILE).read_text(encoding="utf-8"))
+            values = json.loads((folder / _SAID).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise StoreError(f"{folder}: no segment that is complete: {error}") from error
         return cls(
             folder=folder,
             path=Path(values["path"]),
             identity=Identity.from_dict(values["identity"]),
-            files=values["files"],
+            trace=values["trace"],
             checksums={name: Checksum(**one) for name, one in values["checksums"].items()},
             words=values["words"],
         )

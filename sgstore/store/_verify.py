@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final
 import sgstore.store._schema as shape
 from sgstore.config import from_dict
 from sgstore.errors import SgstoreError, StoreError
+from sgstore.store._columns import Checksum, expressions
 from sgstore.store._locking import Access, translated
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED, checksum_of, owned
-from sgstore.store._staging import Checksum, expressions
 from sgstore.store._traces import stored_traces
 from sgstore.world import BUCKET_FRAMES
 

@@ -7,6 +7,7 @@ at all.
 from __future__ import annotations
 
 from dataclasses import asdict
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -15,12 +16,11 @@ import sgstore.store._packing as packing
 import sgstore.store._payloads as payloads
 from sgstore.errors import StoreError
 from sgstore.store._classes import IngestedClasses
-from sgstore.store._locking import translated
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
-from sgstore.store._payloads import Happenings
-from sgstore.store._publish import fill_trace, publish_in
+from sgstore.store._payloads import FrameTimes, Happenings
+from sgstore.store._publish import publish_in
 from sgstore.store._staging import Sealed, Staging
-from sgstore.world import BUCKET_FRAMES, Origin, origin_of, quantize
+from sgstore.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -85,6 +85,8 @@ class Segment:
         self._classes = IngestedClasses(road_map)
         self._happenings = Happenings(identity.trace_id)
         self._next_seq = 0
+        self._times: list[Ints] = []
+        self._constants = {name: [np.zeros(0, object)] for name in ("special", "subkind")}
         self._staging = Staging(store, place)
         try:
             self._insert_about()
@@ -229,31 +231,70 @@ class Segment:
         if not self._next_seq:
             raise ValueError("a trace without frames")
         staging, identity = self._staging, self._identity
-        with translated(self._store):
-            staging.insert("event", self._owned(self._happenings.rest()))
-            if parked is not None:
-                staging.mark_parked(parked)
-            payloads.join(
-                staging.connection,
-                staging.all_messages(),
-                self._info.channels,
-                self._periods,
-                identity.payloads,
-            )
-            origin = self._origin or Origin(0.0, 0.0, 0.0)
-            values = {
-                "origin_x": origin.x,
-                "origin_y": origin.y,
-                "origin_z": origin.z,
-                "answers": list(self._answers),
-                "report": packing.as_json(asdict(report) | dict(more or {})),
-            }
-            fill_trace(staging.connection, self._info, identity, values)
-            files, checksums = staging.seal()
-        words = staging.words(self._answers)
-        sealed = Sealed(staging.folder, self._info.path, identity, files, checksums, words)
+        time_ns, log_time_ns = np.concatenate(self._times, axis=1)
+        staging.insert("event", self._owned(self._happenings.rest()))
+        if parked is not None:
+            staging.mark("entity", "parked", self._parked(parked))
+        for columns in payloads.joined(
+            FrameTimes(log_time_ns),
+            staging.messages,
+            self._info.channels,
+            self._periods,
+            identity.payloads,
+        ):
+            self._insert_payloads(columns)
+        period_ns = _period_ns(time_ns)
+        staging.insert("bucket", self._owned(self._bucket_columns(time_ns, period_ns)))
+        staging.seal()
+        origin = self._origin or Origin(0.0, 0.0, 0.0)
+        trace = {"map_id": None} | identity.numbers | {
+            "trace_id": identity.trace_id,
+            "flavour": self._info.flavour,
+            "ego": identity.ego or None,
+            "since": identity.since,
+            "until": identity.until,
+            "frames": len(time_ns),
+            "start_ns": int(time_ns[0]),
+            "end_ns": int(time_ns[-1]),
+            "period_ns": period_ns,
+            "origin_x": origin.x,
+            "origin_y": origin.y,
+            "origin_z": origin.z,
+            "answers": list(self._answers),
+            "report": packing.as_json(asdict(report) | dict(more or {})),
+            "version": version("sgstore"),
+        }  # fmt: skip
+        words, path = staging.words(self._answers), self._info.path
+        sealed = Sealed(staging.folder, path, identity, trace, staging.checksums, words)
         sealed.write()
         return sealed
+
+    def _parked(self, parked: Codes) -> Ints:
+        known = np.full(len(self._kinds.entities), packing.MISSING)
+        known[: len(parked)] = packing.unless(parked, parked < 0)[: len(known)]
+        return known
+
+    def _insert_payloads(self, columns: Columns) -> None:
+        seq = columns.pop("seq")
+        bucket = packing.trace_bucket(self._identity.trace_id, seq)
+        places = {"bucket": bucket, "bit": seq % BUCKET_FRAMES, **columns}
+        self._staging.insert("payload", self._owned(places))
+        self._staging.write("payload")
+
+    def _bucket_columns(self, time_ns: Ints, period_ns: int) -> Columns:
+        """Table ``bucket``: the frames of each, and which of them follow on the one before."""
+        seq = np.arange(len(time_ns))
+        one = np.left_shift(1, seq % BUCKET_FRAMES)
+        step = np.diff(time_ns, prepend=time_ns[0])
+        joined = (seq > 0) & (step >= 0) & (step <= longest_step_ns(period_ns))
+        starts = seq[::BUCKET_FRAMES]
+        columns = {
+            "bucket": packing.trace_bucket(self._identity.trace_id, starts),
+            "valid": np.bitwise_or.reduceat(one, starts),
+            "joined": np.bitwise_or.reduceat(np.where(joined, one, 0), starts),
+        }
+        number = self._identity.numbers.get("map_id")
+        return columns if number is None else columns | {"map_id": np.full(len(starts), number)}
 
     def _insert_about(self) -> None:
         """Insert all that is known before the first frame: recording, settings, channels, context and map."""
@@ -293,8 +334,10 @@ class Segment:
         if self._road_map is not None:
             of_frames["map_id"] = np.full(len(graph.frames), self._identity.numbers["map_id"])
         insert("frame", self._owned(of_frames))
-        insert("entity", self._owned(packing.entity_columns(graph, origin)))
-        insert("state", packing.state_columns(graph, trace_id, kinds, origin))
+        entities = packing.entity_columns(graph, origin)
+        insert("entity", self._owned(entities))
+        states = packing.state_columns(graph, trace_id, kinds, origin)
+        insert("state", states | self._constants_of(entities, graph.frames.states.node))
         insert("node", packing.node_columns(graph, trace_id, kinds))
         for columns in packing.edge_columns(graph, trace_id, kinds):
             insert("edge", columns)
@@ -305,15 +348,31 @@ class Segment:
             insert(table, columns)
         messages = packing.message_columns(graph.frames.messages, self._channel_ids)
         insert("message", messages)
+        self._times.append(np.stack([graph.frames.time_ns, graph.frames.log_time_ns]))
         self._periods.see(payloads.FRAMES, graph.frames.log_time_ns)
         channel = messages["channel"]
         for number in np.unique(channel).tolist():
             self._periods.see(number, messages["log_time_ns"][channel == number])
 
+    def _constants_of(self, entities: Columns, node: Ints) -> Columns:
+        """Columns of states that are constants of their entities, where any entity so far has one."""
+        found: Columns = {}
+        for name, known in self._constants.items():
+            known[:] = [np.concatenate([*known, entities[name]])]
+            if any(known[0]):
+                found[name] = known[0][node]
+        return found
+
     def _owned(self, columns: Columns) -> Columns:
         """The columns, and whose they are."""
         count = len(next(iter(columns.values())))
         return columns | {"trace_id": np.full(count, self._identity.trace_id)}
+
+
+def _period_ns(time_ns: Ints) -> int:
+    """Median difference of consecutive frames, of two in the middle the lower; 0 for one frame."""
+    steps = np.sort(np.diff(time_ns))
+    return int(steps[(len(steps) - 1) // 2]) if len(steps) else 0
 
 
 def _map_tables(road_map: RoadMap) -> dict[str, Columns]:

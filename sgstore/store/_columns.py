@@ -1,0 +1,350 @@
+"""Columns of the tables of a store as arrays: their types, their order, and checksums of their rows.
+
+Checksums of rows: the same for the same rows in any order, in any version of the database.
+
+A row becomes 64 bits, mixed from the bits of its values, and the checksum is their sum modulo 2⁶⁴. So rows can
+come in parts and be stored in any order. The mixing is SplitMix64's (Steele, Lea, Flood: Fast splittable
+pseudorandom number generators, 2014): it is no cipher, and tells what happens by chance, not by intent.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import StoreError
+from sgstore.quoting import quoted
+from sgstore.store._packing import MISSING
+from sgstore.store._schema import INSIDE, code_sql, enums_of, expected, own_labels
+from sgstore.vocabulary import NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.store._packing import Columns
+    from sgstore.world import Ints
+
+    Words = NDArray[np.uint64]
+
+
+# Types ------------------------------------------------------------------------------------------------------
+
+MESSAGES: Final = {
+    "channel": "INTEGER",
+    **dict.fromkeys(("log_time_ns", "chunk_offset", "offset", "length"), "BIGINT"),
+}
+"""Columns of the messages that were seen, which are staged like a table until they are joined to frames."""
+
+TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP", "UUID"}
+
+_WHOLE: Final = {
+    "BIGINT": np.dtype(np.int64),
+    **dict.fromkeys(("INTEGER", "SMALLINT", "TINYINT", "BOOLEAN"), np.dtype(np.int32)),
+}
+_FLOATS: Final = {"FLOAT": np.dtype(np.float32), "DOUBLE": np.dtype(np.float64)}
+
+
+@cache
+def types_of(table: str) -> Mapping[str, str]:
+    """Columns of a table of ``schema.sql`` with their types; of an enumeration ``ENUM``."""
+    if table == "message":
+        return MESSAGES
+    found: dict[str, str] = {}
+    depth, name = 0, ""
+    for word in expected().tables[table][4:-1]:
+        depth += (word == "(") - (word == ")")
+        if word == "," and not depth:
+            name = ""
+        elif not name:
+            name = word
+        elif name not in found:
+            found[name] = word
+        elif word == "[":
+            found[name] += "[]"
+    return found
+
+
+def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A column of numbers as it is staged: what is missing is NaN or :data:`MISSING`.
+
+    Raises
+    ------
+    StoreError
+        A number is too large for the column.
+    """
+    kind = types_of(table)[name]
+    if kind in _FLOATS:
+        plain = values.astype(_FLOATS[kind], copy=False)
+        odd = np.isinf(plain)
+        return np.where(odd, plain.dtype.type(np.nan), plain) if odd.any() else plain
+    wanted = _WHOLE.get(kind, np.dtype(np.int32))
+    if values.dtype.kind == "f":
+        known = np.isfinite(values)
+        values = np.where(known, np.rint(np.where(known, values, 0)), MISSING).astype(np.int64)
+    if values.dtype.itemsize > wanted.itemsize:
+        bound = np.iinfo(wanted)
+        if len(values) and not bound.min <= values.min() <= values.max() <= bound.max:
+            raise StoreError(f"a number is too large for {table}.{name}")
+        return values.astype(wanted)
+    return values
+
+
+def blank(table: str, name: str, count: int) -> NDArray[Any]:
+    """A staged column in which nothing is known."""
+    kind = types_of(table)[name]
+    if kind in _FLOATS:
+        return np.full(count, np.nan, _FLOATS[kind])
+    if kind in TEXTS:
+        return np.full(count, -1, np.int32)
+    return np.full(count, MISSING, _WHOLE.get(kind, np.dtype(np.int32)))
+
+
+def missing_of(table: str, name: str, values: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Mask of what is missing in a staged column; ``None`` if nothing is."""
+    if types_of(table)[name] in TEXTS:
+        missing = values < 0
+    elif values.dtype.kind == "f":
+        missing = np.isnan(values)
+    elif values.dtype.kind == "i" and values.dtype.itemsize >= 4:
+        missing = values == MISSING
+    else:
+        return None
+    return missing if missing.any() else None
+
+
+# Orders -----------------------------------------------------------------------------------------------------
+
+ORDERS: Final = {
+    "state": "is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
+    "lane_state": "kind, frame_id >> 6, node_id, frame_id, lane",
+    "lane_gap": "frame_id >> 6, src, dst, frame_id",
+    "frame": "frame_id",
+    "payload": "channel_id, bucket, bit",
+    "map_node": "node_id DESC",
+    "message": "",
+}
+"""Order of the rows of tables, in a trace and in a store that is written anew; others go by all columns."""
+
+MASKS: Final = (
+    *("node", "edge", "frame_class", "lane_role", "later_class", "derived_node", "derived_edge"),
+)
+"""Tables with a mask: rows that differ in nothing else are one."""
+
+
+@cache
+def _keys(table: str) -> tuple[tuple[str, int, bool], ...]:
+    """Columns by which a table is sorted: how far each is shifted to the right, and whether it descends."""
+    if table not in ORDERS:
+        names = [name for name in types_of(table) if name != "mask" or table not in MASKS]
+        return tuple((name, 0, False) for name in names)
+    found: list[tuple[str, int, bool]] = []
+    for term in filter(None, ORDERS[table].split(", ")):
+        name, *words = term.split()
+        shift = int(words[words.index(">>") + 1]) if ">>" in words else 0
+        found.append((name, shift, "DESC" in words))
+    return tuple(found)
+
+
+def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
+    """The rows of a table, sorted; those that differ in their masks only as one.
+
+    Parameters
+    ----------
+    table : str
+    columns : dict
+        As they are staged: texts as indices into ``texts``, -1 where there is none.
+    texts : sequence of str
+    """
+    rank = np.empty(len(texts) + 1, np.int64)
+    rank[sorted(range(len(texts)), key=texts.__getitem__)] = np.arange(len(texts))
+    rank[-1] = len(texts)
+    keys: list[NDArray[Any]] = []
+    for name, shift, down in _keys(table):
+        if name not in columns:
+            continue
+        key = columns[name]
+        if types_of(table)[name] in TEXTS:
+            key = rank[key]
+        elif key.dtype.kind == "i" and (missing := missing_of(table, name, key)) is not None:
+            key = np.where(missing, np.iinfo(key.dtype).max, key)  # NULL comes last
+        key = key >> shift if shift else key
+        keys.append(-key.astype(np.int64) if down else key)
+    if not keys or len(keys[0]) < 2:
+        return columns
+    packed = _packed(keys)
+    order = np.lexsort(keys[::-1]) if packed is None else np.argsort(packed)
+    if table not in MASKS:
+        return {name: values[order] for name, values in columns.items()}
+    ranked = keys if packed is None else [packed]
+    fresh = np.ones(len(order), np.bool_)
+    fresh[1:] = False
+    for key in (key[order] for key in ranked):
+        fresh[1:] |= key[1:] != key[:-1]
+    first = np.flatnonzero(fresh)
+    whole = {name: values[order[first]] for name, values in columns.items()}
+    if len(first) < len(order):
+        whole["mask"] = np.bitwise_or.reduceat(columns["mask"][order], first)
+    return whole
+
+
+def _packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
+    """Keys as one number that sorts as they do; ``None`` if that would be too large."""
+    if any(key.dtype.kind == "f" for key in keys):
+        return None
+    bounds = [(int(key.min()), int(key.max())) for key in keys]
+    if math.prod(high - low + 1 for low, high in bounds) >= 1 << 62:
+        return None
+    packed = np.zeros(len(keys[0]), np.int64)
+    for key, (low, high) in zip(keys, bounds, strict=True):
+        if low < high:
+            packed *= high - low + 1
+            packed += key
+            packed -= low
+    return packed
+
+
+# Checksums --------------------------------------------------------------------------------------------------
+
+_STEP: Final = 0x9E3779B97F4A7C15
+_FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND: Final = np.uint64(0x94D049BB133111EB)
+_MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
+"""What stands for NULL."""
+
+_AT_ONCE: Final = 1 << 13
+"""Rows that are mixed together: their words stay in the cache of a processor."""
+
+_ASSIGNED: Final = {
+    ("trace", "name"),
+    ("trace", "ingested_at"),
+    ("map", "name"),
+    ("recording", "place"),
+}
+"""Tables and columns to which a store gives a value of its own."""
+
+
+@dataclass(slots=True)
+class Checksum:
+    """Checksum of some rows.
+
+    Attributes
+    ----------
+    rows : int
+    value : int
+        0 … 2⁶³ - 1.
+    """
+
+    rows: int = 0
+    value: int = 0
+
+    def add(self, columns: Mapping[str, NDArray[Any] | None]) -> None:
+        """Add rows, as columns of numbers and truth values, masked where missing; ``None``: all are missing."""
+        count = next((len(values) for values in columns.values() if values is not None), 0)
+        hashes, words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(3))
+        for first in range(0, count, _AT_ONCE):
+            here = slice(first, min(first + _AT_ONCE, count))
+            size = here.stop - first
+            mixed, word, spare = hashes[:size], words[:size], shifted[:size]
+            mixed[:] = 0
+            for number, name in enumerate(sorted(columns)):
+                values = columns[name]
+                if values is None:
+                    word[:] = _MISSING
+                else:
+                    _words(values[here], word)
+                word ^= np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
+                mixed += word
+                _mix(mixed, spare)
+            self.value = (self.value + int(mixed.sum(dtype=np.uint64))) & 0x7FFFFFFFFFFFFFFF
+        self.rows += count
+
+
+def _mix(words: Words, spare: Words) -> None:
+    for shift, factor in ((30, _FIRST), (27, _SECOND), (31, None)):
+        np.right_shift(words, np.uint64(shift), out=spare)
+        words ^= spare
+        if factor is not None:
+            words *= factor
+
+
+def _words(values: NDArray[Any], out: Words) -> None:
+    """The bits of values as words of 64."""
+    plain = np.ma.getdata(values)
+    if plain.dtype.kind == "f":
+        plain = plain + plain.dtype.type(0)  # one zero: DuckDB 1.5 does not keep the sign of it
+        out[:] = plain.view(np.uint32 if plain.dtype.itemsize == 4 else np.uint64)
+    else:
+        out.view(np.int64)[:] = plain
+    if (missing := np.ma.getmask(values)) is not np.ma.nomask:
+        out[missing] = _MISSING
+
+
+def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, NDArray[Any] | None]:
+    """Staged columns as :meth:`Checksum.add` takes them, those that are not there among them."""
+    enums = enums_of(table)
+    found: dict[str, NDArray[Any] | None] = {}
+    for name, kind in types_of(table).items():
+        values = columns.get(name)
+        if (table, name) in _ASSIGNED:
+            continue
+        if values is not None:
+            missing = missing_of(table, name, values)
+            if kind in TEXTS:
+                values = np.array([*(_number(kind, text) for text in texts), 0], np.int64)[values]
+            elif name in enums:
+                values = _coded(enums[name], values)
+            if missing is not None:
+                values = np.ma.MaskedArray(values, missing)
+        found[name] = values
+    return found
+
+
+def _number(kind: str, text: str) -> int:
+    """60 bits of the MD5 of a text, as the database writes it."""
+    if kind == "UUID" and "-" not in text:
+        text = "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:]))
+    return int(hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()[:15], 16)
+
+
+def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
+    """Codes of an enumeration; of what ``schema.sql`` has not, a number that is the same in every store."""
+    own = len(own_labels(enum))
+    if codes.max(initial=0) < own:
+        return codes
+    names = NAMES[enum]
+    table = [*range(own), *(_number("VARCHAR", name) for name in names[own:])]
+    return np.array(table, np.int64)[np.maximum(codes, 0)]
+
+
+def columns_of(
+    connection: DuckDBPyConnection, table: str, catalog: str = ""
+) -> list[tuple[str, str]]:
+    """Names and types of the columns of a table of the schema; ``duckdb_columns()`` would bind every view."""
+    place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
+    rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
+    return [(name, kind) for name, kind, *_ in rows]
+
+
+def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
+    """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them.
+
+    Numbers are as they are, enumerations their codes, texts 60 bits of their MD5.
+    """
+    listed: list[str] = []
+    for name, kind in columns_of(connection, table, catalog):
+        value = f'"{name}"'
+        if kind.startswith("ENUM"):
+            value = code_sql(value, kind)
+        elif kind in TEXTS:
+            value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
+        if (table, name) not in _ASSIGNED:
+            listed.append(f'{value} AS "{name}"')
+    return ", ".join(listed)
