@@ -280,6 +280,31 @@ def test_a_store_that_was_good_is_looked_at_again_once_it_has_changed(store: Any
                 ask()
 
 
+def test_a_store_that_this_process_has_made_is_looked_at_once_it_was_altered(
+    tmp_path: Path,
+) -> None:
+    for name in ("a", "b"):  # the second one is written as the first one was
+        StoreFile.create(tmp_path / name)
+        change(tmp_path / name, "CREATE OR REPLACE VIEW lanes AS SELECT 1 AS x")
+
+        with pytest.raises(StoreError, match="view 'lanes' is not the one"):
+            StoreFile(tmp_path / name)
+
+
+def test_a_store_is_not_taken_for_new_if_a_log_lies_where_it_is_made(tmp_path: Path) -> None:
+    first, second = StoreFile.create(tmp_path / "a"), tmp_path / "b"
+    alters = (
+        "import duckdb, os; c = duckdb.connect({!r}); c.execute('PRAGMA disable_checkpoint_on_shutdown');"
+        " c.execute('CREATE OR REPLACE VIEW lanes AS SELECT 1 AS x'); os._exit(0)"
+    )
+    subprocess.run([sys.executable, "-c", alters.format(str(first.path))], check=True)
+    (tmp_path / "a.wal").rename(tmp_path / "b.wal")
+
+    with pytest.raises(StoreError, match="view 'lanes' is not the one"):
+        StoreFile.create(second).traces()
+    assert first.traces() == ()
+
+
 def test_verify_says_every_object_that_was_altered(run: Any, store: Any) -> None:
     change(
         store,

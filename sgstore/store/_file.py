@@ -92,6 +92,8 @@ class StoreFile:
         Tables of users' own that are seen beside its views.
     root : str or Path, optional
         Where the recordings of the data set are now; see :func:`sgstore.store._traces.located`.
+    made : bool
+        Whether this process has just made it, so that it need not be opened to see that it is a store.
 
     Raises
     ------
@@ -109,6 +111,7 @@ class StoreFile:
         tables: UserTables | None = None,
         spill: int = 0,
         root: str | Path | None = None,
+        made: bool = False,
     ) -> None:
         self.path = Path(path)
         self.tables = tables
@@ -126,8 +129,9 @@ class StoreFile:
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
         self._known: tuple[Stamp, Catalog] | None = None
-        with self.access.reading():  # what is no store of ours is refused there
-            pass
+        if not made:
+            with self.access.reading():  # what is no store of ours is refused there
+                pass
 
     @classmethod
     def create(cls, path: str | Path, *, memory: int = 0, wait_s: float = WAIT_S) -> StoreFile:
@@ -139,9 +143,10 @@ class StoreFile:
             What is there is no store, or one of another version; or its folder cannot be written.
         """
         path = Path(path)
-        if not path.exists():
+        made = not path.exists()
+        if made:
             anew.create(path)
-        return cls(path, memory=memory, wait_s=wait_s)
+        return cls(path, memory=memory, wait_s=wait_s, made=made)
 
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several questions: they see the same state, and cost less."""

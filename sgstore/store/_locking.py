@@ -297,6 +297,25 @@ _doors: dict[Path, _FileLock] = {}
 _doors_lock = threading.Lock()
 
 
+def _door_of(path: Path) -> _FileLock:
+    """The state of a file; what killed processes left beside it is removed when it is first asked for."""
+    with _doors_lock:
+        known = _doors.get(path.resolve())
+        door = known or _doors.setdefault(path.resolve(), _FileLock())
+    if known is None:  # once in the life of a process
+        remove_left_behind(path)
+    return door
+
+
+def trust(path: Path, made: os.stat_result) -> None:
+    """Remember that a file is a store as ours are, if it is the one that this process has just made."""
+    stamp = stamp_of(path)
+    if len(stamp) != 1:
+        return  # there is somebody's log beside it
+    if stamp[0][:4] == (made.st_dev, made.st_ino, made.st_size, made.st_mtime_ns):
+        _door_of(path).good = stamp
+
+
 class Access:
     """A DuckDB file that is opened only while it is used.
 
@@ -344,11 +363,7 @@ class Access:
         self._spill = spill or SPILL
         self._wait_s = wait_s
         refuse_odd_name(path)
-        with _doors_lock:
-            known = _doors.get(path.resolve())
-            self._door = known or _doors.setdefault(path.resolve(), _FileLock())
-        if known is None:  # once in the life of a process
-            remove_left_behind(path)
+        self._door = _door_of(path)
 
     @contextmanager
     def reading(self) -> Generator[DuckDBPyConnection]:

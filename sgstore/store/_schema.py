@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Tokens = tuple[str, ...]
+    Objects = tuple[tuple[str, str, str, str | Tokens], ...]
 
 
 INSIDE: Final = "inside"
@@ -155,10 +156,11 @@ def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
     ------
     StoreError
     """
-    other = other_version(_about(connection, database, path))
+    objects = objects_of(connection, database)
+    other = other_version(_about(connection, database, path, objects))
     if other:
         raise StoreError(f"{path}: {other}; {_REMEDY}")
-    faults = altered(connection, database)
+    faults = _altered(connection, database, objects)
     if faults:
         more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
         raise StoreError(
@@ -179,9 +181,10 @@ def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tu
         It is no store.
     """
     database = database_of(connection)
-    other = other_version(_about(connection, database, path))
-    wrong = [other] if other else altered(connection, database)
-    return wrong, tuple(others(connection, database))
+    objects = objects_of(connection, database)
+    other = other_version(_about(connection, database, path, objects))
+    wrong = [other] if other else _altered(connection, database, objects)
+    return wrong, tuple(others(objects))
 
 
 def database_of(connection: DuckDBPyConnection) -> str:
@@ -191,8 +194,10 @@ def database_of(connection: DuckDBPyConnection) -> str:
     return name
 
 
-def _about(connection: DuckDBPyConnection, database: str, path: Path) -> dict[str, str]:
-    about = about_store(connection, database)
+def _about(
+    connection: DuckDBPyConnection, database: str, path: Path, objects: Objects
+) -> dict[str, str]:
+    about = about_store(connection, database, objects)
     if about is None:
         raise StoreError(
             f"{path}: a DuckDB database, but not a store; expected a file that 'sgstore ingest' made"
@@ -200,12 +205,15 @@ def _about(connection: DuckDBPyConnection, database: str, path: Path) -> dict[st
     return about
 
 
-def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str] | None:
+def about_store(
+    connection: DuckDBPyConnection, database: str, objects: Objects
+) -> dict[str, str] | None:
     """Read version and digest of a store's schema from it; ``None`` if it is no store."""
-    schema = schema_of(connection, database)
-    made = _made(connection, database)["table", schema].get("store_info")
-    if made is None:
+    schema = schema_of(objects)
+    told = _info_of(objects).get(schema)
+    if told is None:
         return None
+    made = _statement(told)
     own, added = expected().tables["store_info"], {"NOT", "NULL"}  # to its columns, since
     if [word for word in made if word not in added] != [word for word in own if word not in added]:
         return {}  # whatever it is, it is not read
@@ -213,9 +221,18 @@ def about_store(connection: DuckDBPyConnection, database: str) -> dict[str, str]
     return {str(key): str(value) for key, value in rows.fetchall()}
 
 
-def schema_of(connection: DuckDBPyConnection, database: str) -> str:
+def schema_of(objects: Objects) -> str:
     """Return the schema in which a store has its tables: stores of before have them among the views."""
-    return INSIDE if "store_info" in _made(connection, database)["table", INSIDE] else "main"
+    return INSIDE if INSIDE in _info_of(objects) else "main"
+
+
+def _info_of(objects: Objects) -> dict[str, str]:
+    """The statement of the table that says what a store is, by the schema where it stands."""
+    return {
+        schema: str(told)
+        for what, schema, name, told in objects
+        if what == "table" and name.lower() == "store_info"
+    }
 
 
 def other_version(about: dict[str, str]) -> str:
@@ -240,25 +257,43 @@ def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
 
     Kinds, relations and states of lights may have come to those of ``schema.sql``; they are made known here.
     """
-    made = _made(connection, database)
+    return _altered(connection, database, objects_of(connection, database))
+
+
+def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) -> list[str]:
+    if objects not in _compared:
+        if len(_compared) >= _MOST_COMPARED:
+            _compared.clear()
+        _compared[objects] = tuple(_changed(objects, _expected_views(connection)))
+    found = [*_compared[objects], *_shadowing(connection, database)]
+    found += _attached(connection, database)
+    return found or [*_strange(objects)]
+
+
+_compared: dict[Objects, tuple[str, ...]] = {}
+"""Faults of the objects of stores that were compared: those of one store are mostly those of the next."""
+
+_MOST_COMPARED: Final = 64
+
+
+def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
+    """Objects that are not as ``schema.sql`` makes them, or stand where others of it are looked for."""
+    made = _made(objects)
     types = made["type", "main"]
-    labels = {enum: _labels(types.get(enum, ())) for enum in NAMES}
-    wider = [
-        (enum, types[enum])
-        for enum, some in labels.items()
-        if some[: len(own_labels(enum))] == own_labels(enum)
-    ]
-    shape = expected(*wider)
-    found = [*_differing("table", shape.tables, made["table", INSIDE], made["view", INSIDE])]
-    found += _differing(
-        "view", _expected_views(connection), made["view", "main"], made["table", "main"]
+    shape = expected(
+        *(
+            (enum, types[enum])
+            for enum in NAMES
+            if _labels(types.get(enum, ()))[: len(own_labels(enum))] == own_labels(enum)
+        )
     )
-    found += _differing("type", shape.types, types, {})
-    found += _misplaced(connection, database, shape)
-    found += (f"{INSIDE}.{name} takes the place of a type" for name in sorted(made["type", INSIDE]))
-    found += _shadowing(connection, database)
-    found += _attached(connection, database, shape)
-    return found or [*_strange(labels)]
+    yield from _differing("table", shape.tables, made["table", INSIDE], made["view", INSIDE])
+    yield from _differing("view", views, made["view", "main"], made["table", "main"])
+    yield from _differing("type", shape.types, types, {})
+    yield from _misplaced(objects, shape)
+    yield from (
+        f"{INSIDE}.{name} takes the place of a type" for name in sorted(made["type", INSIDE])
+    )
 
 
 # Kinds, relations, states of lights: a store made before holds a new one ------------------------------------
@@ -337,38 +372,29 @@ def code_sql(column: str, enum: str) -> str:
     return f"CASE WHEN {code} < {many} THEN {code} ELSE {number} END"
 
 
-def _strange(labels: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+def _strange(objects: Objects) -> Iterator[str]:
     """The values of enumerations that this process cannot take."""
-    for enum, some in labels.items():
-        for label in some[len(own_labels(enum)) :]:
+    labels = {
+        name: told for what, schema, name, told in objects if (what, schema) == ("type", "main")
+    }
+    for enum in NAMES:
+        for label in labels[enum][len(own_labels(enum)) :]:
             try:
                 learn(enum, label)
             except ValueError as error:
                 yield f"a {enum.replace('_', ' ')}: {error}"
 
 
-def others(connection: DuckDBPyConnection, database: str) -> list[str]:
+def others(objects: Objects) -> list[str]:
     """Tables and views in a store that are none of ours, sorted."""
-    schema = schema_of(connection, database)
-    ours = {(schema, name) for name in expected().tables}
+    inside = schema_of(objects)
+    ours = {(inside, name) for name in expected().tables}
     ours |= {("main", name) for name in expected().views}
     return sorted(
         name if schema == "main" else f"{schema}.{name}"
-        for schema, name in _all(connection, database)
-        if (schema, name.lower()) not in ours
+        for what, schema, name, _ in objects
+        if what != "type" and (schema, name.lower()) not in ours
     )
-
-
-def _all(connection: DuckDBPyConnection, database: str) -> list[tuple[str, str]]:
-    """The schemas and names of all tables and views."""
-    rows: list[tuple[str, str]] = []
-    for what, column in (("tables", "table_name"), ("views", "view_name")):
-        rows += connection.execute(
-            f"SELECT schema_name, {column} FROM system.main.duckdb_{what}()"
-            " WHERE database_name = ? AND internal = false",
-            [database],
-        ).fetchall()
-    return rows
 
 
 # Words ------------------------------------------------------------------------------------------------------
@@ -426,11 +452,9 @@ def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
 # What is there ----------------------------------------------------------------------------------------------
 
 
-def _made(
-    connection: DuckDBPyConnection, database: str
-) -> Mapping[tuple[str, str], dict[str, Tokens]]:
-    """The tables, views and types of our schemas, by what they are and the schema: statements by name."""
-    found: dict[tuple[str, str], dict[str, Tokens]] = defaultdict(dict)
+def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
+    """Read the tables, views and types of a database: kind, schema, name, and statement or values of each."""
+    found: list[tuple[str, str, str, str | Tokens]] = []
     for what, told in (("table", "sql"), ("view", "sql"), ("type", "labels")):
         rows = connection.execute(
             f"SELECT schema_name, {what}_name, {told} FROM system.main.duckdb_{what}s()"
@@ -438,11 +462,21 @@ def _made(
             [database],
         ).fetchall()
         for schema, name, made in rows:
-            if schema in {"main", INSIDE} and what == "type":
-                found[what, schema][name] = tuple(_words(_enum(made or ())))
-            elif schema in {"main", INSIDE}:
-                written = (made or "").rstrip().removesuffix(";")
-                found[what, schema][name.lower()] = _statement(written)
+            text = tuple(made or ()) if what == "type" else (made or "").rstrip().removesuffix(";")
+            found.append((what, schema, name, text))
+    return tuple(found)
+
+
+def _made(objects: Objects) -> Mapping[tuple[str, str], dict[str, Tokens]]:
+    """The tables, views and types of our schemas, by what they are and the schema: statements by name."""
+    found: dict[tuple[str, str], dict[str, Tokens]] = defaultdict(dict)
+    for what, schema, name, told in objects:
+        if schema not in {"main", INSIDE}:
+            continue
+        if isinstance(told, str):
+            found[what, schema][name.lower()] = _statement(told)
+        else:
+            found[what, schema][name] = tuple(_words(_enum(told)))
     return found
 
 
@@ -463,9 +497,11 @@ def _differing(
             yield f"{what} {name!r} is not the one that sgstore makes"
 
 
-def _misplaced(connection: DuckDBPyConnection, database: str, shape: Shape) -> Iterator[str]:
+def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
     """Tables and views of somebody else's that are called like ours and would be found in their place."""
-    for schema, name in sorted(_all(connection, database)):
+    for schema, name in sorted(
+        (schema, name) for what, schema, name, _ in objects if what != "type"
+    ):
         ours = {"main": shape.tables, INSIDE: shape.views}.get(schema, {})
         if name.lower() in ours:
             yield f"{schema}.{name} takes the place of {'a table' if schema == 'main' else 'a view'}"
@@ -494,8 +530,9 @@ def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
             yield f"there is a schema {name!r}"
 
 
-def _attached(connection: DuckDBPyConnection, database: str, shape: Shape) -> Iterator[str]:
+def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
     """Triggers and indexes on tables of ours."""
+    ours = {*expected().tables, *expected().views}
     for what in ("trigger", "index"):
         plural = {"trigger": "triggers", "index": "indexes"}[what]
         try:
@@ -507,7 +544,7 @@ def _attached(connection: DuckDBPyConnection, database: str, shape: Shape) -> It
         except duckdb.CatalogException:  # DuckDB 1.5 has no triggers, and reads no store that has
             continue
         for schema, table, name in rows:
-            if schema in {"main", INSIDE} and table.lower() in (*shape.tables, *shape.views):
+            if schema in {"main", INSIDE} and table.lower() in ours:
                 yield f"table {table!r} has the {what} {name!r}"
 
 
