@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
-from sgstore.columns import chained, taken
+from sgstore.columns import taken
 from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sgstore.world import Codes, Floats, FrameBlock, Ints
 
     Places = Sequence[tuple[int, float]]
-    Whole = NDArray[np.integer[Any]]
+    Whole = NDArray[np.signedinteger[Any]]
     Attributes = dict[str, Any]
     EdgeRecord = tuple[int, str, int, Attributes]
 
@@ -41,18 +41,18 @@ class Edges:
 
     Attributes
     ----------
-    frame : int64
+    frame : int32 or int64
         Frame, counted in the block.
     relation : int8
         Codes of :data:`sgstore.vocabulary.RELATIONS`.
-    src, dst : int64
+    src, dst : int32 or int64
         Node ids: 0 and above in the trace, below zero in the map.
     """
 
-    frame: Ints
+    frame: Whole
     relation: Codes
-    src: Ints
-    dst: Ints
+    src: Whole
+    dst: Whole
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -68,10 +68,16 @@ class Edges:
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
-        """Edges of all parts, one part after another; of no part none."""
-        none = np.empty(0, dtype=np.int64)
-        parts = parts or [cls(none, none.astype(np.int8), none, none)]
-        return chained(parts)
+        """Edges of all parts, one part after another, in columns of int32; of no part none."""
+        none = np.empty(0, np.int8)
+        parts = [cls(none, none, none, none), *parts]
+        frame, src, dst = (
+            np.concatenate(
+                [getattr(part, name) for part in parts], dtype=np.int32, casting="same_kind"
+            )
+            for name in ("frame", "src", "dst")
+        )
+        return cls(frame, np.concatenate([part.relation for part in parts]), src, dst)
 
 
 @dataclass(frozen=True, slots=True)
@@ -589,13 +595,13 @@ def edge_attributes(
     return known
 
 
-def _divided(frame: Ints, frames: int) -> list[slice]:
+def _divided(frame: Whole, frames: int) -> list[slice]:
     """Rows of each frame, of a column that ascends."""
     ends = np.searchsorted(frame, np.arange(frames + 1)).tolist()
     return [slice(*pair) for pair in pairwise(ends)]
 
 
-def _narrow(nodes: Ints) -> Whole:
+def _narrow(nodes: Whole) -> Whole:
     """The same node ids in half the space, unless one of them is larger than it takes."""
     narrow = nodes.astype(np.int32)
     return narrow if np.array_equal(narrow, nodes) else nodes

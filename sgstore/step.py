@@ -50,7 +50,7 @@ from sgstore.world import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from sgstore.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph
+    from sgstore.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph, Whole
     from sgstore.roads import RoadMap
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Codes, Floats, Ints
@@ -492,7 +492,7 @@ def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attribut
         yield frame, a, b, _numbers({"gap": gap})
 
 
-def _outward(nodes: Ints, outer: Ints) -> Ints:
+def _outward(nodes: Whole, outer: Ints) -> Ints:
     """Node ids of the records for those of a block."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
 

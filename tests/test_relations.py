@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 from builders import PaperMap, Patch, Place, Recording, Thing, edges, frames, graph_of, thing
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sgstore.config import Config, Direction, PairSettings, Proximity, RangeSettings
@@ -431,7 +431,7 @@ def defined(things: list[Thing], radius: float = 50) -> set[tuple[str, str, str]
     inside = [t for t in things if in_range(t, ego, radius)]
     of: set[tuple[str, str, str]] = set()
     for a in inside:
-        of |= standing(a, ego, radius)
+        of |= standing(a, inside, radius)
         for b in inside:
             if a is not b and related(a, b):
                 of |= seen(a, b)
@@ -502,15 +502,17 @@ def seen(a: Thing, b: Thing) -> set[tuple[str, str, str]]:
     return of
 
 
-def standing(t: Thing, ego: Thing, radius: float) -> set[tuple[str, str, str]]:
-    """The lanes it is in; for a signal, the lanes in range that it controls."""
+def standing(t: Thing, inside: list[Thing], radius: float) -> set[tuple[str, str, str]]:
+    """The lanes it is in; for a signal, the lanes that it controls and that are in range or stood on."""
     if t.kind in SIGNALS:
-        around = shapely.Point(ego.x, ego.y).buffer(radius, 500)
-        lanes = [p for p in TOWN.patches if t.map_ref and p.controlled_by == t.map_ref]
-        near = [p.name for p in lanes if TOWN.shapes[p.name].intersects(around)]
-        return {(t.name, "controlsTrafficOf", name) for name in near}
-    box = np.array([t.x, t.y, t.heading, t.length, t.width])
-    touched = [p for kind in ("lane", "crosswalk") for p, _ in TOWN.touched(box, bottom(t), kind)]
+        centre = shapely.Point(inside[0].x, inside[0].y)
+        near = {name for name, shape in TOWN.shapes.items() if shape.distance(centre) <= radius}
+        for other in inside:
+            if other.kind not in SIGNALS:
+                near |= {p.name for p in touched_by(other, "lane")}
+        lanes = [p.name for p in TOWN.patches if t.map_ref and p.controlled_by == t.map_ref]
+        return {(t.name, "controlsTrafficOf", name) for name in lanes if name in near}
+    touched = touched_by(t, "lane", "crosswalk")
     of = {(t.name, "isIn", p.name) for p in touched}
     users = (*VEHICLES, "person", "animal", "prop")
     if (t.kind in users or not t.static) and not any(
@@ -520,7 +522,13 @@ def standing(t: Thing, ego: Thing, radius: float) -> set[tuple[str, str, str]]:
     return of
 
 
+def touched_by(t: Thing, *kinds: str) -> list[Patch]:
+    box = np.array([t.x, t.y, t.heading, t.length, t.width])
+    return [p for kind in kinds for p, _ in TOWN.touched(box, bottom(t), kind)]
+
+
 @given(st.integers(0, 2**32), st.integers(2, 25), st.sampled_from([8, 30, 70]))
+@example(410388, 5, 70)  # a lane out of range in which a body in range stands
 @settings(max_examples=60, deadline=None)
 def test_relations_equal_their_definition_on_random_scenes(
     seed: int, count: int, size: float

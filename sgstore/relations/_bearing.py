@@ -17,14 +17,25 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.graph import Edges
 from sgstore.relations._pairs import are_of_kinds
-from sgstore.relations._scene import BlockScene, Relation, edges_between
+from sgstore.relations._scene import (
+    BlockScene,
+    Relation,
+    edges_of_pairs,
+    even_parts,
+    span_up_to,
+)
 from sgstore.vocabulary import DIRECTIONS, RELATION_CODE, SIDES
 
 if TYPE_CHECKING:
-    from sgstore.config import Config
-    from sgstore.graph import Edges
+    from numpy.typing import NDArray
+
+    from sgstore.config import Config, Direction
+    from sgstore.relations._scene import BodyPairs
     from sgstore.world import Bools, Floats
+
+    Rows = NDArray[np.intp]
 
 
 NOISE: Final = 1e-6
@@ -34,31 +45,79 @@ BESIDE: Final = 1e-3
 """What is not farther off the axis is neither left nor right; m."""
 
 
-def _seen(scene: BlockScene) -> Bools:
-    """Mask of the pairs that the settings tell directions of, and whose bearing is known."""
+TINY: Final = np.float32(1e-30)
+"""Distances that numbers of 32 bits no longer tell; m."""
+
+DOUBT: Final = 4e-6
+"""Directions this close to a bound are computed as bearings: more than :data:`NOISE` counts for; rad."""
+
+
+# Sectors and sides are told by products of vectors, which are quick. Where these are within their rounding of a
+# bound, or something is missing, the bearing itself is computed: the definition.
+
+
+def _wanted(scene: BlockScene) -> Bools | None:
+    """Mask of the pairs that the settings tell directions of; None: all."""
     settings, pairs = scene.config.direction, scene.pairs
-    seen = ~np.isnan(pairs.bearing)
+    wanted: Bools | None = None
     if settings.within > 0:
-        seen &= pairs.distance <= settings.within
+        near = pairs.span <= span_up_to(settings.within, scene.config.proximity.between)
+        wanted = np.concatenate([near, near])
     if settings.kinds:
-        seen &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
-    return seen
+        listed = are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
+        wanted = listed if wanted is None else wanted & listed
+    return wanted
 
 
 def _direction_edges(scene: BlockScene) -> Edges:
     settings, pairs = scene.config.direction, scene.pairs
-    seen = np.flatnonzero(_seen(scene) & bool(settings.names))
+    if not settings.names:
+        return Edges.chained([])
+    names = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
+    codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
+    bounds = [
+        (np.float32(np.sin(bound)), np.float32(np.cos(bound)))
+        for bound in np.radians(settings.upper) + NOISE
+    ]
+    ahead, left = pairs.offsets
+    for part in even_parts(len(pairs)):
+        onward, aside = ahead[part], np.abs(left[part])
+        sector, least = np.zeros(len(aside), np.int8), np.abs(onward) + aside
+        reach = least * np.float32(DOUBT)
+        for sin, cos in bounds:
+            short_of = (
+                sin * onward - cos * aside
+            )  # the distance times the sine of what is left to the bound
+            sector += short_of < 0
+            least = np.minimum(least, np.abs(short_of))
+        codes[part] = names[sector]
+        holds[part] = least > reach + TINY
+    wanted = _wanted(scene)
+    doubtful = np.flatnonzero(~holds if wanted is None else ~holds & wanted)
+    rows, sectors = _by_bearing(settings, pairs, doubtful)
+    if wanted is not None:
+        holds &= wanted
+    sure = edges_of_pairs(pairs, codes, holds, seen_by_a=True)
+    if not len(rows):
+        return sure
+    frame, a, b = (column[rows] for column in pairs.ends)
+    return Edges.chained([sure, Edges(frame, names[sectors], b, a)])
+
+
+def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
+    """Of some pairs, rows and sectors, by the bearings; two of what is on a bound, if the settings say so."""
+    bearing = pairs.bearings(rows)
+    known = ~np.isnan(bearing)
+    rows, bearing = rows[known], bearing[known]
     bounds = np.radians(settings.upper) + NOISE
-    bearing = pairs.bearing[seen]
     sector = np.searchsorted(bounds, np.abs(bearing))
     tie = np.abs(bearing) >= np.append(bounds, np.inf)[sector] - 2 * NOISE
     if settings.ties == "carlasgg":
         sector += tie & _behind(bearing)
     elif settings.ties == "both":
-        seen = np.concatenate([seen, seen[tie]])
+        rows = np.concatenate([rows, rows[tie]])
         sector = np.concatenate([sector, sector[tie] + 1])
-    codes = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
-    return edges_between(scene, codes[sector], pairs.b[seen], pairs.a[seen])
+    return rows, sector
 
 
 def _behind(bearing: Floats) -> Bools:
@@ -72,19 +131,32 @@ def _behind(bearing: Floats) -> Bools:
 
 
 def _side_edges(scene: BlockScene) -> Edges:
-    if scene.config.direction.sides == "none":
-        none = np.zeros(0, np.intp)
-        return edges_between(scene, SIDES[0], none, none)
-    bodies, pairs = scene.bodies, scene.pairs
-    dx, dy = bodies.x[pairs.b] - bodies.x[pairs.a], bodies.y[pairs.b] - bodies.y[pairs.a]
-    off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(pairs.bearing))
-    if scene.config.direction.sides == "closed":  # to the last bit, as CARLASGG has it
-        aside = np.flatnonzero(_seen(scene))
-    else:
-        aside = np.flatnonzero(_seen(scene) & (off_axis > BESIDE))
-    left, right = (RELATION_CODE[name] for name in SIDES)
-    codes = np.where(pairs.bearing[aside] >= 0, left, right).astype(np.int8)
-    return edges_between(scene, codes, pairs.b[aside], pairs.a[aside])
+    settings, pairs = scene.config.direction, scene.pairs
+    if settings.sides == "none":
+        return Edges.chained([])
+    names = np.array([RELATION_CODE[name] for name in SIDES], np.int8)
+    ahead, left = pairs.offsets
+    codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
+    doubtful = np.empty(len(pairs), np.bool_)
+    is_open, beside = settings.sides == "open", np.float32(BESIDE)
+    for part in even_parts(len(pairs)):
+        aside = np.abs(left[part])
+        reach = (np.abs(ahead[part]) + aside) * np.float32(DOUBT) + TINY
+        codes[part] = names[(left[part] < 0).view(np.int8)]
+        holds[part] = aside > (beside if is_open else reach)
+        doubtful[part] = ~(np.abs(aside - beside) > reach if is_open else holds[part])
+    wanted = _wanted(scene)
+    rows = np.flatnonzero(doubtful if wanted is None else doubtful & wanted)
+    if len(rows):
+        bearing = pairs.bearings(rows)
+        dx, dy = (of[pairs.b[rows]] - of[pairs.a[rows]] for of in (scene.bodies.x, scene.bodies.y))
+        off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(bearing))
+        codes[rows] = names[np.where(bearing >= 0, 0, 1)]
+        # Closed: to the last bit, as CARLASGG has it.
+        holds[rows] = off_axis > BESIDE if is_open else ~np.isnan(bearing)
+    if wanted is not None:
+        holds &= wanted
+    return edges_of_pairs(pairs, codes, holds, seen_by_a=True)
 
 
 def sector(name: str, legend: str = "") -> Relation:

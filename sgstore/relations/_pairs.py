@@ -9,10 +9,17 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.geometry import bearings
 from sgstore.mcap import Loss
-from sgstore.pair_numbers import gap
-from sgstore.relations._scene import IS_SIGNAL, IS_VEHICLE, Bodies, BodyPairs, parts, spread
+from sgstore.relations._scene import (
+    IS_SIGNAL,
+    Bodies,
+    BodyPairs,
+    distances,
+    parts,
+    span_up_to,
+    spans,
+    spread,
+)
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled, normalize_name
 from sgstore.world import Entities, MessageRefs
 
@@ -23,7 +30,7 @@ if TYPE_CHECKING:
 
     from sgstore.config import Config
     from sgstore.graph import GraphBlock
-    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
+    from sgstore.world import Bools, Codes, FrameBlock, Ints
 
     Rows = NDArray[np.intp]
     Halves = tuple[Rows, Rows]
@@ -82,18 +89,19 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
     """
     settings, between = config.pairs, config.proximity.between
     if not settings.ego:
-        return _with_mirror_images(bodies, *of_kinds(bodies, ego, near, settings.kinds), between)
+        return BodyPairs(bodies, *of_kinds(bodies, ego, near, settings.kinds), between)
     mine = ego[bodies.frame]
-    others = np.flatnonzero((mine >= 0) & (mine != np.arange(len(bodies))))
+    is_ego = mine == np.arange(len(bodies))
+    others = np.flatnonzero((mine >= 0) & ~is_ego)
     a, b = near
-    further = (ego[bodies.frame[a]] != a) & (ego[bodies.frame[b]] != b)
+    further = np.flatnonzero(~(is_ego[a] | is_ego[b]))
     with_ego = mine[others], others
     if settings.ego_within > 0:
         close = distances(bodies, *with_ego, between) <= settings.ego_within
         with_ego = with_ego[0][close], with_ego[1][close]
     halves = joined_pairs([with_ego, (a[further], b[further])])
     halves = of_kinds(bodies, ego, halves, settings.kinds)
-    return _with_mirror_images(bodies, *halves, between)
+    return BodyPairs(bodies, *halves, between)
 
 
 def of_kinds(
@@ -154,39 +162,14 @@ def _near_pairs(
     start = np.arange(1, len(rows) + 1)
     # One strip more than the distance is wide: the division above may round up.
     count = np.searchsorted(key, key + CELLS + 1, side="right") - start
-    frame = bodies.frame[rows]
+    frame, limit = bodies.frame[rows], span_up_to(within, between)
     for part in parts(count):
         if unwanted[frame[part]].all():
             continue
         owner, index = spread(start[part], count[part])
         first, second = rows[part][owner], rows[index]
-        near = distances(bodies, first, second, between) <= within
+        near = np.flatnonzero(spans(bodies, first, second, between) <= limit)
         yield first[near], second[near]
-
-
-def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Distances of pairs of bodies, as :attr:`sgstore.config.Proximity.between` says; m.
-
-    The origin of a vehicle that moves is on the ground, that of anything else in the centre of its box: where
-    CARLA has them, as far as a recording tells. A footprint without extent or heading is a point.
-    """
-    if between == "footprints":
-        boxes = bodies.boxes
-        boxes[np.isnan(boxes).any(axis=1), 2:] = 0
-        return gap(boxes[a], boxes[b])
-    z = bodies.z
-    if between == "origins":
-        on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
-        z = np.where(on_ground, bodies.bottom, z)
-    dx, dy, dz = (of[b] - of[a] for of in (bodies.x, bodies.y, z))
-    return np.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-def _with_mirror_images(bodies: Bodies, a: Rows, b: Rows, between: str) -> BodyPairs:
-    distance = distances(bodies, a, b, between)
-    a, b = np.concatenate([a, b]), np.concatenate([b, a])
-    bearing = bearings(bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a], bodies.heading[a])
-    return BodyPairs(a, b, np.concatenate([distance, distance]), bearing)
 
 
 # Pairs of what never moves: found once, when it appears, and looked up where both of them are in range ----

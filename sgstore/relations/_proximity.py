@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sgstore.relations._pairs import are_of_kinds
-from sgstore.relations._scene import BlockScene, Relation, edges_between
+from sgstore.relations._scene import (
+    BlockScene,
+    Relation,
+    edges_of_pairs,
+    even_parts,
+    span_up_to,
+)
 from sgstore.vocabulary import PROXIMITY, RELATION_CODE
 
 if TYPE_CHECKING:
@@ -21,14 +27,21 @@ if TYPE_CHECKING:
 
 def _edges(scene: BlockScene) -> Edges:
     settings, pairs = scene.config.proximity, scene.pairs
-    # What is beyond the last rung, or has no distance (NaN sorts last), falls behind all of them.
-    rung = np.searchsorted(np.array(settings.upper), pairs.distance)
-    holds = rung < len(settings.upper)
+    bounds = [span_up_to(upper, settings.between) for upper in settings.upper]
+    codes = np.array(
+        [RELATION_CODE[name] for name in (*settings.names, *settings.names[:1])], np.int8
+    )
+    found, holds = np.zeros(len(pairs.span), np.int8), np.zeros(len(pairs.span), np.bool_)
+    for part in even_parts(len(found) if bounds else 0):
+        span, rung = pairs.span[part], np.zeros(part.stop - part.start, np.int8)
+        for bound in bounds:
+            rung += span > bound
+        found[part] = codes[rung]
+        holds[part] = span <= bounds[-1]  # what has no distance is in no rung
+    found, holds = np.concatenate([found, found]), np.concatenate([holds, holds])
     if settings.kinds:
         holds &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
-    on = np.flatnonzero(holds)
-    codes = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
-    return edges_between(scene, codes[rung[on]], pairs.a[on], pairs.b[on])
+    return edges_of_pairs(pairs, found, holds)
 
 
 def rung(name: str) -> Relation:

@@ -63,7 +63,7 @@ class NodeKinds:
             raise ValueError(f"new entities begin at {entities.first}, not {len(self.entities)}")
         self.entities = np.concatenate([self.entities, entities.kind])
 
-    def of(self, nodes: Ints) -> Codes:
+    def of(self, nodes: Whole) -> Codes:
         """Kinds of nodes."""
         kinds = np.empty(len(nodes), np.int8)
         kinds[nodes >= 0] = self.entities[nodes[nodes >= 0]]
