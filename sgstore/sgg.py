@@ -106,6 +106,8 @@ class SceneGraphGenerator:
         computed = relations_under(config)
         computed = tuple(one for one in computed if road_map is not None or not one.needs_map)
         self._functions = functions(computed)
+        own = {one.edges for one in computed if one.name in OWN_RELATIONS}
+        self._others = not own.issuperset(self._functions)
         self._of_pairs = frozenset(one.name for one in computed if one.of_pairs)
         self._extent = Extent(config.range, road_map)
         self._keeping = Keeping(config, road_map)
@@ -188,7 +190,12 @@ class SceneGraphGenerator:
         frames = replace(frames, entities=renamed(frames.entities, self._config.types))
         self._learn(frames)
         views = [self._view(replace(frames, ego=ego)) for ego in egos]
-        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(view.keys for view in views)]))
+        if len(views) == 1:
+            keys = views[0].keys  # ascending
+        else:
+            keys = np.unique(
+                np.concatenate([view.keys for view in views] or [np.zeros(0, np.int64)])
+            )
         return views, self._world(frames, keys)
 
     def _view(self, frames: FrameBlock) -> _View:
@@ -258,7 +265,8 @@ class SceneGraphGenerator:
         touching = of_kinds(bodies, view.ego, touching, self._config.pairs.kinds)
         scene = BlockScene(self._config, bodies, view.ego, pairs, touching, ground)
         edges = self._keeping.edges(Edges.chained([edges(scene) for edges in self._functions]))
-        self._refuse_undeclared(edges)
+        if self._others:
+            self._refuse_undeclared(edges)
         return GraphBlock(
             frames=view.frames,
             presence=_presence(bodies, ground and self._keeping.present(ground.present)),
@@ -451,7 +459,7 @@ class SceneGraphGenerator:
         reduced = replace(
             frames,
             offsets=np.searchsorted(kept, frames.offsets),
-            states=states.take(kept),
+            states=states if len(kept) == len(states) else states.take(kept),
             ego=np.where(seen, frames.ego, -1),
         )
         return reduced, kept, here

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.geometry import offsets
 from sgstore.pair_numbers import gap
 from sgstore.relations._scene import IS_SIGNAL, Relation, edges_between, meeting, relates_pairs
 from sgstore.roads import STOREY
@@ -33,6 +34,13 @@ if TYPE_CHECKING:
 
 TOUCH: Final = 1e-4
 """Gap that means nothing: rounding of positions far from the origin; m."""
+
+
+SURE: Final = 1e-4
+"""Separations this far from a bound need no gap; m."""
+
+PLAIN: Final = 1e8
+"""Places and headings below this are exact enough for that; m, rad."""
 
 
 def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
@@ -79,8 +87,34 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
     bottoms = np.abs(bodies.bottom[b] - bodies.bottom[a])
     level = ~np.where(np.isnan(reach), bottoms > STOREY, apart > reach)
     a, b = a[level], b[level]
-    touch = gap(_boxes(bodies, a), _boxes(bodies, b)) <= TOUCH
+    apart = _separation(bodies, a, b)
+    touch = apart < -SURE
+    near = np.flatnonzero(~(touch | (apart > TOUCH + SURE)))
+    touch[near] = gap(_boxes(bodies, a[near]), _boxes(bodies, b[near])) <= TOUCH
     return a[touch], b[touch]
+
+
+def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
+    """How far the sides of one or the other keep two footprints apart; below 0 where they overlap; m.
+
+    The gap is as large at least. NaN where rounding, or a size that is none, leaves it to the gap.
+    """
+    dx, dy = bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a]
+    heading, length, width = bodies.heading, bodies.length / 2, bodies.width / 2
+    cos, sin = np.cos(heading[b] - heading[a]), np.sin(heading[b] - heading[a])
+    cos, sin = np.abs(cos), np.abs(sin)
+    apart = np.full(len(a), -np.inf)
+    for one, other in ((a, b), (b, a)):
+        ahead, left = offsets(dx, dy, heading[one])
+        apart = np.maximum(
+            apart, np.abs(ahead) - length[one] - cos * length[other] - sin * width[other]
+        )
+        apart = np.maximum(
+            apart, np.abs(left) - width[one] - sin * length[other] - cos * width[other]
+        )
+    plain = np.abs(bodies.x) + np.abs(bodies.y) + np.abs(heading) < PLAIN
+    plain &= (length >= 0) & (width >= 0)
+    return np.where(plain[a] & plain[b], apart, np.nan)
 
 
 def _boxes(bodies: Bodies, rows: Rows) -> Floats:

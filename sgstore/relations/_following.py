@@ -108,6 +108,10 @@ class LaneNet:
 # Where along a lane a place is: the foot of the perpendicular on its centre line ----------------
 
 
+RUN: Final = 8
+"""Pieces of a centre line that are passed over together where none of them can be the nearest."""
+
+
 class Centrelines:
     """The centre lines of all lanes, to be asked for places along them.
 
@@ -125,6 +129,17 @@ class Centrelines:
         self._run_x, self._run_y = np.diff(x), np.diff(y)
         squared = self._run_x**2 + self._run_y**2
         self._squared = np.where(squared > 0, squared, 1.0)
+        # Runs of pieces: of each lane the first and the number, of each run its pieces and a circle around it.
+        self._runs = -(-self._count // RUN)
+        self._first_run = np.cumsum(self._runs) - self._runs
+        lane, number = spread(np.zeros(len(self._runs), np.int64), self._runs)
+        self._run_first = self._first[lane] + number * RUN
+        self._run_count = np.minimum(self._count[lane] - number * RUN, RUN)
+        self._middle = self._run_first + self._run_count // 2
+        run, point = spread(self._run_first, self._run_count + 1)
+        far = np.hypot(x[point] - x[self._middle[run]], y[point] - y[self._middle[run]])
+        self._radius = np.zeros(len(self._run_first))
+        np.maximum.at(self._radius, run, far)
 
     def along(self, lane: Ints, x: Floats, y: Floats) -> Floats:
         """Length of the centre line from the lane's start up to the foot of the perpendicular from a place.
@@ -142,30 +157,45 @@ class Centrelines:
             m. The foot is the nearest point, of several the first; where that is an end of the lane, it is
             where the lane would be if it went straight on: below 0, or above its length.
         """
-        count = self._count[lane]
         found = np.empty(len(lane))
-        for part in parts(count):
-            found[part] = self._of(self._first[lane[part]], count[part], x[part], y[part])
+        for part in parts(self._count[lane]):
+            found[part] = self._of(lane[part], x[part], y[part])
         return found
 
-    def _of(self, first: Ints, count: Ints, x: Floats, y: Floats) -> Floats:
-        owner, piece = spread(first, count)
+    def _of(self, lane: Ints, x: Floats, y: Floats) -> Floats:
+        owner, piece = self._near(lane, x, y)
         if not len(owner):
-            return np.zeros(len(first))
+            return np.zeros(len(lane))
         run_x, run_y = self._run_x[piece], self._run_y[piece]
         away_x, away_y = x[owner] - self._x[piece], y[owner] - self._y[piece]
         onward = (away_x * run_x + away_y * run_y) / self._squared[piece]
         share = np.minimum(np.maximum(onward, 0.0), 1.0)
         squared = (away_x - share * run_x) ** 2 + (away_y - share * run_y) ** 2
-        starts = np.cumsum(count) - count
-        least = np.repeat(np.minimum.reduceat(squared, starts), count)
         # Every lane has a piece at least, so each owner has a first that is the nearest.
-        nearest = np.flatnonzero(squared == least)
-        _, at = np.unique(owner[nearest], return_index=True)
-        at = nearest[at]
-        before, after = self._along[piece[at]], self._along[piece[at] + 1]
-        out = ((at == starts) & (onward[at] < 0)) | ((at == starts + count - 1) & (onward[at] > 1))
-        return before + np.where(out, onward[at], share[at]) * (after - before)
+        starts = np.flatnonzero(np.diff(owner, prepend=-1))
+        least = np.minimum.reduceat(squared, starts)
+        nearest = np.flatnonzero(squared == least[owner])
+        at = nearest[np.diff(owner[nearest], prepend=-1) != 0]
+        first = self._first[lane]
+        piece, onward = piece[at], onward[at]
+        before, after = self._along[piece], self._along[piece + 1]
+        out = (piece == first) & (onward < 0)
+        out |= (piece == first + self._count[lane] - 1) & (onward > 1)
+        return before + np.where(out, onward, share[at]) * (after - before)
+
+    def _near(self, lane: Ints, x: Floats, y: Floats) -> tuple[Rows, Rows]:
+        """Places, and pieces of their lanes among which the nearest are, by circles around runs of pieces."""
+        first, count = self._first_run[lane], self._runs[lane]
+        owner, run = spread(first, count)
+        away = np.hypot(
+            x[owner] - self._x[self._middle[run]], y[owner] - self._y[self._middle[run]]
+        )
+        starts = np.cumsum(count) - count
+        least = np.minimum.reduceat(away, starts) if len(starts) else away
+        near = np.flatnonzero(~(away - self._radius[run] > least[owner] * (1 + 1e-9) + 1e-6))
+        owner, run = owner[near], run[near]
+        at, piece = spread(self._run_first[run], self._run_count[run])
+        return owner[at], piece
 
 
 # Which lanes a signal may affect: those from which it lies ahead --------------------------------

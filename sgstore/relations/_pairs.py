@@ -297,10 +297,12 @@ def gathered(
     """
     most = MOST_PAIRS if most is None else most
     over, count = np.zeros(frames, np.bool_), np.zeros(frames, np.int64)
-    none = np.zeros(0, np.intp)
-    found: list[Halves] = [(none, none)]
+    found: list[Halves] = [NO_PAIRS]
+    crowd = int(np.bincount(frame, minlength=1).max())
     for chunk in chunks(over):
         found.append(chunk)
+        if crowd * (crowd - 1) // 2 <= most:
+            continue
         count += np.bincount(frame[chunk[0]], minlength=frames)
         new = (count > most) & ~over
         if new.any():

@@ -132,6 +132,7 @@ class Keeping:
             self.parts = self._kept_parts(road_map, config.lanes.types)
             if not config.lanes.sections:
                 self._same = first_sections(road_map.nodes)
+        self._everything = bool(not dropped and self.parts.all() and self._same is None)
 
     def _kept_parts(self, road_map: RoadMap, lane_types: tuple[str, ...]) -> Bools:
         nodes, edges = road_map.nodes, road_map.edges
@@ -161,6 +162,8 @@ class Keeping:
 
     def edges(self, edges: Edges) -> Edges:
         """The edges that are kept: of kept relations, to and from parts of the map that are kept."""
+        if self._everything:
+            return edges
         kept = self._relations[edges.relation]
         if not self.parts.all():
             kept &= self._stays(edges.src) & self._stays(edges.dst)
@@ -174,6 +177,8 @@ class Keeping:
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
         """Those in lanes that are kept. Of sections that are one lane, the one with the larger share speaks."""
+        if self._everything:
+            return lanes
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
         lanes = lanes if kept.all() else taken(lanes, kept)
         if self._same is None or not len(lanes):
