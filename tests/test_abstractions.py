@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter
+from dataclasses import fields
 
 import networkx as nx
 import numpy as np
@@ -18,6 +20,7 @@ from sgstore.abstractions import (
     MapColumns,
     abstraction_named,
     classes_of,
+    contents_of,
     register,
 )
 from sgstore.abstractions._literature import roadscene2vec
@@ -88,6 +91,55 @@ def scene(
         ego_lane=np.array([ego_lane]),
         grounds=ground,
     )
+
+
+def together(scenes: list[GraphColumns]) -> GraphColumns:
+    """Scenes of one frame each as the frames of one."""
+    columns = {}
+    for field in fields(GraphColumns):
+        of = [getattr(one, field.name) for one in scenes]
+        if field.name in {"node_frame", "frame"}:
+            columns[field.name] = np.concatenate([i + frame for i, frame in enumerate(of)])
+        elif isinstance(of[0], np.ndarray):
+            columns[field.name] = np.concatenate(of)
+    return GraphColumns(frames=len(scenes), grounds=scenes[0].grounds, **columns)
+
+
+def any_scene(rng: random.Random) -> GraphColumns:
+    """One of some thousand scenes."""
+    bodies, lanes = (EGO, CAR, BUS, PERSON), (LEFT, OWN, AGAINST)
+    edges = [(body, "isIn", rng.choice(lanes)) for body in bodies[: rng.randrange(4)]]
+    if rng.random() < 0.5:
+        edges.append((EGO, rng.choice(("near", "inSFrontOf", "sees")), rng.choice((CAR, BUS))))
+    return scene(
+        *rng.sample(edges, len(edges)),
+        places=rng.choice((((0, 0), (30, 0), (20, 0), (0, 9)), ())),
+        present=rng.choice(((OWN, ROAD), (OWN, LEFT, RIGHT, AGAINST, ROAD))),
+        ego_lane=rng.choice((OWN, AGAINST, 0)),
+    )
+
+
+def test_frames_of_equal_contents_are_of_equal_classes() -> None:
+    """And nothing else is in the contents: a frame that only has other distances is as one before."""
+    rng = random.Random(6)
+    scenes = [any_scene(rng) for _ in range(1500)]
+    seen = together(scenes)
+    named = [classes_of(abstraction_named(name).function(seen)) for name in AT_INGEST]
+    of: dict[bytes, set[tuple[str, ...]]] = {}
+    for content, *names in zip(contents_of(seen), *named, strict=True):
+        of.setdefault(content, set()).add(tuple(names))
+
+    assert all(len(names) == 1 for names in of.values())
+    assert 100 < len(of) < 1000
+    assert len(set(zip(*named, strict=True))) > len(of) / 4
+    assert [contents_of(one)[0] for one in scenes[:50]] == contents_of(seen)[:50]
+    some = np.arange(3, 1500, 7)
+    assert contents_of(seen.taken(some)) == [contents_of(seen)[i] for i in some.tolist()]
+    for name in AT_INGEST:
+        function = abstraction_named(name).function
+        assert classes_of(function(seen.taken(some))) == [
+            classes_of(function(seen))[i] for i in some.tolist()
+        ]
 
 
 def lanes_of(seen: GraphColumns) -> dict[str, str]:

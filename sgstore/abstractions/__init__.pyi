@@ -2,6 +2,7 @@
 
 from ._classes import Classes as Classes
 from ._classes import classes_of as classes_of
+from ._classes import contents_of as contents_of
 from ._columns import GraphColumns as GraphColumns
 from ._columns import Labelled as Labelled
 from ._columns import MapColumns as MapColumns
@@ -35,6 +36,7 @@ __all__ = [
     "abstractions",
     "check_name",
     "classes_of",
+    "contents_of",
     "found",
     "lane_roles",
     "of_frames",

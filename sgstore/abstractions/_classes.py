@@ -20,12 +20,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sgstore.abstractions._columns import found
+from sgstore.abstractions._columns import ego_lanes, found
+from sgstore.abstractions._literature import OF_JUNCTION
+from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from sgstore.abstractions._columns import Labelled
+    from sgstore.abstractions._columns import GraphColumns, Labelled
     from sgstore.world import Bools, Ints
 
 
@@ -284,6 +286,43 @@ class Classes:
         while len(self._known) > REMEMBERED:
             self._known.popitem(last=False)
         return answer
+
+
+_TOLD: Final = np.zeros(MOST_RELATIONS, np.bool_)
+_TOLD[[RELATION_CODE[name] for name in OF_JUNCTION]] = True
+
+
+def contents_of(seen: GraphColumns) -> list[bytes]:
+    """256 bits for each frame; where they are equal, so is all that the abstractions made at ingest see of it.
+
+    These are its nodes, the edges that ``junction`` has, and its lanes as the ego has them. Two frames that are
+    equal in this have the same classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction``, and none needs a
+    labelled graph if the other had one. The map has to be the same.
+    """
+    lanes = ego_lanes(seen)
+    own = seen.kind.astype(np.int64) * 2 + seen.is_ego
+    rows = np.flatnonzero(_TOLD[seen.relation])
+    sums = np.zeros((4, seen.frames), np.uint64)
+    _told(sums[:2], seen.node_frame, seen.node, own, np.zeros(1, np.int64))
+    _told(sums[:2], lanes.frame, lanes.strand, lanes.role, np.ones(1, np.int64))
+    _told(sums[:2], np.arange(seen.frames), seen.ego_lane, np.full(1, 2), np.ones(1, np.int64))
+    columns = (seen.frame, seen.src, seen.relation, seen.dst)
+    _told(sums[2:], *(column[rows] for column in columns))
+    return [row.tobytes() for row in np.ascontiguousarray(sums.T)]
+
+
+def _told(sums: Words, frame: Ints, *columns: NDArray[Any]) -> None:
+    """Add two words for each row to the sums of its frame."""
+    if not len(frame):
+        return
+    words = sum(
+        column.astype(np.int64, copy=False).view(np.uint64) * factor
+        for column, factor in zip(columns, (_A, _B, _C), strict=True)
+    )
+    first = _mixed(words)
+    starts = np.flatnonzero(np.append(True, frame[1:] != frame[:-1]))
+    for total, values in zip(sums, (first, _mixed(first * _D + words)), strict=True):
+        np.add.at(total, frame[starts], np.add.reduceat(values, starts))
 
 
 @dataclass(frozen=True)

@@ -267,6 +267,25 @@ class GraphColumns:
         a, b = np.divmod(pair, max(most, 1))
         return frame, node[starts[frame] + a], node[starts[frame] + b], bits
 
+    def taken(self, frames: Ints) -> GraphColumns:
+        """Some of the frames, in ascending order."""
+        if len(frames) == self.frames:
+            return self
+        number = np.full(self.frames, -1)
+        number[frames] = np.arange(len(frames))
+        nodes = np.flatnonzero(number[self.node_frame] >= 0)
+        edges = np.flatnonzero(number[self.frame] >= 0)
+        of_nodes = ("node", "kind", "is_ego", "x", "y", "z", "heading")
+        return GraphColumns(
+            frames=len(frames),
+            node_frame=number[self.node_frame[nodes]],
+            **{name: getattr(self, name)[nodes] for name in of_nodes},
+            frame=number[self.frame[edges]],
+            **{name: getattr(self, name)[edges] for name in ("relation", "src", "dst")},
+            ego_lane=self.ego_lane[frames],
+            grounds=self.grounds,
+        )
+
     def row_of(self, frame: Ints, node: Ints) -> Ints:
         """Rows of nodes in frames; -1 where they are not in the graph."""
         return found(self.node_frame, self.node, frame, node)

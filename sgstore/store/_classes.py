@@ -6,6 +6,7 @@ are made at ingest are published with their trace; others wait until they are as
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -17,6 +18,7 @@ from sgstore.abstractions import (
     GraphColumns,
     MapColumns,
     abstraction_named,
+    contents_of,
     found,
     lane_roles,
 )
@@ -52,6 +54,10 @@ ORDER BY ingested_at, name
 """
 
 
+_REMEMBERED: Final = 4096
+"""Frames whose classes are remembered."""
+
+
 class TraceClasses:
     """Classes of the frames of one trace, block by block.
 
@@ -63,17 +69,38 @@ class TraceClasses:
 
     def __init__(self, names: Sequence[str] = AT_INGEST) -> None:
         self._of = [(abstraction_named(name), Classes()) for name in names]
+        self._known: OrderedDict[bytes, list[str]] = OrderedDict()
 
     def columns(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Tables ``frame_class`` and ``later_class``, of frames whose numbers are ``seq``."""
+        """Table ``later_class``, of frames whose numbers are ``seq``."""
+        return self._columns(self._named(seen), trace_id, seq)
+
+    def ingested(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
+        """Table ``frame_class``, of a frame like one before they are known."""
+        contents = contents_of(seen)
+        rows = {content: row for row, content in enumerate(contents) if content not in self._known}
+        fresh = sorted(rows.values())
+        if fresh:
+            named = zip(*self._named(seen.taken(np.array(fresh))), strict=True)
+            for row, names in zip(fresh, named, strict=True):
+                self._known[contents[row]] = list(names)
+        of_frames = [self._known[content] for content in contents]
+        while len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+        return self._columns([*zip(*of_frames, strict=True)], trace_id, seq)
+
+    def _named(self, seen: GraphColumns) -> list[list[str]]:
+        """For each abstraction the classes of the frames."""
+        return [classes.of(abstraction.function(seen)) for abstraction, classes in self._of]
+
+    def _columns(self, named: Sequence[Sequence[str]], trace_id: int, seq: Ints) -> Columns:
         rows: list[tuple[str, str]] = []
         buckets: list[Ints] = []
         masks: list[Ints] = []
-        for abstraction, classes in self._of:
-            names = classes.of(abstraction.function(seen))
+        bucket = trace_bucket(trace_id, seq)
+        for (abstraction, _), names in zip(self._of, named, strict=True):
             number = {name: i for i, name in enumerate(dict.fromkeys(names))}
             code = np.array([number[name] for name in names], np.int64)
-            bucket = trace_bucket(trace_id, seq)
             first, mask = masks_of((bucket, code), seq % BUCKET_FRAMES)
             rows += [(abstraction.name, names[row]) for row in first.tolist()]
             buckets.append(bucket[first])
@@ -98,7 +125,7 @@ class IngestedClasses:
         seen = GraphColumns.of(graph, kinds, self._grounds)
         seq = graph.frames.seq
         return {
-            "frame_class": self._classes.columns(seen, trace_id, seq),
+            "frame_class": self._classes.ingested(seen, trace_id, seq),
             "lane_role": _role_columns(seen, trace_id, seq),
         }
 

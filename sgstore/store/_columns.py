@@ -298,7 +298,9 @@ def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, N
         if values is not None:
             missing = missing_of(table, name, values)
             if kind in TEXTS:
-                values = np.array([*(_number(kind, text) for text in texts), 0], np.int64)[values]
+                used, index = np.unique(values, return_inverse=True)
+                numbers = [_number(kind, texts[at]) if at >= 0 else 0 for at in used.tolist()]
+                values = np.array(numbers, np.int64)[index]
             elif name in enums:
                 values = _coded(enums[name], values)
             if missing is not None:

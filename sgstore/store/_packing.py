@@ -130,7 +130,7 @@ def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]
     if not len(bits):
         return np.zeros(0, np.intp), bits
     packed = _packed(keys)
-    order = np.argsort(packed, kind="stable")
+    order = np.argsort(packed)
     ranked = packed[order]
     starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1]))
     return order[starts], np.bitwise_or.reduceat(np.left_shift(1, bits[order]), starts)
@@ -307,7 +307,7 @@ def texts(values: Iterable[str]) -> NDArray[Any]:
 
 def plain(text: str) -> str:
     """A text with ``?`` for what is not Unicode: parts of files that are not what they say."""
-    return text.encode("utf-8", "replace").decode()
+    return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
 def as_json(values: dict[str, Any]) -> str:
