@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from sgstore.lang._catalog import DisplayUnit, Home
+from sgstore.lang._operators import COMPARISONS, OPERATORS
 from sgstore.lang.ir import Bound, Operation, PairNumber, Scope, any_relation
 from sgstore.quoting import literal
 from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
@@ -131,12 +132,6 @@ def alias_of(edge: Edge) -> str:
 
 # What conditions say of kinds of nodes: numbers of pairs are of entities, and what is compared is known ----
 
-_COMPARED: Final = frozenset({"=", "<>", "<", "<=", ">", ">="})
-_STRICT: Final = frozenset(
-    {"+", "-", "*", "/", "%", "negative", "abs", "sqrt", "floor", "ceil", "round", "min", "max"}
-)
-"""Operations that are unknown where one operand is."""
-
 
 def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
     """Nodes whose pair is compared are entities: of others the number is unknown, and a comparison never true.
@@ -145,7 +140,7 @@ def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
     """
     nodes = dict(scope.nodes)
     for condition in scope.where:
-        if isinstance(condition, Operation) and condition.word in _COMPARED:
+        if isinstance(condition, Operation) and condition.word in COMPARISONS:
             for pair in (p for operand in condition.operands for p in _needed(operand)):
                 for key in {pair.a, pair.b} & set(nodes):
                     nodes[key] = replace(nodes[key], kinds=nodes[key].kinds.only(entity_kinds()))
@@ -157,7 +152,7 @@ def _needed(expression: Bound) -> Iterator[PairNumber]:
     match expression:
         case PairNumber():
             yield expression
-        case Operation(word=word, operands=operands) if word in _STRICT:
+        case Operation(word=word, operands=operands) if OPERATORS[word].strict:
             for operand in operands:
                 yield from _needed(operand)
         case _:

@@ -80,12 +80,15 @@ class Operator:
         Its values, given those of its operands.
     infix : bool
         Whether it is written between its operands.
+    strict : bool
+        Whether it is unknown where one of its operands is.
     """
 
     sql: SqlOf
     one: Callable[[Sequence[Callable[[Any], Any]]], Callable[[Any], Any]]
     columns: Callable[[Sequence[Column]], Column]
     infix: bool = False
+    strict: bool = False
 
 
 # SQL: a call takes its operands as they are, all else takes them in brackets where they need them ----
@@ -191,7 +194,7 @@ def _strict(
         known = all_known(parts)
         return Column(values, fits if known is True else known & fits)
 
-    return Operator(_sql(sql), of_one, of_some if partial else of_columns, infix)
+    return Operator(_sql(sql), of_one, of_some if partial else of_columns, infix, strict=True)
 
 
 def _divided(a: float, by: float) -> float | None:
