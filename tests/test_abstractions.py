@@ -304,8 +304,8 @@ def store(town_store):
 
 @pytest.fixture
 def people():
-    register("people", only_people)
-    yield "people"
+    register("only_people", only_people)
+    yield "only_people"
     REGISTERED.clear()
 
 
@@ -354,10 +354,10 @@ def windows(store):
 
 
 def test_later_classes_are_computed_once_and_then_kept_and_verified(store, people) -> None:
-    before = store.sql("SELECT count(*) FROM classes WHERE abstraction = 'people'").values
+    before = store.sql("SELECT count(*) FROM classes WHERE abstraction = 'only_people'").values
     first = store.file.abstracted.complete(people)
     again = store.file.abstracted.complete(people)
-    (rows,) = store.sql("SELECT count(*) FROM classes WHERE abstraction = 'people'").values
+    (rows,) = store.sql("SELECT count(*) FROM classes WHERE abstraction = 'only_people'").values
 
     assert (before, first, again) == ([(0,)], 1, 0)
     assert rows == (store.info()[0].frames,)

@@ -34,13 +34,13 @@ def edges_of_pairs_abreast(scene: BlockScene) -> Edges:
     pairs = scene.pairs
     abreast = np.abs(np.abs(pairs.bearing) - np.pi / 2) < 0.5
     rows = np.flatnonzero(abreast & (pairs.distance < 5))
-    return edges_between(scene, "besides", pairs.b[rows], pairs.a[rows])
+    return edges_between(scene, "abreast_of", pairs.b[rows], pairs.a[rows])
 
 
-BESIDES = Relation(
-    name="besides", doc="b → a: b is abreast of a", edges=edges_of_pairs_abreast, of_pairs=True
+ABREAST_OF = Relation(
+    name="abreast_of", doc="b → a: b is abreast of a", edges=edges_of_pairs_abreast, of_pairs=True
 )
-ABREAST = "SELECT frame_id, src, dst FROM edges WHERE relation = 'besides' ORDER BY ALL"
+ABREAST = "SELECT frame_id, src, dst FROM edges WHERE relation = 'abreast_of' ORDER BY ALL"
 
 
 def entry(loaded: Any) -> SimpleNamespace:
@@ -49,7 +49,7 @@ def entry(loaded: Any) -> SimpleNamespace:
             raise loaded
         return loaded
 
-    return SimpleNamespace(name="besides", value="package:BESIDES", load=load)
+    return SimpleNamespace(name="abreast_of", value="package:ABREAST_OF", load=load)
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     put([before for _, before in kept])
 
 
-def installed(monkeypatch: pytest.MonkeyPatch, loaded: Any = BESIDES) -> None:
+def installed(monkeypatch: pytest.MonkeyPatch, loaded: Any = ABREAST_OF) -> None:
     found = {plugins.RELATIONS.group: [entry(loaded)]}
     monkeypatch.setattr(plugins, "entry_points", lambda group: found.get(group, []))
     registry.relations.cache_clear()
@@ -86,19 +86,19 @@ def test_a_store_made_before_holds_a_relation_of_another_package(
     path = tmp_path / "s.db"
     StoreFile.create(path)
     ingest(path, [RECORDING], until=4.0)
-    with pytest.raises(QueryNameError, match="unknown relation 'besides'"):
-        Store(path).find("MATCH (a)-[:besides]->(b)")
+    with pytest.raises(QueryNameError, match="unknown relation 'abreast_of'"):
+        Store(path).find("MATCH (a)-[:abreast_of]->(b)")
     before = Store(path).sql("SELECT * FROM edges ORDER BY ALL").values
 
     installed(monkeypatch)
-    asked = "MATCH (a)-[:besides]->(b) RETURN COUNT(*) AS n"
+    asked = "MATCH (a)-[:abreast_of]->(b) RETURN COUNT(*) AS n"
     assert list(Store(path).find(asked)) == [(0,)]  # nothing is known of it there
     ingest(path, [RECORDING], until=4.0, force=True)
 
     abreast = Store(path).sql(ABREAST).values
     assert abreast
     assert list(Store(path).find(asked)) == [(len(abreast),)]
-    rest = "SELECT * FROM edges WHERE relation <> 'besides' ORDER BY ALL"
+    rest = "SELECT * FROM edges WHERE relation <> 'abreast_of' ORDER BY ALL"
     assert Store(path).sql(rest).values == before
     assert not Store(path).file.verify().faults
 
@@ -112,23 +112,23 @@ def test_a_store_answers_about_a_relation_that_nothing_here_knows(
     ingest(path, [RECORDING], until=4.0)
     abreast = Store(path).sql(ABREAST).values
     del names[len(vocabulary.OWN_RELATIONS) :]
-    vocabulary._relation_code.pop("besides")
-    vocabulary._made_known.pop(("relation", "besides"))
+    vocabulary._relation_code.pop("abreast_of")
+    vocabulary._made_known.pop(("relation", "abreast_of"))
     installed(monkeypatch, None)
     monkeypatch.setattr(plugins, "entry_points", lambda group: [])
     vocabulary.add_relation("comes_first")  # codes here are others than in the store
     again.write_bytes(path.read_bytes())
 
     store = Store(again)
-    found = store.find("MATCH (a)-[r:besides]->(b) RETURN COUNT(*) AS n")
+    found = store.find("MATCH (a)-[r:abreast_of]->(b) RETURN COUNT(*) AS n")
     frame = abreast[0][0]
-    edges = [(a, b) for a, b, name in store.graph(frame).edges(keys=True) if name == "besides"]
+    edges = [(a, b) for a, b, name in store.graph(frame).edges(keys=True) if name == "abreast_of"]
 
     assert list(found) == [(len(abreast),)]
     assert sorted(edges) == sorted((a, b) for f, a, b in abreast if f == frame)
     assert not store.file.verify().faults
     whole = store.graph(frame, abstraction="SG")
-    assert {name for *_, name in whole.edges(keys=True)} >= {"besides", "isIn"}
+    assert {name for *_, name in whole.edges(keys=True)} >= {"abreast_of", "isIn"}
     store.file.compact()
     assert store.sql(ABREAST).values == abreast
 
@@ -178,17 +178,17 @@ def test_a_package_whose_relation_cannot_be_loaded_is_named(
 ) -> None:
     installed(monkeypatch, loaded)
 
-    with pytest.raises(ConfigError, match="the relation 'besides'"):
+    with pytest.raises(ConfigError, match="the relation 'abreast_of'"):
         registry.relations()
 
 
 def edges_of_pairs_near_enough(scene: BlockScene) -> Edges:
     rows = np.flatnonzero(scene.pairs.distance < scene.parameters(NEAR_ENOUGH)["reach"])
-    return edges_between(scene, "besides", scene.pairs.b[rows], scene.pairs.a[rows])
+    return edges_between(scene, "abreast_of", scene.pairs.b[rows], scene.pairs.a[rows])
 
 
 NEAR_ENOUGH = Relation(
-    name="besides",
+    name="abreast_of",
     doc="b → a: b is near a",
     edges=edges_of_pairs_near_enough,
     of_pairs=True,
@@ -201,22 +201,22 @@ def test_a_relation_of_another_package_has_settings(
 ) -> None:
     installed(monkeypatch, NEAR_ENOUGH)
     path, file = tmp_path / "s.db", tmp_path / "c.toml"
-    file.write_text("[relations.besides]\nreach = 3\n", encoding="utf-8")
+    file.write_text("[relations.abreast_of]\nreach = 3\n", encoding="utf-8")
     config = load(file)
     distances = "SELECT max(p.distance) FROM edges e JOIN pairs p USING (frame_id, src, dst)"
     reached = dict[float, float]()
     for reach, one in {5.0: Config(), 3.0: config}.items():
         StoreFile.create(path)
         ingest(path, [RECORDING], until=4.0, config=one)
-        ((reached[reach],),) = Store(path).sql(f"{distances} WHERE relation = 'besides'").values
+        ((reached[reach],),) = Store(path).sql(f"{distances} WHERE relation = 'abreast_of'").values
         ((kept,),) = StoreFile(path).rows("SELECT settings FROM config").values
         assert json.loads(kept)["relations"] == (
-            {} if reach == 5 else {"besides": {"reach": 3.0, "loud": False}}
+            {} if reach == 5 else {"abreast_of": {"reach": 3.0, "loud": False}}
         )
         path.unlink()
 
     assert 0 < reached[3.0] <= 3 < reached[5.0] <= 5
-    assert "[relations.besides]\nreach = 3.0\nloud = false" in as_toml(config)
+    assert "[relations.abreast_of]\nreach = 3.0\nloud = false" in as_toml(config)
     assert from_dict(tomllib.loads(as_toml(config))) == config
     assert from_dict(json.loads(json.dumps(config.as_dict()))) == config
 
@@ -224,12 +224,15 @@ def test_a_relation_of_another_package_has_settings(
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"besides": {"reach": "far"}}, "'relations.besides.reach' is 'far'; expected a number"),
-        ({"besides": {"loud": 1}}, "'relations.besides.loud' is 1; expected true or false"),
-        ({"besides": {"raech": 3}}, "did you mean 'relations.besides.reach'"),
-        ({"beside": {"reach": 3}}, "'relations' is 'beside'; expected 'besides', perhaps"),
+        (
+            {"abreast_of": {"reach": "far"}},
+            "'relations.abreast_of.reach' is 'far'; expected a number",
+        ),
+        ({"abreast_of": {"loud": 1}}, "'relations.abreast_of.loud' is 1; expected true or false"),
+        ({"abreast_of": {"raech": 3}}, "did you mean 'relations.abreast_of.reach'"),
+        ({"abreast": {"reach": 3}}, "'relations' is 'abreast'; expected 'abreast_of', perhaps"),
         ({"near": {}}, "'relations' is 'near'"),
-        ({"besides": 3}, "a table"),
+        ({"abreast_of": 3}, "a table"),
     ],
 )
 def test_settings_of_a_relation_are_checked(
@@ -249,7 +252,7 @@ def test_edges_that_no_relation_declares_are_refused(
     def strange(scene: BlockScene) -> Edges:
         return edges_between(scene, "strange", scene.pairs.b, scene.pairs.a)
 
-    installed(monkeypatch, Relation(name="besides", doc="", edges=strange, of_pairs=True))
+    installed(monkeypatch, Relation(name="abreast_of", doc="", edges=strange, of_pairs=True))
     StoreFile.create(tmp_path / "s.db")
 
     (outcome,) = ingest(tmp_path / "s.db", [RECORDING], until=1.0)
