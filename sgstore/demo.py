@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -183,6 +184,9 @@ def _say_what_next(folder: Path, clip: Path, pictures: list[Path | None], say: S
     say("")
     say("What to type next:")
     say("")
+    called = Path(sys.argv[0])
+    if called.name == "sgstore" and not shutil.which("sgstore"):
+        say(f"  . {called.parent / 'activate'}")
     pattern = '"MATCH (e:Ego)-[:near_coll]->(v:Vehicle) RETURN v.name, INTERVALS"'
     count = '"FROM edges SELECT relation, dst_kind, count(*) GROUP BY ALL"'
     say(f"  sgstore find {store} {pattern}")
