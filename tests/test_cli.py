@@ -460,6 +460,15 @@ def test_a_query_and_a_name_are_not_asked_at_once(
     assert "give one of" in err
 
 
+def test_a_table_in_a_pipe_is_whole_however_late_a_long_value_comes(
+    store: str, sgstore: Any
+) -> None:
+    rows = "SELECT CASE WHEN i = 900 THEN 'a long value' ELSE 'x' END AS v FROM range(1000) AS t(i)"
+    _, out, _ = sgstore("sql", store, rows)
+
+    assert "a long value" in out.splitlines()
+
+
 def test_a_narrow_table_keeps_the_frames_that_one_will_type(
     store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -314,10 +314,11 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
     numeric = [all(_is_number(row[i]) for row in first) for i in range(len(columns))]
     widths = [max(len(name), *(len(row[i]) for row in first)) for i, name in enumerate(columns)]
     widths = _fitted(columns, widths, _room(stream))
-    stream.write(_line(columns, widths, numeric))
-    stream.write(_line(["─" * width for width in widths], widths, numeric))
+    cut = stream.isatty()
+    stream.write(_line(columns, widths, numeric, cut=cut))
+    stream.write(_line(["─" * width for width in widths], widths, numeric, cut=cut))
     rest = ([_cell(value) for value in row] for row in rows)
-    return _count(stream.write(_line(row, widths, numeric)) for row in chain(first, rest))
+    return _count(stream.write(_line(row, widths, numeric, cut=cut)) for row in chain(first, rest))
 
 
 def _room(stream: TextIO) -> int | None:
@@ -340,10 +341,13 @@ def _fitted(columns: Sequence[str], widths: list[int], room: int | None) -> list
     return widths
 
 
-def _line(cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool]) -> str:
-    parts = []
+def _line(
+    cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool], *, cut: bool
+) -> str:
+    """A row as text; a cell that is too wide is cut on a terminal, and whole in a file or a pipe."""
+    parts: list[str] = []
     for cell, width, right in zip(cells, widths, numeric, strict=True):
-        text = cell if len(cell) <= width else f"{cell[: width - 1]}…"
+        text = f"{cell[: width - 1]}…" if cut and len(cell) > width else cell
         parts.append(text.rjust(width) if right else text.ljust(width))
     return f"{GAP.join(parts).rstrip()}\n"
 
