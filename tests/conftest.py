@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +26,7 @@ else:
     settings.load_profile("here")
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from duckdb import DuckDBPyConnection
+    from collections.abc import Callable, Iterator
 
     from sgstore.query import Store
 
@@ -86,29 +85,6 @@ def data() -> Path:
     return folder
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _empty_stores_are_copied() -> Iterator[None]:
-    """Run the statements of the schema once in a process: tests make hundreds of stores."""
-    from sgstore.store import _rebuild
-
-    made: dict[str, bytes] = {}
-    make = _rebuild.attach_empty
-
-    def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
-        schema = _rebuild.schema_sql()
-        if schema in made:
-            place.write_bytes(made[schema])
-            connection.execute(f"ATTACH {_rebuild.literal(str(place.absolute()))} AS fresh")
-            return
-        make(connection, place)
-        connection.execute("CHECKPOINT fresh")
-        made[schema] = place.read_bytes()
-
-    _rebuild.attach_empty = attach_empty
-    yield
-    _rebuild.attach_empty = make
-
-
 @pytest.fixture(scope="session")
 def town_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the bundled recording, made by the first process of the run that asks; nobody writes to it."""
@@ -144,6 +120,15 @@ def open_town(town_store: Path) -> Iterator[Store]:
     store = Store(town_store)
     with store.file.snapshot():
         yield store
+
+
+@pytest.fixture(scope="module")
+def kept_open() -> Iterator[Callable[[Path | str], None]]:
+    """Keeps stores open that no test of the file changes: to open one takes longer than most answers."""
+    from sgstore.store import StoreFile
+
+    with ExitStack() as open_stores:
+        yield lambda path: open_stores.enter_context(StoreFile(Path(path)).snapshot())
 
 
 @pytest.fixture

@@ -180,7 +180,7 @@ def test_what_a_handler_of_signals_raises_ends_a_question_of_the_library(
     before = signal.signal(signal.SIGALRM, up)
     late.start()
     try:
-        signal.setitimer(signal.ITIMER_REAL, 1.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.5)
         start = time.monotonic()
         with pytest.raises(TimeIsUpError):
             ENDLESS_IN_PYTHON[face](store)
@@ -266,25 +266,28 @@ def test_errors_of_the_database_and_other_threads_are_as_they_were(town_store: P
 
 
 @pytest.mark.parametrize("end", ["deadline", "Ctrl-C", "safe"])
-def test_a_find_of_long_steps_ends(end: str, town_store: Path) -> None:
-    more = {"deadline": ["--timeout", "1s"], "Ctrl-C": [], "safe": ["--safe", "--timeout", "1s"]}
+def test_a_find_of_long_steps_ends(end: str, town_store: Path, tmp_path: Path) -> None:
+    late = ["--timeout", "500ms"]
+    more = {"deadline": late, "Ctrl-C": [], "safe": ["--safe", *late]}
     line = ["find", str(town_store), LONG_STEP, *more[end]]
     process = subprocess.Popen(
         [sys.executable, "-m", "sgstore", *line],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
     )
     try:
         if end == "Ctrl-C":
-            time.sleep(4)
+            assert wait(lambda: list(tmp_path.glob("sgstore-held-*")))
+            time.sleep(1)
             process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
     finally:
         process.kill()
 
     assert (process.returncode, out) == (130 if end == "Ctrl-C" else 2, "")
-    told = "sgstore: interrupted" if end == "Ctrl-C" else "sgstore: stopped after 1 s"
+    told = "sgstore: interrupted" if end == "Ctrl-C" else "sgstore: stopped after 0.5 s"
     # In its process memory is bounded, too: which bound ends it first, the machine decides.
     memory = end == "safe" and err.startswith("sgstore: stopped: it took more memory")
     assert err.startswith(told) or memory

@@ -10,7 +10,7 @@ from fractions import Fraction
 from itertools import combinations, product
 from math import comb
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 import numpy as np
@@ -47,6 +47,9 @@ from sgstore.coverage._frames import block_of, query_of_features
 from sgstore.errors import ConfigError, QueryError, StoreError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 PRECONDITIONS = Path(__file__).parent / "golden" / "s3c_preconditions.toml"
 RATE = float(os.environ.get("SGSTORE_COVERAGE_RATE", "0.5"))
@@ -98,11 +101,14 @@ def class_of(scene: Scene) -> Class:
 
 
 @pytest.fixture(scope="module")
-def worlds(tmp_path_factory: pytest.TempPathFactory) -> Worlds:
+def worlds(tmp_path_factory: pytest.TempPathFactory, kept_open: Callable[[str], None]) -> Worlds:
     """Two stores, and the scenes in them: A of two traces, B of one."""
     folder = tmp_path_factory.mktemp("worlds")
     of_a, of_b = [scenes(1, 70), scenes(2, 40)], [scenes(3, 50)]
-    return written(folder, "a", of_a), written(folder, "b", of_b), of_a, of_b
+    a, b = written(folder, "a", of_a), written(folder, "b", of_b)
+    kept_open(a)
+    kept_open(b)
+    return a, b, of_a, of_b
 
 
 def chained(traces: list[list[Scene]]) -> list[Class]:
@@ -596,9 +602,12 @@ def test_cells_of_a_query_are_counted_against_what_was_said(worlds: Worlds) -> N
 
 
 @pytest.fixture(scope="module")
-def town02(data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+def town02(
+    data: Path, tmp_path_factory: pytest.TempPathFactory, kept_open: Callable[[str], None]
+) -> str:
     store = tmp_path_factory.mktemp("s3c") / "x.sgstore"
     import_graphs(store, [data / "s3c" / "carla_max_vehicle_v3_Town02.csv.xz"], "s3c")
+    kept_open(str(store))
     return str(store)
 
 

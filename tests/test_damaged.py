@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,10 @@ import pytest
 from carla_recordings import read, states
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+
+    Had = Callable[[str], tuple[Any, list[Any], Any]]
 
 pytestmark = pytest.mark.data
 
@@ -54,6 +58,12 @@ def folder(data: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
+def had(folder: Path) -> Had:
+    """All that is read of a file; each is read once."""
+    return cache(lambda name: read(folder / f"{name}.mcap"))
+
+
+@pytest.fixture(scope="module")
 def whole(data: Path) -> dict[int, dict[str, Any]]:
     """Log time → states, of the file before it was hurt."""
     _, blocks, _ = read(data / "traces/carla/Town01.carla.mcap")
@@ -62,10 +72,10 @@ def whole(data: Path) -> dict[int, dict[str, Any]]:
 
 
 @each_file
-def test_what_can_be_saved_is_saved_and_what_is_lost_is_named(folder: Path, name: str) -> None:
+def test_what_can_be_saved_is_saved_and_what_is_lost_is_named(had: Had, name: str) -> None:
     hurt = FILES[name]
 
-    _, blocks, report = read(folder / f"{name}.mcap")
+    _, blocks, report = had(name)
 
     assert report.frames >= hurt.frames
     assert report.frames == sum(map(len, blocks))
@@ -79,9 +89,9 @@ def test_what_can_be_saved_is_saved_and_what_is_lost_is_named(folder: Path, name
     ["cut_mid_chunk", "flipped_chunk", "flipped_chunk_nocrc", "no_footer", "unknown_channel"],
 )
 def test_every_frame_that_is_saved_is_what_it_was(
-    folder: Path, whole: dict[int, dict[str, Any]], name: str
+    had: Had, whole: dict[int, dict[str, Any]], name: str
 ) -> None:
-    _, blocks, _ = read(folder / f"{name}.mcap")
+    _, blocks, _ = had(name)
     times = np.concatenate([block.log_time_ns for block in blocks]).tolist()
 
     for time, ours in zip(times, states(blocks), strict=True):
@@ -93,9 +103,9 @@ def test_every_frame_that_is_saved_is_what_it_was(
             )
 
 
-def test_lights_hold_over_a_hole(folder: Path, whole: dict[int, dict[str, Any]]) -> None:
+def test_lights_hold_over_a_hole(had: Had, whole: dict[int, dict[str, Any]]) -> None:
     """The message that changed them at 10 s lies in the hole: behind it they are as they were before."""
-    _, blocks, _ = read(folder / "flipped_chunk.mcap")
+    _, blocks, _ = had("flipped_chunk")
     found = states(blocks)
     shown = [
         {i: s["light_state"] for i, s in frame.items() if s["light_state"] >= 0} for frame in found
@@ -107,8 +117,8 @@ def test_lights_hold_over_a_hole(folder: Path, whole: dict[int, dict[str, Any]])
     assert len(shown[0]) == 36
 
 
-def test_only_what_is_unusable_is_left_out(folder: Path, whole: dict[int, dict[str, Any]]) -> None:
-    _, blocks, report = read(folder / "nan_poses.mcap")
+def test_only_what_is_unusable_is_left_out(had: Had, whole: dict[int, dict[str, Any]]) -> None:
+    _, blocks, report = had("nan_poses")
     gone = [
         (frame, ident)
         for frame, (ours, theirs) in enumerate(zip(states(blocks), whole.values(), strict=True))
@@ -123,8 +133,8 @@ def test_only_what_is_unusable_is_left_out(folder: Path, whole: dict[int, dict[s
     ]
 
 
-def test_a_clock_that_jumps_moves_no_frame(folder: Path, whole: dict[int, dict[str, Any]]) -> None:
-    _, blocks, _ = read(folder / "clock_jump.mcap")
+def test_a_clock_that_jumps_moves_no_frame(had: Had, whole: dict[int, dict[str, Any]]) -> None:
+    _, blocks, _ = had("clock_jump")
     times = np.concatenate([block.time_ns for block in blocks])
     seqs = np.concatenate([block.seq for block in blocks])
 

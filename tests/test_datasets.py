@@ -14,6 +14,7 @@ from sgstore.errors import QueryError
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from sgstore.query import Store
@@ -39,7 +40,8 @@ def path(town_store: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(path: Path) -> Store:
+def store(path: Path, kept_open: Callable[[Path], None]) -> Store:
+    kept_open(path)
     return sgstore.open(path)
 
 

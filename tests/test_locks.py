@@ -60,8 +60,10 @@ def lock_of(store: Store, way: Strategy = Strategy.minimal, *, payloads: bool = 
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return made(tmp_path_factory.mktemp("locks") / "here")
+def store(tmp_path_factory: pytest.TempPathFactory, kept_open: Callable[[Path], None]) -> Store:
+    store = made(tmp_path_factory.mktemp("locks") / "here")
+    kept_open(store.file.path)
+    return store
 
 
 @pytest.fixture(scope="module")

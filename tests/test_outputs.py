@@ -50,10 +50,15 @@ WRITERS = {
 
 
 @pytest.fixture(scope="module")
-def named(town_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def named(
+    town_store: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    kept_open: Callable[[Path], None],
+) -> dict[str, str]:
     """What stands in the command lines."""
     from sgstore.demo import RECORDING
 
+    kept_open(town_store)
     lock = tmp_path_factory.mktemp("locks") / "town.lock"
     assert run(["select", str(town_store), "--minimal", "--no-payloads", "-o", str(lock)]) == 0
     return {"store": str(town_store), "recording": str(RECORDING), "lock": str(lock)}

@@ -22,6 +22,7 @@ from sgstore.store import FrameRef, StoreFile
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from sgstore.query import Store
@@ -36,11 +37,12 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def world(path: Path) -> World:
+def world(path: Path, kept_open: Callable[[Path], None]) -> World:
     """A random world, in a store's file."""
     StoreFile.create(path)
     world = random_world(3, traces=3, frames=25, path=path)
     world.connection.close()
+    kept_open(path)
     return world
 
 

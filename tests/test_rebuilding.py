@@ -43,14 +43,15 @@ class Made:
 
 def held(path: Path) -> dict[str, Any]:
     """All rows of a store, but for times, and for where recordings lie from its folder."""
-    found: dict[str, Any] = dict(content(path))
     store = StoreFile(path)
-    found["derived"] = store.rows(
-        "SELECT * EXCLUDE (derived_at) FROM inside.derived ORDER BY name, trace_id"
-    ).values
+    with store.snapshot():
+        found: dict[str, Any] = dict(content(path))
+        found["derived"] = store.rows(
+            "SELECT * EXCLUDE (derived_at) FROM inside.derived ORDER BY name, trace_id"
+        ).values
+        found["order"] = [one.name for one in store.traces()]
+        assert store.verify().faults == []
     found["manifest"] = [row for row in found["manifest"] if row[2] != "derived"]  # holds a time
-    found["order"] = [one.name for one in store.traces()]
-    assert store.verify().faults == []
     return found
 
 

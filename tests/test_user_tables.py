@@ -18,6 +18,7 @@ from sgstore.errors import MissingExtraError, QueryError, StoreError
 from sgstore.sandbox import Sandbox
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from sgstore.query import Store
@@ -26,7 +27,8 @@ FRAMES = "MATCH (e:Ego) RETURN FRAMES"
 
 
 @pytest.fixture(scope="module")
-def path(town_store: Path) -> Path:
+def path(town_store: Path, kept_open: Callable[[Path], None]) -> Path:
+    kept_open(town_store)
     return town_store
 
 
