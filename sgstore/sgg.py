@@ -22,6 +22,7 @@ import numpy as np
 
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
 from sgstore.columns import chained
+from sgstore.compiled import worth
 from sgstore.errors import ConfigError
 from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
@@ -208,6 +209,7 @@ class SceneGraphGenerator:
 
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
+        worth(len(bodies))
         rows = keys, len(frames.states), len(self._scenery)
         standing = None
         if self._survey is not None:

@@ -21,7 +21,18 @@ PACKAGE = Path(__file__).parents[1] / "sgstore"
 # From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
 # one another, except that the files of one folder know each other.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"columns", "errors", "geometry", "pair_numbers", "plugins", "processes", "quoting"}),
+    frozenset(
+        {
+            "columns",
+            "compiled",
+            "errors",
+            "geometry",
+            "pair_numbers",
+            "plugins",
+            "processes",
+            "quoting",
+        }
+    ),
     frozenset({"mcap", "vocabulary"}),
     frozenset({"abstractions", "config", "files", "graph", "lang", "roads", "world"}),
     frozenset({"contrib", "opendrive", "relations", "step", "trace_parts"}),
@@ -42,6 +53,7 @@ OWNERS = {
     "zstandard": {"mcap", "readers", "exporters"},
     "lz4": {"mcap", "exporters"},
     "isal": {"mcap"},
+    "numba": {"compiled"},
     "typer": {"cli"},
     "rich": {"cli"},
     "networkx": {"graph", "exporters"},

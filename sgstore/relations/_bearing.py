@@ -22,6 +22,8 @@ from sgstore.relations._pairs import are_of_kinds
 from sgstore.relations._scene import (
     BlockScene,
     Relation,
+    edge_room,
+    edges_filled,
     edges_of_pairs,
     even_parts,
     span_up_to,
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
     from sgstore.config import Config, Direction
     from sgstore.relations._scene import BodyPairs
-    from sgstore.world import Bools, Floats
+    from sgstore.world import Bools, Codes, Floats
 
     Rows = NDArray[np.intp]
 
@@ -74,34 +76,57 @@ def _direction_edges(scene: BlockScene) -> Edges:
     if not settings.names:
         return Edges.chained([])
     names = np.array([RELATION_CODE[name] for name in settings.names], np.int8)
+    bounds = np.radians(settings.upper) + NOISE
+    bounds = np.sin(bounds), np.cos(bounds)
+    if _in_loops(scene):
+        from sgstore.relations import _loops
+
+        columns, unsure = edge_room(len(pairs)), np.empty(len(pairs), np.intp)
+        many, doubtful = _loops.sectors(*pairs.for_loops, bounds, names, DOUBT, columns, unsure)
+        sure, doubtful = edges_filled(columns, many), unsure[:doubtful]
+    else:
+        sure, doubtful = _sectors(scene, bounds, names)
+    rows, sectors = _by_bearing(settings, pairs, doubtful)
+    if not len(rows):
+        return sure
+    return Edges.chained([sure, _looking(pairs, rows, names[sectors])])
+
+
+def _in_loops(scene: BlockScene) -> bool:
+    """Whether loops tell directions, which know nothing of limits to them."""
+    settings = scene.config.direction
+    return scene.pairs.in_loops and not settings.kinds and not settings.within > 0
+
+
+def _looking(pairs: BodyPairs, rows: Rows, codes: Codes) -> Edges:
+    """Edges of some pairs, from what is seen to who sees."""
+    frame, a, b = (column[rows] for column in pairs.ends)
+    return Edges(frame, codes, b, a)
+
+
+def _sectors(scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes) -> tuple[Edges, Rows]:
+    """Edges of directions, and the pairs that need the bearing."""
+    pairs = scene.pairs
     codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
-    bounds = [
-        (np.float32(np.sin(bound)), np.float32(np.cos(bound)))
-        for bound in np.radians(settings.upper) + NOISE
-    ]
     ahead, left = pairs.offsets
+    sines, cosines = (of.astype(np.float32) for of in bounds)
     for part in even_parts(len(pairs)):
         onward, aside = ahead[part], np.abs(left[part])
         sector, least = np.zeros(len(aside), np.int8), np.abs(onward) + aside
         reach = least * np.float32(DOUBT)
-        for sin, cos in bounds:
+        for sin, cos in zip(sines, cosines, strict=True):
             short_of = (
                 sin * onward - cos * aside
-            )  # the distance times the sine of what is left to the bound
+            )  # distance times sine of the angle up to the bound
             sector += short_of < 0
             least = np.minimum(least, np.abs(short_of))
         codes[part] = names[sector]
         holds[part] = least > reach + TINY
     wanted = _wanted(scene)
     doubtful = np.flatnonzero(~holds if wanted is None else ~holds & wanted)
-    rows, sectors = _by_bearing(settings, pairs, doubtful)
     if wanted is not None:
         holds &= wanted
-    sure = edges_of_pairs(pairs, codes, holds, seen_by_a=True)
-    if not len(rows):
-        return sure
-    frame, a, b = (column[rows] for column in pairs.ends)
-    return Edges.chained([sure, Edges(frame, names[sectors], b, a)])
+    return edges_of_pairs(pairs, codes, holds, seen_by_a=True), doubtful
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
@@ -135,28 +160,45 @@ def _side_edges(scene: BlockScene) -> Edges:
     if settings.sides == "none":
         return Edges.chained([])
     names = np.array([RELATION_CODE[name] for name in SIDES], np.int8)
+    is_open = settings.sides == "open"
+    if _in_loops(scene):
+        from sgstore.relations import _loops
+
+        columns, unsure = edge_room(len(pairs)), np.empty(len(pairs), np.intp)
+        beside = BESIDE if is_open else -1.0
+        many, doubtful = _loops.sides(*pairs.for_loops, beside, names, DOUBT, columns, unsure)
+        sure, doubtful = edges_filled(columns, many), unsure[:doubtful]
+    else:
+        sure, doubtful = _sides(scene, names, is_open=is_open)
+    bearing = pairs.bearings(doubtful)
+    a, b = pairs.a[doubtful], pairs.b[doubtful]
+    dx, dy = (of[b] - of[a] for of in (scene.bodies.x, scene.bodies.y))
+    off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(bearing))
+    # Closed: to the last bit, as CARLASGG has it.
+    holds = off_axis > BESIDE if is_open else ~np.isnan(bearing)
+    if not holds.any():
+        return sure
+    codes = names[np.where(bearing[holds] >= 0, 0, 1)]
+    return Edges.chained([sure, _looking(pairs, doubtful[holds], codes)])
+
+
+def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Edges, Rows]:
+    """Edges of sides, and the pairs that need the bearing."""
+    pairs = scene.pairs
     ahead, left = pairs.offsets
-    codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
-    doubtful = np.empty(len(pairs), np.bool_)
-    is_open, beside = settings.sides == "open", np.float32(BESIDE)
+    codes, beside = np.empty(len(pairs), np.int8), np.float32(BESIDE)
+    holds, doubtful = np.empty((2, len(pairs)), np.bool_)
     for part in even_parts(len(pairs)):
         aside = np.abs(left[part])
         reach = (np.abs(ahead[part]) + aside) * np.float32(DOUBT) + TINY
         codes[part] = names[(left[part] < 0).view(np.int8)]
-        holds[part] = aside > (beside if is_open else reach)
-        doubtful[part] = ~(np.abs(aside - beside) > reach if is_open else holds[part])
+        doubtful[part] = ~((np.abs(aside - beside) if is_open else aside) > reach)
+        holds[part] = ~doubtful[part] & (aside > beside) if is_open else ~doubtful[part]
     wanted = _wanted(scene)
-    rows = np.flatnonzero(doubtful if wanted is None else doubtful & wanted)
-    if len(rows):
-        bearing = pairs.bearings(rows)
-        dx, dy = (of[pairs.b[rows]] - of[pairs.a[rows]] for of in (scene.bodies.x, scene.bodies.y))
-        off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(bearing))
-        codes[rows] = names[np.where(bearing >= 0, 0, 1)]
-        # Closed: to the last bit, as CARLASGG has it.
-        holds[rows] = off_axis > BESIDE if is_open else ~np.isnan(bearing)
     if wanted is not None:
+        doubtful &= wanted
         holds &= wanted
-    return edges_of_pairs(pairs, codes, holds, seen_by_a=True)
+    return edges_of_pairs(pairs, codes, holds, seen_by_a=True), np.flatnonzero(doubtful)
 
 
 def sector(name: str, legend: str = "") -> Relation:

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.compiled import worth
 from sgstore.mcap import Loss
 from sgstore.relations._scene import (
+    CHUNK,
     IS_SIGNAL,
     Bodies,
     BodyPairs,
     distances,
+    levels,
     parts,
     span_up_to,
     spans,
@@ -68,7 +71,9 @@ def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halv
 def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> Iterator[Halves]:
     """The same of some rows, whatever they are."""
     within, between = config.pairs.within, config.proximity.between
-    if within > 0:
+    if within > 0 and between != "footprints" and worth():
+        yield from _near_in_loops(bodies, rows, within, between, unwanted)
+    elif within > 0:
         yield from _near_pairs(bodies, rows, within, between, unwanted)
 
 
@@ -170,6 +175,28 @@ def _near_pairs(
         first, second = rows[part][owner], rows[index]
         near = np.flatnonzero(spans(bodies, first, second, between) <= limit)
         yield first[near], second[near]
+
+
+def _near_in_loops(
+    bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
+) -> Iterator[Halves]:
+    """The same pairs, in another order."""
+    from sgstore.relations import _loops
+
+    rows = rows[np.isfinite(bodies.x[rows])]
+    order = rows[np.lexsort((bodies.x[rows], bodies.frame[rows]))]
+    frame = bodies.frame[order]
+    end = np.searchsorted(frame, frame, side="right")
+    room = max(CHUNK, int((end - np.arange(len(end))).max(initial=0)))
+    a, b = found = np.empty(room, np.intp), np.empty(room, np.intp)
+    place, limit = (bodies.x, bodies.y, levels(bodies, between)), span_up_to(within, between)
+    first = 0
+    while first < len(order):
+        if unwanted[frame[first]]:
+            first = int(end[first])
+            continue
+        many, first = _loops.near_pairs(first, order, end, place, limit, found)
+        yield a[:many].copy(), b[:many].copy()
 
 
 # Pairs of what never moves: found once, when it appears, and looked up where both of them are in range ----

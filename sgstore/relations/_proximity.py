@@ -14,6 +14,8 @@ from sgstore.relations._pairs import are_of_kinds
 from sgstore.relations._scene import (
     BlockScene,
     Relation,
+    edge_room,
+    edges_filled,
     edges_of_pairs,
     even_parts,
     span_up_to,
@@ -31,6 +33,12 @@ def _edges(scene: BlockScene) -> Edges:
     codes = np.array(
         [RELATION_CODE[name] for name in (*settings.names, *settings.names[:1])], np.int8
     )
+    if bounds and pairs.in_loops and not settings.kinds:
+        from sgstore.relations import _loops
+
+        columns = edge_room(len(pairs))
+        many = _loops.rungs(*pairs.for_loops[:4], np.array(bounds), codes, columns)
+        return edges_filled(columns, many)
     found, holds = np.zeros(len(pairs.span), np.int8), np.zeros(len(pairs.span), np.bool_)
     for part in even_parts(len(found) if bounds else 0):
         span, rung = pairs.span[part], np.zeros(part.stop - part.start, np.int8)

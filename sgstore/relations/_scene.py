@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.columns import taken
+from sgstore.compiled import worth
 from sgstore.geometry import bearings
 from sgstore.graph import Edges
 from sgstore.pair_numbers import gap
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 
     Nodes = NDArray[np.int32]
     Rows = NDArray[np.intp]
+    Columns = tuple[Nodes, Codes, Nodes, Nodes]
+    Looped = tuple[
+        Rows, Rows, tuple[Nodes, Nodes], tuple[Floats, Floats, Floats], tuple[Floats, Floats]
+    ]
 
 
 CHUNK: Final = 1 << 16
@@ -195,8 +200,7 @@ class BodyPairs:
         NaN where a's heading is missing, or farther from 0 than :data:`MOST_TURNED`.
         """
         of, half = self._bodies, self._half
-        heading = np.where(np.abs(of.heading) <= MOST_TURNED, of.heading, np.nan)
-        cos, sin = np.cos(heading).astype(np.float32), np.sin(heading).astype(np.float32)
+        cos, sin = (column.astype(np.float32) for column in self._turns)
         ahead, left = np.empty((2, len(self)), np.float32)
         for part in even_parts(half):
             a, b = self.a[:half][part], self.b[:half][part]
@@ -209,6 +213,29 @@ class BodyPairs:
         np.negative(ahead[half:], out=ahead[half:])
         np.negative(left[half:], out=left[half:])
         return ahead, left
+
+    @cached_property
+    def for_loops(self) -> Looped:
+        """Halves, frames and nodes of the bodies, their places and turns: what loops over pairs are given."""
+        of, half = self._bodies, self._half
+        return (
+            self.a[:half],
+            self.b[:half],
+            (of.frame.astype(np.int32), of.node.astype(np.int32)),
+            (of.x, of.y, levels(of, self._between)),
+            self._turns,
+        )
+
+    @property
+    def in_loops(self) -> bool:
+        """Return whether loops tell of them, which know nothing of footprints."""
+        return self._between != "footprints" and worth()
+
+    @cached_property
+    def _turns(self) -> tuple[Floats, Floats]:
+        heading = self._bodies.heading
+        heading = np.where(np.abs(heading) <= MOST_TURNED, heading, np.nan)
+        return np.cos(heading), np.sin(heading)
 
     @cached_property
     def ends(self) -> tuple[Nodes, Nodes, Nodes]:
@@ -228,6 +255,17 @@ MOST_TURNED: Final = 1e3
 
 EVEN_PART: Final = 1 << 13
 """Pairs whose numbers are computed together: few enough for the nearest caches of a processor."""
+
+
+def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
+    """Rows by frame, and where those of each frame begin, and the last ones end."""
+    order = np.argsort(frame, kind="stable")
+    return order, np.searchsorted(frame[order], np.arange(frames + 1))
+
+
+def turns(bodies: Bodies) -> tuple[Floats, Floats]:
+    """Cosines and sines of the headings."""
+    return np.cos(bodies.heading), np.sin(bodies.heading)
 
 
 def even_parts(count: int) -> Iterator[slice]:
@@ -252,12 +290,17 @@ def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
         boxes = bodies.boxes
         boxes[np.isnan(boxes).any(axis=1), 2:] = 0
         return gap(boxes[a], boxes[b])
-    z = bodies.z
-    if between == "origins":
-        on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
-        z = np.where(on_ground, bodies.bottom, z)
-    dx, dy, dz = (of[b] - of[a] for of in (bodies.x, bodies.y, z))
+    places = (bodies.x, bodies.y, levels(bodies, between))
+    dx, dy, dz = (of[b] - of[a] for of in places)
     return dx * dx + dy * dy + dz * dz
+
+
+def levels(bodies: Bodies, between: str) -> Floats:
+    """Heights of what distances are measured between; m."""
+    if between != "origins":
+        return bodies.z
+    on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
+    return np.where(on_ground, bodies.bottom, bodies.z)
 
 
 def span_up_to(distance: float, between: str) -> float:
@@ -433,6 +476,18 @@ def edges_between(
     return Edges(
         bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
     )
+
+
+def edge_room(count: int) -> Columns:
+    """Columns of so many edges, for loops to fill in."""
+    frame, src, dst = np.empty((3, count), np.int32)
+    return frame, np.empty(count, np.int8), src, dst
+
+
+def edges_filled(columns: Columns, count: int) -> Edges:
+    """The first of these edges."""
+    frame, relation, src, dst = columns
+    return Edges(frame[:count], relation[:count], src[:count], dst[:count])
 
 
 def edges_of_pairs(

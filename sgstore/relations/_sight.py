@@ -20,8 +20,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.compiled import worth
 from sgstore.geometry import corners, wrapped
-from sgstore.relations._scene import IS_SIGNAL, Relation, edges_between, meeting
+from sgstore.relations._scene import (
+    IS_SIGNAL,
+    Relation,
+    by_frame,
+    edges_between,
+    meeting,
+    turns,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -54,6 +62,8 @@ def seen(bodies: Bodies, ego: Rows) -> Rows:
     ego : (F,) intp
         Row of the ego of each frame; -1: nothing is seen.
     """
+    if worth():
+        return _seen_in_loops(bodies, ego)
     mine = ego[bodies.frame]
     there = (mine >= 0) & (mine != np.arange(len(bodies)))
     rows = np.flatnonzero(there & np.isfinite(bodies.x) & np.isfinite(bodies.y))
@@ -69,6 +79,17 @@ def seen(bodies: Bodies, ego: Rows) -> Rows:
                 blocked = pairs[_blocked(views, target[pairs], cover[pairs], point)]
                 hidden[target[blocked], point] = True
     return rows[~hidden.all(axis=1)]
+
+
+def _seen_in_loops(bodies: Bodies, ego: Rows) -> Rows:
+    from sgstore.relations import _loops
+
+    order, starts = by_frame(bodies.frame, len(ego))
+    place, size = (bodies.x, bodies.y, bodies.z), (bodies.length, bodies.width, bodies.height)
+    signal = IS_SIGNAL[bodies.kind]
+    return np.flatnonzero(
+        _loops.sight(order, starts, ego, place, turns(bodies), size, signal, GRAZE)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,55 @@
+"""Loops that numba compiles, where it is installed: the extra ``[fast]``.
+
+Without it numpy does the same, and the answers are equal: loops add, multiply, divide, take roots and compare,
+with the roundings of numpy, and leave to it whatever needs an angle. Numba takes a third of a second to start,
+so loops are used when a process has seen work that is worth it. The first time on a machine they take some
+seconds to compile; what is compiled is kept beside the source, or in the user's cache.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+WORTH: Final = 100_000
+"""Bodies in graphs after which a process uses loops."""
+
+_seen = {"bodies": 0}
+
+
+def worth(bodies: int = 0) -> bool:
+    """Return whether loops are to be used; ``bodies`` are more that graphs are made of."""
+    _seen["bodies"] += bodies
+    return _seen["bodies"] >= WORTH and _numba() is not None
+
+
+def use_loops(*, at_once: bool) -> bool:
+    """Use loops from now on, or only when it is worth it; return whether there is anything to compile them."""
+    _seen["bodies"] = WORTH if at_once else 0
+    return _numba() is not None
+
+
+@cache
+def _numba() -> Any:
+    try:
+        return import_module("numba")
+    except ImportError:  # it is not there, or does not work with this numpy
+        return None
+
+
+def compiled(loop: Loop) -> Loop:
+    """A function of numbers and arrays, as numba compiles it when it is first called; itself without numba."""
+    numba = _numba()
+    if numba is None:
+        return loop
+    options = {"error_model": "numpy", "nogil": True}
+    try:
+        return numba.njit(loop, cache=True, **options)
+    except RuntimeError:  # there is no place where it may be kept
+        return numba.njit(loop, **options)

@@ -1,0 +1,123 @@
+"""Graphs are the same with loops that numba compiles (the extra ``[fast]``) and with numpy alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from builders import Thing, frames, thing
+from test_relations import TOWN, busy, crowd
+
+from sgstore import compiled
+from sgstore.config import Config, configured
+from sgstore.demo import RECORDING
+from sgstore.opendrive import read_map
+from sgstore.readers import open_trace
+from sgstore.sgg import SceneGraphGenerator
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.graph import GraphBlock
+    from sgstore.roads import RoadMap
+    from sgstore.world import FrameBlock
+
+CONFIGS = [
+    Config(),
+    configured(direction={"ties": "carlasgg", "sides": "closed"}, proximity={"between": "origins"}),
+    configured(direction={"ties": "both", "within": 12}, pairs={"static": True, "within": 40}),
+    configured(proximity={"between": "footprints"}, direction={"sides": "none"}),
+    configured(direction={"kinds": [["Ego", "Vehicle"]]}, pairs={"ego": False}),
+]
+
+
+@pytest.fixture
+def _ends_without_loops() -> Iterator[None]:
+    yield
+    compiled.use_loops(at_once=False)
+
+
+def columns(graph: GraphBlock) -> list[np.ndarray[Any, Any]]:
+    """All columns of a block of graphs: edges in order, numbers as they are."""
+    edges = graph.edges.distinct()
+    tables = (edges, graph.lanes, graph.gaps, graph.presence)
+    return [getattr(table, field.name) for table in tables for field in fields(table)]
+
+
+def assert_same_both_ways(
+    blocks: list[FrameBlock], road_map: RoadMap | None, config: Config
+) -> None:
+    found: list[list[np.ndarray[Any, Any]]] = []
+    for at_once in (False, True):
+        if not compiled.use_loops(at_once=at_once):
+            pytest.skip("numba is not installed")
+        generator = SceneGraphGenerator(road_map, config)
+        found.append([column for block in blocks for column in columns(generator.block(block))])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def on_a_grid(seed: int) -> list[Thing]:
+    """Things of many kinds whose bearings and distances lie on bounds, two of them in one place."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(-8, 8, (2, 20))
+    heading = rng.integers(-4, 5, 20) * (np.pi / 4)
+    kinds = rng.choice(["car", "person", "truck", "traffic_light"], 20)
+    things = [
+        thing(f"t{i}", float(x[i]), float(y[i]), float(heading[i]), kind=str(kinds[i]))
+        for i in range(20)
+    ]
+    return [thing("ego"), thing("twin"), *things, thing("turned", 3, 3, 1e5)]
+
+
+@cache
+def sample() -> tuple[list[FrameBlock], RoadMap]:
+    with open_trace(RECORDING) as recording:
+        road_map = read_map(recording.info.map_text, recording.info.map_name)
+        return [block for block, _ in zip(recording.blocks(20), range(2), strict=False)], road_map
+
+
+@pytest.mark.usefixtures("_ends_without_loops")
+@pytest.mark.parametrize("config", CONFIGS, ids=range(len(CONFIGS)))
+def test_loops_and_numpy_give_the_same_graphs_of_random_scenes(config: Config) -> None:
+    scenes = [busy(1), crowd(2, 40, 20), crowd(3, 25, 60), on_a_grid(4), on_a_grid(5), [thing("x")]]
+    block = frames(*scenes)
+    assert_same_both_ways([block], TOWN, config)
+    assert_same_both_ways([block], None, config)
+
+
+@pytest.mark.usefixtures("_ends_without_loops")
+@pytest.mark.parametrize("config", CONFIGS[:2], ids=range(2))
+def test_loops_and_numpy_give_the_same_graphs_of_the_sample(config: Config) -> None:
+    assert_same_both_ways(*sample(), config)
+
+
+@pytest.mark.usefixtures("_ends_without_loops")
+def test_loops_are_used_when_they_are_worth_it() -> None:
+    if not compiled.use_loops(at_once=False):
+        pytest.skip("numba is not installed")
+
+    assert not compiled.worth(compiled.WORTH - 1)
+    assert compiled.worth(1)
+
+
+def test_without_numba_nothing_is_compiled() -> None:
+    program = """if True:
+        import sys
+        sys.modules["numba"] = None
+        from sgstore import compiled
+        assert not compiled.use_loops(at_once=True) and not compiled.worth(compiled.WORTH)
+        from sgstore.relations import _loops
+        import numpy as np
+        order, end = np.arange(3), np.full(3, 3)
+        place, found = (np.array([0.0, 1.0, 9.0]), *np.zeros((2, 3))), tuple(np.zeros((2, 9), int))
+        assert _loops.near_pairs(0, order, end, place, 4.0, found) == (1, 3)
+        import sgstore.sgg
+        assert "numba" not in {name for name, module in sys.modules.items() if module is not None}
+    """
+    subprocess.run([sys.executable, "-c", program], check=True)
