@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.draw import draw_stored
 from sgstore.errors import ExportError, MissingExtraError, TraceError
-from sgstore.exporters import write_stored
+from sgstore.exporters import Export, WrittenClip, write_export
 from sgstore.ingest import ingest
 from sgstore.query import Store
 
@@ -166,7 +166,8 @@ def _export(store: Store, folder: Path, say: Say) -> Path:
     question = QUESTIONS[0]
     to = folder / "clips"
     clips = list(store.find(question.pattern).clips(before=2.0, after=2.0))
-    written = write_stored(store, clips, to, query=question.pattern)
+    export = Export(store, tuple(clips), provenance={"query": question.pattern})
+    written = [one for one in write_export(export, to) if isinstance(one, WrittenClip)]
     say("")
     say(
         "The first answer as a test case of its own: the original messages, 2 s before to 2 s after."

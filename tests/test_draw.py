@@ -17,7 +17,7 @@ from drawing import Crossing, crowd, entity, graph_of, related
 from PIL import Image
 
 import sgstore.draw._palette as palette
-from sgstore.draw import SheetFrame, draw_frame, draw_map, draw_sheet
+from sgstore.draw import draw_frame, draw_map
 from sgstore.draw._page import FURTHEST
 from sgstore.draw._picture import title_of
 from sgstore.errors import ExportError, MissingExtraError
@@ -331,23 +331,6 @@ def test_a_map_without_anything_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(ExportError, match="no lane, crosswalk or object"):
         draw_map(Empty(), tmp_path / "m.svg")
-
-
-def test_a_sheet_has_a_window_for_each_frame(tmp_path: Path) -> None:
-    frames = [SheetFrame(two(), None, {"p": 17}, f"frame of {n}") for n in range(5)]
-    draw_sheet(frames, tmp_path / "s.svg", columns=3, title="five")
-    told = texts(svg(tmp_path / "s.svg"))
-
-    assert {f"frame of {n}" for n in range(5)} | {"five"} <= set(told)
-    assert told.count("p = person 17") == 5
-
-
-@pytest.mark.parametrize(("count", "columns"), [(0, 4), (101, 4), (1, 0)])
-def test_a_sheet_of_none_or_too_many_is_a_mistake_of_the_caller(
-    tmp_path: Path, count: int, columns: int
-) -> None:
-    with pytest.raises(ValueError, match="1 to 100 frames"):
-        draw_sheet([SheetFrame(two(), None)] * count, tmp_path / "s.png", columns=columns)
 
 
 @pytest.mark.parametrize("package", ["matplotlib", "PIL"])

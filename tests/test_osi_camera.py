@@ -13,7 +13,7 @@ from recordings import Recorder, car, ground_truth
 from test_osi_file import messages, packed
 
 import sgstore
-from sgstore.exporters import write_stored
+from sgstore.exporters import Export, write_export
 from sgstore.ingest import ingest
 from sgstore.readers import OsiFile, descriptors, message_class, open_trace
 from sgstore.store import StoreFile
@@ -149,7 +149,7 @@ def test_a_jpeg_in_the_place_of_pixels_is_exported_under_its_own_ending(tmp_path
     store = sgstore.open(tmp_path / "s.sgstore")
     clips = list(store.find("MATCH (e:Ego)").clips(0.0, 0.0))
 
-    write_stored(store, clips, tmp_path / "clips", form="frames", query="")
+    write_export(Export(store, tuple(clips)), tmp_path / "clips", "frames")
 
     (file,) = (tmp_path / "clips").rglob("*.jpg")
     assert file.read_bytes() == stream.getvalue()
@@ -187,7 +187,7 @@ def test_a_single_channel_file_is_ingested_asked_read_and_cut(tmp_path: Path) ->
     assert StoreFile(store_path).carried("drive#6", "ground_truth").data == told[6]
 
     matches = store.find("MATCH (e:Ego) WHERE e.x >= 5 AND e.x < 8")
-    write_stored(store, list(matches.clips(0.0, 0.0)), tmp_path / "clips", form="mcap", query="")
+    write_export(Export(store, tuple(matches.clips(0.0, 0.0))), tmp_path / "clips")
     (clip,) = (tmp_path / "clips").glob("*.mcap")
     with clip.open("rb") as stream:
         cut = [message.data for _, _, message in make_reader(stream).iter_messages()]

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 PUBLIC = {
     "sgstore": (),
     "sgstore.query": ("Store",),
-    "sgstore.draw": ("draw_frame", "draw_map", "draw_sheet", "draw_stored", "draw_clip"),
+    "sgstore.draw": ("draw_frame", "draw_map", "draw_stored", "draw_clip"),
     "sgstore.locks": (),
     "sgstore.coverage": (),
     "sgstore.selection": (),
-    "sgstore.exporters": ("write_export", "write_stored", "Recorder"),
+    "sgstore.exporters": ("write_export", "Recorder"),
     "sgstore.record": ("record",),
     "sgstore.ingest": (),
     "sgstore.map_files": ("read_map_file",),

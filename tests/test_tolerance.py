@@ -14,7 +14,7 @@ from thorough import LONG
 
 import sgstore
 from sgstore.errors import StoreError
-from sgstore.exporters import write_stored
+from sgstore.exporters import Export, write_export
 from sgstore.ingest import ingest
 from sgstore.query import Store
 from sgstore.step import Frame
@@ -209,7 +209,7 @@ def test_a_clip_has_the_frames_at_its_ends(truncated: tuple[Path, Store], tmp_pa
     rows = store.sql("SELECT seq, log_time_ns FROM frames ORDER BY seq").values
     lies = {seq for seq, log in rows if clips[0].start_ns - 500 <= log <= clips[0].end_ns + 500}
 
-    (written,) = write_stored(store, clips, tmp_path / "clips")
+    (written,) = write_export(Export(store, tuple(clips)), tmp_path / "clips")
     ingest(tmp_path / "clip.sgstore", [written.file])
     (trace,) = Store(tmp_path / "clip.sgstore").info()
 

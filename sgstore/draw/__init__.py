@@ -1,4 +1,4 @@
-"""Frames, maps and contact sheets as pictures, PNG or SVG by the ending of the file's name.
+"""Frames and maps as pictures, PNG or SVG by the ending of the file's name.
 
 A frame is seen from above with the ego in the middle, heading up. A picture is made for a person who
 has never seen this project: whatever occurs in it is explained beside it, and nothing else is. A file

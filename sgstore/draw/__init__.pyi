@@ -5,10 +5,8 @@ from ._charts import draw_growth as draw_growth
 from ._charts import draw_matrix as draw_matrix
 from ._charts import draw_rank_sizes as draw_rank_sizes
 from ._view import Relations as Relations
-from ._picture import SheetFrame as SheetFrame
 from ._picture import draw_frame as draw_frame
 from ._picture import draw_map as draw_map
-from ._picture import draw_sheet as draw_sheet
 from ._stored import camera_image as camera_image
 from ._stored import draw_clip as draw_clip
 from ._stored import draw_stored as draw_stored
@@ -24,7 +22,6 @@ __all__ = [
     "LETTERS",
     "NAME",
     "Relations",
-    "SheetFrame",
     "camera_image",
     "draw_clip",
     "draw_curve",
@@ -33,7 +30,6 @@ __all__ = [
     "draw_map",
     "draw_matrix",
     "draw_rank_sizes",
-    "draw_sheet",
     "draw_stored",
     "draw_timelines",
     "frame_image",

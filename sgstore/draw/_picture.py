@@ -1,4 +1,4 @@
-"""Frames, maps and contact sheets as pictures, PNG or SVG by the ending of the file's name.
+"""Frames and maps as pictures, PNG or SVG by the ending of the file's name.
 
 A frame is seen from above with the ego in the middle, heading up. A picture is made for a person who
 has never seen this project: whatever occurs in it is explained beside it, and nothing else is. A file
@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
@@ -31,13 +30,10 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
 
-__all__ = ["Relations", "SheetFrame", "draw_frame", "draw_map", "draw_sheet"]
-
 _MARGIN: Final = 14.0
 _TITLE: Final = 40.0
 _WINDOW: Final = 520.0
 _PANEL: Final = 244.0
-_CELL: Final = 300.0
 _READ_DIAGRAM: Final = (
     "above: entities, where the ego sees them; below: the map, from left to right"
 )
@@ -153,77 +149,6 @@ def diagram_page(
     _paint_title(page, "Its scene graph", f"{told}  ·  {_READ_DIAGRAM}", left=middle)
     paint_key(page, key, (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2))
     return page
-
-
-@dataclass(frozen=True, slots=True)
-class SheetFrame:
-    """A frame of a contact sheet.
-
-    Attributes
-    ----------
-    graph : SceneGraph
-    road_map : RoadMap or None
-    highlight : mapping of str to int, or sequence of int
-        As in :func:`draw_frame`.
-    caption : str
-        By default trace, frame and time.
-    """
-
-    graph: SceneGraph
-    road_map: RoadMap | None
-    highlight: Mapping[str, int] | Sequence[int] = ()
-    caption: str = ""
-
-
-def draw_sheet(
-    frames: Sequence[SheetFrame],
-    to: str | Path,
-    *,
-    columns: int = 3,
-    radius: float | None = None,
-    title: str | None = None,
-) -> None:
-    """Draw several frames on one sheet, row by row, all to one scale.
-
-    Parameters
-    ----------
-    frames : sequence of SheetFrame
-        At least one, at most 100.
-    to : str or Path
-        As in :func:`draw_frame`.
-    columns : int
-        Frames in a row, at most.
-    radius : float, optional
-        Half the side of each window; m. By default what the frames need, 30 to 60 m.
-    title : str, optional
-
-    Raises
-    ------
-    ExportError, MissingExtraError
-        As in :func:`draw_frame`.
-    """
-    if not 1 <= len(frames) <= 100 or columns < 1:
-        raise ValueError(f"a sheet has 1 to 100 frames in columns, not {len(frames)} in {columns}")
-    reach = checked(radius) or max(
-        view_of(f.graph, None, matched_nodes(f.highlight)).radius for f in frames
-    )
-    across = min(columns, len(frames))
-    down = -(-len(frames) // across)
-    head = _TITLE if title else _MARGIN
-    step, tall = _CELL + _MARGIN, _CELL + _MARGIN + 8
-    with drawing(to):
-        from sgstore.draw._page import Page
-
-        page = Page(_MARGIN + across * step, down * tall + head)
-        for index, frame in enumerate(frames):
-            left, top = _MARGIN + index % across * step, page.height - head - index // across * tall
-            _paint_cell(page, frame, (left, top - 10 - _CELL, left + _CELL, top - 10), reach)
-        if title:
-            told = (
-                "seen from above; the ego in the middle, orange; what was matched is marked yellow"
-            )
-            _paint_title(page, title, told)
-        page.save(to)
 
 
 def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> None:
@@ -365,14 +290,3 @@ def _paint_panel(
         side.paint_matches(panel, scene)
     side.paint_surroundings(panel, scene, bottom + side.legend_height(entries))
     side.paint_legend(panel, entries)
-
-
-def _paint_cell(page: Page, frame: SheetFrame, box: Rect, radius: float) -> None:
-    from sgstore.draw._scene import DrawnFrame, paint_scene
-
-    view = view_of(frame.graph, radius)
-    matched = matched_nodes(frame.highlight)
-    scene = DrawnFrame.of(frame.graph, frame.road_map, matched, view, "ego")
-    paint_scene(page.stage(box, view), scene, every_name=False)
-    caption = clean(frame.caption) if frame.caption else title_of(frame.graph)
-    page.text(box[0], box[3] + 4, clean(caption, 60), fontsize=7.0, weight="bold")

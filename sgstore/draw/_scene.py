@@ -58,7 +58,7 @@ _LEADER: Final = 9.0
 _PEN: Final = 4.5
 
 
-def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect], *, every: bool) -> int:
+def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect]) -> int:
     """Names of what was matched, then the ego's, then relations on the lines, then all other names.
 
     Parameters
@@ -67,8 +67,6 @@ def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect], *, ev
     scene : DrawnFrame
     reserved : iterable of Rect
         Room that is taken already.
-    every : bool
-        Otherwise only the matched and the ego are named.
 
     Returns
     -------
@@ -87,8 +85,6 @@ def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect], *, ev
     for link in scene.links:
         if link.family == "matched":
             _paint_relations(stage, scene, placer, link, sentences(link, scene.matched))
-    if not every:
-        return 0
     near = scene.near_first()
     order = {body.node: rank for rank, body in enumerate(near)}
     close = [k for k in scene.links if k.family == "ego" and k.b in order]
@@ -333,11 +329,8 @@ def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | No
     ]
 
 
-def paint_scene(stage: Stage, scene: DrawnFrame, *, every_name: bool = True) -> int:
-    """Draw a frame in its window; returns the number of names that found no room.
-
-    Without ``every_name`` only the ego and what was matched are named.
-    """
+def paint_scene(stage: Stage, scene: DrawnFrame) -> int:
+    """Draw a frame in its window; returns the number of names that found no room."""
     if scene.ground is not None:
         _paint_map(stage, scene, scene.ground)
     rings = paint_rings(stage) if scene.graph.ego in scene.bodies else []
@@ -348,7 +341,7 @@ def paint_scene(stage: Stage, scene: DrawnFrame, *, every_name: bool = True) -> 
     for body in scene.near_first():
         paint_body(stage, body)
     reserved = (*rings, paint_scale(stage), paint_compass(stage))
-    return paint_texts(stage, scene, reserved, every=every_name)
+    return paint_texts(stage, scene, reserved)
 
 
 def _paint_map(stage: Stage, scene: DrawnFrame, ground: GroundView) -> None:

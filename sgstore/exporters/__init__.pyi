@@ -19,7 +19,6 @@ from ._registry import exporter_named as exporter_named
 from ._registry import exporters as exporters
 from ._registry import labelled as labelled
 from ._registry import write_export as write_export
-from ._registry import write_stored as write_stored
 
 __all__ = [
     "ClipFrames",
@@ -41,5 +40,4 @@ __all__ = [
     "labelled",
     "parse_labels",
     "write_export",
-    "write_stored",
 ]

@@ -25,7 +25,7 @@ from google.protobuf import (
     timestamp_pb2,
 )
 
-from sgstore.readers import png
+from sgstore.readers import add_fields, png
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:
@@ -35,14 +35,6 @@ if TYPE_CHECKING:
     from sgstore.graph import SceneGraph
 
 
-_FIELD: Final = descriptor_pb2.FieldDescriptorProto
-_SCALARS: Final = {
-    "double": _FIELD.TYPE_DOUBLE,
-    "string": _FIELD.TYPE_STRING,
-    "bytes": _FIELD.TYPE_BYTES,
-    "fixed32": _FIELD.TYPE_FIXED32,
-    "bool": _FIELD.TYPE_BOOL,
-}
 _GOOGLE: Final = {"Timestamp": timestamp_pb2.DESCRIPTOR, "Duration": duration_pb2.DESCRIPTOR}
 _TYPES: Final = {
     "Vector3": "x=1:double y=2:double z=3:double",
@@ -121,28 +113,14 @@ def _descriptors(name: str) -> descriptor_pb2.FileDescriptorSet:
 
 def _add_message(message: descriptor_pb2.DescriptorProto) -> None:
     """Fill in the fields and enumerations of a message, by its name."""
-    for item in _TYPES[message.name].split():
-        label, _, rest = item.partition("=")
-        number, _, kind = rest.partition(":")
-        field = message.field.add(name=label, number=int(number))
-        field.label = _FIELD.LABEL_REPEATED if kind.endswith("*") else _FIELD.LABEL_OPTIONAL
-        _set_type(field, kind.removesuffix("*"))
+    google = dict.fromkeys(_GOOGLE, "google.protobuf")
+    add_fields(message, _TYPES[message.name], _ENUMS, "foxglove", google)
     for name_of, words in _ENUMS.items():
         owner, _, own = name_of.partition(".")
         if owner == message.name:
             enum = message.enum_type.add(name=own)
             for number, word in enumerate(words.split()):
                 enum.value.add(name=word, number=number)
-
-
-def _set_type(field: descriptor_pb2.FieldDescriptorProto, kind: str) -> None:
-    if kind in _SCALARS:
-        field.type = _SCALARS[kind]
-    elif kind in _ENUMS:
-        field.type, field.type_name = _FIELD.TYPE_ENUM, f".foxglove.{kind}"
-    else:
-        package = "google.protobuf" if kind in _GOOGLE else "foxglove"
-        field.type, field.type_name = _FIELD.TYPE_MESSAGE, f".{package}.{kind}"
 
 
 @cache

@@ -19,7 +19,7 @@ from mcap.writer import Writer
 import sgstore.exporters._foxglove as foxglove
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import tool
-from sgstore.readers import SensorCloud, SensorPicture, descriptors
+from sgstore.readers import SensorCloud, SensorPicture, add_fields, descriptors
 from sgstore.step import NUMBERS
 from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS, VEHICLES
 
@@ -301,15 +301,11 @@ _INDICATORS: Final = ("OFF", "LEFT", "RIGHT", "WARNING")
 def types() -> tuple[type[Any], type[Any], bytes, bytes]:
     """Classes of a sensor view and of a road map, and the descriptors that an MCAP file carries for them."""
     view_schema = descriptors()
-    field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(
         name="osi3/osi_mapasamopendrive.proto", package="osi3", syntax="proto2"
     )
     message = file.message_type.add(name=ROAD_MAP.partition(".")[2])
-    for number, name in enumerate(("map_reference", "open_drive_xml_content"), start=1):
-        message.field.add(
-            name=name, number=number, type=field.TYPE_STRING, label=field.LABEL_OPTIONAL
-        )
+    add_fields(message, "map_reference=1:string open_drive_xml_content=2:string", (), "osi3")
     map_schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
     pool = descriptor_pool.DescriptorPool()
     for schema in (view_schema, map_schema):

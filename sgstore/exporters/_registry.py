@@ -234,29 +234,3 @@ def _check(export: Export, exporter: Exporter) -> None:
             raise ExportError(
                 f"a clip of {clip.trace!r} ends at {clip.end_ns} ns, before its start"
             )
-
-
-def write_stored(
-    store: Store, clips: Sequence[Clip], to: str | Path, *, form: str = "mcap", query: str = ""
-) -> list[WrittenClip]:
-    """Cut clips out of the recordings of a store; :func:`write_export` without options.
-
-    Parameters
-    ----------
-    store : Store
-    clips : sequence of Clip
-    to : str or Path
-        Folder; made if it does not exist, and nothing in it is overwritten.
-    form : str
-        Name of an exporter of clips.
-    query : str
-        What found them; kept with every clip.
-
-    Raises
-    ------
-    ExportError, TraceError
-        As the exporter says; then nothing is written.
-    """
-    provenance = {"query": query} if query else {}
-    written = write_export(Export(store, tuple(clips), provenance=provenance), to, form)
-    return [one for one in written if isinstance(one, WrittenClip)]

@@ -35,6 +35,7 @@ from .carla._live import Sensors as Sensors
 from .carla._live import load_sensors as load_sensors
 from .foxglove._messages import DERIVED as DERIVED
 from .osi._file import OsiFile as OsiFile
+from .osi._schema import add_fields as add_fields
 from .osi._schema import descriptors as descriptors
 from .osi._schema import message_class as message_class
 
@@ -59,6 +60,7 @@ __all__ = [
     "SensorReading",
     "Sensors",
     "TraceMessage",
+    "add_fields",
     "channels_of",
     "connect",
     "decode",

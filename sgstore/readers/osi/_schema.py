@@ -14,6 +14,7 @@ import math
 import tomllib
 from functools import cache
 from importlib import resources
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, unknown_fields
@@ -23,7 +24,7 @@ from sgstore.errors import TraceError
 from sgstore.readers._blocks import FAR, NAN
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Container, Iterator, Mapping
 
     from google.protobuf.descriptor import Descriptor
     from mcap.records import Schema
@@ -308,6 +309,7 @@ _SCALARS: Final = {
     "bool": _FIELD.TYPE_BOOL,
     "string": _FIELD.TYPE_STRING,
     "bytes": _FIELD.TYPE_BYTES,
+    "fixed32": _FIELD.TYPE_FIXED32,
 }
 
 
@@ -332,14 +334,30 @@ def descriptors() -> bytes:
         if len({value.number for value in enum.value}) == len(enum.value):
             enum.ClearField("options")  # protobuf refuses leave for aliases where there are none
     for name, items in tables["messages"].items():
-        _add_fields(types[name], items.split(), tables["enums"])
+        add_fields(types[name], items, tables["enums"], "osi3")
     return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
 
 
-def _add_fields(
-    message: descriptor_pb2.DescriptorProto, items: list[str], enums: Mapping[str, str]
+def add_fields(
+    message: descriptor_pb2.DescriptorProto,
+    fields: str,
+    enums: Container[str],
+    package: str,
+    elsewhere: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    for item in items:
+    """Give a message type its fields.
+
+    Parameters
+    ----------
+    message : DescriptorProto
+    fields : str
+        ``name=number:type`` for each, with * if it is repeated.
+    enums : container of str
+        Which types are enumerations.
+    package : str
+        Where types are defined, unless ``elsewhere`` names another package for them.
+    """
+    for item in fields.split():
         label, _, rest = item.partition("=")
         number, _, kind = rest.partition(":")
         field = message.field.add(name=label, number=int(number))
@@ -349,7 +367,7 @@ def _add_fields(
             field.type = _SCALARS[kind]
         else:
             field.type = _FIELD.TYPE_ENUM if kind in enums else _FIELD.TYPE_MESSAGE
-            field.type_name = f".osi3.{kind}"
+            field.type_name = f".{elsewhere.get(kind, package)}.{kind}"
 
 
 # Message classes of ASAM OSI, made from the descriptors that a recording carries ----------------
