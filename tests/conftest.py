@@ -45,7 +45,8 @@ _build, _built = typer.main.get_command, {}
 
 
 def _command(app: typer.Typer) -> Any:
-    key = id(app), len(app.registered_commands), len(app.registered_groups)
+    parts = [app, *(group.typer_instance for group in app.registered_groups)]
+    key = tuple(verb.callback for part in parts for verb in part.registered_commands)
     return _built.get(key) or _built.setdefault(key, _build(app))
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -371,17 +372,19 @@ def test_a_command_line_knows_its_verb_alone_and_without_one_all_of_them() -> No
         "known = application(sys.argv[1:]); names = [v.name or v.callback.__name__ for v in"
         " known.registered_commands] + [g.name for g in known.registered_groups];"
         "modules = [m for m in VERBS if f'sgstore.cli._{m}' in sys.modules];"
-        "assert sorted(names) == sorted(v for m in modules for v in VERBS[m]), (names, modules);"
-        "print(*modules)"
+        "print(*sorted(names)); print(*modules)"
     )
 
     def known(*arguments: str) -> list[str]:
         command = [sys.executable, "-c", program, *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True
+        ).stdout.splitlines()
 
-    assert known("find", "s.sgstore", "MATCH (export)") == ["queries"]
-    assert known("lock", "verify") == ["selection"]
-    assert known() == known("--help") == known("fnd", "find") == list(VERBS)
+    every = [" ".join(sorted(chain.from_iterable(VERBS.values()))), " ".join(VERBS)]
+    assert known("find", "s.sgstore", "MATCH (export)") == ["find patterns", "queries"]
+    assert known("lock", "verify") == ["lock", "selection"]
+    assert known() == known("--help") == known("fnd", "find") == every
 
 
 @pytest.mark.parametrize("verb", [verb for verbs in VERBS.values() for verb in verbs])

@@ -54,8 +54,10 @@ def test_a_command_of_the_page_runs(
 
 
 def test_every_verb_of_coverage_and_every_format_is_on_the_page() -> None:
+    from sgstore.cli import application
     from sgstore.cli._coverage import coverage
 
+    application()
     verbs = {command.name for command in coverage.registered_commands}
 
     assert {shlex.split(command)[2] for command in COMMANDS if " coverage " in command} == verbs

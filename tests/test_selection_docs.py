@@ -76,8 +76,10 @@ def test_the_old_names_of_options_are_understood(
 
 
 def test_every_verb_of_locks_is_on_the_page() -> None:
+    from sgstore.cli import application
     from sgstore.cli._selection import lock
 
+    application()
     verbs = {command.name for command in lock.registered_commands}
 
     assert verbs <= {shlex.split(command)[2] for command in COMMANDS if " lock " in command}

@@ -7,6 +7,7 @@ recording was lost; 4 nothing matched (with ``--require``).
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from importlib import import_module
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 import sgstore.cli._process as ending
-from sgstore.cli._options import ERROR, USAGE, app
+from sgstore.cli._options import ERROR, USAGE, Verbs, app
 from sgstore.cli._output import say, write_error
 from sgstore.cli._process import take_streams
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
@@ -38,9 +39,12 @@ VERBS: Final = {
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.
 
-A verb is known once its module is imported: :func:`application` imports what is asked for, because to import
-and to build them all takes longer than many an answer.
+A verb is known once its module is imported and its options are worked out: :func:`application` does that for
+what is asked, because for all of them it takes longer than many an answer.
 """
+
+_OF_ALL: Final = ("--help", "-h", "--version")
+"""Orders that are about the application itself, of whose verbs no more is told than what they do."""
 
 
 def application(arguments: Sequence[str] = ()) -> typer.Typer:
@@ -49,11 +53,17 @@ def application(arguments: Sequence[str] = ()) -> typer.Typer:
     Returns
     -------
     typer.Typer
-        It knows the verb that is asked for; where none is, or one that there is not, it knows all of them.
+        It knows the verb that is asked for; where none is, or one that there is not, it knows all of them. For
+        help on itself it knows them without their options.
     """
-    asked = [module for module, verbs in VERBS.items() if {*arguments[:1]} & {*verbs}]
+    first = {*arguments[:1]}
+    asked = [module for module, verbs in VERBS.items() if first & {*verbs}]
     for module in asked or VERBS:
         import_module(f"{__name__}._{module}")
+    app.build(first if asked else (), options=not first & {*_OF_ALL})
+    for group in app.registered_groups:
+        if isinstance(group.typer_instance, Verbs) and (group.name in first or not first):
+            group.typer_instance.build()
     order = [f"{__name__}._{module}" for module in VERBS]
     app.registered_commands.sort(key=lambda verb: order.index(verb.callback.__module__))
     return app
@@ -65,6 +75,11 @@ _PUBLISHING: Final = ("ingest", "import", "derive")
 
 def main() -> None:
     """Run the command line of this process and end it with the right exit code."""
+    # Numpy starts a thread for each core when it is imported; only what multiplies large tables needs them.
+    if not {*sys.argv[1:2]} & {*VERBS["coverage"], *VERBS["selection"]}:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Nothing of what is imported is ever garbage: to look for some while it comes takes a tenth of a short run.
+    gc.set_threshold(50_000)
     take_streams()
     ending.heed_signals()
     code = run(sys.argv[1:])

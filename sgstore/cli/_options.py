@@ -8,20 +8,20 @@ import re
 import sys
 from collections import Counter
 from dataclasses import dataclass, fields, is_dataclass
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_type_hints
 
 import typer
 from typer import Argument, Option
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from sgstore.cli._output import Format, say, write_rows
 from sgstore.cli._process import set_deadline
 from sgstore.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from sgstore.config import Config
     from sgstore.coverage import ChosenFrames, ReportTable
@@ -43,7 +43,59 @@ class Verb(TyperCommand):
                     raise typer.BadParameter(
                         f"given {times} times, but it takes one value", ctx=ctx, param=parameter
                     )
+        _spare(self.get_params(ctx))
         return super().parse_args(ctx, args)
+
+
+class Application(TyperGroup):
+    """The verbs of an application; see :func:`_spare`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read a command line up to the verb."""
+        _spare(self.get_params(ctx))
+        return super().parse_args(ctx, args)
+
+
+def _spare(parameters: Iterable[Any]) -> None:
+    """Let parameters take plain values as they are.
+
+    From 0.29 on typer asks pydantic about every value, whose import takes longer than many an answer.
+    """
+    for one in parameters:
+        if hasattr(one, "type_descriptor") and "process_value" not in vars(one):
+            one.process_value = partial(_taken, one, one.process_value)
+
+
+def _taken(parameter: Any, ask: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
+    found = _plain(parameter, value)
+    if found is _NOT_PLAIN:
+        return ask(context, value)
+    return found if parameter.callback is None else parameter.callback(context, parameter, found)
+
+
+_NOT_PLAIN: Final = object()
+"""Neither a default nor a text that is taken as it stands: something may be wrong with it."""
+
+
+def _plain(parameter: Any, value: Any) -> Any:
+    """The value that a parameter has; :data:`_NOT_PLAIN` where that is not plain to see."""
+    about, several = parameter.type_descriptor, parameter.multiple or parameter.nargs == -1
+    kind = about.annotation
+    if value is None:
+        return _NOT_PLAIN if parameter.required else () if several else None
+    if several:
+        kinds = get_args(kind)
+        found = [_plain_text(kinds[0], one) for one in value] if len(kinds) == 1 else [_NOT_PLAIN]
+        return _NOT_PLAIN if _NOT_PLAIN in found else found
+    if about.is_choice:
+        return next((one for one in about.choices if one == value), _NOT_PLAIN)
+    same = value == parameter.default and isinstance(kind, type) and isinstance(value, kind)
+    return value if same else _plain_text(kind, value)
+
+
+def _plain_text(kind: Any, value: Any) -> Any:
+    fits = kind in {str, Path} and isinstance(value, str) and value.isprintable()
+    return kind(value) if fits else _NOT_PLAIN
 
 
 def _says_one_thing(parameter: Any) -> bool:
@@ -54,21 +106,46 @@ def _says_one_thing(parameter: Any) -> bool:
 
 
 class Verbs(typer.Typer):
-    """An application, or a part of one, whose commands are each a :class:`Verb`."""
+    """An application, or a part of one, whose commands are each a :class:`Verb`.
+
+    Its verbs are noted first and built later, because to work out the options of all takes longer than many an
+    answer.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._verbs: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {}
+        self._built: set[str] = set()
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
-        """A decorator that registers a function as a verb; see :meth:`typer.Typer.command`.
+        """A decorator that makes a function a verb; see :meth:`typer.Typer.command`.
 
         A parameter whose type is a dataclass stands for the options that are its fields.
         """
-        every: dict[str, Any] = {"cls": Verb, **options}
-        register = super().command(name, **every)
 
-        def registered(function: Callable[..., Any]) -> Callable[..., Any]:
-            register(_unbundled(function))
+        def noted(function: Callable[..., Any]) -> Callable[..., Any]:
+            self._verbs[name or function.__name__] = options, function
             return function
 
-        return registered
+        return noted
+
+    def build(self, only: Collection[str] = (), *, options: bool = True) -> None:
+        """Register the verbs of these names, by default all, with their options or only with what they do."""
+        built = [one for one in self.registered_commands if one.name in self._built]
+        self.registered_commands = built
+        for name, (about, function) in self._verbs.items():
+            if name in self._built or (only and name not in only):
+                continue
+            verb = _unbundled(function) if options else _without_options(function)
+            super().command(name, cls=Verb, **about)(verb)
+            self._built |= {name} if options else set()
+
+
+def _without_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    def verb() -> None: ...
+
+    verb.__module__, verb.__doc__ = function.__module__, function.__doc__
+    return verb
 
 
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -100,6 +177,7 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
 # The application, the arguments that verbs share, and how their texts become values -------------
 
 app = Verbs(
+    cls=Application,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

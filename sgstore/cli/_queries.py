@@ -82,7 +82,7 @@ def find(
         with _sandbox(store, ask, max_rows, tables) as box:
             answer = box.find(text, **values)
         _say_all(answer)
-        number = ask.write(*_as_shown(answer, ask.chosen))
+        number = ask.write(*_as_shown(answer, answer.rows, ask.chosen))
         return _ended(number, ask, require=require)
     opened = ask.opened(store, tables_of(tables))
     with opened.file.snapshot():  # it is opened once
@@ -95,7 +95,7 @@ def find(
             number = matches.count()
             typer.echo(number)
             return NO_MATCH if require and not number else 0
-        number = ask.write(*_as_shown(matches, ask.chosen))
+        number = ask.write(*_as_shown(matches, matches, ask.chosen))
     return _ended(number, ask, require=require)
 
 
@@ -107,13 +107,11 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 
 
 def _as_shown(
-    answer: Matches | Answer, form: Format
+    answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
     from sgstore.lang import for_people
-    from sgstore.sandbox import Answer
 
-    rows = answer.rows if isinstance(answer, Answer) else answer
     if form is Format.table:
         return for_people(answer.columns, rows, graphs=answer.graphs)
     return _node_link(answer, rows, form) if answer.graphs else (answer.columns, rows)

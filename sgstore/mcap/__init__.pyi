@@ -23,9 +23,9 @@ from ._fetch import open_regular as open_regular
 from ._fetch import part_at as part_at
 from ._fetch import parts_of as parts_of
 from ._fetch import read_and_digest as read_and_digest
-from ._chunks import MAX_LOSSES as MAX_LOSSES
-from ._chunks import Findings as Findings
-from ._chunks import Loss as Loss
+from ._findings import MAX_LOSSES as MAX_LOSSES
+from ._findings import Findings as Findings
+from ._findings import Loss as Loss
 from ._read_ahead import MAGIC as MAGIC
 from ._read_ahead import read_summary as read_summary
 from ._reader import CLIP as CLIP

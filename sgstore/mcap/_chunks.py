@@ -1,11 +1,11 @@
-"""Chunks of MCAP files, decompressed under guard, and reports of losses."""
+"""Chunks of MCAP files, decompressed under guard."""
 
 from __future__ import annotations
 
 import struct
 from array import array
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -17,6 +17,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
 from sgstore.errors import TraceError
+from sgstore.mcap._findings import Loss
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -26,71 +27,10 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
 
+    from sgstore.mcap._findings import Findings
+
     Ints = NDArray[np.int64]
     Memory = Callable[[int], memoryview]
-
-# Findings of reading a file: what could not be used, and what is odd ----------------------------
-
-MAX_LOSSES: Final = 1000
-"""Losses that are listed one by one; the last of them stands for all that follow."""
-
-
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Something in a recording that could not be used, and was not passed over in silence.
-
-    Attributes
-    ----------
-    reason : str
-        What was wrong.
-    messages, bytes : int
-        How much was lost; -1 where it cannot be known.
-    start_ns, end_ns : int
-        Log times between which it was lost; -1 where they cannot be known.
-    offset : int
-        Byte offset in the file, -1 where there is none.
-    """
-
-    reason: str
-    messages: int = -1
-    bytes: int = -1
-    start_ns: int = -1
-    end_ns: int = -1
-    offset: int = -1
-
-
-@dataclass(slots=True)
-class Findings:
-    """Findings from walking over a file; filled while its messages are read.
-
-    Attributes
-    ----------
-    warnings : list of str
-        What is odd but lost nothing.
-    losses : list of Loss
-        What could not be used.
-    """
-
-    warnings: list[str] = field(default_factory=list[str])
-    losses: list[Loss] = field(default_factory=list[Loss])
-
-    def lose(self, loss: Loss) -> None:
-        """Report a loss; when there are very many, the last one stands for the rest."""
-        losses = self.losses
-        if len(losses) < MAX_LOSSES:
-            losses.append(loss)
-            return
-        last = losses[-1]
-        many = last.messages >= 0 and loss.messages >= 0
-        losses[-1] = Loss(
-            "further damage of the same kinds",
-            messages=last.messages + loss.messages if many else -1,
-            bytes=max(last.bytes, 0) + max(loss.bytes, 0),
-            start_ns=last.start_ns,
-            end_ns=max(last.end_ns, loss.end_ns),
-            offset=last.offset,
-        )
-
 
 # Containers of messages, as readers of flavours use them: channels, and a walk over messages ------
 

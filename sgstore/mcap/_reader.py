@@ -38,12 +38,9 @@ from sgstore.mcap._chunks import (
     IDS,
     LAST_NS,
     MAX_CHUNK,
-    MAX_LOSSES,
     MESSAGE_HEAD,
     READ_ERRORS,
     ChunkHead,
-    Findings,
-    Loss,
     Messages,
     RecordPlace,
     StrictStream,
@@ -64,6 +61,7 @@ from sgstore.mcap._fetch import (
     part_at,
     parts_of,
 )
+from sgstore.mcap._findings import MAX_LOSSES, Findings, Loss
 from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, chunks_in, read_summary
 
 if TYPE_CHECKING:
