@@ -31,6 +31,7 @@ LAYERS: tuple[frozenset[str], ...] = (
             "plugins",
             "processes",
             "quoting",
+            "records",
         }
     ),
     frozenset({"mcap", "vocabulary"}),

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections import Counter
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_type_hints
@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from sgstore.cli._output import Format, say, write_rows
 from sgstore.cli._process import set_deadline
 from sgstore.errors import ConfigError
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

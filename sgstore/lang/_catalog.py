@@ -11,12 +11,13 @@ its constants in ``entity``; a static entity has everything in ``entity``, a par
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import StrEnum
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.records import dataclass
 from sgstore.vocabulary import (
     KINDS,
     LIGHT_STATES,

@@ -11,7 +11,7 @@ it is written, and says so.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -61,6 +61,7 @@ from sgstore.lang.ir import (
     any_relation,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
+from sgstore.records import dataclass
 from sgstore.vocabulary import KINDS, RELATIONS, asking, entity_kinds, normalize_name
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.errors import QuerySyntaxError, TextSpan
 from sgstore.lang._hints import bracket_hint, places, slip_hint
 from sgstore.lang._syntax_builder import BUILDERS, BuildError
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -6,7 +6,7 @@ for it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import DisplayUnit
@@ -28,6 +28,7 @@ from sgstore.lang.ir import (
     nodes_of,
     walk,
 )
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

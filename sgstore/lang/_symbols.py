@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from fnmatch import fnmatchcase
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, Final, NoReturn
@@ -22,6 +22,7 @@ from sgstore.lang._catalog import PAIR_NAMES, Attribute, DisplayUnit, Home, Type
 from sgstore.lang._hints import condition_hint, hint_at, variable_hint
 from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
 from sgstore.lang.library import predicates
+from sgstore.records import dataclass
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:

@@ -9,10 +9,11 @@ unnamed nodes begin with ``#``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sgstore.lang._catalog import Attribute, Type
+from sgstore.records import dataclass
 from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:

@@ -6,8 +6,9 @@ trees from text.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
+
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from sgstore.errors import TextSpan

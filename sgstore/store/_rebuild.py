@@ -13,7 +13,6 @@ import json
 import math
 import os
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,6 +21,7 @@ import duckdb
 import sgstore.store._schema as shape
 from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
+from sgstore.records import dataclass
 from sgstore.store._locking import (
     STORAGE_VERSION,
     Access,

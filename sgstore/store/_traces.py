@@ -7,11 +7,12 @@ import json
 import os
 import re
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import SgstoreError, StoreError
+from sgstore.records import dataclass
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store._rows import run
 from sgstore.vocabulary import natural, suggestion
