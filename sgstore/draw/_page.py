@@ -8,18 +8,21 @@ import math
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox, IdentityTransform
 from PIL import Image
 from PIL.GifImagePlugin import getdata, getheader
 
@@ -341,6 +344,28 @@ class Stage:
         self.page.write(self.axes, x, y, text, **{"clip_on": True, **look})
 
 
+Sprite = tuple["Pixels", int, int]
+"""A text as drawn, (height, width, 4) from below, and how far its corner lies from its place; pixels."""
+
+
+class DrawnText(Artist):
+    """A text that has been drawn before: a sprite at a place of some axes."""
+
+    def __init__(self, sprite: Sprite, axes: Axes, x: float, y: float, z: float) -> None:
+        super().__init__()
+        self.zorder = z
+        self._sprite, self._within, self._at = sprite, axes, (x, y)
+
+    def draw(self, renderer: Any) -> None:
+        """Lay the sprite on the page, as far as it lies in the axes."""
+        pixels, left, below = self._sprite
+        x, y = self._within.transData.transform(self._at)
+        gc = renderer.new_gc()
+        gc.set_clip_rectangle(self._within.bbox)
+        renderer.draw_image(gc, round(x) + left, round(y) + below, pixels)
+        gc.restore()
+
+
 class Page:
     """A sheet of paper.
 
@@ -350,15 +375,28 @@ class Page:
         In points.
     dpi : float
         Pixels of an inch, where it is drawn in pixels.
+    sprites : dict, optional
+        Texts that were drawn already, for pages that are drawn in pixels one after another: a text is set on
+        whole pixels then.
     """
 
-    def __init__(self, width: float, height: float, dpi: float = DPI) -> None:
+    def __init__(
+        self,
+        width: float,
+        height: float,
+        dpi: float = DPI,
+        sprites: dict[object, Sprite] | None = None,
+    ) -> None:
         self.width = width
         self.height = height
         self._dpi = dpi
+        self._sprites = sprites
+        self._windows: dict[Rect, Axes] = {}
+        self._free: dict[Rect, Axes] = {}
         self._figure = Figure(figsize=(width / 72, height / 72), dpi=dpi, facecolor=PAPER)
         self._canvas = FigureCanvasAgg(self._figure)
         self.sheet = self._axes(0, 0, width, height)
+        self._windows = {}
         self.sheet.set_xlim(0, width)
         self.sheet.set_ylim(0, height)
 
@@ -394,16 +432,19 @@ class Page:
         """Write on a sheet or in a window, in its own measure."""
         gid = look.pop("gid", None)
         style: dict[str, Any] = {"fontsize": 7.0, "color": INK, "va": "baseline", **look}
-        axes.text(x, y, printable(text), parse_math=False, **style).set_gid(gid)
+        text = printable(text)
+        if self._sprites is None:
+            axes.text(x, y, text, parse_math=False, **style).set_gid(gid)
+        elif text:
+            z = style.pop("zorder", Text.zorder)
+            key = text, repr(style)
+            if key not in self._sprites:
+                self._sprites[key] = drawn_text(text, self._dpi, style)
+            axes.add_artist(DrawnText(self._sprites[key], axes, x, y, z))
 
     def text_size(self, text: str, size: float, weight: str = "normal") -> tuple[float, float]:
         """Width and height of a text; points."""
-        font = FontProperties(size=size, weight=weight)
-        width, height, _ = self._canvas.get_renderer().get_text_width_height_descent(
-            printable(text),
-            font,
-            False,  # noqa: FBT003  its only spelling that all releases know
-        )
+        width, height = _text_size(printable(text), size, weight, self._dpi)
         return width * 72 / self._dpi, height * 72 / self._dpi
 
     def plot(self, left: float, bottom: float, right: float, top: float) -> Axes:
@@ -473,14 +514,54 @@ class Page:
         indexed(Image.fromarray(self.pixels())).save(written, "PNG")
         return written.getvalue()
 
+    def clear(self) -> None:
+        """Take all from the page that was drawn; windows of the same places are used again."""
+        for axes in self._figure.axes:
+            drawn = (*axes.artists, *axes.patches, *axes.collections, *axes.lines, *axes.images)
+            for artist in drawn:
+                artist.remove()
+        for share, axes in self._windows.items():
+            if axes in self._figure.axes:
+                self._figure.delaxes(axes)
+                self._free[share] = axes
+        self._windows = {}
+
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        axes = self._figure.add_axes(self._share(left, bottom, width, height))
+        share = self._share(left, bottom, width, height)
+        axes = self._windows[share] = self._figure.add_axes(self._free.pop(share, share))
         axes.set_axis_off()
         axes.set_autoscale_on(False)
         return axes
 
     def _share(self, left: float, bottom: float, width: float, height: float) -> Rect:
         return left / self.width, bottom / self.height, width / self.width, height / self.height
+
+
+@lru_cache(maxsize=4096)
+def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, float]:
+    """Width and height; pixels."""
+    font = FontProperties(size=size, weight=weight)
+    ismath = False
+    width, height, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(text, font, ismath)
+    return width, height
+
+
+def drawn_text(text: str, dpi: float, style: dict[str, Any]) -> Sprite:
+    """A text, and what is under it, drawn alone; ``style`` as of a text of the drawing package."""
+    figure = Figure(dpi=dpi)
+    written = figure.text(0, 0, text, parse_math=False, transform=None, **style)
+    written.set_transform(IdentityTransform())
+    renderer = RendererAgg(1, 1, dpi)
+    written.get_window_extent(renderer)
+    slip = written.get_bbox_patch()
+    written.update_bbox_position_size(renderer)
+    boxes = [written.get_window_extent(renderer)]
+    boxes += [slip.get_window_extent(renderer)] if slip is not None else []
+    left, below, right, above = map(round, Bbox.union(boxes).padded(3).extents)
+    renderer = RendererAgg(right - left, above - below, dpi)
+    written.set_position((-left, -below))
+    written.draw(renderer)
+    return np.array(renderer.buffer_rgba())[::-1], left, below  # as images are drawn, from below
 
 
 def check_format(to: str | Path) -> str:

@@ -20,7 +20,7 @@ from sgstore.draw._view import Relations, clean, counted, number, view_of
 from sgstore.errors import MissingExtraError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Generator, Sequence
     from pathlib import Path
 
     from sgstore.draw._legend import Entry
@@ -103,16 +103,16 @@ def frame_page(
     title: str,
     picture: bytes | None,
     entries: Sequence[Entry] | None = None,
-    dpi: float | None = None,
+    blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
     """The view from above, and beside it what a camera saw, what was matched, what is around, the legend.
 
-    ``entries``: the legend, by default of what occurs; ``dpi``: see :class:`sgstore.draw._page.Page`.
+    ``entries``: the legend, by default of what occurs; ``blank``: gives a page of a width and a height.
     """
-    from sgstore.draw._page import DPI, Page
+    from sgstore.draw._page import Page
     from sgstore.draw._scene import paint_scene
 
-    page = Page(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE, dpi or DPI)
+    page = (blank or Page)(3 * _MARGIN + _WINDOW + _PANEL, _MARGIN + _WINDOW + _TITLE)
     stage = page.stage((_MARGIN, _MARGIN, _MARGIN + _WINDOW, _MARGIN + _WINDOW), scene.view)
     unnamed = paint_scene(stage, scene)
     _paint_title(page, title, _subtitle(scene, unnamed))
@@ -125,21 +125,20 @@ def diagram_page(
     title: str,
     relations: Relations,
     entries: Sequence[Entry] | None = None,
-    dpi: float | None = None,
+    blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
     """The view from above, beside it the graph as nodes and edges, the legend below; see :func:`frame_page`."""
     from sgstore.draw._atlas import key_height, paint_key
     from sgstore.draw._diagram import diagram_entries, paint_diagram
     from sgstore.draw._legend import entries_of
-    from sgstore.draw._page import DPI, Page
+    from sgstore.draw._page import Page
     from sgstore.draw._scene import paint_scene
 
     half = scene.view.radius
     known = entries_of(scene, (half, half)) if entries is None else entries
     key = [*(e for e in known if not e.is_long), *diagram_entries()]
     foot = key_height(len(key)) + _MARGIN
-    size = (3 * _MARGIN + 2 * _WINDOW, _MARGIN + foot + _WINDOW + _TITLE)
-    page = Page(*size, dpi or DPI)
+    page = (blank or Page)(3 * _MARGIN + 2 * _WINDOW, _MARGIN + foot + _WINDOW + _TITLE)
     bottom, middle = _MARGIN + foot, 2 * _MARGIN + _WINDOW
     stage = page.stage((_MARGIN, bottom, _MARGIN + _WINDOW, bottom + _WINDOW), scene.view)
     unnamed = paint_scene(stage, scene)

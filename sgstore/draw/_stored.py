@@ -11,8 +11,10 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
+import numpy as np
+
 from sgstore.draw._legend import entries_of
-from sgstore.draw._page import Gif, own_style
+from sgstore.draw._page import Gif, Page, own_style
 from sgstore.draw._picture import (
     check_installed,
     checked,
@@ -28,7 +30,7 @@ from sgstore.errors import ExportError, StoreError
 from sgstore.opendrive import read_map
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from PIL.Image import Image
 
@@ -99,6 +101,7 @@ class Film:
         self._entries = self._legend(samples)
         self._picture: bytes | None = None
         self._start_ns: int | None = None
+        self._page: Page | None = None
         self._gif = Gif(to)
 
     def __enter__(self) -> Self:
@@ -116,11 +119,18 @@ class Film:
         scene, title = self._scene(shot), title_of(graph)
         with own_style():
             page = (
-                diagram_page(scene, title, self._relations, self._entries, DPI)
+                diagram_page(scene, title, self._relations, self._entries, self._blank)
                 if self._diagram
-                else frame_page(scene, title, self._picture, self._entries, DPI)
+                else frame_page(scene, title, self._picture, self._entries, self._blank)
             )
             self._gif.add(page.pixels(), (graph.time_ns - start) / 1e9)
+
+    def _blank(self, width: float, height: float) -> Page:
+        """The page of all pictures, with nothing on it."""
+        if self._page is None:
+            self._page = Page(width, height, DPI, {})
+        self._page.clear()
+        return self._page
 
     def _scene(self, shot: Shot) -> DrawnFrame:
         graph, marked, _ = shot
@@ -149,6 +159,8 @@ MOST_FPS: Final = 50.0
 """Players show no more: see :data:`sgstore.draw._page.LEAST_DELAY`."""
 SAMPLES: Final = 8
 """Frames of a clip that are looked at before it is drawn."""
+AT_ONCE: Final = 8
+"""Frames that are read together."""
 
 _RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
 
@@ -271,24 +283,29 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     if not 0 < fps <= MOST_FPS:
         raise ValueError(f"fps is {fps}, expected a number up to {MOST_FPS:g}")
 
-    def shot(ref: FrameRef, *, seen: bool) -> Shot:
-        # The store is kept open for one frame at a time, so that others can write while this one draws.
-        with store.file.snapshot():
-            bindings = matches.bindings(ref) if matches is not None else []
-            picture = _picture(store, ref, camera) if seen and not diagram else None
-            return store.file.graph(ref.frame_id), bindings[0] if bindings else {}, picture
+    def shots(refs: Sequence[FrameRef], *, seen: bool) -> Iterator[Shot]:
+        # The store is kept open for a few frames at a time, so that others can write while these are drawn.
+        for start in range(0, len(refs), AT_ONCE):
+            some = refs[start : start + AT_ONCE]
+            with store.file.snapshot():
+                graphs = [*store.file.graphs(np.array([ref.frame_id for ref in some]))]
+                found = [matches.bindings(ref) if matches is not None else [] for ref in some]
+                pictures = [
+                    _picture(store, ref, camera) if seen and not diagram else None for ref in some
+                ]
+            marked = [bindings[0] if bindings else {} for bindings in found]
+            yield from zip(graphs, marked, pictures, strict=True)
 
     with store.file.snapshot():
         chosen = _chosen(store, frames, fps)
         road_map = map_of(store, chosen[0].trace)
     spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
-    samples = [shot(chosen[number], seen=False) for number in spread]
+    samples = [*shots([chosen[number] for number in spread], seen=False)]
     look: dict[str, Any] = {"relations": relations, "radius": radius}
     look |= {"north_up": north_up, "diagram": diagram}
     marked = 0
     with Film(to, road_map, samples, **look) as film:
-        for number, ref in enumerate(chosen, start=1):
-            now = shot(ref, seen=True)
+        for number, now in enumerate(shots(chosen, seen=True), start=1):
             film.add(now)
             marked += bool(now[1])
             if on_frame is not None:
