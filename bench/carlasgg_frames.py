@@ -15,7 +15,7 @@ from sgstore.map_files import read_map_file
 from sgstore.opendrive import read_map
 from sgstore.readers import open_trace
 from sgstore.relations import IS_SIGNAL
-from sgstore.relations._pairs import IS_VEHICLE
+from sgstore.relations._scene import IS_VEHICLE
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATES, RELATIONS
 
