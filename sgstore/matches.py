@@ -220,9 +220,7 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             if compiled.limited_to_frames is not None:
                 return len({row[0] for row in self._frames()})
-            statement = compiled.count()
-            given = self._given(statement)
-            return self._file.rows(statement.sql, statement.values, given=given).values[0][0]
+            return self._file.rows(**self._asked(compiled.count())).values[0][0]
 
     def frames(self) -> Iterator[FrameRef]:
         """The distinct frames, by name of the trace and number; of limited rows, in the order of the rows."""
@@ -244,7 +242,7 @@ class Matches(Tabular):
         bucket = frame.frame_id >> BUCKET_SHIFT
         with self._compiled() as compiled:
             statement = compiled.bindings(Window(bucket, bucket + 1))
-            rows = self._file.rows(statement.sql, statement.values).values
+            rows = self._file.rows(**self._asked(statement)).values
         # A variable that is called like a column of frames, such as t, has ".id" behind it there.
         names = {
             i - 1: name.removesuffix(".name")
@@ -317,8 +315,7 @@ class Matches(Tabular):
     def numpy(self) -> dict[str, NDArray[np.generic]]:
         """All columns as arrays, masked where something is NULL."""
         with self._compiled() as compiled:
-            statement = compiled.rows()
-            return self._file.arrays(statement.sql, statement.values, given=self._given(statement))
+            return self._file.arrays(**self._asked(compiled.rows()))
 
     def _described(self) -> tuple[tuple[str, ...], None]:
         return self.columns, None
@@ -329,8 +326,7 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             most, found = compiled.query.result.limit, list[Any]()
             for ready, windows in self._statements(compiled, Compiled.rows, whole=True):
-                given = self._given(ready)
-                table = self._file.table(ready.sql, ready.values, given=given)
+                table = self._file.table(**self._asked(ready))
                 if table is None:
                     return None
                 windows.rows = len(table)
@@ -369,8 +365,7 @@ class Matches(Tabular):
         self, statements: Iterable[tuple[SqlStatement, Windows]]
     ) -> Iterator[tuple[Any, ...]]:
         for ready, windows in statements:
-            given = self._given(ready)
-            with self._file.batches(ready.sql, ready.values, given=given) as batches:
+            with self._file.batches(**self._asked(ready)) as batches:
                 for batch in batches:
                     windows.rows += len(batch)
                     yield from batch.values
@@ -394,12 +389,17 @@ class Matches(Tabular):
         for window in windows:
             yield statement(compiled, window), windows
 
-    def _given(self, statement: SqlStatement) -> list[GivenTable]:
-        """Return the table that a statement is given of external matches."""
-        return [
+    def _asked(self, statement: SqlStatement) -> dict[str, Any]:
+        """A statement as :class:`StoreFile` takes it: its last step, and the tables that it is given before.
+
+        These are external matches, and what its other steps make.
+        """
+        *before, (sql, values) = statement.steps()
+        matches = [
             GivenTable(one.name, one.types, partial(self._blocks, one))
             for one in statement.gathered
         ]
+        return {"sql": sql, "parameters": values, "given": [*matches, *before]}
 
     def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
         steps = Windows(extents(self._ready.catalog), whole_traces=True)

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     import networkx as nx
     from oracle_worlds import Frame, World
 
+    from sgstore.lang import SqlStatement
+
 VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"}
 MAP_KINDS = {"lane", "road", "junction", "crosswalk", "offroad", "waypoint"}
 GROUPS = {
@@ -582,7 +584,7 @@ def disagreement(text: str, world: World, *, counted: bool = True) -> tuple[str,
     compiled = compile_query(text, world.catalog)  # refused, before anything is searched
     wanted, frames = answer(text, world)
     statement = compiled.rows()
-    found = world.connection.execute(statement.sql, list(statement.values)).fetchall()
+    found = asked(statement, world)
     names = [name for name in statement.columns[5:] if not name.endswith(".name") and name != "ego"]
     order = sorted(range(len(names)), key=lambda i: names[i])
     keep = [statement.columns.index(names[i]) for i in order]
@@ -590,11 +592,17 @@ def disagreement(text: str, world: World, *, counted: bool = True) -> tuple[str,
     if rows != wanted:
         return difference("rows", rows, wanted), 0
     if counted:
-        statement = compiled.count()
-        many = world.connection.execute(statement.sql, list(statement.values)).fetchone()
-        if many is None or many[0] != len(frames):
+        ((many,),) = asked(compiled.count(), world)
+        if many != len(frames):
             return f"frames: counted {many}, wanted {len(frames)}", 0
     return "", len(frames)
+
+
+def asked(statement: SqlStatement, world: World) -> list[tuple[Any, ...]]:
+    """Rows of a statement, step by step, as a store asks for them."""
+    for text, values in statement.steps():
+        world.connection.execute(text, values)
+    return world.connection.fetchall()
 
 
 def disagreement_of_results(text: str, world: World) -> tuple[str, int]:

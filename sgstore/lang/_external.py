@@ -22,15 +22,16 @@ from sgstore.lang._formulas import (
     Aliases,
     Select,
     attribute_text,
+    column_of,
     expression_text,
     leaves,
     nested,
 )
 from sgstore.lang._kinds import kind_conditions
 from sgstore.lang._plan import TRACE_OF_FRAME, FoundRelation, Gathered
-from sgstore.lang._results import SqlStatement, rows
+from sgstore.lang._results import SqlStatement, finished, rows
 from sgstore.lang._rewrite import rewritten
-from sgstore.lang._sql_frames import column_of, frames
+from sgstore.lang._sql_frames import frames
 from sgstore.lang._sql_masks import SqlBuilder
 from sgstore.lang.ir import (
     FrameAttribute,
@@ -106,13 +107,7 @@ def relation(
         told = expression_text(value, lambda leaf: f'":rows".{quoted(column_of(leaf))}', sql.values)
         columns.append(f'{told} AS ":{number}"')
     body = "SELECT " + ",\n  ".join(columns) + "\nFROM " + nested(text, ":rows")
-    before = [
-        f"{quoted(name)} AS NOT MATERIALIZED (\n{shadow}\n)" for name, shadow in catalog.shadows
-    ]
-    before += [f"{quoted(name)} AS (\n{shared}\n)" for name, shared in sql.shared]
-    text = f"WITH {', '.join(before)}\n{body}" if before else body
-    names = (FRAME, *nodes, *edges, *(f":{number}" for number in range(len(values))))
-    return SqlStatement(text, tuple(sql.values.items), names)
+    return finished(sql, body, (FRAME, *nodes, *edges, *(f":{n}" for n in range(len(values)))))
 
 
 _CLOCK: Final = """SELECT "frame_id", "seq", "time_ns", "log_time_ns" FROM "frame"

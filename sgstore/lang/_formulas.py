@@ -236,11 +236,16 @@ def role_text(frame: str, node: str) -> str:
     return f"({role.text()})"
 
 
-def own_text(attribute: Attribute, frame: str, node: str) -> str:
-    """Return the SQL of an attribute of a client's own of a node in a frame."""
+def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = ()) -> str:
+    """Return the SQL of an attribute of a client's own in a frame.
+
+    It is one of a node, or of the edge from there whose relation and other end are given.
+    """
     told = 'json_extract_string("o"."value", \'$\')'
     value = told if attribute.type is Type.text else f"CAST({told} AS {_NATIVE[attribute.type]})"
-    on = [f'"o"."frame_id" = {frame}', f'"o"."node_id" = {node}', '"o"."relation" IS NULL']
+    on = [f'"o"."frame_id" = {frame}', f'"o"."node_id" = {node}']
+    told = zip(("relation", "dst"), edge, strict=False)
+    on += [f'"o"."{column}" = {text}' for column, text in told] or ['"o"."relation" IS NULL']
     on.append(f'"o"."attribute" = {literal(attribute.name)}')
     rows = Select([f"any_value({value})"], ['"attribute" AS "o"'], on)
     return f"({rows.text()})"
@@ -490,6 +495,34 @@ def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> li
     return [quoted(f"{key}.id") for key in sorted(nodes)] + [
         quoted(f"{key}.type") for key in sorted(edges)
     ]
+
+
+def column_of(leaf: Leaf) -> str:
+    """The name of the column of a value."""
+    match leaf:
+        case NodeValue(node=owner):
+            name = "id"
+        case NodeAttribute(node=owner, attribute=attribute):
+            name = _as_column(attribute)
+        case EdgeRelation(edge=owner):
+            name = "type"
+        case EdgeAttribute(edge=owner, attribute=attribute):
+            name = _as_column(attribute)
+        case FrameAttribute(attribute=attribute):
+            owner, name = "frame", attribute.name
+        case TraceAttribute(attribute=attribute):
+            owner, name = "trace", attribute.name
+        case PairNumber(function=function, a=a, b=b):
+            return f"{function}({a}, {b})"
+        case BlockValue(number=number):
+            return f"block {number}"
+    return f"{owner}.{name}"
+
+
+def _as_column(attribute: Attribute) -> str:
+    """The name of an attribute; columns whose names differ in case alone are the same."""
+    own = attribute.unit is DisplayUnit.own and attribute.name != attribute.name.lower()
+    return attribute.name.encode().hex() if own else attribute.name
 
 
 def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:

@@ -12,12 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeGuard
 
-from sgstore.lang._catalog import DisplayUnit, Home, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Home, Type
 from sgstore.lang._formulas import (
     Aliases,
     Leaf,
     Select,
     attribute_text,
+    column_of,
     columns_of,
     edge_table,
     expression_text,
@@ -50,6 +51,7 @@ from sgstore.lang._sql_masks import (
     in_mask,
     in_which,
     merged,
+    told_kinds,
     with_blocks,
 )
 from sgstore.lang.ir import (
@@ -71,7 +73,7 @@ from sgstore.pair_numbers import LANE_DIST, PAIR_FUNCTIONS, needed_for, parts_of
 from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     from sgstore.lang._catalog import Attribute, Catalog
     from sgstore.lang._formulas import BoundValues
@@ -229,32 +231,6 @@ def named(text: str, name: str) -> str:
     return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
 
 
-def column_of(leaf: Leaf) -> str:
-    """The name of the column of a value."""
-    match leaf:
-        case NodeValue(node=owner):
-            name = "id"
-        case NodeAttribute(node=owner, attribute=attribute):
-            name = attribute.name
-            if attribute.unit is DisplayUnit.own and name != name.lower():
-                name = (
-                    name.encode().hex()
-                )  # names of columns that differ in case alone are the same
-        case EdgeRelation(edge=owner):
-            name = "type"
-        case EdgeAttribute(edge=owner, attribute=attribute):
-            name = attribute.name
-        case FrameAttribute(attribute=attribute):
-            owner, name = "frame", attribute.name
-        case TraceAttribute(attribute=attribute):
-            owner, name = "trace", attribute.name
-        case PairNumber(function=function, a=a, b=b):
-            return f"{function}({a}, {b})"
-        case BlockValue(number=number):
-            return f"block {number}"
-    return f"{owner}.{name}"
-
-
 def bounds(conditions: list[Bound]) -> list[Bound]:
     """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
     found: list[Bound] = []
@@ -309,10 +285,14 @@ def masks(
     given: SharedRelation | None,
     nodes: frozenset[str],
     edges: frozenset[str] = frozenset(),
+    kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """The relation of the first phase: one row a bucket and binding of some nodes and edges."""
+    """The relation of the first phase: one row a bucket and binding of some nodes and edges.
+
+    ``kinds`` are nodes whose kind is a column, too, of those of :func:`told_kinds`.
+    """
     if not parts.blocks:
-        return base_rows(sql, scope, parts, given, nodes, edges)
+        return base_rows(sql, scope, parts, given, nodes, edges, kinds)
     outside = {key for c in parts.blocks for block in blocks_of(c) for key in block.scope.outer}
     wide = nodes | frozenset(outside)
     name = sql.share(base_rows(sql, scope, parts, given, wide, edges), "pattern")
@@ -413,14 +393,14 @@ def frames(
     bound |= {end for e in scope.edges if e.key in edged for end in (e.src, e.dst)}
     every = {*scope.nodes, *scope.outer}
     bound |= {key for pair in apart(scope, every, parts.late) for key in pair}
-    ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation)}
+    ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation) or _is_own(leaf)}
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
     layers = Layers(join, needed, conditions)
     text = layers.text(sql.values, columns_of(nodes, edges), wanted)
     told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
     told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
-    told |= {leaf.node for leaf in wanted if _is_id(leaf)}
+    told |= {leaf.node for leaf in wanted if _is(leaf, "id")}
     hidden = (bound | parts.late | ties) - nodes - edges - told
     hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
     known = sql.found_in(scope)
@@ -454,14 +434,21 @@ def _of_buckets(
     given: SharedRelation | None,
     nodes: frozenset[str],
     edges: frozenset[str],
-    wanted: Iterable[Leaf],
+    wanted: Sequence[Leaf],
 ) -> tuple[Select, dict[Leaf, str]]:
     """Return the result of the first phase, joined with the tables of lasting values, and their SQL."""
+    known = told_kinds(sql, scope, parts)
+    kinds = {leaf: leaf.node for leaf in wanted if _is(leaf, "kind") and leaf.node in known}
+    text = masks(sql, scope, parts, given, nodes, edges, frozenset(kinds.values()))
     select = Select()
-    select.join(nested(masks(sql, scope, parts, given, nodes, edges), PATTERN[1:-1]), [])
+    if len(scope.edges) > 1 and scope is sql.query.scope:
+        text = Select(["*"], [quoted(sql.share(text, "pattern"))]).text()
+    select.join(nested(text, PATTERN[1:-1]), [])
     bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
     bucket = f'{PATTERN}."bucket"'
-    texts = _join_lasting(select, bucket, bound, scope, sql.catalog, wanted)
+    others = [leaf for leaf in wanted if leaf not in kinds]
+    texts = _join_lasting(select, bucket, bound, scope, sql.catalog, others)
+    texts |= {leaf: f"{PATTERN}.{quoted(column_of(leaf))}" for leaf in kinds}
     for leaf in wanted:
         if isinstance(leaf, EdgeRelation):
             texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
@@ -534,7 +521,7 @@ def _first_phase(
         name = sql.share(folded(rows.text(), keys), "pattern")
         return join, SharedRelation(name, bound, frozenset())
     text = masks(sql, scope, parts, given, nodes, ties)
-    if blocks:
+    if blocks or scope is sql.query.scope:
         given = SharedRelation(sql.share(text, "pattern"), nodes, ties)
         text = Select(["*"], [quoted(given.name)]).text()
     leader = _leader(sql, scope, parts, nodes, needed)
@@ -711,7 +698,7 @@ def _value_text(  # noqa: PLR0911 - a case each
         case EdgeRelation(edge=edge):
             return f"CAST({join.edges[edge]} AS VARCHAR)"
         case EdgeAttribute(edge=edge):
-            return _of_lane(sql, join, scope, edge, leaf)
+            return _of_edge(sql, join, scope, edge, leaf)
         case FrameAttribute() | TraceAttribute():
             return frame_text(leaf, FRAME, TRACE, MAP)
         case BlockValue():
@@ -733,11 +720,18 @@ def _of_node(sql: SqlBuilder, join: Join, scope: Scope, node: str, attribute: At
     return attribute_text(attribute, join.at[node])
 
 
-def _of_lane(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
+def _is_own(leaf: Leaf) -> TypeGuard[EdgeAttribute]:
+    return isinstance(leaf, EdgeAttribute) and leaf.attribute.unit is DisplayUnit.own
+
+
+def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttribute) -> str:
     alias = quoted(f"{key}:in")
+    edge = next(edge for edge in scope.edges if edge.key == key)
+    if _is_own(leaf):
+        to = join.edges[key], join.nodes[edge.dst]
+        return own_text(leaf.attribute, join.frame, join.nodes[edge.src], to)
     if alias not in join.lanes:
         join.lanes.add(alias)
-        edge = next(edge for edge in scope.edges if edge.key == key)
         table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
         on = [f'{alias}."frame_id" = {join.frame}']
         on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
@@ -777,9 +771,8 @@ def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: B
 def _block_rows(
     sql: SqlBuilder, leaf: BlockValue, given: SharedRelation | None, keys: frozenset[str]
 ) -> str:
-    if (
-        leaf.word == "EXISTS"
-    ):  # a column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL
+    if leaf.word == "EXISTS":
+        # A column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL.
         rows = frames(sql, leaf.scope, given, keys)
         return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
     parts = list(leaves(leaf.value)) if leaf.value is not None else []
@@ -794,8 +787,8 @@ def _block_rows(
     return select.text()
 
 
-def _is_id(leaf: Leaf) -> TypeGuard[NodeAttribute]:
-    return isinstance(leaf, NodeAttribute) and leaf.attribute.unit is DisplayUnit.binding
+def _is(leaf: Leaf, name: str) -> TypeGuard[NodeAttribute]:
+    return isinstance(leaf, NodeAttribute) and leaf.attribute is NODE_ATTRIBUTES[name]
 
 
 _BARE: Final = frozenset(
@@ -828,10 +821,7 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
 
 def _of_kind(leaf: Leaf) -> bool:
     """Tell whether a value is made of the kind, and the id, of a node."""
-    attribute = leaf.attribute if isinstance(leaf, NodeAttribute) else None
-    return attribute is not None and (
-        attribute.unit is DisplayUnit.label or attribute.name == "kind"
-    )
+    return _is(leaf, "kind") or _is(leaf, "name")
 
 
 # Values that a binding has for a whole bucket: constants of entities, of parts of the map, and of traces ----

@@ -265,6 +265,12 @@ class Base:
         Whether a binding may come in several rows whose masks overlap.
     knows_map : bool
         Whether the row of the bucket is joined, which knows the map.
+    stops : list of str
+        Columns of nodes on the way that must be present, too; NULL where a way has fewer.
+    several : set of str
+        Edges of several relations: without their relation, a binding may come in several rows.
+    kinds : dict of str to str
+        Node → a column with its kind.
     """
 
     select: Select = field(default_factory=Select)
@@ -275,6 +281,9 @@ class Base:
     present: set[str] = field(default_factory=set[str])
     repeats: bool = False
     knows_map: bool = False
+    stops: list[str] = field(default_factory=list[str])
+    several: set[str] = field(default_factory=set[str])
+    kinds: dict[str, str] = field(default_factory=dict[str, str])
 
     def join(
         self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
@@ -441,7 +450,9 @@ def base_rows(
     given: SharedRelation | None,
     nodes: frozenset[str],
     edges: frozenset[str],
+    kinds: frozenset[str] = frozenset(),
 ) -> str:
+    """The join of nodes and edges: one row a bucket and binding of some, with the kinds of some nodes."""
     unfolded = _unfolded(sql, scope, parts, given, nodes, edges)
     if unfolded:
         return unfolded
@@ -467,7 +478,11 @@ def base_rows(
     where += sql.within(base.bucket)
     where += sql.of_traces(f"{base.bucket} >> 18", scope)
     where += [trace_text(c, f"{base.bucket} >> 18", sql.values) for c in parts.trace]
-    return _masked(base, nodes, edges)
+    keep = dict(zip(columns_of(nodes), (base.nodes[key] for key in sorted(nodes)), strict=True))
+    keep |= {quoted(f"{key}.type"): base.edges[key] for key in sorted(edges)}
+    keep |= {quoted(f"{key}.kind"): base.kinds[key] for key in sorted(kinds)}
+    base.repeats |= bool(base.several - edges) or set(base.nodes) > nodes
+    return _masked(sql, base, keep)
 
 
 def _join_given(sql: SqlBuilder, base: Base, scope: Scope, given: SharedRelation) -> None:
@@ -492,27 +507,42 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
     base.edges[edge.key] = f'{alias}."relation"'
     if edge.src == edge.dst:
         base.select.where.append(f'{alias}."src" = {alias}."dst"')
-    if edge.high > 1:
+    if edge.high > 1 and (ways := _ways(sql, scope, edge)):
+        base.need_bucket()
+        base.repeats = True
+        on = [f'{alias}."map_id" = {BUCKET}."map_id"']
+        base.tie(f"{quoted(sql.share(ways, 'ways'))} AS {alias}", ends, on)
+        base.stops += [f'{alias}."stop {number}"' for number in range(1, edge.high)]
+    elif edge.high > 1:
         base.repeats = True
         base.join(nested(_paths(sql, scope, edge), alias[1:-1]), alias, ends)
     elif edge.both or (moving and lasting):
         base.repeats = True
         rows = _rows(sql, scope, edge, moving=moving, lasting=lasting)
         base.join(nested(rows, alias[1:-1]), alias, ends)
-    elif lasting:
-        base.need_bucket()
-        on = edge_conditions(sql.catalog, scope, edge, alias, moving=False)
-        on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
-        base.repeats |= len(edge.relations) > 1
-        base.tie(f'"map_edge" AS {alias}', ends, on)
     else:
-        base.repeats |= len(edge.relations) > 1
-        base.join(
-            f'"edge" AS {alias}',
-            alias,
-            ends,
-            edge_conditions(sql.catalog, scope, edge, alias, moving=True),
-        )
+        base.several |= {edge.key} if len(edge.relations) > 1 else set()
+        base.kinds |= {edge.src: f'{alias}."src_kind"', edge.dst: f'{alias}."dst_kind"'}
+        on = edge_conditions(sql.catalog, scope, edge, alias, moving=not lasting)
+        if lasting:
+            base.need_bucket()
+            on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
+            base.tie(f'"map_edge" AS {alias}', ends, on)
+        else:
+            base.join(f'"edge" AS {alias}', alias, ends, on)
+
+
+def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
+    """Nodes whose kind the rows of an edge say, so that :func:`base_rows` can have it as a column."""
+    if parts.blocks or any(edge.high > 1 for edge in scope.edges):
+        return frozenset()
+    found = set[str]()
+    for edge in scope.edges:
+        ends = scope.kinds(edge.src), scope.kinds(edge.dst)
+        tables = (sql.catalog.edges, sql.catalog.map_edges)
+        if not edge.both and not all(any(possible(edge, *ends, table)) for table in tables):
+            found |= {edge.src, edge.dst}
+    return frozenset(found)
 
 
 def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
@@ -562,7 +592,7 @@ def _unfolded(
 
     So a path begins where other edges lead, rather than anywhere.
     """
-    paths = [edge for edge in scope.edges if edge.high > 1]
+    paths = [edge for edge in scope.edges if edge.high > 1 and not _ways(sql, scope, edge)]
     lengths = list(product(*(range(path.low, path.high + 1) for path in paths)))
     wanted = any(path.key in edges for path in paths)
     if not paths or wanted or len(paths) == len(scope.edges) or len(lengths) > _BRANCHES:
@@ -584,21 +614,67 @@ def _unfolded(
     return select.text()
 
 
-def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
+def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
+    """A path of ``low`` to ``high`` edges as patterns of single ones, one for each length that it can have."""
     nodes = {key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)}
     single = replace(edge, low=1, high=1)
+    alone = Scope(nodes, {}, (single,), (), frozenset())
+    found = (
+        chain(alone, single, length, injective=sql.query.injective)
+        for length in range(edge.low, edge.high + 1)
+    )
+    found = (ordered(narrowed(inner, sql.catalog), sql.catalog) for inner in found)
+    return [inner for inner in found if inner.where != (FALSE,)]
+
+
+def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
+    """Ways on the maps that a path may be, with the nodes on them; empty if it may lead over edges of frames.
+
+    There are few of them, whatever the number of frames: other edges are joined to them, and then it is
+    looked up whether the nodes on the way are present.
+    """
+    if edge.both or len(scope.edges) == 1:
+        return ""
     branches: list[str] = []
-    for length in range(edge.low, edge.high + 1):
-        inner = Scope(nodes, {}, (single,), (), frozenset())
-        inner = chain(inner, single, length, injective=sql.query.injective)
-        inner = ordered(narrowed(inner, sql.catalog), sql.catalog)
-        if inner.where != (FALSE,):
-            rows = base_rows(sql, inner, Phases(), None, frozenset(nodes), frozenset())
-            ends = ((edge.src, "src"), (edge.dst, "dst"))
-            columns = [f'{quoted(f"{key}.id")} AS "{end}"' for key, end in ends]
-            select = Select(['"bucket"', *columns, '"mask"'], [nested(rows, ":path")])
-            branches.append(select.text())
+    for inner in _chains(sql, scope, edge):
+        for link in inner.edges:
+            ends = inner.kinds(link.src), inner.kinds(link.dst)
+            if any(possible(link, *ends, sql.catalog.edges)):
+                return ""
+        branches.append(_ways_along(sql, inner, edge))
+    return "\nUNION ALL\n".join(branches)
+
+
+def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
+    """Ways on the maps that a chain of edges may be."""
+    base, first = Base(), f'{quoted(alias_of(scope.edges[0]))}."map_id"'
+    for edge in scope.edges:
+        alias = quoted(alias_of(edge))
+        on = edge_conditions(sql.catalog, scope, edge, alias, moving=False)
+        on += [f'{alias}."map_id" = {first}'] if base.nodes else []
+        on += [f'{alias}."src" = {alias}."dst"'] if edge.src == edge.dst else []
+        ends = {edge.src: f'{alias}."src"', edge.dst: f'{alias}."dst"'}
+        base.tie(f'"map_edge" AS {alias}', ends, on)
+    bound, select = set(base.nodes), base.select
+    select.where += [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in apart(scope, bound, bound)]
+    select.columns = [f'{first} AS "map_id"', f'{base.nodes[path.src]} AS "src"']
+    select.columns.append(f'{base.nodes[path.dst]} AS "dst"')
+    for number in range(1, path.high):
+        stop = base.nodes.get(f"#{path.key}.{number}", "CAST(NULL AS INTEGER)")
+        select.columns.append(f'{stop} AS "stop {number}"')
+    return select.text()
+
+
+def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
+    """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
+    ends = ((edge.src, "src"), (edge.dst, "dst"))
+    keys = frozenset((edge.src, edge.dst))
+    branches: list[str] = []
+    for inner in _chains(sql, scope, edge):
+        rows = base_rows(sql, inner, Phases(), None, keys, frozenset())
+        columns = [f'{quoted(f"{key}.id")} AS "{end}"' for key, end in ends]
+        select = Select(['"bucket"', *columns, '"mask"'], [nested(rows, ":path")])
+        branches.append(select.text())
     if not branches:
         columns = ['"bucket"', '"src"', '"dst"', '"mask"']
         branches.append(Select(columns, ['"edge"'], ["FALSE"]).text())
@@ -669,11 +745,7 @@ def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[B
         and not kinds.other
         and profile.moving >= (sql.catalog.moving & entity_kinds())
     ):
-        branches.append(
-            _ego(
-                sql,
-            )
-        )
+        branches.append(_ego(sql))
     elif profile.moving:
         branches.append(_moving(sql, kinds, profile, conditions))
     if profile.fixed:
@@ -683,9 +755,7 @@ def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[B
     return "\nUNION ALL\n".join(branches)
 
 
-def _ego(
-    sql: SqlBuilder,
-) -> str:
+def _ego(sql: SqlBuilder) -> str:
     select = Select(['"bucket"', '"ego" AS "node_id"', f'bit_or({bit_of(_BIT)}) AS "mask"'])
     select.join('"frame"', ['"ego" IS NOT NULL', *sql.within('"bucket"')])
     select.group = ['"bucket"', '"ego"']
@@ -745,21 +815,40 @@ def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bo
     return '"t"'
 
 
-def _masked(base: Base, nodes: frozenset[str], edges: frozenset[str]) -> str:
-    """The join as a relation of some nodes and edges, each binding once."""
+def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
+    """The join as a relation of some columns, by their names; each combination once."""
     select, masks = base.select, base.masks
     mask = " & ".join(masks)
-    keep = [base.nodes[key] for key in sorted(nodes)] + [base.edges[key] for key in sorted(edges)]
-    named = [f"{c} AS {name}" for c, name in zip(keep, columns_of(nodes, edges), strict=True)]
+    named = [f"{column} AS {name}" for name, column in keep.items()]
     if len(masks) <= _MANY:
         select.where += [f"({a} & {b}) <> 0" for a, b in combinations(masks, 2)]
     if len(masks) > 2:
         select.where.append(f"({mask}) <> 0")
     select.columns = [f'{base.bucket} AS "bucket"', *named, f'{mask} AS "mask"']
-    if base.repeats or set(base.nodes) > nodes:
+    if base.stops:
+        return _on_the_way(sql, select, base.stops, list(keep))
+    if base.repeats:
         select.columns[-1] = f'bit_or({mask}) AS "mask"'
-        select.group = [base.bucket, *keep]
+        select.group = [base.bucket, *keep.values()]
     return select.text()
+
+
+def _on_the_way(sql: SqlBuilder, join: Select, stops: list[str], keys: list[str]) -> str:
+    """The rows of a join, in those frames in which the nodes on the way are present; each key once."""
+    names = [f"stop {number}" for number in range(1, len(stops) + 1)]
+    join.columns += [f"{stop} AS {quoted(name)}" for stop, name in zip(stops, names, strict=True)]
+    found = Select(['":way"."bucket"', *(f'":way".{key}' for key in keys)])
+    found.join(f'{quoted(sql.share(join.text(), "way"))} AS ":way"', [])
+    mask = '":way"."mask"'
+    for name in names:
+        alias, node = quoted(f":{name}"), f'":way".{quoted(name)}'
+        on = [f'{alias}."bucket" = ":way"."bucket"', f'{alias}."node_id" = {node}']
+        found.join(f'"node" AS {alias}', on, "LEFT JOIN")
+        mask += f' & CASE WHEN {node} IS NULL THEN -1 ELSE coalesce({alias}."mask", 0) END'
+    found.where.append(f"({mask}) <> 0")
+    found.group = list(found.columns)
+    found.columns.append(f'bit_or({mask}) AS "mask"')
+    return found.text()
 
 
 def _row_columns(alias: str, mask: str, *, swapped: bool) -> list[str]:

@@ -28,7 +28,7 @@ from sgstore.store._locking import (
 from sgstore.store._packing import plain
 from sgstore.store._payloads import payload_place
 from sgstore.store._publish import publish_in, remove
-from sgstore.store._rows import BATCH, Batches, GivenTable, Rows, give
+from sgstore.store._rows import BATCH, Batches, Given, Rows, give
 from sgstore.store._staging import scratch
 from sgstore.store._traces import (
     FrameRef,
@@ -153,7 +153,7 @@ class StoreFile:
         return self.access.reading()
 
     def rows(
-        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Rows:
         """All rows of a statement of ours.
 
@@ -163,7 +163,7 @@ class StoreFile:
             Trusted; users' statements go through :meth:`user_sql`.
         parameters : sequence or mapping, optional
             Values of ``?`` or of ``$name``.
-        given : iterable of GivenTable
+        given : iterable of Given
             Tables that it speaks of beside those of the store.
 
         Raises
@@ -175,14 +175,14 @@ class StoreFile:
             return found
 
     def arrays(
-        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> dict[str, NDArray[np.generic]]:
         """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL."""
         with self._answered(lambda at, _: rows.arrays(at, sql, parameters), given) as found:
             return found
 
     def table(
-        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[GivenTable] = ()
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:
         """All rows of a statement of ours as Arrow; see :func:`sgstore.store._rows.table_of`."""
         with self._answered(lambda at, _: rows.table_of(at, sql, parameters), given) as found:
@@ -195,7 +195,7 @@ class StoreFile:
         parameters: Parameters | None = None,
         size: int = BATCH,
         *,
-        given: Iterable[GivenTable] = (),
+        given: Iterable[Given] = (),
     ) -> Generator[Batches]:
         """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
         with self._answered(lambda at, _: Batches(at, sql, parameters, size), given) as found:
@@ -661,7 +661,7 @@ class StoreFile:
     def _answered(
         self,
         ask: Callable[[DuckDBPyConnection, ExitStack], T],
-        given: Iterable[GivenTable] = (),
+        given: Iterable[Given] = (),
     ) -> Generator[T]:
         """Answer of a question, while the store is open.
 

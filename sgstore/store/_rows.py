@@ -6,8 +6,10 @@ import csv
 import json
 import re
 import threading
+from collections.abc import Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
@@ -23,7 +25,7 @@ from sgstore.store._locking import EngineError, engine_fault, spill_fault
 from sgstore.store._steps import interruptible
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
@@ -791,9 +793,16 @@ class GivenTable:
     blocks: Callable[[], Iterable[Sequence[list[Any]]]]
 
 
-def give(connection: DuckDBPyConnection, given: Iterable[GivenTable]) -> None:
+Given = GivenTable | tuple[str, Mapping[str, object]]
+"""A table that a statement is given: its rows, or a statement of ours that makes it, and its values."""
+
+
+def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
     """Make tables that nobody but this connection sees, until it is closed."""
     for table in given:
+        if isinstance(table, tuple):
+            interruptible(connection, partial(connection.execute, table[0], table[1] or None))
+            continue
         columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in table.types.items())
         name = quoted(table.name)
         connection.execute(f"CREATE OR REPLACE TEMP TABLE {name} ({columns})")
