@@ -91,25 +91,30 @@ def test_labels_relations_and_attributes_of_a_stranger_come_back(tmp_path: Path)
     assert not verify_file(store.file.path).faults
 
 
+def of_its_own(rng: random.Random) -> dict[str, Any]:
+    """Attributes that somebody else gave, of several types; some are missing."""
+    values = {
+        "color": rng.choice(("red", "blue", "it's", None)),
+        "weight": rng.choice((1, 2.5, -3, 10**6)),
+        "isNew": rng.random() < 0.5,
+        "tags": rng.choice(([], ["small", "wet"], {"a": [1]})),
+        "mixed": rng.choice((1, "1", 0.5, True, None)),
+        "SIZE": rng.choice((1, 2)),
+        "size": rng.choice(("big", "huge")),
+    }
+    return {name: value for name, value in values.items() if rng.random() < 0.7}
+
+
 def strange(number: int) -> nx.MultiDiGraph[str]:
-    """A random graph whose nodes have attributes of their own, some of them, and of several types."""
+    """A random graph whose nodes and edges have attributes of their own."""
     rng = random.Random(number)
     graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(name=f"{number}.jpg")
     for node in range(rng.choice((2, 4, 6))):
-        values = {
-            "color": rng.choice(("red", "blue", "it's", None)),
-            "weight": rng.choice((1, 2.5, -3, 10**6)),
-            "isNew": rng.random() < 0.5,
-            "tags": rng.choice(([], ["small", "wet"], {"a": [1]})),
-            "mixed": rng.choice((1, "1", 0.5, True, None)),
-            "SIZE": rng.choice((1, 2)),
-            "size": rng.choice(("big", "huge")),
-        }
-        held = {name: value for name, value in values.items() if rng.random() < 0.7}
+        held = of_its_own(rng)
         graph.add_node(f"o{node}", kind=rng.choice(("car", "person")), **held)
     for _ in range(8):
         a, b = rng.sample(sorted(graph.nodes), 2)
-        graph.add_edge(a, b, relation="near")
+        graph.add_edge(a, b, relation=rng.choice(("near", "visible")), **of_its_own(rng))
     return graph
 
 
@@ -149,17 +154,43 @@ def test_attributes_of_a_client_are_asked_for_in_patterns(
     single = {(n, i) for n, g in graphs.items() for i, x in g.nodes(data=True) if fits(x)}
     ends = {(n, a) for n, g in graphs.items() for a, b in g.edges() if (n, b) in single}
     pattern = f"MATCH (x) WHERE {condition} RETURN frame.seq, x.id"
-    beside = f"EXISTS {{(a)-[:near]->(x) WHERE {condition}}}"
+    beside = f"EXISTS {{(a)-[:near|visible]->(x) WHERE {condition}}}"
 
     assert {(row.frame_seq, row.x_id) for row in attributed.find(pattern)} == single
     assert single
     found = attributed.find(f"MATCH (a) WHERE {beside} RETURN frame.seq, a.id")
     assert {(row.frame_seq, row.a_id) for row in found} == ends
-    found = attributed.find(f"MATCH (a)-[:near]->(x) WHERE {condition} RETURN frame.seq, a.id")
+    found = attributed.find(
+        f"MATCH (a)-[:near|visible]->(x) WHERE {condition} RETURN frame.seq, a.id"
+    )
     assert {(row.frame_seq, row.a_id) for row in found} == ends
     for number in range(0, 12, 4):  # in memory
         answer = attributed.why_not(f"genome#{number}", f"MATCH (x) WHERE {condition}")
         assert answer.as_dict()["matches"] == (number in {n for n, _ in single})
+
+
+@pytest.mark.parametrize("condition", OWN)
+def test_attributes_of_edges_are_asked_for_in_patterns(attributed: Store, condition: str) -> None:
+    fits, asked = OWN[condition], condition.replace("x.", "r.")
+    edges, near = set[Any](), set[Any]()
+    for n in range(12):
+        for a, b, r in attributed.graph(f"genome#{n}").edges(data=True):
+            if fits(r):
+                edges.add((n, a, b, r["relation"], text_of(r.get("color"))))
+                near |= {(n, a)} if r["relation"] == "near" else set()
+
+    rows = attributed.find(
+        f"MATCH (a)-[r]->(b) WHERE {asked} RETURN frame.seq, a.id, b.id, type(r), r.color"
+    )
+    assert set(rows) == edges
+    assert edges
+    there = f"EXISTS {{(a)-[r:near]->() WHERE {asked}}}"
+    assert set(attributed.find(f"MATCH (a) WHERE {there} RETURN frame.seq, a.id")) == near
+    for number in range(0, 12, 4):  # in memory
+        answer = attributed.why_not(f"genome#{number}", f"MATCH (a)-[r]->(b) WHERE {asked}")
+        assert answer.as_dict()["matches"] == (number in {row[0] for row in edges})
+    with pytest.raises(QueryError, match="only a single edge, one way, has"):
+        attributed.find(f"MATCH (a)-[r]-(b) WHERE {asked}")
 
 
 def test_attributes_of_a_client_are_returned(attributed: Store) -> None:

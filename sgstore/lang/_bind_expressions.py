@@ -37,7 +37,6 @@ from sgstore.lang._symbols import (
 from sgstore.vocabulary import (
     KINDS,
     LANE_TYPES,
-    NAMES,
     entity_kinds,
     kind_named,
     kinds_labelled,
@@ -248,11 +247,13 @@ def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
     QueryNameError
         There is none of that name.
     QueryError
-        The edge is not one of those that have it: ``isIn`` by itself, or ``leads`` or ``follows`` one way.
+        The edge is not one of those that have it: ``isIn`` by itself, or ``leads`` or ``follows`` one way; a
+        single one, one way, of an attribute of a client's own.
     """
     found = EDGE_ATTRIBUTES.get(EDGE_ALIASES.get(normalize_name(name), normalize_name(name)))
+    found = found or _own_attribute(name, names.session.own_edges)
     if found is None:
-        known = [attribute.name for attribute in EDGE_ATTRIBUTES.values()]
+        known = [one.name for one in EDGE_ATTRIBUTES.values()] + [*names.session.own_edges]
         hint = (
             f"{name}(a, b) is a number of two nodes" if normalize_name(name) in PAIR_NAMES else None
         )
@@ -262,7 +263,12 @@ def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
     edge = next((edge for edge in names.scope.edges if edge.key == key), None)
     if edge is None:
         names.session.refuse("an edge is known only in the pattern that binds it", span)
-    if found.name == "gap":
+    if found.unit is DisplayUnit.own:
+        if edge.high > 1 or edge.both:
+            names.session.refuse(
+                f"only a single edge, one way, has '{found.name}'", span, "write -[…]->"
+            )
+    elif found.name == "gap":
         if not (edge.relations in FOLLOWED and edge.high == 1 and not edge.both):
             names.session.refuse(
                 "only edges leads or follows, one of them and one way, have 'gap'",
@@ -391,8 +397,7 @@ def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTabl
 def _vocabulary(expression: b.Bound) -> Sequence[str]:
     match expression:
         case b.NodeAttribute(attribute=attribute) | b.FrameAttribute(attribute=attribute):
-            enum = {id(values): enum for enum, values in NAMES.items()}.get(id(attribute.values))
-            return known_names(enum) if enum else attribute.values
+            return known_names(attribute.enum) if attribute.enum else attribute.values
         case b.EdgeRelation():
             return sorted(known_names("relation"))
         case _:

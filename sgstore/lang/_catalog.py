@@ -143,6 +143,8 @@ class Attribute:
         Kinds of the vocabulary whose nodes may have it; :attr:`kinds` are all of them.
     values : sequence of str
         All values that it can have, if they are a closed list.
+    enum : str
+        The enumeration of the vocabulary that its values are of; empty for all others.
     meaning : str
         For the documentation; with unit.
     table : str
@@ -160,6 +162,7 @@ class Attribute:
     values: Sequence[str] = ()
     table: str = ""
     traces: tuple[int, ...] = ()
+    enum: str = ""
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -226,6 +229,7 @@ NODE_ATTRIBUTES: Final = _named(
             {Home.entity: "kind", Home.map: "kind"},
             "what it is",
             values=KINDS,
+            enum="kind",
         ),
         Attribute("is_ego", Type.boolean, {Home.state: "is_ego"}, "whether it is the ego"),
         Attribute(
@@ -313,6 +317,7 @@ NODE_ATTRIBUTES: Final = _named(
             "what a traffic light shows",
             own_kinds=frozenset({"traffic_light"}),
             values=LIGHT_STATES,
+            enum="light_state",
         ),
         _control("steer", "steering input, -1 … 1, positive to the left"),
         _control("throttle", "0 … 1"),
@@ -374,7 +379,7 @@ NODE_ATTRIBUTES: Final = _named(
 
 @cache
 def own_attribute(name: str, kind: Type) -> Attribute:
-    """Return an attribute of a client's own, which nodes of any kind may have."""
+    """Return an attribute of a client's own, which nodes of any kind, or edges of any relation, may have."""
     return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own)
 
 
@@ -673,6 +678,8 @@ class Catalog:
         The abstractions that a query can name: what makes the catalog of each from this one.
     own : mapping of str to Type
         Attributes of a client's own that nodes have, by their names.
+    own_edges : mapping of str to Type
+        The same of edges.
     names : mapping or None
         Kinds, relations and states of lights that the store has beside those of this package; ``None``: those
         of all stores that the process has met.
@@ -698,6 +705,7 @@ class Catalog:
         default_factory=dict[str, "Callable[[Catalog], Catalog]"]
     )
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
     names: Mapping[str, Sequence[str]] | None = None
     unknowing: frozenset[int] = frozenset()
     lacks: dict[Any, frozenset[int]] = field(

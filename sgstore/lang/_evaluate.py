@@ -232,6 +232,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.edges[edge][0]
         case b.EdgeAttribute(edge=edge, attribute=attribute):
             name = attribute.name
+            if attribute.unit is DisplayUnit.own and attribute.type is Type.text:
+                return lambda at: _text_of(at.edges[edge][1].get(name))
             return lambda at: at.edges[edge][1].get(name)
         case b.FrameAttribute(attribute=attribute) if attribute.unit is DisplayUnit.classed:
             (name,) = attribute.columns.values()

@@ -153,7 +153,7 @@ def _file(condition: Bound, parts: Phases) -> None:
     if all(_is_direct(leaf) for leaf in found):
         parts.direct.append(condition)
     elif any(
-        isinstance(leaf, NodeAttribute)
+        isinstance(leaf, NodeAttribute | EdgeAttribute)
         and leaf.attribute.unit in {DisplayUnit.role, DisplayUnit.own}
         for leaf in found
     ):

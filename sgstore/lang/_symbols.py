@@ -106,6 +106,7 @@ class Session:
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, "TableFacts"])
     traces: tuple[TraceFacts, ...] = ()
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
     the_ego: str | None = None
     numbers: int = 0
     blocks: int = 0
@@ -113,7 +114,7 @@ class Session:
     def ask(self, catalog: Catalog) -> None:
         """Take over what a catalog says of the store that is asked."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
-        self.own = catalog.own
+        self.own, self.own_edges = catalog.own, catalog.own_edges
 
     def key(self, name: str | None) -> str:
         """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""

@@ -66,7 +66,8 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         ),
         classed=tuple(sorted(name for (name,) in classed)),
         names={enum: others_of(connection, enum) for enum in NAMES},
-        own=_own(connection),
+        own=_own(connection, "relation IS NULL"),
+        own_edges=_own(connection, "relation IS NOT NULL"),
     )
     sets: dict[str, Callable[[Catalog], Catalog]] = {
         name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()
@@ -80,11 +81,11 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
     return replace(whole, sets=sets)
 
 
-def _own(connection: DuckDBPyConnection) -> dict[str, Type]:
-    """Attributes of a client's own that nodes have: numbers or truth values if all values are, else texts."""
+def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
+    """Attributes of a client's own of nodes or edges: numbers or truth values if all values are, else texts."""
     types = "list(DISTINCT json_type(value)) FILTER (json_type(value) <> 'NULL')"
     rows = connection.execute(
-        f"SELECT attribute, {types} FROM attribute WHERE relation IS NULL GROUP BY ALL ORDER BY ALL"
+        f"SELECT attribute, {types} FROM attribute WHERE {whose} GROUP BY ALL ORDER BY ALL"
     ).fetchall()
     return {
         name: Type.boolean
