@@ -306,8 +306,7 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
     _told(sums[:2], seen.node_frame, seen.node, own, np.zeros(1, np.int64))
     _told(sums[:2], lanes.frame, lanes.strand, lanes.role, np.ones(1, np.int64))
     _told(sums[:2], np.arange(seen.frames), seen.ego_lane, np.full(1, 2), np.ones(1, np.int64))
-    columns = (seen.frame, seen.src, seen.relation, seen.dst)
-    _told(sums[2:], *(column[rows] for column in columns))
+    _told(sums[2:], seen.frame[rows], seen.src[rows], seen.relation[rows], seen.dst[rows])
     return [row.tobytes() for row in np.ascontiguousarray(sums.T)]
 
 
@@ -315,10 +314,9 @@ def _told(sums: Words, frame: Ints, *columns: NDArray[Any]) -> None:
     """Add two words for each row to the sums of its frame."""
     if not len(frame):
         return
-    words = sum(
-        column.astype(np.int64, copy=False).view(np.uint64) * factor
-        for column, factor in zip(columns, (_A, _B, _C), strict=True)
-    )
+    words = np.zeros(1, np.uint64)
+    for column, factor in zip(columns, (_A, _B, _C), strict=True):
+        words = words + column.astype(np.int64, copy=False).view(np.uint64) * factor
     first = _mixed(words)
     starts = np.flatnonzero(np.append(True, frame[1:] != frame[:-1]))
     for total, values in zip(sums, (first, _mixed(first * _D + words)), strict=True):

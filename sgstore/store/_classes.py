@@ -89,11 +89,11 @@ class TraceClasses:
             self._known.popitem(last=False)
         return self._columns([*zip(*of_frames, strict=True)], trace_id, seq)
 
-    def _named(self, seen: GraphColumns) -> list[list[str]]:
+    def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
         """For each abstraction the classes of the frames."""
-        return [classes.of(abstraction.function(seen)) for abstraction, classes in self._of]
+        return [tuple(classes.of(abstraction.function(seen))) for abstraction, classes in self._of]
 
-    def _columns(self, named: Sequence[Sequence[str]], trace_id: int, seq: Ints) -> Columns:
+    def _columns(self, named: Sequence[tuple[str, ...]], trace_id: int, seq: Ints) -> Columns:
         rows: list[tuple[str, str]] = []
         buckets: list[Ints] = []
         masks: list[Ints] = []

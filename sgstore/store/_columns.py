@@ -299,7 +299,7 @@ def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, N
             missing = missing_of(table, name, values)
             if kind in TEXTS:
                 used, index = np.unique(values, return_inverse=True)
-                numbers = [_number(kind, texts[at]) if at >= 0 else 0 for at in used.tolist()]
+                numbers = [_number(kind, str(texts[at])) if at >= 0 else 0 for at in used.tolist()]
                 values = np.array(numbers, np.int64)[index]
             elif name in enums:
                 values = _coded(enums[name], values)

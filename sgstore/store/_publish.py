@@ -18,14 +18,17 @@ from sgstore.quoting import literal, quoted
 from sgstore.store._columns import (
     MASKS,
     ORDERS,
+    TEXTS,
     Checksum,
+    blank,
     columns_of,
     expressions,
     missing_of,
+    types_of,
 )
 from sgstore.store._locking import spill_folder
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, MISSING, plain
-from sgstore.store._staging import FILE, PIECE_ROWS, Staging, TableFile, chained, scratch
+from sgstore.store._staging import FILE, PIECE_ROWS, Staging, TableFile, scratch
 from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
 from sgstore.vocabulary import NAMES
 from sgstore.world import BUCKET_FRAMES
@@ -160,43 +163,56 @@ def insert(
 ) -> None:
     """Insert the staged rows of a table, with the values that only the store can give."""
     given = given or {}
-    for columns in _batches(tables, table):
+    # The same arrays for all rows: until it ends, the transaction keeps whatever it has been given.
+    staged = _buffers(tables, table)
+    size = len(next(iter(staged.values())))
+    connection.register("staged", staged)
+    for count in _filled(tables, table, staged):
         listed = [f"${name} AS {name}" for name in given]
         listed += [
-            f'{_value(table, name, values)} AS "{name}"'
-            for name, values in columns.items()
+            f'{_value(table, name, values[:count])} AS "{name}"'
+            for name, values in staged.items()
             if name not in given
         ]
-        connection.register("staged", columns)
+        limit = "" if count == size else f" LIMIT {count}"
         connection.execute(
-            f"INSERT INTO store.inside.{table} BY NAME SELECT {', '.join(listed)} FROM staged",
+            f"INSERT INTO store.inside.{table} BY NAME SELECT {', '.join(listed)} FROM staged{limit}",
             given,
         )
-        connection.unregister("staged")
+    connection.unregister("staged")
 
 
-def _batches(tables: TableFile, table: str) -> Iterator[Columns]:
-    """Staged rows of a table, pieces together as far as memory is for them."""
-    waiting: list[Columns] = []
-    rows = 0
+def _buffers(tables: TableFile, table: str) -> Columns:
+    """Columns for so many rows of a table as are inserted together."""
+    pieces, types = tables.pieces(table), types_of(table)
+    size = min(sum(piece.rows for piece in pieces), PIECE_ROWS)
+    return {
+        name: np.full(size, "", object) if types[name] in TEXTS else blank(table, name, size)
+        for name in dict.fromkeys(name for piece in pieces for name in piece.columns)
+    }
+
+
+def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
+    """Fill the columns with rows of a table until there are no more; how many there are each time."""
+    size, count = len(next(iter(staged.values()))), 0
     for piece in tables.pieces(table):
-        if waiting and rows + piece.rows > PIECE_ROWS:
-            yield chained(table, waiting)
-            waiting, rows = [], 0
-        columns = tables.read(piece)
-        for name, about in piece.columns.items():
-            if "texts" in about:
-                columns[name] = np.array([*about["texts"], ""], object)[columns[name]]
-        waiting.append(columns)
-        rows += piece.rows
-    if waiting:
-        yield chained(table, waiting)
+        first = 0
+        while first < piece.rows:
+            more = min(size - count, piece.rows - first)
+            for name, values in staged.items():
+                values[count : count + more] = tables.values(piece, name, first, first + more)
+            first, count = first + more, count + more
+            if count == size:
+                yield count
+                count = 0
+    if count:
+        yield count
 
 
 def _value(table: str, name: str, values: NDArray[Any]) -> str:
     """SQL of a staged column: enumerations by their codes, NULL for what is missing; NaN is NULL anyway."""
     if values.dtype.kind == "O":
-        return f"nullif(\"{name}\", '')"
+        return f"nullif(\"{name}\", '')" if values.any() else "NULL"
     enum = shape.enums_of(table).get(name)
     if enum is not None:
         codes = [code for code in np.unique(values).tolist() if code >= 0]

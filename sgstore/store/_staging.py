@@ -170,6 +170,17 @@ class TableFile:
             values = np.frombuffer(data, kind)
         return values.astype(np.int64) + about["base"] if "base" in about else values
 
+    def values(self, piece: Piece, name: str, first: int, end: int) -> NDArray[Any]:
+        """One of them with its texts, whether the piece has it or not."""
+        if name not in piece.columns:
+            texts = types_of(piece.table)[name] in TEXTS
+            count = end - first
+            return np.full(count, "", object) if texts else blank(piece.table, name, count)
+        values = self.column(piece, name, first, end)
+        if "texts" not in piece.columns[name]:
+            return values
+        return np.array([*piece.columns[name]["texts"], ""], object)[values]
+
     def _bytes(self, at: int, count: int) -> bytes:
         try:
             self._file.seek(at)
@@ -217,7 +228,7 @@ def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None
 PART_ROWS: Final = 20_000
 """Rows of all growing tables together that are kept in memory."""
 
-PIECE_ROWS: Final = 60_000
+PIECE_ROWS: Final = 20_000
 """Most rows of a table that are read and inserted together."""
 
 MERGE_ROWS: Final = 1 << 19
@@ -361,7 +372,7 @@ class Staging:
 
     def _gathered(self, table: str) -> Columns:
         """The rows of a table that are in memory, sorted."""
-        return in_order(table, chained(table, self._waiting.pop(table)), self._texts_of(table))
+        return in_order(table, _chained(table, self._waiting.pop(table)), self._texts_of(table))
 
     def _texts_of(self, table: str) -> list[str]:
         return list(self._texts[table in _CUT])[1:]
@@ -405,8 +416,8 @@ class Staging:
                 if low < high:
                     found.append(self._file.read(run, low, high))
                 if sum(len(one["mask"]) for one in found) > 2 * self._most:
-                    found = [in_order(table, chained(table, found), texts)]
-            yield in_order(table, chained(table, found), texts)
+                    found = [in_order(table, _chained(table, found), texts)]
+            yield in_order(table, _chained(table, found), texts)
 
     def messages(self) -> Iterator[Columns]:
         """All messages, some at a time."""
@@ -423,22 +434,21 @@ class Staging:
         self.checksums = dict(sorted(self.checksums.items()))
 
 
-def chained(table: str, blocks: list[Columns]) -> Columns:
+def _chained(table: str, blocks: list[Columns]) -> Columns:
     """Staged rows of a table one behind the other, with all columns that any of them has."""
     if len(blocks) == 1:
         return blocks[0]
-    found: Columns = {}
-    for name in dict.fromkeys(name for block in blocks for name in block):
-        parts: list[NDArray[Any]] = []
-        texts = any(name in block and block[name].dtype.kind == "O" for block in blocks)
-        for block in blocks:
-            count = len(next(iter(block.values())))
-            if name in block:
-                parts.append(block[name])
-            else:
-                parts.append(np.full(count, "", object) if texts else blank(table, name, count))
-        found[name] = np.concatenate(parts)
-    return found
+    return {
+        name: np.concatenate(
+            [
+                block[name]
+                if name in block
+                else blank(table, name, len(next(iter(block.values()))))
+                for block in blocks
+            ]
+        )
+        for name in dict.fromkeys(name for block in blocks for name in block)
+    }
 
 
 # Databases in memory ------------------------------------------------------------------------------------------
