@@ -128,7 +128,7 @@ def draw_rank_sizes(
     MissingExtraError
         The packages for drawing are not installed.
     """
-    from matplotlib.ticker import EngFormatter, NullLocator, PercentFormatter
+    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator, PercentFormatter
 
     once = sum(1 for size in sizes if size == 1)
     below = f"{len(sizes)} classes, {sum(sizes)} {unit}s; {once} classes come once"
@@ -138,9 +138,11 @@ def draw_rank_sizes(
         axes.loglog(ranks, sizes, color=ROAD_EDGE, linewidth=1.6, marker=".", markersize=2.5)
         axes.set_xlim(1, max(len(sizes), 10))
         axes.set_ylim(1, max(sizes[0], 10))
-        for axis in (axes.xaxis, axes.yaxis):
+        for axis, most in ((axes.xaxis, len(sizes)), (axes.yaxis, sizes[0])):
             axis.set_major_formatter(EngFormatter(sep=""))
             axis.set_minor_locator(NullLocator())
+            if most < 100:  # powers of ten alone would be two numbers
+                axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         if len(cumulative):
             share: Axes = axes.twinx()
             share.plot(

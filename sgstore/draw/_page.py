@@ -77,6 +77,8 @@ MOST_COLOURS: Final = 50_000
 """A picture with more colours than this is a photograph."""
 FURTHEST: Final = 24.0
 """Greatest distance in RGB, of 0 … 255 each, that a mixture may be moved."""
+_AREA: Final = 30
+"""Pixels of one colour that are an area."""
 
 
 def indexed(picture: Image.Image) -> Image.Image:
@@ -91,9 +93,53 @@ def indexed(picture: Image.Image) -> Image.Image:
         return picture
     places = np.zeros(1 << 24, np.uint8)
     places[_packed(colours)] = nearest
-    made = Image.fromarray(places[_packed(np.asarray(picture))])
-    made.putpalette(colours[chosen].astype(np.uint8).tobytes())
+    return _with_palette(places[_packed(np.asarray(picture))], colours[chosen])
+
+
+def _with_palette(places: Pixels, colours: NDArray[np.float32]) -> Image.Image:
+    made = Image.fromarray(places)
+    made.putpalette(colours.astype(np.uint8).tobytes())
     return made
+
+
+class LastingPalette:
+    """The palette of one picture for those that follow, as long as it does them justice.
+
+    It does if no mixture of colours is moved further than in :func:`indexed`, and no area at all.
+    """
+
+    def __init__(self) -> None:
+        self._colours = np.zeros((0, 3), np.float32)
+        self._places = np.full(1 << 24, -1, np.int16)  # of all colours that have been met
+
+    def indexed(self, picture: Image.Image) -> Image.Image:
+        """An RGB picture with a palette of at most 256 colours."""
+        packed = _packed(np.asarray(picture))
+        if not self._takes(packed[self._places[packed] < 0]):
+            made = indexed(picture)
+            if made.mode != "P":
+                return picture.quantize(PLACES, dither=Image.Dither.NONE)
+            palette = np.array(made.getpalette(), np.float32).reshape(-1, 3)
+            self._colours = palette[: 1 + int(np.asarray(made).max())]
+            self._places.fill(-1)
+            self._places[packed] = np.asarray(made)
+            return made
+        return _with_palette(self._places[packed].astype(np.uint8), self._colours)
+
+    def _takes(self, unknown: NDArray[np.int32]) -> bool:
+        """Give places to pixels of colours that are new, if there are such places."""
+        if not len(self._colours):
+            return False
+        found, many = np.unique(unknown, return_counts=True)
+        if len(found) > PLACES * 16 or (many > _AREA).any():
+            return False
+        colours = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1).astype(np.float32)
+        away = np.square(colours[:, None] - self._colours).sum(axis=2)
+        near = away.argmin(axis=1) if len(found) else np.zeros(0, np.intp)
+        if (away[np.arange(len(found)), near] > FURTHEST**2).any():
+            return False
+        self._places[found] = near
+        return True
 
 
 def _palette(colours: NDArray[np.float32]) -> tuple[list[int], NDArray[np.intp], float]:
@@ -143,6 +189,7 @@ class Gif:
         self._stream = self._output.stream()
         self._waiting: tuple[Pixels, int] | None = None
         self._last: Pixels | None = None
+        self._palette = LastingPalette()
         self._shown = 100  # the last frame is shown as long as the one before
         self.frames = 0
 
@@ -177,11 +224,8 @@ class Gif:
             self._stream.write(b"".join(head))
         left, top, right, bottom = changed(self._last, pixels)
         part = Image.fromarray(np.ascontiguousarray(pixels[top:bottom, left:right]))
-        picture = indexed(part)
-        if picture.mode != "P":
-            picture = picture.quantize(PLACES, dither=Image.Dither.NONE)
         pieces = getdata(
-            picture,
+            self._palette.indexed(part),
             (left, top),
             duration=min(delay, MOST_DELAY) * 10,
             disposal=1,

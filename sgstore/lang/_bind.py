@@ -5,7 +5,7 @@ Everything that can be the user's fault is found here or in the parser, before a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError, TextSpan
@@ -28,6 +28,7 @@ from sgstore.lang._symbols import (
 )
 from sgstore.lang.syntax import CheckClause as WrittenCheck
 from sgstore.lang.syntax import Define, MatchClause
+from sgstore.records import dataclass
 from sgstore.vocabulary import (
     RELATION_ALIASES,
     entity_kinds,

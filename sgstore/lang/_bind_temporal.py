@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError
@@ -21,6 +21,7 @@ from sgstore.lang._operators import COMPARISONS
 from sgstore.lang._parse import parse
 from sgstore.lang._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
 from sgstore.lang.library import patterns
+from sgstore.records import dataclass
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:

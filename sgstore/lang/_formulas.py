@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import DERIVED, Attribute, DisplayUnit, Home, Type
@@ -28,6 +28,7 @@ from sgstore.lang.ir import (
 )
 from sgstore.pair_numbers import pair_sql, stage_of
 from sgstore.quoting import literal, quoted
+from sgstore.records import dataclass
 from sgstore.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ is bound already. Every condition is tested as soon as all that it speaks of is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from sgstore.lang._evaluate import (
     crowd_test,
     evaluator,
 )
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

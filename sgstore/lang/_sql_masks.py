@@ -6,7 +6,7 @@ Presence of nodes and conditions on one node alone: as masks, a relation for eac
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Final
 
@@ -52,6 +52,7 @@ from sgstore.lang.ir import (
     Scope,
 )
 from sgstore.quoting import quoted
+from sgstore.records import dataclass
 from sgstore.vocabulary import entity_kinds
 
 if TYPE_CHECKING:

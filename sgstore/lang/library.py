@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from difflib import get_close_matches
 from functools import cache
 from importlib import resources
@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang._parse import parse
 from sgstore.lang.syntax import Define
+from sgstore.records import dataclass
 from sgstore.vocabulary import normalize_name, suggestion
 
 if TYPE_CHECKING:

@@ -7,7 +7,6 @@ are made at ingest are published with their trace; others wait until they are as
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -22,6 +21,7 @@ from sgstore.abstractions import (
     found,
     lane_roles,
 )
+from sgstore.records import dataclass
 from sgstore.store._graphs import Graphs
 from sgstore.store._packing import SEQ_BITS, frames_of, masks_of, texts, trace_bucket
 from sgstore.store._publish import add, note, writing

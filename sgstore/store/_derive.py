@@ -6,7 +6,6 @@ Stored states come out as the generator saw them, and what it makes of them unde
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
@@ -17,6 +16,7 @@ import sgstore.store._packing as packing
 import sgstore.store._schema as shape
 from sgstore.errors import AbstractionError, StoreError
 from sgstore.graph import SceneGraph
+from sgstore.records import dataclass
 from sgstore.store._graphs import Graphs, filled
 from sgstore.store._packing import FRAME_BITS, NodeKinds, as_json, texts
 from sgstore.store._publish import add, note, widen, writing

@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 import secrets
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,6 +25,7 @@ from sgstore.errors import StoreError
 from sgstore.files import temporary_folder
 from sgstore.lang import TableFacts, Type
 from sgstore.quoting import literal
+from sgstore.records import dataclass
 from sgstore.store._packing import TOLERANCE
 
 if TYPE_CHECKING:

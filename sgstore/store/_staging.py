@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
@@ -17,6 +17,7 @@ import duckdb
 import numpy as np
 
 from sgstore.errors import StoreError
+from sgstore.records import dataclass
 from sgstore.store._columns import (
     TEXTS,
     Checksum,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from sgstore.lang import ExternalRelation, Window, of_query, relation, value_text, with_places
 from sgstore.lang.ir import Bound, Query, SignalCall, StepTime, Tense
 from sgstore.matches import Matches
+from sgstore.records import dataclass
 from sgstore.store import BUCKET_BITS
 from sgstore.temporal._checks import lacking
 from sgstore.temporal._formula import formula_text

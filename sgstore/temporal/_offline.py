@@ -6,7 +6,7 @@ at a time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from sgstore.lang import (
     traces_of,
 )
 from sgstore.matches import Windows
+from sgstore.records import dataclass
 from sgstore.store import trace_of
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows

@@ -27,13 +27,14 @@ none can be copied when it comes. Values of signals at former frames are kept as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
 from sgstore.lang import Type, relation, unnumbered_text, value_text
 from sgstore.lang import ir as b
+from sgstore.records import dataclass
 from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:

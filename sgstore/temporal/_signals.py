@@ -7,7 +7,6 @@ side fails.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from sgstore.lang import Column, all_known, column_evaluator
 from sgstore.lang import ir as b
+from sgstore.records import dataclass
 from sgstore.temporal._formula import (
     TRUE,
     And,
