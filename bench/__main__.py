@@ -14,6 +14,7 @@ TITLES = {
     "classes": "Classes: isomorphic or not, beside networkx",
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
+    "sharing": "A store that stays open: small questions, and writers beside readers",
     "patterns": "Patterns over a million frames",
     "real": "Real traffic: replicas of recordings of simulators",
     "temporal": "Time: formulas over columns, and frame by frame",

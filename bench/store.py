@@ -136,6 +136,7 @@ def run(quick: bool = False) -> list[Measure]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         store, frames = filled(folder, traces=3 if quick else 10, minutes=2 if quick else 10)
+        store.close()  # connections of duckdb's own come
         whole = store.path.stat().st_size
         table = [
             Measure("whole store", whole / frames, "B/frame", f"{frames:,} frames, {CARS} cars")

@@ -59,8 +59,9 @@ def open(
 class Store:
     """A store of traces, by its path.
 
-    Its file is open only while something is asked of it, so that others can write to it: nothing has to be
-    closed, and ``with`` is a matter of style.
+    Its file stays open for a second after a question. It is given back at once when another process wants to
+    write to it, so that nothing has to be closed. To open it by other means in the same process, such as
+    ``duckdb.connect``, call :meth:`close` first, or use ``with``.
 
     Parameters
     ----------
@@ -117,7 +118,11 @@ class Store:
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        pass
+        self.close()
+
+    def close(self) -> None:
+        """Give the file back now. A later question opens it again."""
+        self.file.close()
 
     def ingest(
         self, traces: str | Path | Sequence[str | Path], /, **options: Any

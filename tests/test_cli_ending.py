@@ -22,7 +22,7 @@ from verb_lines import LINES, verbs
 
 import sgstore
 import sgstore.cli._process as ending
-import sgstore.store._locking as access
+import sgstore.store._lease as lease
 import sgstore.store._rows as rows
 from sgstore.cli import application, run
 from sgstore.demo import RECORDING
@@ -163,7 +163,7 @@ class TimeIsUpError(Exception):
 
 def interrupt_readers() -> None:
     """End whatever this process is asking of stores."""
-    for door in tuple(access._doors.values()):
+    for door in tuple(lease.files.values()):
         for connection in tuple(door.cursors):
             connection.interrupt()
 
@@ -336,11 +336,11 @@ def test_every_verb_that_asks_heeds_its_bounds_and_leaves_nothing_where_time_is_
         opened.append(options.get("config", {}).get("max_temp_directory_size"))
         return connect(*arguments, **options)
 
-    def entering(access: Access, *arguments: object) -> object:
+    def entering(access: Access, *arguments: object, **named: object) -> object:
         asked[0] += 1
         if asked[0] == last[0]:
             signal.raise_signal(signal.SIGALRM)
-        return enter(access, *arguments)
+        return enter(access, *arguments, **named)
 
     monkeypatch.setattr(duckdb, "connect", connecting)
     monkeypatch.setattr(Access, "_enter", entering)

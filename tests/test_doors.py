@@ -25,6 +25,7 @@ from sgstore.cli import run as command_line
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
+from sgstore.store._lease import give_back
 from sgstore.store._locking import Access
 from sgstore.store._schema import schema_sql
 from sgstore.store._staging import scratch
@@ -112,6 +113,7 @@ def store(drives: Any, tmp_path: Path) -> Path:
 
 
 def change(store: Path, *statements: str) -> None:
+    give_back()
     with duckdb.connect(str(store)) as connection:
         for statement in statements:
             connection.execute(statement)
@@ -460,6 +462,7 @@ def test_a_store_that_this_process_has_open_by_duckdb_is_said_to_be_at_once(
     store: Any, drives: Any, read_only: Any, write: Any
 ) -> None:
     opened = sgstore.open(store)
+    opened.close()
 
     def ask() -> None:
         if write:

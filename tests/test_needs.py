@@ -49,6 +49,7 @@ def silent(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     _, store = worlds(5, tmp_path_factory.mktemp("silent"))
     columns = ["speed", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate", "heading", "pitch", "roll"]
     columns += ["length", "width", "height", "steer", "throttle", "brake", "lights", "light_state"]
+    store.close()
     with duckdb.connect(str(store.file.path)) as connection:
         for table, some in (("state", columns), ("entity", ["parked", "heading", *columns[11:14]])):
             trace = "frame_id >> 24" if table == "state" else "trace_id"

@@ -462,8 +462,10 @@ def test_a_store_that_has_grown_is_asked_as_it_is_now(tmp_path: Path) -> None:
     first = random_world(20, traces=1, frames=12, path=path)
     first.connection.execute("UPDATE inside.edge SET src_kind = 'car'")
     first.connection.close()
-    matches = sgstore.open(path).find("MATCH (v:Car)-[d]->(x) RETURN COUNT(*)")
+    opened = sgstore.open(path)
+    matches = opened.find("MATCH (v:Car)-[d]->(x) RETURN COUNT(*)")
     before = matches.rows()
+    opened.close()  # a connection of duckdb's own comes
 
     bus = "REPLACE ('bus' AS {0}, 99 AS {1})"
     with duckdb.connect(str(path)) as connection:

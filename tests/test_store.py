@@ -14,6 +14,7 @@ from graph_blocks import CHANNELS, MAP, RandomTrace, map_stub, publish
 from sgstore.config import Config, RangeSettings
 from sgstore.errors import StoreError
 from sgstore.store import StoreFile
+from sgstore.store._lease import give_back
 from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreFile]:
 
 def content(path: Path) -> list[tuple[str, int]]:
     """Tables of a database and how many rows each has."""
+    give_back()
     with duckdb.connect(str(path), read_only=True) as connection:
         sql = "SELECT schema_name || '.' || table_name FROM duckdb_tables() ORDER BY 1"
         names = connection.execute(sql).fetchall()

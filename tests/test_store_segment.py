@@ -265,6 +265,7 @@ def test_two_of_one_number_are_not_mixed(store: Any, what: str) -> None:
     change = f"UPDATE inside.{table} SET digest = '{other}'"
     import duckdb
 
+    store.close()
     with duckdb.connect(str(store.path)) as connection:
         connection.execute(change)
     before = store.path.read_bytes()
@@ -283,6 +284,7 @@ def test_two_traces_with_one_id_are_not_mixed(store: Any) -> None:
     other = trace_info(path="other", digest="e" * 64)
     import duckdb
 
+    store.close()
     with duckdb.connect(str(store.path)) as connection:
         taken = trace_id_of(other.digest, other.ego)
         connection.execute(f"UPDATE inside.trace SET trace_id = {taken}")

@@ -42,6 +42,7 @@ def faults(store: StoreFile) -> list[Fault]:
 
 
 def change(store: StoreFile, *statements: str) -> None:
+    store.close()
     with duckdb.connect(str(store.path)) as connection:
         for statement in statements:
             connection.execute(statement)

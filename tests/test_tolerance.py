@@ -38,6 +38,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Store, Stor
         (folder / name).mkdir()
         _, store = worlds(11, folder / name)
         stores.append(store)
+    stores[1].close()
     with duckdb.connect(str(stores[1].file.path)) as connection:
         off = f"CAST(hash(frame_id) % {2 * JITTER_NS} AS BIGINT) - {JITTER_NS}"
         connection.execute(

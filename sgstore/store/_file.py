@@ -1,4 +1,4 @@
-"""A store: one DuckDB file, opened only while it is read or published to."""
+"""A store: one DuckDB file, which stays open for a while after each question."""
 
 from __future__ import annotations
 
@@ -76,7 +76,9 @@ def _damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 class StoreFile:
-    """A store, by its path. It is opened only while something is asked of it or published to it.
+    """A store, by its path.
+
+    Its file stays open for a second after a question, unless a writer waits for it.
 
     Parameters
     ----------
@@ -151,6 +153,10 @@ class StoreFile:
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several questions: they see the same state, and cost less."""
         return self.access.reading()
+
+    def close(self) -> None:
+        """Close the file, unless something is asked of it now; it is opened again with the next question."""
+        self.access.close()
 
     def rows(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
@@ -279,7 +285,7 @@ class StoreFile:
             of = partial(step, connection)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, of))
 
-        with self._answered(ask) as found:
+        with self._answered(ask, public=True) as found:
             return found
 
     @contextmanager
@@ -292,7 +298,7 @@ class StoreFile:
             begin = partial(Batches, connection, sql, size=size)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, begin))
 
-        with self._answered(ask) as found:
+        with self._answered(ask, public=True) as found:
             yield found
 
     def joined(self) -> dict[str, JoinedTable]:
@@ -662,6 +668,8 @@ class StoreFile:
         self,
         ask: Callable[[DuckDBPyConnection, ExitStack], T],
         given: Iterable[Given] = (),
+        *,
+        public: bool = False,
     ) -> Generator[T]:
         """Answer of a question, while the store is open.
 
@@ -671,7 +679,7 @@ class StoreFile:
         with ExitStack() as stack:
             while True:
                 try:
-                    connection = stack.enter_context(self.access.reading())
+                    connection = stack.enter_context(self.access.reading(public=public))
                     with translated(self.path):
                         give(connection, given)
                         found = ask(connection, stack)

@@ -12,9 +12,9 @@ import stat
 import threading
 import time
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from glob import escape
 from typing import TYPE_CHECKING, Final
+from weakref import finalize
 
 import duckdb
 
@@ -23,6 +23,7 @@ from sgstore.errors import SqlError, StoreError
 from sgstore.files import HeldFolder, new_place, sweep
 from sgstore.quoting import literal
 from sgstore.store._joins import tables_folder
+from sgstore.store._lease import OpenFile, files, gate_of, stamp_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -31,9 +32,8 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.store._joins import UserTables
+    from sgstore.store._lease import Stamp
 
-
-Stamp = tuple[tuple[int, ...], ...]
 
 _KINDS: Final = {
     stat.S_IFDIR: "a folder",
@@ -85,16 +85,6 @@ def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...
     connection.execute("SET python_enable_replacements = false")
     connection.execute("SET enable_external_access = false")
     connection.execute("SET lock_configuration = true")
-
-
-def stamp_of(path: Path) -> Stamp:
-    """Identity, size and time of a store's file and of its log: they change whenever the store does."""
-    found: list[tuple[int, ...]] = []
-    for file in (path, path.with_name(f"{path.name}.wal")):
-        with suppress(OSError):
-            of = file.stat()
-            found.append((of.st_dev, of.st_ino, of.st_size, of.st_mtime_ns, of.st_ctime_ns))
-    return tuple(found)
 
 
 # A folder beside a store for what is on its way into it, called ``STORE.segment-…`` -------------
@@ -174,7 +164,8 @@ def spill_fault(message: str) -> str | None:
 
 # How readers and writers share one DuckDB file: within a process, and among processes -----------
 # DuckDB lets one process write a file, or many read it, and refuses everyone else at once. Here nobody is
-# refused: whoever comes waits, for a bounded time, and the file is held only while it is read or published to.
+# refused: whoever comes waits, for a bounded time. The file is held while it is read or published to, and for a
+# short while after it was read, unless somebody waits to write (see :mod:`sgstore.store._lease`).
 #
 # * *Among processes* DuckDB's own lock decides. A writer that waits for readers holds a second lock, the
 #   *gate* (``STORE.gate``), that new readers pass first, so that a stream of them cannot keep it out for ever.
@@ -264,47 +255,18 @@ def memory_setting(memory: int) -> str:
     return f"{memory // 1024}KiB"
 
 
-@dataclass(slots=True)
-class _FileLock:
-    """The state of one file in this process.
-
-    ``checked`` says whether the instance has been found to be a store as ``schema.sql`` makes it, ``good`` what
-    file it was that last was.
-    """
-
-    changed: threading.Condition = field(default_factory=threading.Condition)
-    instance: DuckDBPyConnection | None = None
-    checked: bool = False
-    good: Stamp = ()
-    readers: int = 0
-    writing: bool = False
-    waiting: int = 0
-    careful: bool = False
-    cursors: list[DuckDBPyConnection] = field(default_factory=list["DuckDBPyConnection"])
-    held: threading.local = field(default_factory=threading.local)
-
-    @property
-    def mine(self) -> int:
-        """Number of readings that this thread has open."""
-        return getattr(self.held, "count", 0)
-
-    @mine.setter
-    def mine(self, count: int) -> None:
-        self.held.count = max(count, 0)  # a reading may end in another thread than it began in
+_files_lock = threading.Lock()
 
 
-_doors: dict[Path, _FileLock] = {}
-_doors_lock = threading.Lock()
-
-
-def _door_of(path: Path) -> _FileLock:
+def _file_at(path: Path) -> OpenFile:
     """The state of a file; what killed processes left beside it is removed when it is first asked for."""
-    with _doors_lock:
-        known = _doors.get(path.resolve())
-        door = known or _doors.setdefault(path.resolve(), _FileLock())
+    place = path.resolve()
+    with _files_lock:
+        known = files.get(place)
+        file = known or files.setdefault(place, OpenFile(place))
     if known is None:  # once in the life of a process
         remove_left_behind(path)
-    return door
+    return file
 
 
 def trust(path: Path, made: os.stat_result) -> None:
@@ -313,11 +275,11 @@ def trust(path: Path, made: os.stat_result) -> None:
     if len(stamp) != 1:
         return  # there is somebody's log beside it
     if stamp[0][:4] == (made.st_dev, made.st_ino, made.st_size, made.st_mtime_ns):
-        _door_of(path).good = stamp
+        _file_at(path).good = stamp
 
 
 class Access:
-    """A DuckDB file that is opened only while it is used.
+    """A DuckDB file that is open while it is used, and for a short while after it was read.
 
     Parameters
     ----------
@@ -363,11 +325,19 @@ class Access:
         self._spill = spill or SPILL
         self._wait_s = wait_s
         refuse_odd_name(path)
-        self._door = _door_of(path)
+        self._file = file = _file_at(path)
+        token = object()
+        file.holders.add(token)
+        finalize(self, file.let_go, token).atexit = False
 
     @contextmanager
-    def reading(self) -> Generator[DuckDBPyConnection]:
+    def reading(self, *, public: bool = False) -> Generator[DuckDBPyConnection]:
         """A read-only connection. Readings may be nested; all that overlap see the same state.
+
+        Parameters
+        ----------
+        public : bool
+            Whether names are looked for among the public views, not first among the tables.
 
         Raises
         ------
@@ -375,12 +345,17 @@ class Access:
             There is no such file, it is no database, or a writer kept it for too long.
         """
         deadline = _Deadline(self._wait_s)
-        connection = self._enter(deadline)
+        connection = self._enter(deadline, public=public)
+        failed = True
         try:
             if self._tables is not None:
                 self._tables.show(connection)
             with translated(self.path):
                 yield connection
+            failed = False
+        except GeneratorExit:  # somebody has enough
+            failed = False
+            raise
         except _SURPRISES as error:
             if self._checked and (reason := self._damage(connection, error)):
                 raise StoreError(
@@ -392,7 +367,12 @@ class Access:
             try:
                 connection.close()
             finally:
-                self._leave(connection)
+                self._leave(connection, failed=failed)
+
+    def close(self) -> None:
+        """Give the file back, unless somebody reads it now; it is opened again with the next question."""
+        with self._file.changed:
+            self._file.close()
 
     def _damage(self, connection: DuckDBPyConnection, error: Exception) -> str:
         """The fault of the store by which our own code failed; empty if it failed for another reason."""
@@ -415,68 +395,77 @@ class Access:
             Whether a question may be asked again: not if other threads read the file, too, or if it was open
             in this way already.
         """
-        door = self._door
-        with door.changed:
-            if door.readers != door.mine:
+        file = self._file
+        with file.changed:
+            if file.readers != file.mine:
                 return False
-            for connection in (*door.cursors, door.instance):
+            for connection in (*file.cursors, file.instance):
                 if connection is not None:
                     connection.close()
-            door.instance = None
-            again, door.careful = not door.careful, True
+            file.instance = None
+            again, file.careful = not file.careful, True
         return again
 
-    def _enter(self, deadline: _Deadline) -> DuckDBPyConnection:
-        door = self._door
-        if not door.mine:  # a nested one must not wait for a writer who waits for the outer one
+    def _enter(self, deadline: _Deadline, *, public: bool) -> DuckDBPyConnection:
+        file = self._file
+        if not file.mine:  # a nested one must not wait for a writer who waits for the outer one
             _pass_gate(self.path, deadline)
-        with door.changed:
-            free = door.changed.wait_for(
-                lambda: not door.writing and (door.mine or not door.waiting), deadline.left()
+        with file.changed:
+            free = file.changed.wait_for(
+                lambda: not file.writing and (file.mine or not file.waiting), deadline.left()
             )
             if not free:
                 raise StoreError(f"{self.path}: another thread has been writing for too long")
-            if door.instance is None:
-                door.instance = self._opened(deadline)
-                door.checked = False
+            settings = self._memory, self._spill, file.careful
+            file.refresh(settings, None if self._tables is None else tables_folder())
             try:
-                if self._checked and not door.checked:
-                    self._check(door.instance)
-                    door.checked = True
-                connection = door.instance.cursor()
-                if self._checked:
+                instance = file.instance
+                if instance is None:
+                    file.folder, file.settings = tables_folder(), settings
+                    instance = self._open(deadline)
+                if self._checked and not file.checked:
+                    self._check(instance, "", file.opened)
+                    file.checked = True
+                connection = instance.cursor()
+                if self._checked and not public:
                     connection.execute(f"USE {shape.INSIDE}")  # a cursor does not inherit it
             except BaseException:
-                self._close_unused()
+                file.close()
                 raise
-            door.cursors.append(connection)
-            door.readers += 1
-            door.mine += 1
+            file.cursors.append(connection)
+            file.readers += 1
+            file.mine += 1
             return connection
 
-    def _leave(self, connection: DuckDBPyConnection) -> None:
-        door = self._door
-        with door.changed:
-            door.cursors.remove(connection)
-            door.mine -= 1
-            door.readers -= 1
-            self._close_unused()
+    def _leave(self, connection: DuckDBPyConnection, *, failed: bool) -> None:
+        file = self._file
+        with file.changed:
+            file.spoiled |= failed
+            if connection in file.cursors:  # not in a process that was forked off meanwhile
+                file.cursors.remove(connection)
+                file.mine -= 1
+                file.readers -= 1
+                file.rest()
 
-    def _close_unused(self) -> None:
-        door = self._door
-        if not door.readers and door.instance is not None:
-            instance, door.instance = door.instance, None  # gone even if closing it is interrupted
-            instance.close()
-            door.changed.notify_all()
-
-    def _check(self, connection: DuckDBPyConnection, database: str = "") -> None:
+    def _check(self, connection: DuckDBPyConnection, database: str, stamp: Stamp) -> None:
         """Refuse what is no store as ours are; one that was looked at before is not looked at again."""
-        stamp = stamp_of(self.path)
-        if stamp and stamp == self._door.good:
+        if stamp and stamp == self._file.good:
             return
         with translated(self.path):
             shape.check(connection, database or shape.database_of(connection), self.path)
-        self._door.good = stamp
+        self._file.good = stamp
+
+    def _open(self, deadline: _Deadline) -> DuckDBPyConnection:
+        """Open the file for all readers of this process."""
+        file = self._file
+        while True:
+            stamp = stamp_of(self.path)
+            instance = self._opened(deadline)
+            if stamp == stamp_of(self.path):
+                break
+            instance.close()  # another file has taken its place, and nobody knows which of the two this is
+        file.instance, file.opened, file.checked = instance, stamp, False
+        return instance
 
     def _opened(self, deadline: _Deadline) -> DuckDBPyConnection:
         # One configuration for all readers: they share the instance, users' statements among them.
@@ -494,9 +483,9 @@ class Access:
                 with translated(self.path):
                     connection = duckdb.connect(str(self.path), read_only=True, config=config)
                     # Among the settings above DuckDB might take these before the folder, and refuse that.
-                    connection.execute("SET allowed_directories = [?]", [str(tables_folder())])
+                    connection.execute("SET allowed_directories = [?]", [str(self._file.folder)])
                     without_faults(connection)
-                    if self._door.careful:
+                    if self._file.careful:
                         _be_careful(connection)
                     connection.execute("SET enable_external_access = false")
                     connection.execute("SET lock_configuration = true")
@@ -530,7 +519,7 @@ class Access:
             checked = False
             try:
                 if self._checked:
-                    self._check(connection, "store")
+                    self._check(connection, "store", stamp_of(self.path))
                     checked = True
                 with translated(self.path):
                     yield
@@ -539,31 +528,32 @@ class Access:
                 with suppress(duckdb.Error):
                     connection.execute("DETACH store")
                     if checked:  # what came into it is ours
-                        self._door.good = stamp_of(self.path)
+                        self._file.good = stamp_of(self.path)
 
     @contextmanager
     def _alone(self) -> Generator[_Deadline]:
         """No other thread of this process has the file."""
-        door, deadline = self._door, _Deadline(self._wait_s)
-        if door.mine:
+        file, deadline = self._file, _Deadline(self._wait_s)
+        if file.mine:
             raise StoreError(f"{self.path}: cannot be written while the same thread reads it")
-        with door.changed:
-            door.waiting += 1
+        with file.changed:
+            file.waiting += 1
             try:
-                free = door.changed.wait_for(
-                    lambda: not door.writing and not door.readers, deadline.left()
+                free = file.changed.wait_for(
+                    lambda: not file.writing and not file.readers, deadline.left()
                 )
                 if not free:
                     raise StoreError(f"{self.path}: another thread has been using it for too long")
-                door.writing = True
+                file.close()  # it may have been kept open
+                file.writing = True
             finally:
-                door.waiting -= 1
+                file.waiting -= 1
         try:
             yield deadline
         finally:
-            with door.changed:
-                door.writing = False
-                door.changed.notify_all()
+            with file.changed:
+                file.writing = False
+                file.changed.notify_all()
 
     def _attach(self, connection: DuckDBPyConnection, deadline: _Deadline) -> None:
         while True:
@@ -676,16 +666,12 @@ class _Deadline:
         self._next = min(self._next * 1.5, self._longest)
 
 
-def _gate(path: Path) -> Path:
-    return path.with_name(f"{path.name}.gate")
-
-
 def _pass_gate(path: Path, deadline: _Deadline) -> None:
     """Wait while a writer waits for readers to go. A courtesy: DuckDB's lock decides."""
     if fcntl is None:
         return
     try:
-        gate = os.open(_gate(path), os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        gate = os.open(gate_of(path), os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError:
         return
     try:
@@ -721,23 +707,35 @@ class _Gate:
     def close(self, deadline: _Deadline) -> None:
         """Wait until nobody else has closed it, and close it."""
         self._begun = True
+        while True:
+            try:
+                self._lock = os.open(gate_of(self._path), os.O_RDWR | os.O_CREAT, 0o666)
+            except OSError as error:
+                raise StoreError(f"{self._path}: cannot be written: {error.strerror}") from error
+            if fcntl is not None:
+                _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
+            if self._is_there():
+                return
+            # Who had it before has taken its name away, so that nobody would find it closed.
+            os.close(self._lock)
+            self._lock = -1
+
+    def _is_there(self) -> bool:
         try:
-            self._lock = os.open(_gate(self._path), os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise StoreError(f"{self._path}: cannot be written: {error.strerror}") from error
-        if fcntl is not None:
-            _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
+            return os.path.samestat(os.fstat(self._lock), gate_of(self._path).stat())
+        except FileNotFoundError:
+            return False
 
     def remove(self) -> None:
         """Open it, unless another process has it now."""
         if fcntl is None or not self._begun:
             return
-        # Whoever waits has it open and does not mind that it has no name any more.
         with suppress(OSError):
             if self._lock < 0:  # an interrupt came before its number was noted
-                self._lock = os.open(_gate(self._path), os.O_RDWR)
+                self._lock = os.open(gate_of(self._path), os.O_RDWR)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _gate(self._path).unlink()
+            if self._is_there():
+                gate_of(self._path).unlink()
         with suppress(OSError):
             os.close(self._lock)
         self._lock, self._begun = -1, False

@@ -255,9 +255,13 @@ class Batches:
     ) -> None:
         self._connection = connection
         self._size = size
-        interruptible(connection, lambda: connection.execute(sql, parameters or None))
+
+        def begin() -> list[tuple[Any, ...]]:
+            return connection.execute(sql, parameters or None).fetchmany(size)
+
+        # Faults of the statement come before its first row is given.
+        self._next = interruptible(connection, begin)
         self.columns, self.types = _described(connection)
-        self._next = self._more()  # faults of the statement come before its first row is given
 
     def _more(self) -> list[tuple[Any, ...]]:
         return interruptible(self._connection, lambda: self._connection.fetchmany(self._size))
@@ -265,7 +269,7 @@ class Batches:
     def __iter__(self) -> Iterator[Rows]:
         while values := self._next:
             yield Rows(self.columns, self.types, values)
-            self._next = self._more()
+            self._next = self._more() if len(values) == self._size else []
 
 
 def table_of(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Any:
@@ -356,7 +360,7 @@ def arrays(
 def user_statement(
     connection: DuckDBPyConnection, sql: str, timeout_s: float | None, ask: Callable[[], T]
 ) -> Generator[T]:
-    """Run a statement of a user's on a connection that can read the store and nothing else.
+    """Run a statement of a user's on a connection that can read the store and nothing else, by its views.
 
     ``ask`` begins it; what is read of it is read before this is left.
 
@@ -365,7 +369,6 @@ def user_statement(
     SqlError
         It is not one statement that only reads, the database refuses it, or it runs for too long.
     """
-    connection.execute("USE main")  # the views alone
     with _refused(sql, timeout_s):
         _check(connection, sql)
     with _interrupted_after(connection, timeout_s), _refused(sql, timeout_s):

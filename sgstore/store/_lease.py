@@ -1,0 +1,267 @@
+"""Files of stores that stay open between questions, and are given back when a writer waits.
+
+To open a file takes a hundred times as long as to ask a small question. So the instance of the database that
+reads a file is kept for a while after a question. It is closed
+
+* at once, if a writer waits: one of this process says so itself; one of another process closes the *gate*
+  beside the file (see :mod:`sgstore.store._locking`), and a thread of this process looks for it
+  every :data:`LOOK_S` seconds while an instance is kept;
+* :data:`LEASE_S` seconds after the last question, so that other programs can have the file, too;
+* with the last object that reads the file, at the end of the process, and before it is forked.
+
+No answer comes from a file of before: an instance is used again only if the file is the same and as it was.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there nobody could ask for a file that is kept, so none is
+    fcntl = None
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    Stamp = tuple[tuple[int, ...], ...]
+
+
+LEASE_S: Final = 1.0
+"""How long a file stays open after a question; s."""
+
+LOOK_S: Final = 0.05
+"""How often somebody looks whether another process waits for a file that is kept open; s."""
+
+
+def stamp_of(path: Path) -> Stamp:
+    """Identity, size and time of a store's file and of its log: they change whenever the store does."""
+    found: list[tuple[int, ...]] = []
+    for file in (path, _beside(path, ".wal")):
+        with suppress(OSError):
+            of = file.stat()
+            found.append((of.st_dev, of.st_ino, of.st_size, of.st_mtime_ns, of.st_ctime_ns))
+    return tuple(found)
+
+
+def gate_of(path: Path) -> Path:
+    """The file that a writer holds while it waits for the readers of a store, or writes."""
+    return _beside(path, ".gate")
+
+
+@lru_cache(maxsize=256)
+def _beside(path: Path, ending: str) -> Path:
+    return path.with_name(f"{path.name}{ending}")
+
+
+def _wanted(path: Path) -> bool:
+    """Return whether a writer has closed the gate of a store."""
+    if fcntl is None:
+        return True
+    try:
+        gate = os.open(gate_of(path), os.O_RDONLY | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(gate, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(gate)
+    return False  # one that was killed left it
+
+
+@dataclass(slots=True, eq=False)
+class OpenFile:
+    """The state of one file in this process. Whoever changes it holds ``changed``.
+
+    Attributes
+    ----------
+    instance : DuckDBPyConnection or None
+        The instance of the database that all readers share.
+    opened : Stamp
+        The file that it was when it was opened.
+    settings : tuple
+        The settings with which it was opened.
+    folder : Path or None
+        The only folder beside it that may be read: that of users' tables.
+    checked : bool
+        Whether the instance has been found to be a store as ``schema.sql`` makes it.
+    good : Stamp
+        The file that last was one.
+    spoiled : bool
+        Whether a question has failed in it: then it is not kept.
+    readers, writing, waiting
+        How many readings are under way, whether somebody writes, and how many wait to write.
+    careful : bool
+        Whether it is opened without whatever of DuckDB may be at fault.
+    cursors : list
+        The connections of the readings.
+    used : float
+        When the last reading ended, by the clock of :func:`time.monotonic`.
+    holders : set
+        Tokens of the objects that read or write the file.
+    """
+
+    path: Path
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    instance: DuckDBPyConnection | None = None
+    opened: Stamp = ()
+    settings: tuple[object, ...] = ()
+    folder: Path | None = None
+    checked: bool = False
+    good: Stamp = ()
+    spoiled: bool = False
+    readers: int = 0
+    writing: bool = False
+    waiting: int = 0
+    careful: bool = False
+    cursors: list[DuckDBPyConnection] = field(default_factory=list["DuckDBPyConnection"])
+    used: float = 0.0
+    holders: set[object] = field(default_factory=set[object])
+    held: threading.local = field(default_factory=threading.local)
+
+    @property
+    def mine(self) -> int:
+        """Number of readings that this thread has open."""
+        return getattr(self.held, "count", 0)
+
+    @mine.setter
+    def mine(self, count: int) -> None:
+        self.held.count = max(count, 0)  # a reading may end in another thread than it began in
+
+    def close(self) -> None:
+        """Close the instance, unless somebody reads."""
+        if not self.readers and self.instance is not None:
+            instance, self.instance = self.instance, None  # gone even if closing it is interrupted
+            self.spoiled = False
+            instance.close()
+
+    def rest(self) -> None:
+        """Keep the instance after a reading, or close it if there is a reason to."""
+        if self.readers:
+            return
+        self.changed.notify_all()
+        if self.instance is None:
+            return
+        self.used = time.monotonic()
+        given_up = self.spoiled or self.waiting or not self.holders or _wanted(self.path)
+        if given_up or not _watch.over(self):
+            self.close()
+
+    def refresh(self, settings: tuple[object, ...], folder: Path | None) -> None:
+        """Close an instance of a file of before, or one that was opened otherwise, unless somebody reads."""
+        if self.instance is None or self.readers:
+            return
+        other = self.settings != settings or folder not in {None, self.folder}
+        if other or self.opened != stamp_of(self.path):
+            self.close()
+
+    def let_go(self, token: object) -> None:
+        """Note that one of the objects that use the file is gone, and close it after the last one."""
+        self.holders.discard(token)
+        # An object may go at any time and in any thread: nobody is waited for. The watcher looks, too.
+        if not self.holders and self.changed.acquire(blocking=False):
+            try:
+                self.close()
+            finally:
+                self.changed.release()
+
+
+# The thread that gives files back ---------------------------------------------------------------
+
+
+class _Watch:
+    """Files that may be open with nobody reading, and the thread that looks after them while there are any."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin with no file and no thread."""
+        self.kept: set[OpenFile] = set()
+        self.running = False
+        self._lock = threading.Lock()
+
+    def over(self, file: OpenFile) -> bool:
+        """Look after a file, too; ``False``: there can be no thread for it."""
+        if file in self.kept:
+            return True
+        with self._lock:
+            if not self.running:
+                thread = threading.Thread(target=self._run, name="sgstore-lease", daemon=True)
+                self.running = True
+                try:
+                    thread.start()
+                except RuntimeError:  # no more threads may be had
+                    self.running = False
+                    return False
+            self.kept.add(file)
+        return True
+
+    def _run(self) -> None:
+        while self.running:
+            time.sleep(LOOK_S)
+            for file in tuple(self.kept):
+                self._look(file)
+            with self._lock:
+                self.running = bool(self.kept)
+
+    def _look(self, file: OpenFile) -> None:
+        """Close a file that nobody reads if somebody waits for it, or if nobody has asked for long."""
+        if not file.changed.acquire(blocking=False):
+            return  # somebody comes or goes
+        try:
+            late = time.monotonic() - file.used > LEASE_S
+            if late or not file.holders or _wanted(file.path):
+                file.close()
+            if file.instance is None:
+                self.kept.discard(file)
+        finally:
+            file.changed.release()
+
+
+_watch = _Watch()
+
+files: Final[dict[Path, OpenFile]] = {}
+"""The files of stores that this process has asked for, by their paths."""
+
+
+def give_back(patience_s: float = 0.0) -> None:
+    """Close all files that nobody reads."""
+    for file in tuple(_watch.kept):
+        if file.changed.acquire(timeout=patience_s):
+            try:
+                file.close()
+            finally:
+                file.changed.release()
+
+
+# At the end of the process the thread must not be within the database.
+atexit.register(give_back, 5.0)
+
+_of_parents: Final[list[object]] = []
+"""What a process that was forked off has of its parent's: the database survives no fork, not even its end."""
+
+
+def _begin_anew() -> None:
+    """Forget, in a process that was forked off, what threads of its parent did."""
+    _watch.begin()
+    for file in files.values():
+        _of_parents.extend((file.instance, *file.cursors))
+        file.changed, file.held = threading.Condition(), threading.local()
+        file.instance, file.cursors, file.spoiled = None, [], False
+        file.readers, file.writing, file.waiting = 0, False, 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=give_back, after_in_child=_begin_anew)
