@@ -25,7 +25,7 @@ from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of
 from sgstore.processes import command
 from sgstore.readers import ENDINGS
 from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
-from sgstore.store import Folder, Sealed, StoreFile
+from sgstore.store import Folder, PresentError, Sealed, StoreFile
 from sgstore.trace_parts import TracePart
 from sgstore.world import BUCKET_FRAMES
 
@@ -358,12 +358,12 @@ def _published(
     try:
         file = file or StoreFile.create(job.store)
         sealed = Sealed.read(place)
-        name = file.has(sealed, as_it_is=not job.force)
-        if name is not None and not job.force:  # the same recording twice in one run
-            known = (outcome.path, "present", name, outcome.ego, outcome.frames)
-            return file, TraceOutcome(*known, seconds=outcome.seconds)
+        known = file.has(sealed, as_it_is=False) if job.force else None
         outcome.name = file.publish(sealed, replace=job.force)
-        outcome.status = "added" if name is None else "replaced"
+        outcome.status = "added" if known is None else "replaced"
+    except PresentError as error:  # the same recording twice in one run
+        told = (outcome.path, "present", error.name, outcome.ego, outcome.frames)
+        outcome = TraceOutcome(*told, seconds=outcome.seconds)
     except SgstoreError as error:
         outcome.error = error
     return file, outcome

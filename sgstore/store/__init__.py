@@ -8,10 +8,10 @@ and frames by their names, ``_graphs`` reads graphs,
 the store, and ``_contents`` makes digests of frames.
 
 Writing: ``_packing`` turns the graphs of a block into columns and masks. ``_write`` builds a trace aside,
-in tables that wait in ``_staging``, ``_payloads`` joins its messages to its frames, and ``_publish`` brings
-it into the store. ``_classes`` adds classes of frames, ``_derive`` other sets of relations; ``_similarity``
-compares frames. ``_verify`` looks whether all is as it was published, ``_rebuild`` makes stores, and makes
-them anew.
+in arrays that wait in a file of ``_staging``, sorted and summed by ``_columns``; ``_payloads`` joins its
+messages to its frames, and ``_publish`` brings it into the store. ``_classes`` adds classes of frames,
+``_derive`` other sets of relations; ``_similarity`` compares frames. ``_verify`` looks whether all is as it
+was published, ``_rebuild`` makes stores, and makes them anew.
 """
 
 import lazy_loader

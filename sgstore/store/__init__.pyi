@@ -18,6 +18,7 @@ from ._packing import seq_of as seq_of
 from ._packing import begins as begins
 from ._packing import SEQ_BITS as SEQ_BITS
 from ._packing import frame_ids as frame_ids
+from ._publish import PresentError as PresentError
 from ._rebuild import OldMap as OldMap
 from ._rebuild import OldTrace as OldTrace
 from ._rebuild import Remains as Remains
@@ -57,6 +58,7 @@ __all__ = [
     "OldMap",
     "OldTrace",
     "ParquetTable",
+    "PresentError",
     "Remains",
     "Rows",
     "SCHEMA_VERSION",

@@ -53,6 +53,20 @@ SHARED: Final = {
 """Tables of what many traces may have: it comes into a store once, and is known there by its digest."""
 
 
+class PresentError(StoreError):
+    """The store has the trace already, read in the same way.
+
+    Attributes
+    ----------
+    name : str
+        Of the trace in the store.
+    """
+
+    def __init__(self, message: str, name: str) -> None:
+        super().__init__(message)
+        self.name = name
+
+
 def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
     """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
     with writing(access) as connection:
@@ -75,7 +89,7 @@ def _put(
     taken = connection.execute("SELECT name FROM store.inside.trace").fetchall()
     if not replace and already_stored(connection, identity, catalog="store.inside."):
         name = stored_name(connection, identity, catalog="store.inside.")
-        raise StoreError(f"{sealed.path}: came into the store meanwhile, as {name!r}")
+        raise PresentError(f"{sealed.path}: came into the store meanwhile, as {name!r}", name or "")
     name = stored_name(connection, identity, catalog="store.inside.")
     known = name is not None
     if name is None:
