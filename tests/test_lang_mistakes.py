@@ -177,3 +177,33 @@ def test_intervals_for_people_begin_with_their_first_frame() -> None:
 
     assert shown == ("from", "start", "end", "frames", "who")
     assert list(rows) == [("a#3", 0.1, 0.3, 3, "x")]
+
+
+DIGITS = "9" * 400
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"MATCH (e:Ego) WHERE e.speed > {DIGITS}",
+        f"MATCH (e:Ego) WHERE e.speed > {DIGITS}.5",
+        f"MATCH (e:Ego) FOR >= {DIGITS}s",
+        f"MATCH (e:Ego) FOR >= {DIGITS}.5min",
+        f"MATCH (e:Ego) FOR >= {DIGITS}frames",
+        f"MATCH (e:Ego) WHERE delta(e.speed, {DIGITS}.5s) > 1",
+        f"MATCH (e:Ego) WHERE ONCE[0s,{DIGITS}s] e.speed > 1",
+        f"MATCH (e:Ego) WHERE ONCE[{DIGITS}ms,INF] e.speed > 1",
+        f"MATCH (e:Ego) THEN WITHIN {DIGITS}s MATCH (e)",
+        f"MATCH (e:Ego) LIMIT {DIGITS}",
+        f"MATCH (e:Ego) RETURN CLIPS(-{DIGITS}s, +1s)",
+    ],
+)
+def test_a_number_or_a_time_of_400_digits_is_refused_where_it_stands(text: str) -> None:
+    error = refused(text)
+
+    assert str(error).startswith(("too large a number", "no length of time"))
+
+
+@pytest.mark.parametrize("value", [10**400, 1e300, -1e300, f"{DIGITS}s", f"{DIGITS}frames"])
+def test_a_parameter_that_is_no_length_of_time_of_a_trace_is_refused(value: object) -> None:
+    assert "no length of time" in str(refused("MATCH (e:Ego) FOR >= $p", p=value))

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 
 MAX_NS: Final = 10**18
+_NO_LENGTH: Final = "no length of time that a trace may have"
 """The longest time that a query may speak of: some 30 years; ns."""
 
 _UNBOUNDED: Final = frozenset({"NEXT", "WEAKNEXT", "PREVIOUS"})
@@ -74,17 +75,19 @@ def length(e: s.Duration | s.Parameter, names: SymbolTable) -> o.Length:
     if unit == "frames":
         if amount != int(amount):
             names.session.refuse("expected a whole number of frames", e.span)
+        if amount >= s.LONGEST:
+            names.session.refuse(_NO_LENGTH, e.span)
         return o.Length(int(amount), frames=True)
     ns = s.Duration(amount, unit, e.span).ns
     if not 0 <= ns <= MAX_NS:
-        names.session.refuse("no length of time that a trace may have", e.span)
+        names.session.refuse(_NO_LENGTH, e.span)
     return o.Length(ns, frames=False)
 
 
 def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
     value = parameter(e, names)
     if isinstance(value, int | float) and not isinstance(value, bool) and value == value:  # noqa: PLR0124 - no NaN
-        return float(min(value, 1e300)), "s"
+        return float(max(-s.LONGEST, min(value, s.LONGEST))), "s"
     found = _LENGTH.fullmatch(value.strip()) if isinstance(value, str) else None
     if found is None:
         names.session.refuse(
@@ -92,7 +95,7 @@ def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
             e.span,
             "give it a number of seconds, or a text such as '2s' or '10frames'",
         )
-    return float(found[1]), found[2].lower()
+    return min(float(found[1]), s.LONGEST), found[2].lower()
 
 
 def timespan(e: s.Duration, _: SymbolTable) -> b.Value:

@@ -74,9 +74,15 @@ def _duration(span: TextSpan, children: Children) -> s.Duration | s.Parameter:
     token = children[0]
     if token.name == "PARAM":
         return s.Parameter(token.text[1:], span)
-    found = _DURATION.fullmatch(token.text)
-    assert found is not None, token.text  # noqa: S101 - the lexer's pattern is narrower
-    return s.Duration(float(found[1]), found[2].lower(), span)
+    return _length(token.text, span)
+
+
+def _length(text: str, span: TextSpan) -> s.Duration:
+    found = _DURATION.fullmatch(text)
+    assert found is not None, text  # noqa: S101 - the lexer's pattern is narrower
+    if (amount := float(found[1])) > s.LONGEST:
+        raise BuildError("no length of time that a trace may have", span)
+    return s.Duration(amount, found[2].lower(), span)
 
 
 def _parameter(span: TextSpan, children: Children) -> s.Parameter:
@@ -193,9 +199,7 @@ def _bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
 def _end(text: str, span: TextSpan) -> s.Duration | s.Parameter:
     if text.startswith("$"):
         return s.Parameter(text[1:], span)
-    found = _DURATION.fullmatch(text)
-    assert found is not None, text  # noqa: S101 - the lexer's pattern is narrower
-    return s.Duration(float(found[1]), found[2].lower(), span)
+    return _length(text, span)
 
 
 def _block_expression(word: str, span: TextSpan, children: Children) -> s.BlockExpression:

@@ -6,7 +6,7 @@ trees from text.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from sgstore.records import dataclass
 
@@ -23,6 +23,10 @@ class Constant:
 
     value: int | float | str | bool | None
     span: TextSpan
+
+
+LONGEST: Final = 1e18
+"""More than a trace lasts in any unit; the largest amount of a :class:`Duration`."""
 
 
 @dataclass(frozen=True, slots=True)
