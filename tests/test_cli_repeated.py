@@ -1,14 +1,15 @@
-"""Options that are given more than once: collected, or refused; never is one of them forgotten."""
+"""Every option of every verb: given more than once it is collected or refused, and no number is too odd."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
 import typer
 
 from sgstore.cli import application, run
+from sgstore.demo import RECORDING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,6 +63,58 @@ def test_an_option_that_is_repeated_keeps_all_its_values_or_is_refused(
         told = " ".join(capsys.readouterr().err.replace("│", " ").split())
         assert "given 2 times, but it takes one value" in told
         assert option.opts[0] in told
+
+
+AT_WORK = {"ingest", "rebuild", "record", "demo"}
+"""Verbs that would do all their work for a number that they may take."""
+
+
+def numbers_of(parameter: Any) -> set[type]:
+    annotation = parameter.type_descriptor.annotation
+    return {float, int} & {annotation, *get_args(annotation)}
+
+
+@pytest.fixture(scope="module")
+def short_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first three seconds of the sample."""
+    store = tmp_path_factory.mktemp("short") / "short.sgstore"
+    assert run(["ingest", str(store), str(RECORDING), "--until", "3"]) == 0
+    return store
+
+
+@pytest.mark.parametrize(
+    ("path", "command"),
+    [
+        pytest.param(path, command, id=" ".join(path))
+        for path, command in verbs(typer.main.get_command(application()))
+        if path[-1] not in AT_WORK and any(map(numbers_of, command.params))
+    ],
+)
+def test_a_number_that_is_none_or_has_400_digits_ends_no_verb_in_a_traceback(
+    path: tuple[str, ...],
+    command: Any,
+    short_store: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    store = str(short_store)
+    query = "MATCH (e:Ego)-[:near]->(c:Car)"
+    known = {"query": query, "pattern": query, "frame": f"{RECORDING.stem}#3"}
+    odd = {float: ["1e999", "nan"], int: ["9" * 400, "-1"]}
+    for parameter in filter(numbers_of, command.params):
+        needed = [one for one in command.params if one.required and one is not parameter]
+        given = [
+            word
+            for one in needed
+            for word in (
+                *one.opts[:1] * (one.param_type_name == "option"),
+                known.get(one.name, store),
+            )
+        ]
+        for value in (value for kind in numbers_of(parameter) for value in odd[kind]):
+            option = f"{parameter.opts[0]}={value}"
+            assert run([*path, *given, option]) in {0, 1, 2, 3}
 
 
 def test_a_switch_both_ways_is_refused_and_a_flag_said_twice_is_a_flag(

@@ -266,8 +266,8 @@ def test_an_empty_graph_is_an_empty_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
-def test_an_absurd_radius_is_a_mistake_of_the_caller(tmp_path: Path, radius: float) -> None:
-    with pytest.raises(ValueError, match="expected 1 to 10,000 m"):
+def test_an_absurd_radius_is_refused(tmp_path: Path, radius: float) -> None:
+    with pytest.raises(ExportError, match="expected 1 to 10,000 m"):
         draw_frame(two(), None, tmp_path / "a.png", radius=radius)
 
 

@@ -232,7 +232,7 @@ def test_a_clip_that_is_none_says_why(store: Path, tmp_path: Path) -> None:
         draw_clip(opened, ("town@20s", "town@10s"), to)
     with pytest.raises(StoreError, match="town"):
         draw_clip(opened, ("town@70s", "town@500s"), to)
-    with pytest.raises(ValueError, match="fps"):
+    with pytest.raises(ExportError, match="fps"):
         draw_clip(opened, ("town@1s", "town@2s"), to, fps=0.0)
     assert list(tmp_path.iterdir()) == []
 

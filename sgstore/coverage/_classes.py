@@ -14,6 +14,7 @@ import numpy as np
 
 from sgstore.coverage._frames import ChosenFrames, run_begins
 from sgstore.coverage._slots import slot_sets
+from sgstore.errors import AbstractionError
 from sgstore.store import begins, trace_of
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 UNKNOWN: Final = -1
 """Code of a frame whose class nobody can tell."""
+LONGEST_WINDOW: Final = 10_000
+"""Most frames of a window: minutes of a recording, so that windows end in memory and time."""
 
 
 class Missing(StrEnum):
@@ -136,7 +139,8 @@ def classed(
     abstraction : str
         Whose classes.
     window : int
-        Frames that are seen together: a frame and those recorded before it in its trace.
+        Frames that are seen together: a frame and those recorded before it in its trace; at most
+        :data:`LONGEST_WINDOW`.
     missing : Missing
         How a window counts in which frames are missing.
     slots : Specification, optional
@@ -146,10 +150,12 @@ def classed(
     Raises
     ------
     AbstractionError
-        There is no such abstraction.
+        There is no such abstraction, or no such window.
     QueryError
         A pattern of a slot is none.
     """
+    if not 1 <= window <= LONGEST_WINDOW:
+        raise AbstractionError(f"a window has 1 to {LONGEST_WINDOW:,} frames")
     if slots is not None:
         frame_id, names, code = slot_sets(ChosenFrames(chosen.text, chosen.store), slots)
         whole = Classed(chosen, tuple(names), frame_id, code)
@@ -172,15 +178,18 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
     state = code + 1  # 0: missing
     parts = [state]
     complete = code != UNKNOWN
-    for back in range(1, window):
+    furthest = int(within.max(initial=0))
+    for back in range(1, min(window, furthest + 1)):
         before = np.zeros(len(code), np.int64)
         reaches = np.flatnonzero(within >= back)
         before[reaches] = state[reaches - back]
         parts.append(before)
         complete &= before > 0
+    complete &= window <= furthest + 1
     key, first = _numbered(parts)
+    none = [""] * (window - len(parts))
     names = [
-        _window_name([whole.names[part[row] - 1] if part[row] else "" for part in parts])
+        _window_name([whole.names[part[row] - 1] if part[row] else "" for part in parts] + none)
         for row in first.tolist()
     ]
     if missing is Missing.drop:

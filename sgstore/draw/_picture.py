@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from sgstore.draw._view import Relations, clean, counted, number, view_of
-from sgstore.errors import MissingExtraError
+from sgstore.errors import ExportError, MissingExtraError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
@@ -224,9 +224,15 @@ def drawing(to: str | Path) -> Generator[None]:
 
 
 def checked(radius: float | None) -> float | None:
-    """A radius that a user gave, if it is one; m."""
+    """A radius that a user gave, if it is one; m.
+
+    Raises
+    ------
+    ExportError
+        It is not from 1 to 10,000 m.
+    """
     if radius is not None and not 1.0 <= radius <= 10_000.0:
-        raise ValueError(f"radius is {radius} m, expected 1 to 10,000 m")
+        raise ExportError(f"radius is {radius} m, expected 1 to 10,000 m")
     return radius
 
 

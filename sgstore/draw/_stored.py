@@ -281,7 +281,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     check_installed()
 
     if not 0 < fps <= MOST_FPS:
-        raise ValueError(f"fps is {fps}, expected a number up to {MOST_FPS:g}")
+        raise ExportError(f"fps is {fps}, expected a number up to {MOST_FPS:g}")
 
     def shots(refs: Sequence[FrameRef], *, seen: bool) -> Iterator[Shot]:
         # The store is kept open for a few frames at a time, so that others can write while these are drawn.

@@ -79,7 +79,7 @@ class SetFamily:
             starts.astype(np.int64),
             members,
             np.ones(sets) if cost is None else cost,
-            np.minimum(often, need).astype(np.int64),
+            np.minimum(often, min(need, sets)).astype(np.int64),
             np.arange(sets) if rank is None else rank,
             np.ones(elements, np.int64),
         )
