@@ -23,6 +23,7 @@ from sgstore.relations._scene import (
     BlockScene,
     Relation,
     edge_room,
+    edges_between,
     edges_filled,
     edges_of_pairs,
     even_parts,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Config, Direction
-    from sgstore.relations._scene import BodyPairs
+    from sgstore.relations._scene import BodyPairs, Columns
     from sgstore.world import Bools, Codes, Floats
 
     Rows = NDArray[np.intp]
@@ -83,13 +84,11 @@ def _direction_edges(scene: BlockScene) -> Edges:
 
         columns, unsure = edge_room(len(pairs)), np.empty(len(pairs), np.intp)
         many, doubtful = _loops.sectors(*pairs.for_loops, bounds, names, DOUBT, columns, unsure)
-        sure, doubtful = edges_filled(columns, many), unsure[:doubtful]
+        doubtful = unsure[:doubtful]
     else:
-        sure, doubtful = _sectors(scene, bounds, names)
+        columns, many, doubtful = _sectors(scene, bounds, names)
     rows, sectors = _by_bearing(settings, pairs, doubtful)
-    if not len(rows):
-        return sure
-    return Edges.chained([sure, _looking(pairs, rows, names[sectors])])
+    return edges_filled(columns, many, _looking(scene, rows, names[sectors]))
 
 
 def _in_loops(scene: BlockScene) -> bool:
@@ -98,14 +97,16 @@ def _in_loops(scene: BlockScene) -> bool:
     return scene.pairs.in_loops and not settings.kinds and not settings.within > 0
 
 
-def _looking(pairs: BodyPairs, rows: Rows, codes: Codes) -> Edges:
+def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
     """Edges of some pairs, from what is seen to who sees."""
-    frame, a, b = (column[rows] for column in pairs.ends)
-    return Edges(frame, codes, b, a)
+    a, b = scene.pairs.some(rows)
+    return edges_between(scene, codes, b, a)
 
 
-def _sectors(scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes) -> tuple[Edges, Rows]:
-    """Edges of directions, and the pairs that need the bearing."""
+def _sectors(
+    scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes
+) -> tuple[Columns, int, Rows]:
+    """Edges of directions, how many, and the pairs that need the bearing."""
     pairs = scene.pairs
     codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
     ahead, left = pairs.offsets
@@ -126,7 +127,7 @@ def _sectors(scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes) -> 
     doubtful = np.flatnonzero(~holds if wanted is None else ~holds & wanted)
     if wanted is not None:
         holds &= wanted
-    return edges_of_pairs(pairs, codes, holds, seen_by_a=True), doubtful
+    return *edges_of_pairs(pairs, codes, holds, seen_by_a=True), doubtful
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
@@ -167,23 +168,21 @@ def _side_edges(scene: BlockScene) -> Edges:
         columns, unsure = edge_room(len(pairs)), np.empty(len(pairs), np.intp)
         beside = BESIDE if is_open else -1.0
         many, doubtful = _loops.sides(*pairs.for_loops, beside, names, DOUBT, columns, unsure)
-        sure, doubtful = edges_filled(columns, many), unsure[:doubtful]
+        doubtful = unsure[:doubtful]
     else:
-        sure, doubtful = _sides(scene, names, is_open=is_open)
+        columns, many, doubtful = _sides(scene, names, is_open=is_open)
     bearing = pairs.bearings(doubtful)
-    a, b = pairs.a[doubtful], pairs.b[doubtful]
+    a, b = pairs.some(doubtful)
     dx, dy = (of[b] - of[a] for of in (scene.bodies.x, scene.bodies.y))
     off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(bearing))
     # Closed: to the last bit, as CARLASGG has it.
     holds = off_axis > BESIDE if is_open else ~np.isnan(bearing)
-    if not holds.any():
-        return sure
     codes = names[np.where(bearing[holds] >= 0, 0, 1)]
-    return Edges.chained([sure, _looking(pairs, doubtful[holds], codes)])
+    return edges_filled(columns, many, _looking(scene, doubtful[holds], codes))
 
 
-def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Edges, Rows]:
-    """Edges of sides, and the pairs that need the bearing."""
+def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, int, Rows]:
+    """Edges of sides, how many, and the pairs that need the bearing."""
     pairs = scene.pairs
     ahead, left = pairs.offsets
     codes, beside = np.empty(len(pairs), np.int8), np.float32(BESIDE)
@@ -198,7 +197,7 @@ def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Edges, Ro
     if wanted is not None:
         doubtful &= wanted
         holds &= wanted
-    return edges_of_pairs(pairs, codes, holds, seen_by_a=True), np.flatnonzero(doubtful)
+    return *edges_of_pairs(pairs, codes, holds, seen_by_a=True), np.flatnonzero(doubtful)
 
 
 def sector(name: str, legend: str = "") -> Relation:

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.compiled import worth
 from sgstore.graph import Edges, LaneGaps
 from sgstore.relations._scene import IS_SIGNAL, IS_VEHICLE, Relation, edges_between, parts, spread
 from sgstore.vocabulary import RELATION_CODE, TRAFFIC
@@ -157,6 +158,11 @@ class Centrelines:
             m. The foot is the nearest point, of several the first; where that is an end of the lane, it is
             where the lane would be if it went straight on: below 0, or above its length.
         """
+        if worth():
+            from sgstore.relations import _loops
+
+            line = self._x, self._y, self._run_x, self._run_y, self._squared, self._along
+            return _loops.along(lane, x, y, self._first, self._count, line)
         found = np.empty(len(lane))
         for part in parts(self._count[lane]):
             found[part] = self._of(lane[part], x[part], y[part])

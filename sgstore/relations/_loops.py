@@ -171,6 +171,34 @@ def sides(
 
 
 @compiled
+def along(
+    lane: Ints,
+    x: Floats,
+    y: Floats,
+    first: Ints,
+    pieces: Ints,
+    line: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
+) -> Floats:
+    """Lengths of lanes up to the feet of places on their centre lines; see ``_following.Centrelines``."""
+    at_x, at_y, run_x, run_y, squared, length = line
+    found = np.empty(len(lane))
+    for i in range(len(lane)):
+        least, best, best_onward = np.inf, first[lane[i]], 0.0
+        last = best + pieces[lane[i]] - 1
+        for piece in range(best, last + 1):
+            away_x, away_y = x[i] - at_x[piece], y[i] - at_y[piece]
+            onward = (away_x * run_x[piece] + away_y * run_y[piece]) / squared[piece]
+            share = min(max(onward, 0.0), 1.0)
+            away = (away_x - share * run_x[piece]) ** 2 + (away_y - share * run_y[piece]) ** 2
+            if away < least:
+                least, best, best_onward = away, piece, onward
+        out = (best == first[lane[i]] and best_onward < 0) or (best == last and best_onward > 1)
+        share = best_onward if out else min(max(best_onward, 0.0), 1.0)
+        found[i] = length[best] + share * (length[best + 1] - length[best])
+    return found
+
+
+@compiled
 def sight(
     order: Ints,
     starts: Ints,

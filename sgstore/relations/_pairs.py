@@ -337,7 +337,7 @@ def gathered(
             found = [_without(pairs, over[frame[pairs[0]]]) for pairs in found]
         elif over.any():
             found[-1] = _without(chunk, over[frame[chunk[0]]])
-    return (np.concatenate([a for a, _ in found]), np.concatenate([b for _, b in found])), over
+    return found[1] if len(found) == 2 else joined_pairs(found), over
 
 
 def _without(pairs: Halves, left_out: Bools) -> Halves:

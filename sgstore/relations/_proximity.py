@@ -49,7 +49,7 @@ def _edges(scene: BlockScene) -> Edges:
     found, holds = np.concatenate([found, found]), np.concatenate([holds, holds])
     if settings.kinds:
         holds &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
-    return edges_of_pairs(pairs, found, holds)
+    return edges_filled(*edges_of_pairs(pairs, found, holds))
 
 
 def rung(name: str) -> Relation:

@@ -152,19 +152,24 @@ class BodyPairs:
         Rows of bodies in the same frame, each pair once.
     between : str
         What is measured: :attr:`sgstore.config.Proximity.between`.
-
-    Attributes
-    ----------
-    a, b : (K,) intp
-        Rows of :class:`Bodies`, in the same frame.
     """
 
     def __init__(self, bodies: Bodies, a: Rows, b: Rows, between: str) -> None:
-        self._bodies, self._half, self._between = bodies, len(a), between
-        self.a, self.b = np.concatenate([a, b]), np.concatenate([b, a])
+        self._bodies, self._between = bodies, between
+        self._halves, self._half = (a, b), len(a)
 
     def __len__(self) -> int:
-        return len(self.a)
+        return 2 * self._half
+
+    @cached_property
+    def a(self) -> Rows:
+        """(K,): rows of :class:`Bodies`."""
+        return np.concatenate(self._halves)
+
+    @cached_property
+    def b(self) -> Rows:
+        """(K,): rows of :class:`Bodies`, in the same frames."""
+        return np.concatenate(self._halves[::-1])
 
     @cached_property
     def span(self) -> Floats:
@@ -173,7 +178,7 @@ class BodyPairs:
         found = np.empty(half)
         for part in even_parts(half):
             found[part] = spans(
-                self._bodies, self.a[:half][part], self.b[:half][part], self._between
+                self._bodies, self._halves[0][part], self._halves[1][part], self._between
             )
         return found
 
@@ -190,8 +195,14 @@ class BodyPairs:
 
     def bearings(self, rows: Rows) -> Floats:
         """Bearings of some of the pairs; rad."""
-        of, a, b = self._bodies, self.a[rows], self.b[rows]
+        of, (a, b) = self._bodies, self.some(rows)
         return bearings(of.x[b] - of.x[a], of.y[b] - of.y[a], of.heading[a])
+
+    def some(self, rows: Rows) -> tuple[Rows, Rows]:
+        """Both ends of some of the pairs: rows of bodies."""
+        first, second = (half[rows % max(self._half, 1)] for half in self._halves)
+        mirrored = rows >= self._half
+        return np.where(mirrored, second, first), np.where(mirrored, first, second)
 
     @cached_property
     def offsets(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -203,7 +214,7 @@ class BodyPairs:
         cos, sin = (column.astype(np.float32) for column in self._turns)
         ahead, left = np.empty((2, len(self)), np.float32)
         for part in even_parts(half):
-            a, b = self.a[:half][part], self.b[:half][part]
+            a, b = self._halves[0][part], self._halves[1][part]
             dx = (of.x[b] - of.x[a]).astype(np.float32)
             dy = (of.y[b] - of.y[a]).astype(np.float32)
             for rows, first in ((a, 0), (b, half)):
@@ -217,10 +228,9 @@ class BodyPairs:
     @cached_property
     def for_loops(self) -> Looped:
         """Halves, frames and nodes of the bodies, their places and turns: what loops over pairs are given."""
-        of, half = self._bodies, self._half
+        of = self._bodies
         return (
-            self.a[:half],
-            self.b[:half],
+            *self._halves,
             (of.frame.astype(np.int32), of.node.astype(np.int32)),
             (of.x, of.y, levels(of, self._between)),
             self._turns,
@@ -241,8 +251,7 @@ class BodyPairs:
     def ends(self) -> tuple[Nodes, Nodes, Nodes]:
         """Frames, and node ids of a and of b, of the pairs; int32."""
         frame, node = self._bodies.frame.astype(np.int32), self._bodies.node.astype(np.int32)
-        half = self._half
-        frame, one, other = frame[self.a[:half]], node[self.a[:half]], node[self.b[:half]]
+        frame, one, other = frame[self._halves[0]], node[self._halves[0]], node[self._halves[1]]
         return (
             np.concatenate([frame, frame]),
             np.concatenate([one, other]),
@@ -484,15 +493,22 @@ def edge_room(count: int) -> Columns:
     return frame, np.empty(count, np.int8), src, dst
 
 
-def edges_filled(columns: Columns, count: int) -> Edges:
-    """The first of these edges."""
+def edges_filled(columns: Columns, count: int, more: Edges | None = None) -> Edges:
+    """The first of these edges, and some more, in the same columns if there is room."""
     frame, relation, src, dst = columns
+    if more is not None and len(more):
+        if count + len(more) > len(frame):
+            return Edges.chained([edges_filled(columns, count), more])
+        to = slice(count, count + len(more))
+        frame[to], relation[to] = more.frame, more.relation
+        src[to], dst[to] = more.src, more.dst
+        count = to.stop
     return Edges(frame[:count], relation[:count], src[:count], dst[:count])
 
 
 def edges_of_pairs(
     pairs: BodyPairs, codes: Codes, holds: Bools, *, seen_by_a: bool = False
-) -> Edges:
+) -> tuple[Columns, int]:
     """Edges of the related pairs of which something holds, from a to b; or from b, ``seen_by_a``, to a.
 
     Parameters
@@ -506,8 +522,10 @@ def edges_of_pairs(
     frame, src, dst = pairs.ends
     if seen_by_a:
         src, dst = dst, src
-    edges = Edges(frame, codes, src, dst)
-    return edges if holds.all() else taken(edges, np.flatnonzero(holds))
+    if holds.all():
+        return (frame, codes, src, dst), len(codes)
+    rows = np.flatnonzero(holds)
+    return (frame[rows], codes[rows], src[rows], dst[rows]), len(rows)
 
 
 def edges_to_map(

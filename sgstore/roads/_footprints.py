@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.columns import chained
+from sgstore.compiled import worth
 from sgstore.roads._ribbons import Ribbons, wrapped
 
 if TYPE_CHECKING:
@@ -230,24 +231,61 @@ class LaneIndex:
     def touches(self, boxes: Floats, z: Floats) -> Touches:
         """Lanes that footprints (N, 5) at heights (N,) touch; see :meth:`sgstore.roads.RoadMap.lanes_of`."""
         shapes = _Shapes.of(boxes, z)
-        parts = [_no_touches()]
-        parts += [self._gathered(shapes, row, quad) for row, quad in self._candidates(shapes)]
-        return chained(parts)
+        found = [self._touching(shapes)] if worth() else self._touching_in_chunks(shapes)
+        return chained([_no_touches(), *(self._gathered(shapes, *touching) for touching in found)])
 
-    def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
-        """Footprints and quadrangles that are close, each pair once, by chunks of footprints."""
+    def _touching(self, shapes: _Shapes) -> tuple[Ints, Ints, Bools, Floats]:
+        """Footprints and quadrangles that touch, whether the centre is inside, and numbers: share, … area."""
+        from sgstore.roads import _loops
+
         grid, quads = self._grid, self._quads
+        rows, *cells = self._cells(shapes)
+        return _loops.touching(
+            rows,
+            (cells[0], cells[1]),
+            (shapes.x, shapes.y, shapes.cos, shapes.sin, shapes.a, shapes.b),
+            (grid.keys, grid.begin, grid.quad, int(grid.shape[1, 0]), grid.first),
+            (quads.middle_x, quads.middle_y, quads.radius),
+            quads.corners,
+            quads.turn,
+            TOUCH,
+        )
+
+    def _touching_in_chunks(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints, Bools, Floats]]:
+        for row, quad in self._candidates(shapes):
+            near = _Pairs.of(self._quads, shapes, row, quad)
+            touch, inside = near.touching()
+            touch = np.flatnonzero(touch)
+            near = near.take(touch)
+            yield (
+                near.row,
+                near.quad,
+                inside[touch],
+                np.stack([*near.beside(), near.common_areas()]),
+            )
+
+    def _cells(self, shapes: _Shapes) -> tuple[Ints, Ints, Ints]:
+        """Footprints that are somewhere, and the first and the last cell of each, (2, R)."""
+        grid = self._grid
         cos, sin = np.abs(shapes.cos), np.abs(shapes.sin)
         reach = np.stack((cos * shapes.a + sin * shapes.b, sin * shapes.a + cos * shapes.b)) + TOUCH
-        around = np.hypot(shapes.a, shapes.b) + TOUCH
         centre = np.stack((shapes.x, shapes.y))
         rows = np.flatnonzero(np.isfinite(centre + reach).all(axis=0))
-        if not len(rows) or not len(grid.quad):
-            return
+        if not len(grid.quad):
+            rows = rows[:0]
         low, high = (centre - reach)[:, rows], (centre + reach)[:, rows]
         top = grid.origin + grid.shape * grid.cell
         first = np.maximum(grid.cells(np.minimum(low, top)), 0)
         last = np.minimum(grid.cells(np.clip(high, grid.origin - 1.0, top)), grid.shape - 1)
+        return rows, first, last
+
+    def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
+        """Footprints and quadrangles that are close, each pair once, by chunks of footprints."""
+        grid, quads = self._grid, self._quads
+        rows, first, last = self._cells(shapes)
+        if not len(rows):
+            return
+        around = np.hypot(shapes.a, shapes.b) + TOUCH
         total = np.cumsum(np.maximum(last - first + 1, 0).prod(axis=0))
         cuts = np.searchsorted(total, np.arange(_CHUNK, total[-1] + _CHUNK, _CHUNK)) + 1
         for begin, end in pairwise([0, *np.unique(cuts).tolist()]):
@@ -258,31 +296,30 @@ class LaneIndex:
             close = squared <= (quads.radius[quad] + around[row]) ** 2
             yield row[close], quad[close]
 
-    def _gathered(self, shapes: _Shapes, row: Ints, quad: Ints) -> Touches:
+    def _gathered(
+        self, shapes: _Shapes, row: Ints, quad: Ints, inside: Bools, numbers: Floats
+    ) -> Touches:
         quads = self._quads
-        near = _Pairs.of(quads, shapes, row, quad)
-        touch, inside = near.touching()
-        touch = np.flatnonzero(touch)
-        near, inside = near.take(touch), inside[touch]
-        share, distance = near.beside()
-        z = quads.z[:, near.quad]
+        share, distance, area = numbers
+        z = quads.z[:, quad]
         level = z[0] + (z[1] - z[0]) * np.clip(share, 0.0, 1.0)
-        apart = np.abs(level - shapes.z[near.row]) > self._storey
+        apart = np.abs(level - shapes.z[row]) > self._storey
         if apart.any():
             same = np.flatnonzero(~apart)
-            near, inside, distance = near.take(same), inside[same], distance[same]
-        lane = quads.lane[near.quad]
-        key = near.row * (int(quads.lane[-1]) + 1) + lane
+            row, quad, inside = row[same], quad[same], inside[same]
+            distance, area = distance[same], area[same]
+        if not len(row):
+            return _no_touches()
+        lane = quads.lane[quad]
+        key = row * (int(quads.lane[-1]) + 1) + lane
         order = np.argsort(key, kind="stable")
         starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-        if not len(starts):
-            return _no_touches()
         best = order[_first_least(distance[order], starts)]
-        area = np.add.reduceat(np.abs(near.common_areas())[order], starts)
-        overlap = np.minimum(area / (4 * near.a[best] * near.b[best]), 1.0)
+        area = np.add.reduceat(np.abs(area)[order], starts)
+        row = row[best]
+        overlap = np.minimum(area / (4 * shapes.a[row] * shapes.b[row]), 1.0)
         within = np.logical_or.reduceat(inside[order], starts)
-        row = near.row[best]
-        offset, error = self._aside(shapes, row, near.quad[best])
+        offset, error = self._aside(shapes, row, quad[best])
         return Touches(row, lane[best], overlap, offset, error, within)
 
     def _aside(self, shapes: _Shapes, row: Ints, quad: Ints) -> tuple[Floats, Floats]:
