@@ -13,7 +13,7 @@ from PIL import Image
 from sgstore.cli import run
 from sgstore.draw import draw_clip, draw_stored, range_of
 from sgstore.draw._page import Gif, changed
-from sgstore.draw._stored import Film, Shot
+from sgstore.draw._stored import Shot, filmed, scale_of
 from sgstore.errors import ExportError, StoreError
 from sgstore.query import Store
 
@@ -154,9 +154,9 @@ def shots() -> list[Shot]:
 
 @pytest.mark.parametrize("diagram", [False, True])
 def test_a_film_is_of_one_size_and_runs_as_fast_as_the_trace(tmp_path: Path, diagram: bool) -> None:
-    with Film(tmp_path / "a.gif", None, shots(), diagram=diagram) as film:
-        for shot in shots():
-            film.add(shot)
+    assert len([*filmed(tmp_path / "a.gif", None, shots(), shots(), diagram=diagram)]) == len(
+        shots()
+    )
 
     pictures, durations = read(tmp_path / "a.gif")
     assert durations == [200, 200, 200]
@@ -168,17 +168,17 @@ def test_the_scale_is_that_of_the_whole_clip(tmp_path: Path) -> None:
     road_map = Crossing()
     near = (graph_of({0: entity("car", 0.0, 0.0, 90.0, is_ego=True)}, []), {}, None)
     far = (crowd(road_map), {}, None)
-    film = Film(tmp_path / "a.gif", road_map, [near, far])
-    with film:
-        scales = {film._scene(shot).view.radius for shot in (near, far)}
+    both = scale_of([near, far])
 
-    assert len(scales) == 1
-    assert scales.pop() > 30.0
+    assert both is not None
+    assert both == scale_of([far]) > 30.0
+    assert scale_of([near]) == 30.0
+    assert [*filmed(tmp_path / "a.gif", road_map, [near, far], [near])] == [near]
 
 
 def test_a_film_that_is_no_gif_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"end the name in \.gif"):
-        Film(tmp_path / "a.png", None, shots())
+        next(filmed(tmp_path / "a.png", None, shots(), shots()))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,7 +9,7 @@ import io
 import re
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from sgstore.errors import ExportError, StoreError
 from sgstore.opendrive import read_map
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from PIL.Image import Image
 
@@ -57,8 +57,18 @@ FrameRange = tuple[str, str]
 """Frames of a trace from one to another, both included; each is named as everywhere: ``town@12s``."""
 
 
-class Film:
-    """Draws shots into an animation; to be used in a ``with``.
+def filmed(  # noqa: PLR0913  as many options as the picture has
+    to: str | Path,
+    road_map: RoadMap | None,
+    samples: Sequence[Shot],
+    shots: Iterable[Shot],
+    *,
+    relations: Relations = "ego",
+    radius: float | None = None,
+    north_up: bool = False,
+    diagram: bool = False,
+) -> Iterator[Shot]:
+    """Draw shots into an animation, and give each when it is drawn.
 
     Parameters
     ----------
@@ -67,6 +77,7 @@ class Film:
     road_map : RoadMap or None
     samples : sequence of Shot
         Some of the shots, from all of the clip: they tell the scale and what the legend explains.
+    shots : iterable of Shot
     relations, radius, north_up, diagram
         As in :func:`sgstore.draw.draw_frame`.
 
@@ -75,78 +86,55 @@ class Film:
     ExportError
         The ending is another, or the file cannot be written.
     """
+    to = Path(to)
+    if to.suffix.lower() != ENDING:
+        raise ExportError(f"cannot draw a clip into {to.name!r}: end the name in {ENDING}")
+    reach = checked(radius) or scale_of(samples)
+    pages: list[Page] = []
 
-    def __init__(
-        self,
-        to: str | Path,
-        road_map: RoadMap | None,
-        samples: Sequence[Shot],
-        *,
-        relations: Relations = "ego",
-        radius: float | None = None,
-        north_up: bool = False,
-        diagram: bool = False,
-    ) -> None:
-        to = Path(to)
-        if to.suffix.lower() != ENDING:
-            raise ExportError(f"cannot draw a clip into {to.name!r}: end the name in {ENDING}")
-        self._map = road_map
-        self._relations: Relations = relations
-        self._north_up = north_up
-        self._diagram = diagram
-        self._radius = checked(radius) or max(
-            (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples),
-            default=None,
-        )
-        self._entries = self._legend(samples)
-        self._picture: bytes | None = None
-        self._start_ns: int | None = None
-        self._page: Page | None = None
-        self._gif = Gif(to)
+    def blank(width: float, height: float) -> Page:
+        pages[:] = pages or [Page(width, height, DPI, {})]
+        pages[0].clear()
+        return pages[0]
 
-    def __enter__(self) -> Self:
-        self._gif.__enter__()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
-        self._gif.__exit__(kind, *exception)
-
-    def add(self, shot: Shot) -> None:
-        """Draw the next shot."""
-        graph, _, picture = shot
-        self._picture = picture or self._picture
-        start = self._start_ns = graph.time_ns if self._start_ns is None else self._start_ns
-        scene, title = self._scene(shot), title_of(graph)
-        with own_style():
-            page = (
-                diagram_page(scene, title, self._relations, self._entries, self._blank)
-                if self._diagram
-                else frame_page(scene, title, self._picture, self._entries, self._blank)
-            )
-            self._gif.add(page.pixels(), (graph.time_ns - start) / 1e9)
-
-    def _blank(self, width: float, height: float) -> Page:
-        """The page of all pictures, with nothing on it."""
-        if self._page is None:
-            self._page = Page(width, height, DPI, {})
-        self._page.clear()
-        return self._page
-
-    def _scene(self, shot: Shot) -> DrawnFrame:
+    def scene_of(shot: Shot) -> DrawnFrame:
         graph, marked, _ = shot
         matched = matched_nodes(marked)
-        view = view_of(graph, self._radius, matched, north_up=self._north_up)
-        return DrawnFrame.of(graph, self._map, matched, view, self._relations)
+        view = view_of(graph, reach, matched, north_up=north_up)
+        return DrawnFrame.of(graph, road_map, matched, view, relations)
 
-    def _legend(self, samples: Sequence[Shot]) -> list[Entry]:
-        """Entries of all samples, each once, in the order of the first that has it."""
-        found: dict[Entry, None] = {}
-        for shot in samples:
-            scene = self._scene(shot)
-            half = scene.view.radius
-            found |= dict.fromkeys(entries_of(scene, (half, half)))
-        signs = [entry.sign for entry in found]
-        return sorted(found, key=lambda entry: signs.index(entry.sign))
+    entries = _legend(map(scene_of, samples))
+    seen: bytes | None = None
+    start: int | None = None
+    with Gif(to) as gif:
+        for shot in shots:
+            graph, _, picture = shot
+            seen = picture or seen
+            start = graph.time_ns if start is None else start
+            scene, title = scene_of(shot), title_of(graph)
+            with own_style():
+                if diagram:
+                    page = diagram_page(scene, title, relations, entries, blank)
+                else:
+                    page = frame_page(scene, title, seen, entries, blank)
+                gif.add(page.pixels(), (graph.time_ns - start) / 1e9)
+            yield shot
+
+
+def scale_of(samples: Iterable[Shot]) -> float | None:
+    """The radius of a view that shows what matters in each of some shots; ``None`` if there is none."""
+    radii = (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples)
+    return max(radii, default=None)
+
+
+def _legend(scenes: Iterable[DrawnFrame]) -> list[Entry]:
+    """Entries of all scenes, each once, in the order of the first that has it."""
+    found: dict[Entry, None] = {}
+    for scene in scenes:
+        half = scene.view.radius
+        found |= dict.fromkeys(entries_of(scene, (half, half)))
+    signs = [entry.sign for entry in found]
+    return sorted(found, key=lambda entry: signs.index(entry.sign))
 
 
 # Pictures of frames of a store: its graph, its map, what a query matches in it, and what a camera saw ----
@@ -304,12 +292,11 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     look: dict[str, Any] = {"relations": relations, "radius": radius}
     look |= {"north_up": north_up, "diagram": diagram}
     marked = 0
-    with Film(to, road_map, samples, **look) as film:
-        for number, now in enumerate(shots(chosen, seen=True), start=1):
-            film.add(now)
-            marked += bool(now[1])
-            if on_frame is not None:
-                on_frame(number, len(chosen))
+    drawn = filmed(to, road_map, samples, shots(chosen, seen=True), **look)
+    for number, (_, found, _) in enumerate(drawn, start=1):
+        marked += bool(found)
+        if on_frame is not None:
+            on_frame(number, len(chosen))
     return marked
 
 
