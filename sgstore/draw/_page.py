@@ -575,6 +575,9 @@ class Page:
         axes = self._windows[share] = self._figure.add_axes(self._free.pop(share, share))
         axes.set_axis_off()
         axes.set_autoscale_on(False)
+        # Each artist that is clipped asks for it, and would have it made anew; it follows the axes by itself.
+        transform = axes.patch.get_transform()
+        axes.patch.get_transform = lambda: transform
         return axes
 
     def _share(self, left: float, bottom: float, width: float, height: float) -> Rect:
@@ -590,13 +593,18 @@ def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, 
     return width, height
 
 
+@cache
+def _nowhere(dpi: float) -> Figure:
+    """A figure for what is measured and drawn outside of all pages."""
+    return Figure(dpi=dpi)
+
+
 def drawn_text(text: str, dpi: float, style: dict[str, Any]) -> Sprite:
     """A text, and what is under it, drawn alone; ``style`` as of a text of the drawing package."""
-    figure = Figure(dpi=dpi)
-    written = figure.text(0, 0, text, parse_math=False, transform=None, **style)
+    written = Text(0, 0, text, parse_math=False, **style)
+    written.set_figure(_nowhere(dpi))
     written.set_transform(IdentityTransform())
     renderer = RendererAgg(1, 1, dpi)
-    written.get_window_extent(renderer)
     slip = written.get_bbox_patch()
     written.update_bbox_position_size(renderer)
     boxes = [written.get_window_extent(renderer)]
