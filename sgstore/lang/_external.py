@@ -28,7 +28,7 @@ from sgstore.lang._formulas import (
     nested,
 )
 from sgstore.lang._kinds import kind_conditions
-from sgstore.lang._plan import TRACE_OF_FRAME, FoundRelation, Gathered
+from sgstore.lang._plan import TRACE_OF_FRAME, Gathered, SharedRelation
 from sgstore.lang._results import SqlStatement, finished, rows
 from sgstore.lang._rewrite import rewritten
 from sgstore.lang._sql_frames import frames
@@ -284,7 +284,7 @@ def external_matches(
         sql.gathered = (gathered,)
         select.join(quoted(GATHERED), [])
     name = sql.share(select.text(), "found")
-    sql.found = FoundRelation(name, frozenset(shape.nodes), frozenset(shape.edges), names)
+    sql.found = SharedRelation(name, frozenset(shape.nodes), frozenset(shape.edges), names)
     return sql
 
 

@@ -67,16 +67,7 @@ class Gathered:
 
 @dataclass(frozen=True, slots=True)
 class SharedRelation:
-    """A shared relation of the first phase that binds nodes for a block, and which; and edges."""
-
-    name: str
-    nodes: frozenset[str]
-    edges: frozenset[str]
-
-
-@dataclass(frozen=True, slots=True)
-class FoundRelation:
-    """A shared relation of matches that are known already: one row a frame and match.
+    """A shared relation: of the first phase, or, of matches that are known, one row a frame and match.
 
     Attributes
     ----------
@@ -90,7 +81,7 @@ class FoundRelation:
     name: str
     nodes: frozenset[str]
     edges: frozenset[str]
-    told: Mapping[FrameAttribute, str]
+    told: Mapping[FrameAttribute, str] = field(default_factory=dict["FrameAttribute", str])
 
 
 @dataclass(slots=True)

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.lang._catalog import Catalog
-    from sgstore.lang._plan import FoundRelation, Gathered, Window
+    from sgstore.lang._plan import Gathered, Window
     from sgstore.lang.ir import Kinds, Query
 
 
@@ -329,7 +329,7 @@ class SqlBuilder:
     values : BoundValues
     shared : list of (str, str)
         Names and texts of relations that are used more than once.
-    found : FoundRelation or None
+    found : SharedRelation or None
         What is known already of the matches of the outermost scope.
     gathered : tuple of Gathered
         Tables that are spoken of and the store has not.
@@ -340,7 +340,7 @@ class SqlBuilder:
     window: Window | None = None
     values: BoundValues = field(default_factory=BoundValues)
     shared: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    found: FoundRelation | None = None
+    found: SharedRelation | None = None
     gathered: tuple[Gathered, ...] = ()
 
     @property
@@ -348,7 +348,7 @@ class SqlBuilder:
         """Kinds of what is present by masks: static entities and parts of the map."""
         return self.catalog.fixed | self.catalog.mapped
 
-    def found_in(self, scope: Scope) -> FoundRelation | None:
+    def found_in(self, scope: Scope) -> SharedRelation | None:
         """Matches of a scope, if they are known already."""
         return self.found if scope is self.query.scope else None
 

@@ -349,7 +349,8 @@ def _relate(
         return 0
     asked = () if ask.value is None else (ask.value,)
     statement = relation(ask.query, catalog, window, asked, {*ask.variables, *ask.edges})
-    arrays = file.arrays(statement.sql, statement.values)
+    *before, (sql, bound) = statement.steps()
+    arrays = file.arrays(sql, bound, given=before)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
     columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
