@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import sgstore
+from bench.floor import floor
 from bench.measure import Measure
+from sgstore import compiled
 from sgstore.config import Config, LaneSettings
 from sgstore.opendrive import read_map
 from sgstore.readers import open_trace
@@ -246,6 +248,8 @@ def run(quick: bool = False) -> list[Measure]:
     for entities, radius, where in scenes:
         blocks = list(traffic(entities, 300, radius))
         name, frames = f"sgg, {entities} entities{where}", sum(map(len, blocks))
+        table += with_loops(name, blocks, road_map, seconds)
+        compiled.use_loops(math.inf)
         with_map = frames / timed(partial(generated, blocks, road_map), seconds)
         columns = frames / timed(partial(generated, blocks, None, sees=False), seconds)
         few = blocks[:1]
@@ -260,14 +264,37 @@ def run(quick: bool = False) -> list[Measure]:
             Measure(f"{name}, no map, row by row", rows, "frames/s", "plain Python, pair by pair"),
             Measure(f"{name}, peak memory", peak_of(partial(generated, blocks, road_map)), "MB"),
         ]
-    online = latency(list(traffic(60, 60 if quick else 300, 45)), road_map)
-    table.append(Measure("sgg, 60 entities, one frame alone", online, "ms", "99th percentile"))
+    alone = list(traffic(60, 60 if quick else 300, 45))
+    for after, how in ((math.inf, ""), (0, ", with numba")):
+        if compiled.use_loops(after) or not how:
+            generated(alone[:1], road_map)
+            online = latency(alone, road_map)
+            label = f"sgg, 60 entities, one frame alone{how}"
+            table.append(Measure(label, online, "ms", "99th percentile"))
+    compiled.use_loops()
     return [
         *table,
         *of_sample(seconds),
         *in_one_pass(road_map, seconds),
         *over_time(road_map, quick),
     ]
+
+
+def with_loops(
+    name: str, blocks: list[FrameBlock], road_map: RoadMap, seconds: float
+) -> list[Measure]:
+    """The same with loops that numba compiles, and their share of what a bare loop reaches."""
+    if not compiled.use_loops(0):
+        return [Measure(f"{name}, with numba", math.nan, "frames/s", "numba is not installed")]
+    generated(blocks[:1], road_map)
+    frames = sum(map(len, blocks))
+    speed = frames / timed(partial(generated, blocks, road_map), seconds)
+    least = floor(blocks[0], road_map)
+    if least is None or not least():
+        raise AssertionError("the floor has no edges")
+    bare = len(blocks[0]) / timed(least, seconds / 4)
+    note = f"{speed / bare:.1%} of a bare loop over pairs and lanes, {bare:,.0f}"
+    return [Measure(f"{name}, with numba", speed, "frames/s", note)]
 
 
 def of_sample(seconds: float) -> list[Measure]:

@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 WORTH: Final = 100_000
 """Bodies in graphs after which a process uses loops."""
 
-_seen = {"bodies": 0}
+_seen: dict[str, float] = {"bodies": 0, "enough": WORTH}
 
 
 def worth(bodies: int = 0) -> bool:
     """Return whether loops are to be used; ``bodies`` are more that graphs are made of."""
     _seen["bodies"] += bodies
-    return _seen["bodies"] >= WORTH and _numba() is not None
+    return _seen["bodies"] >= _seen["enough"] and _numba() is not None
 
 
-def use_loops(*, at_once: bool) -> bool:
-    """Use loops from now on, or only when it is worth it; return whether there is anything to compile them."""
-    _seen["bodies"] = WORTH if at_once else 0
+def use_loops(after: float = WORTH) -> bool:
+    """Use loops after so many bodies from now on; return whether there is anything to compile them."""
+    _seen.update(bodies=0, enough=after)
     return _numba() is not None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from dataclasses import fields
@@ -39,7 +40,7 @@ CONFIGS = [
 @pytest.fixture
 def _ends_without_loops() -> Iterator[None]:
     yield
-    compiled.use_loops(at_once=False)
+    compiled.use_loops()
 
 
 def columns(graph: GraphBlock) -> list[np.ndarray[Any, Any]]:
@@ -53,8 +54,8 @@ def assert_same_both_ways(
     blocks: list[FrameBlock], road_map: RoadMap | None, config: Config
 ) -> None:
     found: list[list[np.ndarray[Any, Any]]] = []
-    for at_once in (False, True):
-        if not compiled.use_loops(at_once=at_once):
+    for after in (math.inf, 0):
+        if not compiled.use_loops(after):
             pytest.skip("numba is not installed")
         generator = SceneGraphGenerator(road_map, config)
         found.append([column for block in blocks for column in columns(generator.block(block))])
@@ -99,7 +100,7 @@ def test_loops_and_numpy_give_the_same_graphs_of_the_sample(config: Config) -> N
 
 @pytest.mark.usefixtures("_ends_without_loops")
 def test_loops_are_used_when_they_are_worth_it() -> None:
-    if not compiled.use_loops(at_once=False):
+    if not compiled.use_loops():
         pytest.skip("numba is not installed")
 
     assert not compiled.worth(compiled.WORTH - 1)
@@ -111,7 +112,7 @@ def test_without_numba_nothing_is_compiled() -> None:
         import sys
         sys.modules["numba"] = None
         from sgstore import compiled
-        assert not compiled.use_loops(at_once=True) and not compiled.worth(compiled.WORTH)
+        assert not compiled.use_loops(0) and not compiled.worth(compiled.WORTH)
         from sgstore.relations import _loops
         import numpy as np
         order, end = np.arange(3), np.full(3, 3)
