@@ -1,6 +1,6 @@
-"""A loop that does no more than the arithmetic of scene graphs: what no generator is faster than, on one core.
+"""A loop that does no more than the arithmetic of scene graphs: a bound of what one core can do.
 
-For every frame all pairs of entities are told (rung, sector and side, both ways), and which quadrangles of lanes
+For every frame all pairs of entities are told (rung, sector, side, both ways), and which quadrangles of lanes
 that are close each footprint touches. There are no tables, no shares, no gaps, and no sight.
 """
 
