@@ -180,7 +180,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
     if not keys or len(keys[0]) < 2:
         return columns
     packed = _packed(keys)
-    order = np.lexsort(keys[::-1]) if packed is None else np.argsort(packed)
+    order = np.lexsort(keys[::-1]) if packed is None else np.argsort(packed, kind="stable")
     if table not in MASKS:
         return {name: values[order] for name, values in columns.items()}
     ranked = keys if packed is None else [packed]

@@ -130,7 +130,9 @@ def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]
     if not len(bits):
         return np.zeros(0, np.intp), bits
     packed = _packed(keys)
-    order = np.argsort(packed)
+    order = np.argsort(
+        packed, kind="stable"
+    )  # edges come in long runs that ascend: merging them is cheap
     ranked = packed[order]
     starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1]))
     return order[starts], np.bitwise_or.reduceat(np.left_shift(1, bits[order]), starts)
