@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import duckdb
 import pytest
@@ -13,9 +14,6 @@ from sgstore.store import StoreFile
 from sgstore.store._schema import schema_sql, schema_version, tables_sql
 from sgstore.vocabulary import OWN_KINDS, OWN_LIGHT_STATES, OWN_RELATIONS, VEHICLE_LIGHTS
 from sgstore.world import BUCKET_FRAMES
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 VIEWS = {
     "frames": "frame_id trace_id seq time_ns ego trace t log_time_ns map",
@@ -110,6 +108,22 @@ def test_no_table_has_keys_that_loading_would_pay_for(empty: duckdb.DuckDBPyConn
     found = empty.execute("SELECT DISTINCT constraint_type FROM duckdb_constraints()").fetchall()
 
     assert found == [("NOT NULL",)]
+
+
+@pytest.mark.skipif(
+    duckdb.__version__ not in shape.KNOWN, reason="this version's words are compared"
+)
+def test_the_objects_of_a_store_are_those_that_are_known_by_their_digest(tmp_path: Path) -> None:
+    store = StoreFile.create(tmp_path / "s.db")
+    with store.access.reading() as connection:
+        objects = shape.objects_of(connection, shape.database_of(connection))
+
+    known, found = shape.KNOWN[duckdb.__version__], shape.digest_of(objects)
+    if "SGSTORE_UPDATE_GOLDEN" in os.environ:
+        source = Path(shape.__file__)
+        source.write_text(source.read_text().replace(known, found))
+        known = found
+    assert known == found, "SGSTORE_UPDATE_GOLDEN=1 writes it"
 
 
 def test_the_head_says_the_version_that_a_store_is_made_with(tmp_path: Path) -> None:

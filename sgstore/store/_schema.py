@@ -264,7 +264,8 @@ def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) ->
     if objects not in _compared:
         if len(_compared) >= _MOST_COMPARED:
             _compared.clear()
-        _compared[objects] = tuple(_changed(objects, _expected_views(connection)))
+        known = digest_of(objects) == KNOWN.get(duckdb.__version__)
+        _compared[objects] = () if known else tuple(_changed(objects, _expected_views(connection)))
     found = [*_compared[objects], *_shadowing(connection, database)]
     found += _attached(connection, database)
     return found or [*_strange(objects)]
@@ -274,6 +275,17 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 """Faults of the objects of stores that were compared: those of one store are mostly those of the next."""
 
 _MOST_COMPARED: Final = 64
+
+KNOWN: Final = {"2.0.0": "d111b24e78e9a9e7f6cb5c29c85ed2d05aee91c0d4e90e3f1dc3711ed6da3b60"}
+"""Digests of the objects of a store, by the version of DuckDB that tells them: to compare words takes 30 ms.
+
+Others are compared word by word.
+"""
+
+
+def digest_of(objects: Objects) -> str:
+    """Return the SHA-256 of the text of ``schema.sql`` and of all that was read of a store's objects."""
+    return hashlib.sha256(repr((schema_sql(), sorted(objects))).encode()).hexdigest()
 
 
 def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
