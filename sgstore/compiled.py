@@ -2,8 +2,8 @@
 
 Without it numpy does the same, and the answers are equal: loops add, multiply, divide, take roots and compare,
 with the roundings of numpy, and leave to it whatever needs an angle. Numba takes a third of a second to start,
-so loops are used when a process has seen work that is worth it. The first time on a machine they take some
-seconds to compile; what is compiled is kept beside the source, or in the user's cache.
+so loops are used when a process has made many graphs, frames that come alone not counted. The first time on a
+machine they take about 15 s to compile; what is compiled is kept beside the source, or in the user's cache.
 """
 
 from __future__ import annotations

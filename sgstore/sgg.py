@@ -209,7 +209,8 @@ class SceneGraphGenerator:
 
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
-        worth(len(bodies))
+        if len(frames) > 1:  # nobody who waits for a frame is to wait for a compiler
+            worth(len(bodies))
         rows = keys, len(frames.states), len(self._scenery)
         standing = None
         if self._survey is not None:

@@ -107,6 +107,17 @@ def test_loops_are_used_when_they_are_worth_it() -> None:
     assert compiled.worth(1)
 
 
+@pytest.mark.usefixtures("_ends_without_loops")
+def test_frames_that_come_alone_do_not_start_the_compiler() -> None:
+    if not compiled.use_loops(after=2):
+        pytest.skip("numba is not installed")
+
+    SceneGraphGenerator(None, Config()).block(frames([thing("ego"), thing("a", 5), thing("b", 9)]))
+    assert not compiled.worth()
+    SceneGraphGenerator(None, Config()).block(frames([thing("ego")], [thing("ego")]))
+    assert compiled.worth()
+
+
 def test_without_numba_nothing_is_compiled() -> None:
     program = """if True:
         import sys
