@@ -14,6 +14,7 @@ rounded to six digits behind the point, so that another order of a sum makes no 
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import csv
 import hashlib
@@ -210,9 +211,13 @@ def compared(path: Path) -> list[str]:
     return list(differences(kept, frozen(path), name_of(path)))
 
 
-def main(arguments: list[str]) -> int:
-    rows = Path(arguments[1]) if arguments[:1] == ["--rows"] else None
-    write, found = arguments == ["--write"], []
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
+    parser.add_argument("--write", action="store_true", help="keep what is answered now")
+    parser.add_argument("--rows", type=Path, metavar="DIR", help="write the rows themselves as CSV")
+    options = parser.parse_args()
+    write, rows = options.write, options.rows
+    found: list[str] = []
     FROZEN.mkdir(exist_ok=True)
     for path in recordings():
         if write or rows:
@@ -235,4 +240,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
