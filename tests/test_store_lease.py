@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import textwrap
 import threading
 import time
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
+from children import process
 from graph_blocks import RandomTrace, publish
 
 import sgstore
@@ -24,7 +22,8 @@ from sgstore.store._locking import Access
 from sgstore.store._staging import scratch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable
+    from pathlib import Path
 
 TRACES = "SELECT count(*) FROM inside.trace"
 
@@ -54,23 +53,6 @@ def until(true: Callable[[], bool], within: float = 20.0) -> float:
         assert time.monotonic() - start < within
         time.sleep(0.005)
     return time.monotonic() - start
-
-
-@contextmanager
-def process(code: str, **values: object) -> Generator[subprocess.Popen[str]]:
-    """A process that has printed a line; it goes on until its stdin ends."""
-    code = textwrap.dedent(code).format(path=[str(Path(__file__).parent)], **values)
-    pipe = subprocess.PIPE
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=pipe, text=True
-    ) as child:
-        assert child.stdout is not None
-        assert child.stderr is not None
-        if not child.stdout.readline():
-            raise AssertionError(child.stderr.read())
-        yield child
-        _, errors = child.communicate(timeout=60)
-        assert child.returncode == 0, errors
 
 
 def written_elsewhere(store: StoreFile, statement: str = "DELETE FROM inside.bits") -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
+from children import process
 from graph_blocks import RandomTrace, publish
 
 from sgstore.errors import StoreError
@@ -35,23 +35,6 @@ def store(tmp_path: Path) -> StoreFile:
     store = StoreFile.create(tmp_path / "s.db")
     publish(store, RandomTrace(1, frames=5, path="first"))
     return store
-
-
-@contextmanager
-def process(code: str, **values: object) -> Iterator[subprocess.Popen[str]]:
-    """A process that has begun: it has printed a line. It goes on until its stdin ends, and is waited for."""
-    code = textwrap.dedent(code).format(path=[str(Path(__file__).parent)], **values)
-    pipe = subprocess.PIPE
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=pipe, text=True
-    ) as child:
-        assert child.stdout is not None
-        assert child.stderr is not None
-        if not child.stdout.readline():
-            raise AssertionError(child.stderr.read())
-        yield child
-        _, errors = child.communicate(timeout=60)
-        assert child.returncode == 0, errors
 
 
 @contextmanager
