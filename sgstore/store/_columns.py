@@ -10,7 +10,6 @@ pseudorandom number generators, 2014): it is no cipher, and tells what happens b
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
@@ -19,7 +18,7 @@ import numpy as np
 
 from sgstore.errors import StoreError
 from sgstore.quoting import quoted
-from sgstore.store._packing import MISSING
+from sgstore.store._packing import MISSING, packed
 from sgstore.store._schema import INSIDE, code_sql, enums_of, expected, own_labels
 from sgstore.vocabulary import NAMES
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.store._packing import Columns
-    from sgstore.world import Ints
 
     Words = NDArray[np.uint64]
 
@@ -179,11 +177,11 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
         keys.append(-key.astype(np.int64) if down else key)
     if not keys or len(keys[0]) < 2:
         return columns
-    packed = _packed(keys)
-    order = np.lexsort(keys[::-1]) if packed is None else np.argsort(packed, kind="stable")
+    number = packed(keys)
+    order = np.lexsort(keys[::-1]) if number is None else np.argsort(number, kind="stable")
     if table not in MASKS:
         return {name: values[order] for name, values in columns.items()}
-    ranked = keys if packed is None else [packed]
+    ranked = keys if number is None else [number]
     fresh = np.ones(len(order), np.bool_)
     fresh[1:] = False
     for key in (key[order] for key in ranked):
@@ -195,20 +193,21 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
     return whole
 
 
-def _packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
-    """Keys as one number that sorts as they do; ``None`` if that would be too large."""
-    if any(key.dtype.kind == "f" for key in keys):
-        return None
-    bounds = [(int(key.min()), int(key.max())) for key in keys]
-    if math.prod(high - low + 1 for low, high in bounds) >= 1 << 62:
-        return None
-    packed = np.zeros(len(keys[0]), np.int64)
-    for key, (low, high) in zip(keys, bounds, strict=True):
-        if low < high:
-            packed *= high - low + 1
-            packed += key
-            packed -= low
-    return packed
+def chained(table: str, blocks: Sequence[Columns]) -> Columns:
+    """Staged rows of a table one behind the other, with all columns that any of them has."""
+    if len(blocks) == 1:
+        return blocks[0]
+    return {
+        name: np.concatenate(
+            [
+                block[name]
+                if name in block
+                else blank(table, name, len(next(iter(block.values()))))
+                for block in blocks
+            ]
+        )
+        for name in dict.fromkeys(name for block in blocks for name in block)
+    }
 
 
 # Checksums --------------------------------------------------------------------------------------------------

@@ -129,24 +129,41 @@ def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]
     """
     if not len(bits):
         return np.zeros(0, np.intp), bits
-    packed = _packed(keys)
-    order = np.argsort(
-        packed, kind="stable"
-    )  # edges come in long runs that ascend: merging them is cheap
-    ranked = packed[order]
+    number = packed(keys)
+    if number is None:  # ids that are far apart: their ranks instead
+        number = np.unique(np.stack(keys), axis=1, return_inverse=True)[1].reshape(-1)
+    # Edges come in long runs that ascend: merging them is cheap.
+    order = np.argsort(number, kind="stable")
+    ranked = number[order]
     starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1]))
     return order[starts], np.bitwise_or.reduceat(np.left_shift(1, bits[order]), starts)
 
 
-def _packed(keys: Sequence[Whole]) -> Ints:
-    """The columns of a key, none of them empty, as one number that sorts as they do."""
-    spans = [int(key.max()) - int(key.min()) + 1 for key in keys]
-    if math.prod(spans) >= 1 << 62:  # ids that are far apart: their ranks instead
-        return np.unique(np.stack(keys), axis=1, return_inverse=True)[1].reshape(-1)
-    packed = np.zeros(len(keys[0]), np.int64)
-    for key, span in zip(keys, spans, strict=True):
-        packed = packed * span + (key - key.min())
-    return packed
+def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
+    """The columns of a key as one number that sorts as they do.
+
+    Parameters
+    ----------
+    keys : sequence of (N,) array
+        The most significant first; N is not 0.
+
+    Returns
+    -------
+    (N,) int64 or None
+        ``None`` if it would be too large, or if a column is not of whole numbers.
+    """
+    if any(key.dtype.kind == "f" for key in keys):
+        return None
+    bounds = [(int(key.min()), int(key.max())) for key in keys]
+    if math.prod(high - low + 1 for low, high in bounds) >= 1 << 62:
+        return None
+    number = np.zeros(len(keys[0]), np.int64)
+    for key, (low, high) in zip(keys, bounds, strict=True):
+        if low < high:
+            number *= high - low + 1
+            number += key
+            number -= low
+    return number
 
 
 def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:

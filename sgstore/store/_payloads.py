@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import StoreError
+from sgstore.store._columns import chained
 from sgstore.store._packing import frame_ids, texts
 from sgstore.vocabulary import suggestion
 
@@ -127,14 +128,10 @@ def _messages_of(
         if len(rows):
             waiting.append({name: values[rows] for name, values in some.items()})
         if sum(len(one["channel"]) for one in waiting) >= _AT_ONCE:
-            yield _together(waiting)
+            yield chained("message", waiting)
             waiting = []
     if waiting:
-        yield _together(waiting)
-
-
-def _together(parts: Sequence[Columns]) -> Columns:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        yield chained("message", waiting)
 
 
 def _own(
@@ -144,7 +141,7 @@ def _own(
     parts = list(_messages_of(messages, leading))
     if not parts:
         return {name: np.zeros(0, np.int64) for name in ("frame", "channel", *_PLACE)}
-    said = _together(parts)
+    said = chained("message", parts)
     order = np.lexsort((said["offset"], said["chunk_offset"], said["log_time_ns"]))
     said = {name: values[order] for name, values in said.items()}
     turn = np.arange(len(frames.time)) - np.searchsorted(frames.time, frames.time)

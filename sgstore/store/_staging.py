@@ -23,6 +23,7 @@ from sgstore.store._columns import (
     Checksum,
     as_summed,
     blank,
+    chained,
     in_order,
     kept,
     types_of,
@@ -373,7 +374,7 @@ class Staging:
 
     def _gathered(self, table: str) -> Columns:
         """The rows of a table that are in memory, sorted."""
-        return in_order(table, _chained(table, self._waiting.pop(table)), self._texts_of(table))
+        return in_order(table, chained(table, self._waiting.pop(table)), self._texts_of(table))
 
     def _texts_of(self, table: str) -> list[str]:
         return list(self._texts[table in _CUT])[1:]
@@ -417,8 +418,8 @@ class Staging:
                 if low < high:
                     found.append(self._file.read(run, low, high))
                 if sum(len(one["mask"]) for one in found) > 2 * self._most:
-                    found = [in_order(table, _chained(table, found), texts)]
-            yield in_order(table, _chained(table, found), texts)
+                    found = [in_order(table, chained(table, found), texts)]
+            yield in_order(table, chained(table, found), texts)
 
     def messages(self) -> Iterator[Columns]:
         """All messages, some at a time."""
@@ -433,23 +434,6 @@ class Staging:
         self._file.close()
         self.checksums.pop("message", None)
         self.checksums = dict(sorted(self.checksums.items()))
-
-
-def _chained(table: str, blocks: list[Columns]) -> Columns:
-    """Staged rows of a table one behind the other, with all columns that any of them has."""
-    if len(blocks) == 1:
-        return blocks[0]
-    return {
-        name: np.concatenate(
-            [
-                block[name]
-                if name in block
-                else blank(table, name, len(next(iter(block.values()))))
-                for block in blocks
-            ]
-        )
-        for name in dict.fromkeys(name for block in blocks for name in block)
-    }
 
 
 # Databases in memory ------------------------------------------------------------------------------------------
