@@ -286,7 +286,7 @@ def test_a_frame_is_named_by_its_place_or_time_in_its_trace(
         ("drive_1@13s", "no frame at 13 s in 'drive_1'; it has frames #0 … #129, 0 s … 12.9 s"),
         ("drive_1@-1s", "no frame at -1 s in 'drive_1'"),
         ("drive_1#x", "'#x'; expected a whole number, as in #12"),
-        (f"drive_1@{'9' * 400}s", r"no frame at 1e\+09 s in 'drive_1'"),
+        (f"drive_1@{'9' * 400}s", "no frame at 9{400} s in 'drive_1'"),
         ("drive_1@noon", "'@noon'; expected seconds, as in @12.3s"),
         ("drive_1", "not a frame: 'drive_1'; expected a frame_id, TRACE#SEQ, or TRACE@12.3s"),
         ("driv_1#5", "did you mean 'drive_1'"),

@@ -429,8 +429,7 @@ def _frame_at_time(
     seconds = _SECONDS.fullmatch(where)
     if seconds is None:
         raise StoreError(f"not a time in {name!r}: '@{where}'; expected seconds, as in @12.3s")
-    after = min(float(seconds[1]), 1e9)  # no trace lasts for thirty years
-    after_ns = round(after * 1e9)
+    after_ns = round(min(float(seconds[1]), 1e9) * 1e9)  # no trace lasts for thirty years
     first, last = _extent(connection, trace_id)[2:]
     row = connection.execute(
         "SELECT period_ns FROM trace WHERE trace_id = ?", [trace_id]
@@ -444,7 +443,7 @@ def _frame_at_time(
             [trace_id, after_ns + tolerance],
         )
     if found is None:
-        raise StoreError(f"no frame at {after:g} s in {name!r}; {_range(connection, trace_id)}")
+        raise StoreError(f"no frame at {seconds[1]} s in {name!r}; {_range(connection, trace_id)}")
     return found
 
 
