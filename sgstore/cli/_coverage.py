@@ -46,10 +46,6 @@ Unit = Annotated[
 Window = Annotated[
     int, Option("--window", "-t", min=1, help="Number of frames that form one class together.")
 ]
-Incomplete = Annotated[
-    Literal["equal", "distinct", "drop"],
-    Option("--incomplete", help="Windows with missing frames: equal, distinct, or dropped."),
-]
 Slots = Annotated[
     Path | None, Option("--slots", metavar="FILE", help="TOML file with declared slots.")
 ]
@@ -65,7 +61,10 @@ class WindowOptions:
 
     abstraction: Abstraction = "RSV"
     window: Window = 1
-    incomplete: Incomplete = "equal"
+    incomplete: Annotated[
+        Literal["equal", "distinct", "drop"],
+        Option("--incomplete", help="Windows with missing frames: equal, distinct, or dropped."),
+    ] = "equal"
 
     def of(self, ask: AskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
         """Frames that texts mean, with their classes; says which traces cannot answer a query."""
@@ -86,6 +85,13 @@ class WindowOptions:
             missing = Missing(self.incomplete)
             found.append(classed(chosen, self.abstraction, self.window, missing, declared))
         return found
+
+
+@dataclass(frozen=True)
+class LongWindowOptions(WindowOptions):
+    """Options for the classes of windows."""
+
+    window: Window = 10
 
 
 @dataclass(frozen=True)
@@ -275,19 +281,11 @@ def spec_(
 
 
 @coverage.command("windows")
-def windows_(
-    a: A,
-    limit: Limit = None,
-    abstraction: Abstraction = "RSV",
-    window: Window = 10,
-    incomplete: Incomplete = "equal",
-    *,
-    ask: AskOptions,
-) -> None:
+def windows_(a: A, limit: Limit = None, *, windows: LongWindowOptions, ask: AskOptions) -> None:
     """List the classes of windows: of a frame together with those recorded before it."""
     from sgstore.coverage import classes
 
-    (frames,) = WindowOptions(abstraction, window, incomplete).of(ask, a)
+    (frames,) = windows.of(ask, a)
     ask.report(classes(frames), limit)
 
 

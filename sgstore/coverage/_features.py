@@ -178,9 +178,9 @@ def combined(found: ClassFeatures, k: int) -> Combinations:
             f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
             " ask for a smaller k, or for an abstraction with fewer labels"
         )
-    k = min(k, many + 1)  # of more there are none either
-    listed = chain.from_iterable(combinations(range(many), k))
-    members = np.fromiter(listed, np.int64, comb(many, k) * k).reshape(-1, k)
+    size = min(k, many + 1)  # of more there are none either
+    listed = chain.from_iterable(combinations(range(many), size))
+    members = np.fromiter(listed, np.int64, comb(many, size) * size).reshape(-1, size)
     if k == 2:
         frames = _together(found)[members[:, 0], members[:, 1]]
     else:
