@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 
 MAX_NS: Final = 10**18
-_NO_LENGTH: Final = "no length of time that a trace may have"
 """The longest time that a query may speak of: some 30 years; ns."""
 
 _UNBOUNDED: Final = frozenset({"NEXT", "WEAKNEXT", "PREVIOUS"})
@@ -76,11 +75,11 @@ def length(e: s.Duration | s.Parameter, names: SymbolTable) -> o.Length:
         if amount != int(amount):
             names.session.refuse("expected a whole number of frames", e.span)
         if amount >= s.LONGEST:
-            names.session.refuse(_NO_LENGTH, e.span)
+            names.session.refuse(s.TOO_LONG, e.span)
         return o.Length(int(amount), frames=True)
     ns = s.Duration(amount, unit, e.span).ns
     if not 0 <= ns <= MAX_NS:
-        names.session.refuse(_NO_LENGTH, e.span)
+        names.session.refuse(s.TOO_LONG, e.span)
     return o.Length(ns, frames=False)
 
 

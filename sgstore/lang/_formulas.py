@@ -245,8 +245,8 @@ def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = 
     told = 'json_extract_string("o"."value", \'$\')'
     value = told if attribute.type is Type.text else f"CAST({told} AS {_NATIVE[attribute.type]})"
     on = [f'"o"."frame_id" = {frame}', f'"o"."node_id" = {node}']
-    told = zip(("relation", "dst"), edge, strict=False)
-    on += [f'"o"."{column}" = {text}' for column, text in told] or ['"o"."relation" IS NULL']
+    ends = [f'"o"."{name}" = {text}' for name, text in zip(("relation", "dst"), edge, strict=False)]
+    on += ends or ['"o"."relation" IS NULL']
     on.append(f'"o"."attribute" = {literal(attribute.name)}')
     rows = Select([f"any_value({value})"], ['"attribute" AS "o"'], on)
     return f"({rows.text()})"
@@ -503,11 +503,12 @@ def column_of(leaf: Leaf) -> str:
     match leaf:
         case NodeValue(node=owner):
             name = "id"
-        case NodeAttribute(node=owner, attribute=attribute):
-            name = _as_column(attribute)
         case EdgeRelation(edge=owner):
             name = "type"
-        case EdgeAttribute(edge=owner, attribute=attribute):
+        case (
+            NodeAttribute(node=owner, attribute=attribute)
+            | EdgeAttribute(edge=owner, attribute=attribute)
+        ):
             name = _as_column(attribute)
         case FrameAttribute(attribute=attribute):
             owner, name = "frame", attribute.name

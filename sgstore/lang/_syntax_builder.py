@@ -81,7 +81,7 @@ def _length(text: str, span: TextSpan) -> s.Duration:
     found = _DURATION.fullmatch(text)
     assert found is not None, text  # noqa: S101 - the lexer's pattern is narrower
     if (amount := float(found[1])) > s.LONGEST:
-        raise BuildError("no length of time that a trace may have", span)
+        raise BuildError(s.TOO_LONG, span)
     return s.Duration(amount, found[2].lower(), span)
 
 

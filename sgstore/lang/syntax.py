@@ -27,6 +27,8 @@ class Constant:
 
 LONGEST: Final = 1e18
 """More than a trace lasts in any unit; the largest amount of a :class:`Duration`."""
+TOO_LONG: Final = "no length of time that a trace may have"
+"""Message about one that is longer."""
 
 
 @dataclass(frozen=True, slots=True)
