@@ -23,9 +23,13 @@ WORTH: Final = 100_000
 _seen: dict[str, float] = {"bodies": 0, "enough": WORTH}
 
 
-def worth(bodies: int = 0) -> bool:
-    """Return whether loops are to be used; ``bodies`` are more that graphs are made of."""
+def count(bodies: int) -> None:
+    """Note that graphs of so many bodies are made."""
     _seen["bodies"] += bodies
+
+
+def worth() -> bool:
+    """Return whether loops are to be used: after many bodies, and where numba is."""
     return _seen["bodies"] >= _seen["enough"] and _numba() is not None
 
 

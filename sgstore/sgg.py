@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sgstore import compiled
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
 from sgstore.columns import chained
-from sgstore.compiled import worth
 from sgstore.errors import ConfigError
 from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
@@ -210,7 +210,7 @@ class SceneGraphGenerator:
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
         if len(frames) > 1:  # nobody who waits for a frame is to wait for a compiler
-            worth(len(bodies))
+            compiled.count(len(bodies))
         rows = keys, len(frames.states), len(self._scenery)
         standing = None
         if self._survey is not None:

@@ -103,8 +103,10 @@ def test_loops_are_used_when_they_are_worth_it() -> None:
     if not compiled.use_loops():
         pytest.skip("numba is not installed")
 
-    assert not compiled.worth(compiled.WORTH - 1)
-    assert compiled.worth(1)
+    compiled.count(compiled.WORTH - 1)
+    assert not compiled.worth()
+    compiled.count(1)
+    assert compiled.worth()
 
 
 @pytest.mark.usefixtures("_ends_without_loops")
@@ -123,7 +125,7 @@ def test_without_numba_nothing_is_compiled() -> None:
         import sys
         sys.modules["numba"] = None
         from sgstore import compiled
-        assert not compiled.use_loops(0) and not compiled.worth(compiled.WORTH)
+        assert not compiled.use_loops(0) and not compiled.worth()
         from sgstore.relations import _loops
         import numpy as np
         order, end = np.arange(3), np.full(3, 3)

@@ -92,7 +92,7 @@ def _direction_edges(scene: BlockScene) -> Edges:
 
 
 def _in_loops(scene: BlockScene) -> bool:
-    """Whether loops tell directions, which know nothing of limits to them."""
+    """Return whether loops tell directions; they know nothing of limits to them."""
     settings = scene.config.direction
     return scene.pairs.in_loops and not settings.kinds and not settings.within > 0
 
@@ -116,9 +116,8 @@ def _sectors(
         sector, least = np.zeros(len(aside), np.int8), np.abs(onward) + aside
         reach = least * np.float32(DOUBT)
         for sin, cos in zip(sines, cosines, strict=True):
-            short_of = (
-                sin * onward - cos * aside
-            )  # distance times sine of the angle up to the bound
+            # The distance times the sine of the angle up to the bound.
+            short_of = sin * onward - cos * aside
             sector += short_of < 0
             least = np.minimum(least, np.abs(short_of))
         codes[part] = names[sector]

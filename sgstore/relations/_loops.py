@@ -313,7 +313,7 @@ def _views(
 
 @compiled
 def _blocked(x: float, y: float, box: Floats, to_x: float, to_y: float, height: float) -> bool:
-    """Whether a box at ``x, y`` blocks the line to a point."""  # as ``_sight._blocked``
+    """Return whether a box at ``x, y`` blocks the line to a point, as ``_sight._blocked`` does."""
     cos, sin = box[0], box[1]
     enters, leaves = 0.0, 1.0
     start_x, run_x = -x * cos - y * sin, to_x * cos + to_y * sin

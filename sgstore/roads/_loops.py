@@ -89,7 +89,7 @@ def touching(
 
 @compiled
 def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
-    """Whether a quadrangle counts in a cell: in a footprint's first all do, else those that begin there."""
+    """Return whether a quadrangle counts in a cell: all in a footprint's first, else those that begin there."""
     if cell_x > first[0] and quad_first[0] != cell_x:
         return False
     return cell_y == first[1] or quad_first[1] == cell_y
@@ -119,7 +119,7 @@ def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats
 def _meets(
     x: Floats, y: Floats, size: tuple[float, float], turn: float, touch: float
 ) -> tuple[bool, bool]:
-    """Whether no axis separates them, and whether the footprint's centre is in the quadrangle."""
+    """Return whether no axis separates them, and whether the footprint's centre is in the quadrangle."""
     a, b = size[0] + touch, size[1] + touch
     if x.min() > a or x.max() < -a or y.min() > b or y.max() < -b:
         return False, False
