@@ -108,7 +108,7 @@ def serve() -> None:
 
     import sgstore.cli._process as ending
     import sgstore.derive
-    import sgstore.exporters._registry
+    import sgstore.exporters._write
     import sgstore.importing
     import sgstore.ingest
     import sgstore.locks

@@ -492,21 +492,37 @@ def test_a_table_in_a_pipe_is_whole_however_late_a_long_value_comes(
     assert "a long value" in out.splitlines()
 
 
-def test_a_narrow_table_keeps_the_frames_that_one_will_type(
-    store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def shown(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *line: str) -> str:
+    """What a command line prints on a terminal of 70 columns."""
     monkeypatch.setenv("COLUMNS", "70")
     with capsys.disabled():
         main, side = os.openpty()
         with os.fdopen(side, "w") as terminal:
             monkeypatch.setattr(sys, "stdout", terminal)
-            assert run(["like", store, "town@20s", "--limit", "3"]) == 0
+            assert run(list(line)) == 0
         said = b""
         with suppress(OSError):  # the end of a terminal whose other side is closed
             while part := os.read(main, 1 << 16):
                 said += part
         os.close(main)
-    lines = said.decode().splitlines()
+    return said.decode()
+
+
+def test_a_late_value_in_the_last_column_may_use_the_room_that_is_left(
+    store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = "CASE i WHEN 201 THEN repeat('b', 9) WHEN 202 THEN repeat('c', 99) ELSE 'x' END"
+    rows = f"SELECT {late} AS v, {late} AS w FROM range(203) AS t(i)"
+    lines = shown(capsys, monkeypatch, "sql", store, rows).splitlines()
+
+    assert lines[-2:] == ["…  bbbbbbbbb", f"…  {'c' * 66}…"]
+
+
+def test_a_narrow_table_keeps_the_frames_that_one_will_type(
+    store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = shown(capsys, monkeypatch, "like", store, "town@20s", "--limit", "3")
+    lines = said.splitlines()
 
     assert all(len(line) <= 70 for line in lines)
     assert any("…" in line for line in lines)

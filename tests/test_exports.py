@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import sgstore
+from sgstore.cli import run
 from sgstore.demo import RECORDING
 from sgstore.errors import AbstractionError, ExportError, QueryError, TraceError
 from sgstore.exporters import (
@@ -302,6 +303,35 @@ def test_a_format_of_another_package_is_found(
     monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Broken()])
     with pytest.raises(ExportError, match=r"'broken' .* cannot be loaded: ImportError"):
         exporter_named("nothing")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [(ZeroDivisionError("so many"), "ZeroDivisionError('so many')"), (["a.txt"], "got 'a.txt'")],
+)
+def test_a_format_that_breaks_is_told_by_its_name_in_one_line(
+    given: Any, said: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    class Point:
+        name, value = "lines", "elsewhere:LINES"
+
+        def load(self) -> Exporter:
+            def write(export: Export, folder: Path) -> Any:
+                (folder / "lines.txt").touch()
+                if isinstance(given, Exception):
+                    raise given
+                return given
+
+            return Exporter("lines", write)
+
+    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
+    line = ["export", str(store.file.path), "MATCH (e:Ego)", "--format", "lines", "--to"]
+
+    assert run([*line, str(tmp_path / "out")]) == 1
+    (told,) = capsys.readouterr().err.splitlines()
+    assert told.startswith("sgstore: the format 'lines' cannot be written: ")
+    assert said in told
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

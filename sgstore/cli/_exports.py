@@ -23,6 +23,7 @@ from sgstore.cli._options import (
     seconds_of,
 )
 from sgstore.cli._output import Format, count_bar, say, write_rows
+from sgstore.exporters import EXPORTERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,6 +34,11 @@ if TYPE_CHECKING:
     from sgstore.world import Clip
 
 PANEL: Final = "Pictures and exports"
+
+
+def _formats(option: str = "") -> str:
+    """Formats of this package, or those of them that heed an option, for help."""
+    return ", ".join(one.name for one in EXPORTERS if not option or option in one.options)
 
 
 @dataclass(frozen=True)
@@ -52,17 +58,27 @@ class ClipOptions:
         ),
     ] = None
     with_graph: Annotated[
-        bool, Option("--with-graph", help="mcap: with the scene graphs, as JSON and to draw.")
+        bool,
+        Option(
+            "--with-graph",
+            help=f"{_formats('with_graph')}: with the scene graphs, as JSON and to draw.",
+        ),
     ] = False
     abstraction: Annotated[
-        str, Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs.")
+        str,
+        Option("--abstraction", help=f"{_formats('abstraction')}: abstraction of the graphs."),
     ] = ""
     channels: Annotated[
         list[str] | None,
-        Option("--channel", metavar="TOPIC", help="frames: only of this sensor; repeatable."),
+        Option(
+            "--channel",
+            metavar="TOPIC",
+            help=f"{_formats('channels')}: only of this sensor; repeatable.",
+        ),
     ] = None
     clouds: Annotated[
-        Literal["pcd", "npy", "bin"], Option("--clouds", help="frames: format of point clouds.")
+        Literal["pcd", "npy", "bin"],
+        Option("--clouds", help=f"{_formats('clouds')}: format of point clouds."),
     ] = "pcd"
 
 
@@ -83,9 +99,7 @@ def export(
             "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
         ),
     ] = None,
-    form: Annotated[
-        str, Option("--format", help="mcap, parquet, frames, nx, pyg, s3c, or of a package.")
-    ] = "mcap",
+    form: Annotated[str, Option("--format", help=f"{_formats()}, or of a package.")] = "mcap",
     as_json: AsJson = False,
     *,
     clip: ClipOptions,

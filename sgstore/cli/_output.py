@@ -313,12 +313,18 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
         return 0
     numeric = [all(_is_number(row[i]) for row in first) for i in range(len(columns))]
     widths = [max(len(name), *(len(row[i]) for row in first)) for i, name in enumerate(columns)]
-    widths = _fitted(columns, widths, _room(stream))
-    cut = stream.isatty()
-    stream.write(_line(columns, widths, numeric, cut=cut))
-    stream.write(_line(["─" * width for width in widths], widths, numeric, cut=cut))
+    room = _room(stream)
+    widths = _fitted(columns, widths, room)
+    most = None if room is None else [*widths[:-1], max(widths[-1], room - _before_last(widths))]
+    stream.write(_line(columns, widths, numeric, most))
+    stream.write(_line(["─" * width for width in widths], widths, numeric, most))
     rest = ([_cell(value) for value in row] for row in rows)
-    return _count(stream.write(_line(row, widths, numeric, cut=cut)) for row in chain(first, rest))
+    return _count(stream.write(_line(row, widths, numeric, most)) for row in chain(first, rest))
+
+
+def _before_last(widths: Sequence[int]) -> int:
+    """Letters of a row that stand before its last cell."""
+    return sum(widths[:-1]) + len(GAP) * (len(widths) - 1)
 
 
 def _room(stream: TextIO) -> int | None:
@@ -333,7 +339,7 @@ def _fitted(columns: Sequence[str], widths: list[int], room: int | None) -> list
     widths = list(widths)
     others = [i for i, name in enumerate(columns) if name not in _KEYS]
     for giving in (others, list(range(len(columns)))):
-        while giving and sum(widths) + len(GAP) * (len(widths) - 1) > room:
+        while giving and _before_last(widths) + widths[-1] > room:
             widest = max(giving, key=widths.__getitem__)
             if widths[widest] <= _LEAST:
                 break
@@ -342,12 +348,15 @@ def _fitted(columns: Sequence[str], widths: list[int], room: int | None) -> list
 
 
 def _line(
-    cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool], *, cut: bool
+    cells: Sequence[str],
+    widths: Sequence[int],
+    numeric: Sequence[bool],
+    most: Sequence[int] | None,
 ) -> str:
-    """A row as text; a cell that is too wide is cut on a terminal, and whole in a file or a pipe."""
+    """A row as text; cells are cut to so many letters, and whole in a file or a pipe (``None``)."""
     parts: list[str] = []
-    for cell, width, right in zip(cells, widths, numeric, strict=True):
-        text = f"{cell[: width - 1]}…" if cut and len(cell) > width else cell
+    for cell, width, right, room in zip(cells, widths, numeric, most or widths, strict=True):
+        text = f"{cell[: room - 1]}…" if most and len(cell) > room else cell
         parts.append(text.rjust(width) if right else text.ljust(width))
     return f"{GAP.join(parts).rstrip()}\n"
 

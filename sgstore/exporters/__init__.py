@@ -1,9 +1,8 @@
 """Clips of recordings and their graphs → files: one file for each format, listed in :data:`EXPORTERS`.
 
-``export`` says what is to be exported, ``stored`` writes it: aside first, then all of it or nothing, with a
-manifest. A format is a function from an :class:`~sgstore.exporters.export.Export` and a folder to what it wrote
-there; other packages add theirs as entry points of the group ``sgstore.exporters``: the name of the format, and
-an :class:`Exporter`.
+Each export is written aside first, then all of it is there or nothing, with a manifest. A format is a function
+from an :class:`Export` and a folder to what it wrote there; other packages add theirs as entry points of the
+group ``sgstore.exporters``: the name of the format, and an :class:`Exporter`.
 """
 
 import lazy_loader

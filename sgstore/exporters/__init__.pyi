@@ -14,11 +14,11 @@ from ._registry import EXPORTERS as EXPORTERS
 from ._registry import GROUP as GROUP
 from ._registry import Exporter as Exporter
 from ._registry import Write as Write
-from ._registry import around_frames as around_frames
+from ._write import around_frames as around_frames
 from ._registry import exporter_named as exporter_named
 from ._registry import exporters as exporters
-from ._registry import labelled as labelled
-from ._registry import write_export as write_export
+from ._write import labelled as labelled
+from ._write import write_export as write_export
 
 __all__ = [
     "ClipFrames",

@@ -1,37 +1,26 @@
-"""The registry of exporters, and export from a store.
+"""The registry of exporters: formats of this package, and those of others.
 
-A format is a function from an :class:`Export` and a folder to what it wrote there. What it writes is there as a
-whole or not at all, with a manifest.
+A format is a function from an :class:`Export` and a folder to what it wrote there. This module loads none of
+them, and is cheap to load: the command line names formats and their options in its help.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from sgstore import plugins
 from sgstore.errors import ExportError
-from sgstore.exporters._clips import (
-    WrittenClip,
-    WrittenFile,
-    export_folder,
-    provenance_of,
-    write_manifest,
-)
-from sgstore.exporters._labels import Export, Labels
-from sgstore.matches import merged
-from sgstore.vocabulary import natural, suggestion
-from sgstore.world import Clip, tolerance_ns
+from sgstore.vocabulary import suggestion
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Sequence
 
-    from sgstore.query import Store
+    from sgstore.exporters._clips import WrittenClip, WrittenFile
+    from sgstore.exporters._labels import Export
 
 
 GROUP: Final = plugins.EXPORTERS.group
@@ -118,119 +107,3 @@ def exporter_named(name: str) -> Exporter:
         hint = f"did you mean '{like}'?" if like else f"known: {', '.join(found)}"
         raise ExportError(f"no export format '{name}'; {hint}")
     return found[name]
-
-
-# From a store to files: which recordings clips are cut from, and clips around frames that are named ----
-
-OPTIONS: Final = {
-    "abstraction": "abstraction",
-    "with_graph": "with-graph",
-    "channels": "channel",
-    "clouds": "clouds",
-}
-"""Options of an export that only some formats mind, and what the command line calls them."""
-
-
-def around_frames(
-    store: Store, frames: Iterable[int | str], before: float, after: float
-) -> list[Clip]:
-    """Clips around frames; those that overlap are one.
-
-    Parameters
-    ----------
-    store : Store
-    frames : iterable
-        ``frame_id``, ``TRACE#SEQ`` or ``TRACE@12.3s`` each.
-    before, after : float
-        What is added at both ends; s.
-
-    Raises
-    ------
-    StoreError
-        There is no such frame.
-    """
-    found = [store.file.frame(frame) for frame in frames]
-    clips = (
-        Clip(f.trace, f.log_time_ns - round(before * 1e9), f.log_time_ns + round(after * 1e9))
-        for f in found
-    )
-    periods = {one.name: tolerance_ns(one.period_ns) for one in store.info()}
-    return list(
-        merged(sorted(clips, key=lambda clip: (natural(clip.trace), clip.start_ns)), periods)
-    )
-
-
-def labelled(export: Export, texts: Mapping[str, str], **parameters: object) -> Export:
-    """An export with labels for the frames of its clips.
-
-    Parameters
-    ----------
-    export : Export
-    texts : mapping
-        Name → expression or query; see :mod:`sgstore.exporters._labels`.
-    **parameters
-        Values of ``$name`` in them.
-
-    Raises
-    ------
-    QueryError, ExportError
-        A text is neither an expression nor a query, or has several values in a frame.
-    """
-    if not texts:
-        return export
-    frame_id = np.concatenate([frames.frame_id for frames in export.frames()])
-    return replace(export, labels=Labels.asked(export.store, texts, frame_id, **parameters))
-
-
-def write_export(
-    export: Export, to: str | Path, form: str = "mcap"
-) -> list[WrittenClip | WrittenFile]:
-    """Write clips of a store, all of it or nothing.
-
-    Parameters
-    ----------
-    export : Export
-    to : str or Path
-        Folder; made if it does not exist, and nothing in it is overwritten.
-    form : str
-        Name of an exporter.
-
-    Returns
-    -------
-    list of WrittenClip or WrittenFile
-        What is there now, without the manifest.
-
-    Raises
-    ------
-    ExportError, TraceError
-        As the exporter says, there is no such format, or it does not mind an option; then nothing is written.
-    """
-    to, exporter = Path(to), exporter_named(form)
-    _check(export, exporter)
-    told = replace(export, provenance=provenance_of(dict(export.provenance)))
-    with told.store.file.snapshot(), export_folder(to) as folder:
-        written = list(exporter.write(told, folder))
-        clips = [one for one in written if isinstance(one, WrittenClip)]
-        files = [one for one in written if isinstance(one, WrittenFile)]
-        if clips and not files:
-            content = {"clips": [one.as_dict() for one in clips]}
-            write_manifest(folder, "sgstore.clips", content)
-        else:
-            content = {"form": form, **told.about(), "files": [one.as_dict() for one in files]}
-            write_manifest(folder, "sgstore.export", content)
-    return [replace(one, file=to / one.file.name) for one in written]
-
-
-def _check(export: Export, exporter: Exporter) -> None:
-    for option in fields(Export):
-        name = option.name
-        if name not in OPTIONS or name in exporter.options:
-            continue
-        if getattr(export, name) != option.default:
-            told = f"--{OPTIONS[name]}"
-            raise ExportError(f"{told} is not for the format '{exporter.name}'")
-    for clip in export.clips:
-        if clip.start_ns > clip.end_ns:
-            raise ExportError(
-                f"a clip of {clip.trace!r} ends at {clip.end_ns} ns, before its start"
-            )

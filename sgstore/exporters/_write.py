@@ -1,0 +1,157 @@
+"""Export from a store: clips around frames that are named, labels, and all files or none, with a manifest."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import ExportError, SgstoreError
+from sgstore.exporters._clips import (
+    WrittenClip,
+    WrittenFile,
+    export_folder,
+    provenance_of,
+    write_manifest,
+)
+from sgstore.exporters._labels import Export, Labels
+from sgstore.exporters._registry import exporter_named
+from sgstore.matches import merged
+from sgstore.vocabulary import natural
+from sgstore.world import Clip, tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.exporters._registry import Exporter
+    from sgstore.query import Store
+
+OPTIONS: Final = {
+    "abstraction": "abstraction",
+    "with_graph": "with-graph",
+    "channels": "channel",
+    "clouds": "clouds",
+}
+"""Options of an export that only some formats mind, and what the command line calls them."""
+
+
+def around_frames(
+    store: Store, frames: Iterable[int | str], before: float, after: float
+) -> list[Clip]:
+    """Clips around frames; those that overlap are one.
+
+    Parameters
+    ----------
+    store : Store
+    frames : iterable
+        ``frame_id``, ``TRACE#SEQ`` or ``TRACE@12.3s`` each.
+    before, after : float
+        What is added at both ends; s.
+
+    Raises
+    ------
+    StoreError
+        There is no such frame.
+    """
+    found = [store.file.frame(frame) for frame in frames]
+    clips = (
+        Clip(f.trace, f.log_time_ns - round(before * 1e9), f.log_time_ns + round(after * 1e9))
+        for f in found
+    )
+    periods = {one.name: tolerance_ns(one.period_ns) for one in store.info()}
+    return list(
+        merged(sorted(clips, key=lambda clip: (natural(clip.trace), clip.start_ns)), periods)
+    )
+
+
+def labelled(export: Export, texts: Mapping[str, str], **parameters: object) -> Export:
+    """An export with labels for the frames of its clips.
+
+    Parameters
+    ----------
+    export : Export
+    texts : mapping
+        Name → expression or query; see :mod:`sgstore.exporters._labels`.
+    **parameters
+        Values of ``$name`` in them.
+
+    Raises
+    ------
+    QueryError, ExportError
+        A text is neither an expression nor a query, or has several values in a frame.
+    """
+    if not texts:
+        return export
+    frame_id = np.concatenate([frames.frame_id for frames in export.frames()])
+    return replace(export, labels=Labels.asked(export.store, texts, frame_id, **parameters))
+
+
+def write_export(
+    export: Export, to: str | Path, form: str = "mcap"
+) -> list[WrittenClip | WrittenFile]:
+    """Write clips of a store, all of it or nothing.
+
+    Parameters
+    ----------
+    export : Export
+    to : str or Path
+        Folder; made if it does not exist, and nothing in it is overwritten.
+    form : str
+        Name of an exporter.
+
+    Returns
+    -------
+    list of WrittenClip or WrittenFile
+        What is there now, without the manifest.
+
+    Raises
+    ------
+    ExportError, TraceError
+        As the exporter says, or it breaks; there is no such format, or it does not mind an option. Then nothing
+        is written.
+    """
+    to, exporter = Path(to), exporter_named(form)
+    _check(export, exporter)
+    told = replace(export, provenance=provenance_of(dict(export.provenance)))
+    with told.store.file.snapshot(), export_folder(to) as folder:
+        written = _written(exporter, told, folder)
+        clips = [one for one in written if isinstance(one, WrittenClip)]
+        files = [one for one in written if isinstance(one, WrittenFile)]
+        if clips and not files:
+            content = {"clips": [one.as_dict() for one in clips]}
+            write_manifest(folder, "sgstore.clips", content)
+        else:
+            content = {"form": form, **told.about(), "files": [one.as_dict() for one in files]}
+            write_manifest(folder, "sgstore.export", content)
+    return [replace(one, file=to / one.file.name) for one in written]
+
+
+def _written(exporter: Exporter, export: Export, folder: Path) -> list[WrittenClip | WrittenFile]:
+    """What an exporter wrote; whatever breaks in it, which may be of another package, is told by its name."""
+    try:
+        written: list[Any] = list(exporter.write(export, folder))
+        odd = [one for one in written if not isinstance(one, WrittenClip | WrittenFile)]
+        if odd:
+            raise TypeError(f"expected WrittenClip or WrittenFile, got {odd[0]!r}")
+    except SgstoreError:
+        raise
+    except Exception as fault:
+        raise ExportError(f"the format {exporter.name!r} cannot be written: {fault!r}") from fault
+    return written
+
+
+def _check(export: Export, exporter: Exporter) -> None:
+    for option in fields(Export):
+        name = option.name
+        if name not in OPTIONS or name in exporter.options:
+            continue
+        if getattr(export, name) != option.default:
+            told = f"--{OPTIONS[name]}"
+            raise ExportError(f"{told} is not for the format '{exporter.name}'")
+    for clip in export.clips:
+        if clip.start_ns > clip.end_ns:
+            raise ExportError(
+                f"a clip of {clip.trace!r} ends at {clip.end_ns} ns, before its start"
+            )
