@@ -116,6 +116,8 @@ QUERIES = [
     "MATCH (e:Ego) WHERE e.speed > 900 RETURN e.speed",
     "MATCH (e:Ego)-[:near]->(v:Vehicle) THEN MATCH (e)-[:very_near]->(v)",
     "MATCH (e:Ego)-[:near]->(v:Vehicle) RETURN DISTINCT v.name AS name, trace.name",
+    "MATCH (e:Ego)-[:near]->(v:Vehicle)",
+    "MATCH (e:Ego)-[:near]->(v:Vehicle) RETURN v.name, ttc(e, v) AS ttc, e.gear, v.speed > 3 AS fast",
 ]
 
 
@@ -135,6 +137,25 @@ def test_tables_of_matches_are_those_of_their_rows(
     assert ours[1].schema == theirs[1].schema
     assert ours[1].equals(theirs[1])
     assert ours[2].equals(theirs[2])
+
+
+@pytest.mark.parametrize("form", ["parquet", "arrow"])
+@pytest.mark.parametrize("query", [*QUERIES, f"{QUERIES[0]} LIMIT 30", f"{QUERIES[0]} LIMIT 0"])
+def test_files_of_matches_are_those_of_their_rows(
+    query: str, form: str, town_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("FIRST_WINDOW", "LAST_WINDOW"):
+        monkeypatch.setattr(sgstore.matches, name, 2)
+    monkeypatch.setattr(rows_of_store, "_TOGETHER", 100)  # rows whose values tell the types
+
+    def written(name: str) -> bytes:
+        assert run(["find", str(town_store), query, "-o", str(tmp_path / name)]) == 0
+        return (tmp_path / name).read_bytes()
+
+    ours = written(f"a.{form}")
+    monkeypatch.setattr(rows_of_store, "record_batches", nothing)
+
+    assert ours == written(f"b.{form}")
 
 
 @pytest.mark.parametrize("form", ["arrow", "polars"])
@@ -183,7 +204,7 @@ def test_files_of_the_verb_hold_the_same_rows(
         return (tmp_path / name).read_bytes()
 
     ours = written(f"a.{form}")
-    monkeypatch.setattr(rows_of_store, "parquet_of", nothing)
+    monkeypatch.setattr(rows_of_store, "record_batches", nothing)
 
     assert ours == written(f"b.{form}")
     assert np.array_equal([row[0] for row in store.sql(sql.format(300))], np.arange(300))

@@ -95,7 +95,10 @@ def find(
             number = matches.count()
             typer.echo(number)
             return NO_MATCH if require and not number else 0
-        number = ask.write(*_as_shown(matches, matches, ask.chosen))
+        if ask.chosen in BINARY and not matches.graphs:
+            number = write_binary(matches.parquet, ask.chosen, ask.output)
+        else:
+            number = ask.write(*_as_shown(matches, matches, ask.chosen))
     return _ended(number, ask, require=require)
 
 

@@ -31,9 +31,11 @@ from ._rows import ParquetTable as ParquetTable
 from ._rows import Rows as Rows
 from ._rows import Tabular as Tabular
 from ._rows import as_told as as_told
+from ._rows import as_told_batches as as_told_batches
 from ._rows import arrow_file as arrow_file
 from ._rows import count_parquet as count_parquet
 from ._rows import write_csv as write_csv
+from ._rows import write_batches as write_batches
 from ._rows import write_parquet as write_parquet
 from ._similarity import SimilarFrames as SimilarFrames
 from ._staging import Sealed as Sealed
@@ -71,6 +73,7 @@ __all__ = [
     "UserTables",
     "WINDOW",
     "arrow_file",
+    "as_told_batches",
     "begins",
     "count_parquet",
     "frame_ids",
@@ -87,5 +90,6 @@ __all__ = [
     "trace_of",
     "verify_file",
     "write_csv",
+    "write_batches",
     "write_parquet",
 ]

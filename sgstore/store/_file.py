@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
-    from sgstore.store._rows import Parameters
+    from sgstore.store._rows import ArrowStream, Parameters
     from sgstore.store._similarity import SimilarFrames
     from sgstore.store._staging import Sealed
     from sgstore.store._verify import Verification
@@ -207,6 +207,14 @@ class StoreFile:
         with self._answered(lambda at, _: Batches(at, sql, parameters, size), given) as found:
             yield found
 
+    @contextmanager
+    def record_batches(
+        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
+    ) -> Generator[ArrowStream | None]:
+        """Rows of a statement of ours as a stream of Arrow; see :func:`sgstore.store._rows.record_batches`."""
+        with self._answered(lambda at, _: rows.record_batches(at, sql, parameters), given) as found:
+            yield found
+
     def user_sql(
         self, sql: str, *, timeout_s: float | None = None, max_rows: int | None = None
     ) -> Rows:
@@ -269,7 +277,12 @@ class StoreFile:
         ExportError
             The file cannot be written.
         """
-        number = self._user_step(sql, timeout_s, lambda at: rows.parquet_of(at, sql, to))
+
+        def step(connection: DuckDBPyConnection) -> int | None:
+            stream = rows.record_batches(connection, sql)
+            return None if stream is None else rows.write_batches(stream, to)
+
+        number = self._user_step(sql, timeout_s, step)
         if number is not None:
             return number
         with self.user_batches(sql, timeout_s=timeout_s) as batches:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Parameters = Sequence[object] | Mapping[str, object]
+    ArrowStream = tuple[list[tuple[str, str]], Iterator[Any]]
+    """Names and types of columns, and batches of their rows."""
 
 
 T = TypeVar("T")
@@ -695,27 +697,20 @@ def write_parquet(
     return table.rows
 
 
-def parquet_of(connection: DuckDBPyConnection, sql: str, to: Path) -> int | None:
-    """Write the rows of a statement to a Parquet file, a batch of Arrow at a time.
+def record_batches(
+    connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None
+) -> ArrowStream | None:
+    """Columns of a statement, and its rows as batches of Arrow, one in memory at a time.
 
-    Returns
-    -------
-    int or None
-        How many rows were written. ``None``, and nothing is written: pyarrow is not installed, or a column is
-        not plain (:func:`table_of`).
-
-    Raises
-    ------
-    ExportError
-        The file cannot be written.
+    ``None``, and nothing is searched: pyarrow is not installed, or a column is not plain (:func:`table_of`).
     """
     try:
-        arrow = _package("pyarrow")
+        _package("pyarrow")
     except MissingExtraError:
         return None
 
     def begun() -> Any:
-        relation: Any = connection.sql(sql)
+        relation: Any = connection.sql(sql, params=parameters or None)
         if not _is_plain(relation):
             return None, ()
         begin = getattr(relation, "to_arrow_reader", None) or relation.fetch_record_batch
@@ -729,13 +724,41 @@ def parquet_of(connection: DuckDBPyConnection, sql: str, to: Path) -> int | None
             raise (duckdb.InterruptException if stopped else duckdb.Error)(str(error)) from error
 
     reader, columns = interruptible(connection, begun)
-    if reader is None:
-        return None
+    return reader and (columns, iter(lambda: interruptible(connection, more), None))
+
+
+def as_told_batches(columns: Sequence[str], stream: ArrowStream) -> ArrowStream:
+    """A stream whose columns have other names, and the types that :func:`write_parquet` tells by values."""
+    (named, batches), first, rows = stream, list[Any](), 0
+    for batch in batches:
+        first.append(batch)
+        if (rows := rows + len(batch)) >= _TOGETHER:
+            break
+    arrow = _package("pyarrow")
+    seen = arrow.Table.from_batches(first).slice(0, _TOGETHER) if first else ()
+    wide = {"INTEGER": "BIGINT", "FLOAT": "DOUBLE"}
+    kinds = ["VARCHAR" if kind.startswith("ENUM") else wide.get(kind, kind) for _, kind in named]
+    for i in range(len(kinds)):
+        if not rows or seen[i].null_count == len(seen):
+            kinds[i] = "VARCHAR"
+    return list(zip(columns, kinds, strict=True)), chain(first, batches)
+
+
+def write_batches(stream: ArrowStream, to: Path) -> int:
+    """Write batches of Arrow to a Parquet file, as :func:`write_parquet` writes rows; how many rows there are.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    columns, batches = stream
+    arrow = _package("pyarrow")
+    names = [f"c{i}" for i in range(len(columns))]
     with written_at(to) as place, ParquetTable(place, columns, enums=True, called=to) as table:
-        while (batch := interruptible(connection, more)) is not None:
-            columns = [_without_nan(column) for column in batch.columns]
-            names = [f"c{i}" for i in range(len(columns))]
-            table.add_arrow(arrow.Table.from_arrays(columns, names=names))
+        for batch in batches:
+            arrays = [_without_nan(column) for column in batch.columns]
+            table.add_arrow(arrow.Table.from_arrays(arrays, names=names))
     return table.rows
 
 
