@@ -412,15 +412,16 @@ def others(objects: Objects) -> list[str]:
 # Words ------------------------------------------------------------------------------------------------------
 
 
-def _statements() -> Iterator[Tokens]:
+@cache
+def _statements() -> tuple[Tokens, ...]:
     """The statements of ``schema.sql``, as words."""
-    words: list[str] = []
+    found: list[list[str]] = [[]]
     for word in _words(schema_sql()):
         if word == ";":
-            yield tuple(words)
-            words = []
+            found.append([])
         else:
-            words.append(word)
+            found[-1].append(word)
+    return tuple(map(tuple, found[:-1]))
 
 
 def _words(sql: str) -> list[str]:
