@@ -32,7 +32,7 @@ from sgstore.mcap import Loss, check_name
 from sgstore.readers import on_map, open_trace
 from sgstore.relations import Crowds, renamed
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.store import Identity, Segment, StoreFile
+from sgstore.store import Identity, OnMap, Segment, StoreFile
 from sgstore.trace_parts import TracePart
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled
 from sgstore.world import longest_step_ns
@@ -270,7 +270,7 @@ class TraceTally:
 
 # One recording → sealed segments, one for each ego ----------------------------------------------
 
-EGOS_AT_ONCE: Final = 4
+EGOS_AT_ONCE: Final = 8
 """Egos whose graphs are built in one pass over a recording: each needs the memory of a segment."""
 
 _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
@@ -312,6 +312,7 @@ class SegmentReader:
         self._on_block = on_block
         self._maps = Maps(job.road_map, job.config.signs)
         self._file: StoreFile | None = None
+        self._on_map: OnMap | None = None
 
     def read(self, path: Path, folder: Path) -> list[tuple[TraceOutcome, Path | None]]:
         """Read a recording; segments are built in folders below the one that is given, which need not exist.
@@ -348,6 +349,10 @@ class SegmentReader:
                 for one in self._wanted(trace, views)
                 if store is None or self._is_new(store, one, road_map)
             ]
+            if store is not None and wanted:  # who publishes need not wait for this process
+                store.close()
+            if wanted and not job.dry_run:
+                config = replace(config, exclude_ids=self._excluded(trace))
             for first in range(0, len(wanted), EGOS_AT_ONCE):
                 group = wanted[first : first + EGOS_AT_ONCE]
                 for one in group:
@@ -356,7 +361,7 @@ class SegmentReader:
                     if job.dry_run:
                         one.outcome.status = "new"
                 if not job.dry_run:
-                    self._build(trace, group, road_map, folder / str(first))
+                    self._build(trace, group, road_map, config, folder / str(first))
 
     # Which views ----------------------------------------------------------------------------------------------
 
@@ -371,7 +376,7 @@ class SegmentReader:
         for name in self._vehicles(trace) if everyone else egos:
             view = _EgoView(TraceOutcome(info.path, ego=name), info)
             try:
-                found = name if everyone else _ident(info, name, self._job.config.mapping)
+                found = name if everyone else self._ident(trace, name)
             except SgstoreError as error:
                 view.outcome.error = error
                 views.append(view)
@@ -382,14 +387,27 @@ class SegmentReader:
                 views.append(view)
                 yield view
 
-    def _excluded(self, info: TraceInfo) -> tuple[str, ...]:
+    def _excluded(self, trace: MessageTrace) -> tuple[str, ...]:
         """The ids of what is to be left out; what is no role or name of a vehicle is an id."""
         found: list[str] = []
         for name in self._job.config.exclude_ids:
             with suppress(SgstoreError):
-                found.append(_ident(info, name, self._job.config.mapping))
+                found.append(self._ident(trace, name))
             found.append(name)
         return tuple(dict.fromkeys(found))
+
+    def _ident(self, trace: MessageTrace, name: str) -> str:
+        """The id of the ego that a name means, as the reader of the recording understands it."""
+        info = trace.info
+        try:
+            found = trace.ego_named(name)
+        except TraceError as error:
+            raise TraceError(error.reason, path=info.path) from error
+        if found is not None:
+            return found
+        mapping = self._job.config.mapping
+        with open_trace(info.path, ego=name, digest=info.digest, mapping=mapping) as again:
+            return again.info.ego
 
     def _vehicles(self, trace: MessageTrace) -> list[str]:
         """The ids of all vehicles of a recording."""
@@ -420,11 +438,15 @@ class SegmentReader:
     # Building -------------------------------------------------------------------------------------------------
 
     def _build(
-        self, trace: MessageTrace, group: list[_EgoView], road_map: RoadMap | None, folder: Path
+        self,
+        trace: MessageTrace,
+        group: list[_EgoView],
+        road_map: RoadMap | None,
+        config: Config,
+        folder: Path,
     ) -> None:
         """Build the segments of some views in one pass over the recording."""
         job, size = self._job, self._job.block_frames
-        config = replace(job.config, exclude_ids=self._excluded(trace.info))
         generator = SceneGraphGenerator(road_map, config)
         tally = TraceTally()
         blocks = job.part.blocks(map(self._meant, trace.blocks(size)), size)
@@ -434,13 +456,20 @@ class SegmentReader:
         with ExitStack() as stack:
             segments: list[Segment] = []
             shown, part = map_of_graphs(road_map, job.config), (job.part.since, job.part.until)
+            if self._on_map is None or self._on_map.road_map is not shown:
+                self._on_map = OnMap(shown)
             for number, one in enumerate(group):
                 one.sealed = folder.with_name(f"{folder.name}-{number}")
                 one.sealed.mkdir(parents=True)
                 identity = Identity.of(one.info, job.config, shown, part)
                 place = (one.sealed, len(group))
                 segment = Segment(
-                    job.store, one.info, identity, shown, generator.answers, place=place
+                    job.store,
+                    one.info,
+                    identity,
+                    self._on_map,
+                    generator.answers,
+                    place=place,
                 )
                 segments.append(stack.enter_context(segment))
             while block := first or next(blocks, None):
@@ -502,12 +531,6 @@ class SegmentReader:
     def _meant(self, block: FrameBlock) -> FrameBlock:
         """The frames, their entities as the client says that type names are meant."""
         return replace(block, entities=renamed(block.entities, self._job.config.types))
-
-
-def _ident(info: TraceInfo, name: str, mapping: str) -> str:
-    """The id of the ego that a name means, as the reader of the recording understands it."""
-    with open_trace(info.path, ego=name, digest=info.digest, mapping=mapping) as trace:
-        return trace.info.ego
 
 
 def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:

@@ -10,10 +10,12 @@ import pytest
 from carla_recordings import Bridge, vehicle
 from foxglove_scenes import SceneRecorder, cube
 from killing import content, made
+from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive, person
 
 import sgstore.mcap._fetch as fetch
 from sgstore import ingest as workers
+from sgstore import readers, segments
 from sgstore.config import Config, RangeSettings
 from sgstore.errors import MapError, StoreError, TraceError
 from sgstore.ingest import ingest, recordings
@@ -266,6 +268,7 @@ def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six cars and a person; car 5 comes late and car 6 goes early."""
     path = tmp_path_factory.mktemp("crowd") / "crowd.mcap"
     with Recorder(path) as recorder:
+        recorder.map(a_map(a_road("1", line(200.0, x=-20.0, y=2.0))))
         for i in range(80):
             here = [k for k in range(1, 7) if not (k == 5 and i < 65) and not (k == 6 and i > 30)]
             cars = [car(k, 15.0 * k + i / 10, 3.5 * (k % 2), v=(1, 0)) for k in here]
@@ -291,9 +294,12 @@ def of_trace(store: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
     }
 
 
+@pytest.mark.parametrize("at_once", [2, 8])
 def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(
-    crowd: Any, tmp_path: Path
+    crowd: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
 ) -> None:
+    """In one reading, or in several that share the rows of the map and the classes of their frames."""
+    monkeypatch.setattr(segments, "EGOS_AT_ONCE", at_once)
     small = Config(range=RangeSettings(25.0))
 
     outcomes = ingest(tmp_path / "s.db", [crowd], config=small, egos=["5", "1", "6"])
@@ -309,6 +315,27 @@ def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(
         assert of_trace(tmp_path / "s.db", outcome.name) == of_trace(alone, "crowd")
     again = ingest(tmp_path / "s.db", [crowd], config=small, egos=["1", "2"])
     assert [(o.ego, o.status) for o in again] == [("1", "present"), ("2", "added")]
+
+
+def test_names_of_egos_are_looked_up_in_a_recording_that_is_open(
+    crowd: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+
+    def open_trace(path: Path, **options: Any) -> Any:
+        opened.append(path)
+        return readers.open_trace(path, **options)
+
+    monkeypatch.setattr(segments, "open_trace", open_trace)
+    config = Config(egos=("5", "1", "nobody"), exclude_ids=("2", "somebody"))
+
+    outcomes = ingest(tmp_path / "s.db", [crowd], config=config)
+
+    assert [o.status for o in outcomes] == ["added", "added", "failed"]
+    assert opened == [crowd]
+    message = str(outcomes[2].error)
+    (alone,) = ingest(tmp_path / "alone.db", [crowd], config=Config(ego="nobody"))
+    assert message == str(alone.error)
 
 
 def test_every_vehicle_can_be_an_ego(crowd: Any, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from sgstore.importing._resolve import (
 )
 from sgstore.mcap import Loss, check_name, digest_of, mark_of
 from sgstore.roads import MapEdges, MapNodes, Ribbons, RoadMap
-from sgstore.store import Folder, Identity, Segment, StoreFile
+from sgstore.store import Folder, Identity, OnMap, Segment, StoreFile
 from sgstore.vocabulary import (
     DIRECTIONS,
     KIND_CODE,
@@ -220,7 +220,9 @@ class _ImportRun:
         blocks = Blocks(info.path, road_map, self.period_ns, any_state=any_state)
         graphs = map(understanding.of, FORMATS[self._form](info.path))
         identity = Identity.of(info, Config(), road_map)
-        with Segment(self._path, info, identity, road_map, answers, place=(folder, 1)) as segment:
+        with Segment(
+            self._path, info, identity, OnMap(road_map), answers, place=(folder, 1)
+        ) as segment:
             kinds: Counter[str] = Counter()
             for some in _blocks(graphs):
                 graph = self._append(segment, blocks, some, done)

@@ -7,6 +7,7 @@ frames can be read; a :class:`~sgstore.readers._blocks.MessageDecoder`, which ma
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
@@ -244,6 +245,18 @@ class Survey(Generic[AnyLead]):
         """The reason why no channel leads."""
         raise NotImplementedError
 
+    def ego_named(self, name: str) -> str | None:
+        """The id of the ego that a name means; None if a reading that begins with it may find more.
+
+        Raises
+        ------
+        TraceError
+            Nothing bears the name, or several things do.
+        """
+        asked = copy(self)  # what an ego is found by stays; the ego that was found does, too
+        asked.wanted, asked.about_ego = name, []
+        return asked.find_ego()
+
     def find_ego(self) -> str:
         """Find the ego, and return its id; empty if there is none.
 
@@ -350,6 +363,17 @@ class MessageTrace:
         """Close the file."""
         self.recording.close()
 
+    def ego_named(self, name: str) -> str | None:
+        """The id of the ego that a name means; None if the recording must be opened for it to be known.
+
+        Raises
+        ------
+        TraceError
+            Nothing bears the name, or several things do.
+        """
+        del name
+        return None
+
     def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
         """A decoder that has read nothing yet. What is known already goes to the report of its reading."""
         raise NotImplementedError
@@ -393,6 +417,7 @@ class SurveyedTrace(MessageTrace):
     """
 
     def __init__(self, survey: Survey[Any], digest: str, **more: Any) -> None:
+        self._found = survey
         recording = survey.recording
         _, digest = read_and_digest(recording.path, digest, survey.read)
         survey.leading = survey.first_lead()
@@ -409,6 +434,10 @@ class SurveyedTrace(MessageTrace):
             lost_lanes=tuple(dict.fromkeys(survey.lost_lanes)),
             **more,
         )
+
+    def ego_named(self, name: str) -> str | None:
+        """The id of the ego that a name means, by what the first reading found."""
+        return self._found.ego_named(name)
 
 
 # Flavours that tell plain frames: messages → frames → blocks of frames ----------------------------
@@ -486,6 +515,10 @@ class FramesTrace(MessageTrace):
             map_text=map_text,
             map_name="map" if map_text else "",
         )
+
+    def ego_named(self, name: str) -> str:
+        """The id of the ego that a name means: ids are all that frames tell."""
+        return name
 
     @staticmethod
     def role(channel: Channel) -> str:

@@ -45,6 +45,7 @@ from ._traces import StoredTrace as StoredTrace
 from ._traces import free_name as free_name
 from ._traces import trace_id_of as trace_id_of
 from ._verify import verify_file as verify_file
+from ._write import OnMap as OnMap
 from ._write import Segment as Segment
 
 __all__ = [
@@ -59,6 +60,7 @@ __all__ = [
     "MessagePlaces",
     "OldMap",
     "OldTrace",
+    "OnMap",
     "ParquetTable",
     "PresentError",
     "Remains",

@@ -42,7 +42,7 @@ from sgstore.store._traces import (
     stored_traces,
     trace_named,
 )
-from sgstore.store._write import Segment
+from sgstore.store._write import OnMap, Segment
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
@@ -545,7 +545,7 @@ class StoreFile:
             Relations that they can hold.
         """
         identity = Identity.of(info, config, road_map)
-        return Segment(self.path, info, identity, road_map, answers, access=self.access)
+        return Segment(self.path, info, identity, OnMap(road_map), answers, access=self.access)
 
     def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
         """Bring a trace into the store, in one transaction.

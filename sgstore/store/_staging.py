@@ -140,6 +140,20 @@ class TableFile:
         except OSError as error:
             raise self._wrong("cannot be written", error) from error
 
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._size
+
+    def behind(self, at: int) -> bytes:
+        """All that stands in the file from a place on."""
+        return self._bytes(at, self._size - at)
+
+    def adopt(self, pieces: bytes) -> None:
+        """Write pieces of another file behind the others; only who reads the file again finds them."""
+        self._write(pieces)
+        self._size += len(pieces)
+
     def pieces(self, table: str) -> list[Piece]:
         """The pieces of a table, in the order in which they were written."""
         return [piece for piece in self._pieces if piece.table == table]
@@ -257,6 +271,17 @@ _RUNS: Final = {
 """Tables whose pieces of masks may be too many for memory; and the first column that tells their rows apart."""
 
 
+class StagedRows(NamedTuple):
+    """Rows of whole tables, as a :class:`Staging` has written them.
+
+    ``words``: enumeration → values in them that ``schema.sql`` has not.
+    """
+
+    pieces: bytes
+    checksums: dict[str, Checksum]
+    words: dict[str, list[str]]
+
+
 class Staging:
     """The tables of one trace.
 
@@ -338,6 +363,18 @@ class Staging:
         """Enumeration → values that a store must be able to hold: relations that are answered, what is new."""
         relations = sorted({*answers, *self._new.get("relation", ())})
         return {**self._new, "relation": relations}
+
+    def shared(self) -> StagedRows:
+        """Write all tables so far, and return their rows for other stagings. No rows come to these any more."""
+        for table in [*self._waiting]:
+            self.write(table)
+        return StagedRows(self._file.behind(0), dict(self.checksums), dict(self._new))
+
+    def adopt(self, rows: StagedRows) -> None:
+        """Take tables that another staging settled, before any other rows."""
+        self._file.adopt(rows.pieces)
+        self.checksums.update(rows.checksums)
+        self._new.update({enum: [*names] for enum, names in rows.words.items()})
 
     def mark(self, table: str, name: str, values: NDArray[Any]) -> None:
         """Add a column to the rows of a table that does not grow."""

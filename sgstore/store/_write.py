@@ -30,8 +30,36 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.store._locking import Access
     from sgstore.store._packing import Columns
+    from sgstore.store._staging import StagedRows
     from sgstore.store._traces import Identity
     from sgstore.world import Codes, FrameBlock, Ints, TraceInfo, TraceReport
+
+
+class OnMap:
+    """Work that the segments on one road map share: classes of their frames, and the rows of the map.
+
+    Parameters
+    ----------
+    road_map : RoadMap or None
+        Also an attribute.
+    """
+
+    def __init__(self, road_map: RoadMap | None) -> None:
+        self.road_map = road_map
+        self.classes = IngestedClasses(road_map)
+        self._rows: StagedRows | None = None
+
+    def insert_into(self, staging: Staging, map_id: int) -> None:
+        """Insert the tables of the map, as the first rows of a staging."""
+        if self.road_map is None:
+            return
+        if self._rows is not None:
+            staging.adopt(self._rows)
+            return
+        for table, columns in _map_tables(self.road_map).items():
+            count = len(next(iter(columns.values())))
+            staging.insert(table, columns | {"map_id": np.full(count, map_id)})
+        self._rows = staging.shared()
 
 
 class Segment:
@@ -44,7 +72,8 @@ class Segment:
     info : TraceInfo
     identity : Identity
         What the trace is in the store, and the settings it was read with.
-    road_map : RoadMap or None
+    on_map : OnMap
+        The map, with what other segments on it have made already.
     answers : tuple of str
         Relations that the generator can answer.
     place : tuple, optional
@@ -63,7 +92,7 @@ class Segment:
         store: Path,
         info: TraceInfo,
         identity: Identity,
-        road_map: RoadMap | None,
+        on_map: OnMap,
         answers: tuple[str, ...],
         *,
         place: tuple[Path, int] | None = None,
@@ -74,7 +103,7 @@ class Segment:
         self._info = info
         self._identity = identity
         self._answers = answers
-        self._road_map = road_map
+        self._road_map = road_map = on_map.road_map
         self._channel_ids = np.array([c.id for c in info.channels], np.int64)
         self._kinds = NodeKinds(
             entities=np.zeros(0, np.int8),
@@ -82,7 +111,7 @@ class Segment:
         )
         self._origin: Origin | None = None
         self._periods = payloads.Periods()
-        self._classes = IngestedClasses(road_map)
+        self._on_map = on_map
         self._happenings = Happenings(identity.trace_id)
         self._next_seq = 0
         self._times: list[Ints] = []
@@ -299,6 +328,7 @@ class Segment:
     def _insert_about(self) -> None:
         """Insert all that is known before the first frame: recording, settings, channels, context and map."""
         insert, info, identity = self._staging.insert, self._info, self._identity
+        self._on_map.insert_into(self._staging, identity.numbers.get("map_id", 0))
         recording = {
             "recording_id": np.array([identity.numbers["recording_id"]]),
             "digest": texts([info.digest]),
@@ -320,16 +350,11 @@ class Segment:
         context = packing.message_columns(self._info.context, self._channel_ids)
         context["channel_id"] = context.pop("channel")
         insert("context", self._owned(context))
-        if self._road_map is not None:
-            for table, columns in _map_tables(self._road_map).items():
-                count = len(next(iter(columns.values())))
-                map_id = np.full(count, identity.numbers["map_id"])
-                insert(table, columns | {"map_id": map_id})
 
     def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
         kinds, insert = self._kinds, self._staging.insert
         # First of all, while little waits: of a crowd what is made on the way takes most.
-        abstracted = self._classes.tables(graph, trace_id, kinds.entities)
+        abstracted = self._on_map.classes.tables(graph, trace_id, kinds.entities)
         of_frames = packing.frame_columns(graph, trace_id)
         if self._road_map is not None:
             of_frames["map_id"] = np.full(len(graph.frames), self._identity.numbers["map_id"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final
 
@@ -406,6 +406,14 @@ class CarlaSurvey(Survey[Lead]):
         """The reason why no channel leads."""
         lost = self.lost.losses()
         return lost[0].reason if lost else "no list of objects can be read"
+
+    def ego_named(self, name: str) -> str | None:
+        """The id of the ego that a name means; objects are looked through for a number that no list has."""
+        egos = self.egos
+        if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
+            return None
+        found, _ = replace(egos, wanted=name).settle(())
+        return str(found)
 
     def find_ego(self) -> str:
         """Find the vehicle with the role of the ego, and return its id."""
