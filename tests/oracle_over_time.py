@@ -7,6 +7,7 @@ every tuple of frames is tried, every operator looks at every frame.
 from __future__ import annotations
 
 import random
+import re
 import sys
 import tempfile
 from collections import Counter
@@ -15,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from oracle import Edge, Search, compare, links_of
+from oracle import Edge, Search, arithmetic, compare, links_of
 from oracle_worlds import random_world
 
 import sgstore
@@ -160,7 +161,7 @@ class Told:
         temporal = isinstance(e, s.Temporal)
         return self.true(e, i, binding) if temporal else self.value(e, i, binding)
 
-    def value(self, e: Any, i: int, binding: Binding) -> Any:  # noqa: C901, PLR0911 - a case each
+    def value(self, e: Any, i: int, binding: Binding) -> Any:  # noqa: C901, PLR0911, PLR0912 - a case each
         """A value at a frame; ``None`` is NULL."""
         match e:
             case s.Comparison(word=word, left=left, right=right):
@@ -182,6 +183,11 @@ class Told:
                 return e.ns / 1e9
             case s.Constant(value=value):
                 return value
+            case s.Arithmetic(first=first, rest=rest) if is_temporal(e):
+                result = self.value(first, i, binding)
+                for sign, term in rest:
+                    result = arithmetic(sign, result, self.value(term, i, binding))
+                return result
             case s.Call(name="prev", arguments=(inner,)):
                 return None if i == 0 or self.gap_before(i) else self.value(inner, i - 1, binding)
             case s.Call(name="delta", arguments=(inner, by)):
@@ -436,6 +442,9 @@ COURSES = (
     "run_length(e.speed > 0.5) >= 0.1s",
     "since_true(e.speed > 2) <= 0.2s",
     "age(e) > 0.2s",
+    "delta(e.speed, 0.2s) > 1 - 0.5 * 2",
+    "prev(e.speed) < abs(-1) + e.speed / 2",
+    "prev(e.speed) * 4 < frame.t + 1",
 )
 PAIR_COURSES = ("prev(dist(e, v)) > dist(e, v)", "exists_now(v)", "age(v) >= 0.1s")
 BOUNDS = ("", "", "[0s, 0.3s]", "[0.1s, 1s]", "[1frames, 3frames]", "[0.2s, INF]")
@@ -520,9 +529,9 @@ def compare_sequence(world: World, store: Store, text: str, policy: str) -> int:
     return sum(expected.values())
 
 
-def compare_condition(world: World, store: Store, rng: random.Random) -> int:
+def compare_condition(world: World, store: Store, rng: random.Random, where: str = "") -> int:
     """Ask a pattern with a condition over time both ways; how many rows there are."""
-    where = condition(rng, pair=True, depth=rng.randint(1, 3), temporal=True)
+    where = where or condition(rng, pair=True, depth=rng.randint(1, 3), temporal=True)
     value = f"ONCE[0s, 0.2s] ({condition(rng, pair=True, depth=1, temporal=True)})"
     text = (
         f"MATCH (e:Ego), (v:Entity) WHERE {where} RETURN trace.name, frame.seq, e, v, {value} AS y"
@@ -642,8 +651,7 @@ def random_check(rng: random.Random) -> str:
     """A check of the ego, or of the ego and all, or some, others."""
     pair = rng.random() < 0.6
     word = rng.choice(("FORALL", "FORSOME"))
-    formula = condition(rng, pair, rng.randint(1, 3), temporal=True).replace("e.", "ego.")
-    formula = formula.replace("(e)", "(ego)").replace("(e,", "(ego,")
+    formula = re.sub(r"\be\b", "ego", condition(rng, pair, rng.randint(1, 3), temporal=True))
     return f"CHECK c: {f'{word} (v:Entity) ' if pair else ''}{formula}"
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from formulas import OnlineFormula, formula_of, prefix_verdicts
 from oracle_over_time import (
+    COURSES,
     compare_check,
     compare_condition,
     compare_edges,
@@ -73,6 +74,13 @@ def test_conditions_over_time_are_what_their_definition_says(asked: tuple[World,
     found = [compare_condition(*asked, rng) for _ in range(12)]
 
     assert sum(found) > 10
+
+
+@pytest.mark.parametrize("where", COURSES)
+def test_each_value_over_time_is_what_its_definition_says(
+    asked: tuple[World, Store], where: str
+) -> None:
+    assert compare_condition(*asked, random.Random(4), where) > 0
 
 
 def test_edges_over_time_are_what_their_definition_says(asked: tuple[World, Store]) -> None:

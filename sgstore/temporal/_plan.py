@@ -84,7 +84,7 @@ class Ask:
     def everywhere(self) -> bool:
         """Tell whether it asks nothing, and so holds in every frame."""
         scope = self.query.scope
-        return not (scope.nodes or scope.edges or scope.where)
+        return self.value is None and not (scope.nodes or scope.edges or scope.where)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
