@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from drawing import Crossing, crowd, entity, graph_of, related
+from matplotlib.artist import Artist
 from PIL import Image
 
 from sgstore.cli import run
 from sgstore.draw import draw_clip, draw_stored, range_of
-from sgstore.draw._page import Gif, changed
+from sgstore.draw._animation import Gif, changed
+from sgstore.draw._film import FilmPage, TextSprites
+from sgstore.draw._page import TEXT, Page, own_style, printable
+from sgstore.draw._picture import diagram_page, frame_page
+from sgstore.draw._scene import DrawnFrame
 from sgstore.draw._stored import Shot, filmed, scale_of
+from sgstore.draw._view import view_of
 from sgstore.errors import ExportError, StoreError
 from sgstore.query import Store
 
@@ -132,6 +138,93 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
         finally:
             tracemalloc.stop()
     assert max(sizes[60:]) <= max(sizes[10:60]) + 20_000
+
+
+def test_a_palette_lasts_and_areas_that_come_later_keep_their_colours(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    colours = rng.integers(0, 256, (900, 3)).astype(np.uint8)
+    ground = colours[rng.integers(0, 900, (60, 60)) % 200]
+    pictures = [ground.copy() for _ in range(6)]
+    for number, picture in enumerate(pictures):
+        picture[5:30, 5 : 20 + number] = colours[300 + number]  # an area of a new colour in each
+    with Gif(tmp_path / "a.gif") as gif:
+        for number, picture in enumerate(pictures):
+            gif.add(picture, number / 10)
+
+    shown, _ = read(tmp_path / "a.gif")
+
+    for picture, seen in zip(pictures, shown, strict=True):
+        assert (picture == seen).all()
+
+
+def test_many_new_colours_make_a_palette_of_their_own(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    pictures = [np.kron(rng.integers(0, 256, (15, 15, 3)), np.ones((20, 20, 1))) for _ in range(3)]
+    pictures = [picture.astype(np.uint8) for picture in pictures]
+    with Gif(tmp_path / "a.gif") as gif:
+        for number, picture in enumerate(pictures):
+            gif.add(picture, number / 10)
+
+    assert all((a == b).all() for a, b in zip(read(tmp_path / "a.gif")[0], pictures, strict=True))
+
+
+# Pages of films -----------------------------------------------------------------------------------
+
+
+class Slow(Page):
+    """A page of objects of the drawing package; its texts are set on whole pixels, as in a film."""
+
+    def write(self, axes: Any, x: float, y: float, text: str, **look: Any) -> None:
+        style = TEXT | look
+        style.pop("gid", None)
+        z = style.pop("zorder", 3.0)
+        width, _ = self.text_size(text, style["fontsize"], style.get("weight", "normal"))
+        sprite = TextSprites(self._dpi).drawn(printable(text), width * self._dpi / 72, style)
+        axes.add_artist(Set(sprite, axes, x, y, z))
+
+
+class Set(Artist):
+    """A text at its place."""
+
+    def __init__(self, sprite: Any, axes: Any, x: float, y: float, z: float) -> None:
+        super().__init__()
+        self.set_zorder(z)
+        self._sprite, self._within, self._at = sprite, axes, (x, y)
+
+    def draw(self, renderer: Any) -> None:
+        pixels, left, below = self._sprite
+        x, y = self._within.transData.transform(self._at)
+        pen = renderer.new_gc()
+        pen.set_clip_rectangle(self._within.bbox)
+        renderer.draw_image(pen, round(x) + left, round(y) + below, pixels)
+
+
+@pytest.mark.parametrize("relations", ["ego", "all"])
+@pytest.mark.parametrize("diagram", [False, True])
+def test_a_page_of_a_film_has_the_pixels_of_a_page(relations: Any, diagram: bool) -> None:
+    road_map = Crossing()
+    film: list[FilmPage] = []
+
+    def again(width: float, height: float) -> FilmPage:
+        film[:] = film or [FilmPage(width, height, 85.0)]
+        film[0].clear()
+        return film[0]
+
+    def slow(width: float, height: float) -> Page:
+        return Slow(width, height, 85.0)
+
+    for turn in (0.0, 30.0, 30.0):
+        graph = crowd(road_map)
+        graph.nodes[0]["heading"] = turn
+        scene = DrawnFrame.of(graph, road_map, {1: "p"}, view_of(graph, 40.0), relations)
+        with own_style():
+            pages = [
+                diagram_page(scene, "a title", relations, None, blank)
+                if diagram
+                else frame_page(scene, "a title", None, None, blank)
+                for blank in (again, slow)
+            ]
+            assert (pages[0].pixels() == pages[1].pixels()).all()
 
 
 # Films --------------------------------------------------------------------------------------------

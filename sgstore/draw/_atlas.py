@@ -79,7 +79,7 @@ class Panel:
         self.y -= HEAD - 3
         self.page.text(self.left, self.y + 4, text, fontsize=7.5, weight="bold")
         rule = Line2D((self.left, self.right), (self.y, self.y), color=palette.RULE, linewidth=0.7)
-        self.page.sheet.add_artist(rule)
+        self.page.add(self.page.sheet, rule)
         self.y -= 3
 
     def row(self, *cells: tuple[float, str], **look: Any) -> None:
@@ -151,7 +151,7 @@ def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
         panel.row((9.0, name), (76.0, metres), (106.0, ", ".join(words)))
         tint = palette.entity_tint(str(graph.nodes[node].get("kind")))
         dot = Circle((panel.left + 3, panel.y + 4.2), 2.4, facecolor=tint, linewidth=0.0)
-        panel.page.sheet.add_artist(dot)
+        panel.page.add(panel.page.sheet, dot)
     if len(near) > len(shown):
         panel.row((0.0, _LEFT_OUT.format(len(near) - len(shown))), color=palette.FAINT_INK)
 
@@ -195,7 +195,7 @@ def paint_key(page: Page, entries: Sequence[Entry], box: Rect) -> None:
 
 
 def _paint_entry(panel: Panel, entry: Entry, x: float, y: float) -> None:
-    paint_swatch(panel.page.sheet, entry, (x + _SWATCH / 2 - 2, y + 4.2))
+    paint_swatch(panel.page, entry, (x + _SWATCH / 2 - 2, y + 4.2))
     panel.page.text(x + _SWATCH, y + 2, entry.text, fontsize=_SMALL)
 
 
@@ -287,7 +287,7 @@ def _paint_signals(stage: Stage, ground: GroundView) -> list[str]:
             linewidths=[0.3],
             zorder=layers.LAMPS,
         )
-        stage.axes.add_artist(dots)
+        stage.page.add(stage.axes, dots)
     return found
 
 

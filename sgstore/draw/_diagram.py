@@ -425,7 +425,7 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
     ground = Rectangle(
         (left, bottom), right - left, top - bottom, facecolor=palette.GROUND, linewidth=0
     )
-    page.sheet.add_artist(ground)
+    page.add(page.sheet, ground)
     graph = scene.graph
     nodes, lines = excerpt_of(graph, frozenset(scene.matched), relations)
     _Diagram(page, box, scene, nodes, lines).paint()
@@ -573,7 +573,7 @@ class _Diagram:
             **look,
         )
         arrow.set_gid(f"edge-{line.a}-{line.b}")
-        self._page.sheet.add_artist(arrow)
+        self._page.add(self._page.sheet, arrow)
 
     def _paint_words(self, line: DiagramLine) -> None:
         text = line.text

@@ -324,7 +324,7 @@ def paint_rings(stage: Stage) -> list[Rect]:
             linestyle=(0, (2, 4)),
             zorder=layers.RINGS,
         )
-        stage.axes.add_artist(ring)
+        stage.page.add(stage.axes, ring)
         at = metres * math.sqrt(0.5)
         look = _SMALL | {"fontsize": 5.5, "color": palette.FAINT_INK, "va": "center"}
         stage.text(at, -at, f"{metres} m", zorder=layers.RINGS, **look)
@@ -355,7 +355,7 @@ def paint_compass(stage: Stage) -> Rect:
     dial = Circle(
         (x, y), 1.55 * reach, facecolor=palette.PAPER, alpha=0.75, zorder=layers.FURNITURE
     )
-    stage.axes.add_artist(dial)
+    stage.page.add(stage.axes, dial)
     for colour, wing in ((palette.INK, 0.45 * aside), (palette.FAINT_INK, -0.45 * aside)):
         half = np.array((0.75 * north, -north + wing, -0.65 * north))
         stage.fill(Outline(middle + half), colour, z=layers.FURNITURE + 0.1)

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
 
     from sgstore.draw._ground import GroundView
+    from sgstore.draw._page import Page
     from sgstore.draw._scene import DrawnFrame
 
 
@@ -91,10 +91,10 @@ def ground_entries(ground: GroundView) -> list[Entry]:
     return entries + [Entry("area", k, palette.entity_tint(k)) for k in sorted(standing)]
 
 
-def paint_swatch(axes: Axes, entry: Entry, at: tuple[float, float]) -> None:
+def paint_swatch(page: Page, entry: Entry, at: tuple[float, float]) -> None:
     """Draw an entry's sign about a point of the sheet; points."""
     for artist in _swatch(entry, *at):
-        axes.add_artist(artist)
+        page.add(page.sheet, artist)
 
 
 def _swatch(  # noqa: PLR0911  one return a sign

@@ -1,8 +1,7 @@
-"""The page: drawing primitives, drawing order, and PNG, SVG and GIF output."""
+"""The page: drawing primitives, drawing order, and PNG and SVG output."""
 
 from __future__ import annotations
 
-import gc
 import io
 import math
 import threading
@@ -10,30 +9,27 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
-from matplotlib.text import Text
-from matplotlib.transforms import Bbox, IdentityTransform
 from PIL import Image
-from PIL.GifImagePlugin import getdata, getheader
 
 from sgstore.draw._palette import FAINT_INK, GROUND, INK, PAPER, RULE
 from sgstore.draw._view import clean
 from sgstore.errors import ExportError
-from sgstore.files import OutputFile, write_bytes
+from sgstore.files import write_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Generator, Hashable, Sequence
 
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
@@ -41,6 +37,7 @@ if TYPE_CHECKING:
     from sgstore.world import Floats
 
     Pixels = NDArray[np.uint8]
+    Colours = NDArray[np.float32]
 
 
 Rect = tuple[float, float, float, float]
@@ -77,8 +74,6 @@ MOST_COLOURS: Final = 50_000
 """A picture with more colours than this is a photograph."""
 FURTHEST: Final = 24.0
 """Greatest distance in RGB, of 0 … 255 each, that a mixture may be moved."""
-_AREA: Final = 30
-"""Pixels of one colour that are an area."""
 
 
 def indexed(picture: Image.Image) -> Image.Image:
@@ -88,166 +83,61 @@ def indexed(picture: Image.Image) -> Image.Image:
         return picture
     counted.sort(reverse=True)
     colours = np.array([colour for _, colour in counted], dtype=np.float32)
-    chosen, nearest, furthest = _palette(colours)
+    palette, nearest, furthest = grown(colours[:COMMONEST], colours)
     if furthest > FURTHEST:
         return picture
     places = np.zeros(1 << 24, np.uint8)
-    places[_packed(colours)] = nearest
-    return _with_palette(places[_packed(np.asarray(picture))], colours[chosen])
+    places[packed(colours)] = nearest
+    return with_palette(places[packed(np.asarray(picture))], palette)
 
 
-def _with_palette(places: Pixels, colours: NDArray[np.float32]) -> Image.Image:
+def with_palette(places: Pixels, colours: Colours) -> Image.Image:
+    """A picture of places in a palette."""
     made = Image.fromarray(places)
     made.putpalette(colours.astype(np.uint8).tobytes())
     return made
 
 
-class LastingPalette:
-    """The palette of one picture for those that follow, as long as it does them justice.
-
-    It does if no mixture of colours is moved further than in :func:`indexed`, and no area at all.
-    """
-
-    def __init__(self) -> None:
-        self._colours = np.zeros((0, 3), np.float32)
-        self._places = np.full(1 << 24, -1, np.int16)  # of all colours that have been met
-
-    def indexed(self, picture: Image.Image) -> Image.Image:
-        """An RGB picture with a palette of at most 256 colours."""
-        packed = _packed(np.asarray(picture))
-        if not self._takes(packed[self._places[packed] < 0]):
-            made = indexed(picture)
-            if made.mode != "P":
-                return picture.quantize(PLACES, dither=Image.Dither.NONE)
-            palette = np.array(made.getpalette(), np.float32).reshape(-1, 3)
-            self._colours = palette[: 1 + int(np.asarray(made).max())]
-            self._places.fill(-1)
-            self._places[packed] = np.asarray(made)
-            return made
-        return _with_palette(self._places[packed].astype(np.uint8), self._colours)
-
-    def _takes(self, unknown: NDArray[np.int32]) -> bool:
-        """Give places to pixels of colours that are new, if there are such places."""
-        if not len(self._colours):
-            return False
-        found, many = np.unique(unknown, return_counts=True)
-        if len(found) > PLACES * 16 or (many > _AREA).any():
-            return False
-        colours = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1).astype(np.float32)
-        away = np.square(colours[:, None] - self._colours).sum(axis=2)
-        near = away.argmin(axis=1) if len(found) else np.zeros(0, np.intp)
-        if (away[np.arange(len(found)), near] > FURTHEST**2).any():
-            return False
-        self._places[found] = near
-        return True
-
-
-def _palette(colours: NDArray[np.float32]) -> tuple[list[int], NDArray[np.intp], float]:
-    """Rows of the chosen colours, the place of each colour's nearest one, and how far the furthest is from it.
-
-    Squares of distances of whole numbers up to 255 are exact in float32.
-    """
-    squares = (colours * colours).sum(axis=1)
-    chosen = list(range(min(COMMONEST, len(colours))))
-    away = squares[:, None] - 2 * (colours @ colours[chosen].T) + squares[chosen]
-    nearest = away.argmin(axis=1)
-    least = away[np.arange(len(colours)), nearest]
-    while len(chosen) < min(PLACES, len(colours)):
-        row = int(least.argmax())
-        away = squares - 2 * (colours @ colours[row]) + squares[row]
-        nearest[away < least] = len(chosen)
-        least = np.minimum(least, away)
-        chosen.append(row)
-    return chosen, nearest, float(np.sqrt(least.max()))
-
-
-def _packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
-    red, green, blue = (colours[..., axis].astype(np.int32) for axis in range(3))
-    return 65536 * red + 256 * green + blue
-
-
-# Animations, written frame by frame: memory does not grow with their length ---------------------
-# Pillow writes the pieces of the file; saving with ``append_images`` would first gather all frames. Each frame
-# is the rectangle in which it differs from the one before, with a palette of its own.
-
-LEAST_DELAY: Final = 2
-"""Hundredths of a second that a frame is shown at least: players take less for a tenth of a second."""
-MOST_DELAY: Final = 65535
-
-
-class Gif:
-    """Writes an animation that repeats for ever; to be used in a ``with``.
+def grown(
+    palette: Colours, colours: Colours, most: int = PLACES, enough: float = 0.0
+) -> tuple[Colours, NDArray[np.intp], float]:
+    """A palette with more of some colours, each time the one that is furthest from all that are in it.
 
     Parameters
     ----------
-    to : Path
-        Gets its name when all is written; a file that is there is replaced.
+    palette, colours : (N, 3) float32
+        Whole numbers up to 255: squares of their distances are exact.
+    most : int
+        Places of the palette.
+    enough : float
+        Distance from which on a colour needs no place of its own.
+
+    Returns
+    -------
+    palette : (N, 3) float32
+    nearest : (N,) intp
+        Place of each colour's nearest one.
+    furthest : float
+        Greatest distance of a colour from its nearest one.
     """
-
-    def __init__(self, to: Path) -> None:
-        self._output = OutputFile(to)
-        self._stream = self._output.stream()
-        self._waiting: tuple[Pixels, int] | None = None
-        self._last: Pixels | None = None
-        self._palette = LastingPalette()
-        self._shown = 100  # the last frame is shown as long as the one before
-        self.frames = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_exception: object) -> None:
-        try:
-            if kind is None and self._waiting is not None:
-                pixels, _ = self._waiting
-                self._write(pixels, self._shown)
-                self._stream.write(b";")  # the trailer of a GIF
-                self._output.keep()
-        finally:
-            self._output.discard()
-
-    def add(self, pixels: Pixels, time_s: float) -> None:
-        """Show a picture, (height, width, 3), from a time on; s. All are of one size, and times ascend."""
-        start = round(time_s * 100)
-        if self._waiting is not None:
-            before, since = self._waiting
-            self._shown = max(start - since, LEAST_DELAY)
-            self._write(before, self._shown)
-        self._waiting = (pixels, start)
-
-    def _write(self, pixels: Pixels, delay: int) -> None:
-        """Write a frame that is shown for so many hundredths of a second."""
-        if self._last is None:
-            height, width, _ = pixels.shape
-            # The frames bring their palettes: the file's own one has no colour of use.
-            head, _ = getheader(Image.new("P", (width, height)), info={"loop": 0})
-            self._stream.write(b"".join(head))
-        left, top, right, bottom = changed(self._last, pixels)
-        part = Image.fromarray(np.ascontiguousarray(pixels[top:bottom, left:right]))
-        pieces = getdata(
-            self._palette.indexed(part),
-            (left, top),
-            duration=min(delay, MOST_DELAY) * 10,
-            disposal=1,
-            include_color_table=True,
-        )
-        self._stream.write(b"".join(pieces))
-        pieces.clear()  # they hang in a cycle of Pillow's
-        gc.collect(0)
-        self._last = pixels
-        self.frames += 1
+    squares = (colours * colours).sum(axis=1)
+    away = squares[:, None] - 2 * (colours @ palette.T) + (palette * palette).sum(axis=1)
+    nearest = away.argmin(axis=1)
+    least = away[np.arange(len(colours)), nearest]
+    more: list[int] = []
+    while len(palette) + len(more) < most and least.max() > enough**2:
+        row = int(least.argmax())
+        away = squares - 2 * (colours @ colours[row]) + squares[row]
+        nearest[away < least] = len(palette) + len(more)
+        least = np.minimum(least, away)
+        more.append(row)
+    return np.concatenate((palette, colours[more])), nearest, float(np.sqrt(least.max()))
 
 
-def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the part of a picture that is other than before; a pixel at least."""
-    height, width, _ = now.shape
-    if before is None:
-        return 0, 0, width, height
-    other = (before != now).any(axis=2)
-    lines, columns = np.flatnonzero(other.any(axis=1)), np.flatnonzero(other.any(axis=0))
-    if not len(lines):
-        return 0, 0, 1, 1
-    return int(columns[0]), int(lines[0]), int(columns[-1]) + 1, int(lines[-1]) + 1
+def packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
+    """Each colour, red, green and blue, as one number."""
+    red, green, blue = (colours[..., axis].astype(np.int32) for axis in range(3))
+    return 65536 * red + 256 * green + blue
 
 
 # The sheet of paper: the only room that knows how pictures are written --------------------------
@@ -258,6 +148,8 @@ def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
 
 DPI: Final = 130
 FORMATS: Final = (".png", ".svg")
+TEXT: Final[dict[str, Any]] = {"fontsize": 7.0, "color": INK, "va": "baseline"}
+"""How texts look if nothing else is said."""
 PICTURE_PIXELS: Final = 64_000_000
 """Most pixels of a camera picture that is opened."""
 PICTURE_SIDE: Final = 640
@@ -343,7 +235,7 @@ class Stage:
         """Fill an outline; ``look`` goes to the patch."""
         patch = PathPatch(outline, facecolor=colour, zorder=z, **{"linewidth": 0.0, **look})
         patch.set_gid(gid)
-        self.axes.add_artist(patch)
+        self.page.add(self.axes, patch)
 
     def fill_all(
         self,
@@ -356,58 +248,34 @@ class Stage:
     ) -> None:
         """Fill many outlines with one colour, with a hairline of the same that closes the seams."""
         if outlines:
-            self.axes.add_artist(
-                PathCollection(
-                    list(outlines),
-                    facecolors=[colour],
-                    edgecolors=[colour],
-                    linewidths=[edge],
-                    alpha=alpha,
-                    zorder=z,
-                )
+            filled = PathCollection(
+                list(outlines),
+                facecolors=[colour],
+                edgecolors=[colour],
+                linewidths=[edge],
+                alpha=alpha,
+                zorder=z,
             )
+            self.page.add(self.axes, filled)
 
     def lines(
         self, lines: Sequence[Floats], colour: str, *, z: float, width: float, **look: Any
     ) -> None:
         """Draw many lines of (N, 2) picture coordinates in one look."""
         if lines:
-            self.axes.add_artist(
-                PathCollection(
-                    [Outline(line) for line in lines],
-                    facecolors=["none"],
-                    edgecolors=[colour],
-                    linewidths=[width],
-                    zorder=z,
-                    **look,
-                )
+            drawn = PathCollection(
+                [Outline(line) for line in lines],
+                facecolors=["none"],
+                edgecolors=[colour],
+                linewidths=[width],
+                zorder=z,
+                **look,
             )
+            self.page.add(self.axes, drawn)
 
     def text(self, x: float, y: float, text: str, **look: Any) -> None:
         """Write in the window; see :meth:`Page.text`."""
         self.page.write(self.axes, x, y, text, **{"clip_on": True, **look})
-
-
-Sprite = tuple["Pixels", int, int]
-"""A text as drawn, (height, width, 4) from below, and how far its corner lies from its place; pixels."""
-
-
-class DrawnText(Artist):
-    """A text that has been drawn before: a sprite at a place of some axes."""
-
-    def __init__(self, sprite: Sprite, axes: Axes, x: float, y: float, z: float) -> None:
-        super().__init__()
-        self.zorder = z
-        self._sprite, self._within, self._at = sprite, axes, (x, y)
-
-    def draw(self, renderer: Any) -> None:
-        """Lay the sprite on the page, as far as it lies in the axes."""
-        pixels, left, below = self._sprite
-        x, y = self._within.transData.transform(self._at)
-        gc = renderer.new_gc()
-        gc.set_clip_rectangle(self._within.bbox)
-        renderer.draw_image(gc, round(x) + left, round(y) + below, pixels)
-        gc.restore()
 
 
 class Page:
@@ -419,28 +287,15 @@ class Page:
         In points.
     dpi : float
         Pixels of an inch, where it is drawn in pixels.
-    sprites : dict, optional
-        Texts that were drawn already, for pages that are drawn in pixels one after another: a text is set on
-        whole pixels then.
     """
 
-    def __init__(
-        self,
-        width: float,
-        height: float,
-        dpi: float = DPI,
-        sprites: dict[object, Sprite] | None = None,
-    ) -> None:
+    def __init__(self, width: float, height: float, dpi: float = DPI) -> None:
         self.width = width
         self.height = height
         self._dpi = dpi
-        self._sprites = sprites
-        self._windows: dict[Rect, Axes] = {}
-        self._free: dict[Rect, Axes] = {}
         self._figure = Figure(figsize=(width / 72, height / 72), dpi=dpi, facecolor=PAPER)
         self._canvas = FigureCanvasAgg(self._figure)
         self.sheet = self._axes(0, 0, width, height)
-        self._windows = {}
         self.sheet.set_xlim(0, width)
         self.sheet.set_ylim(0, height)
 
@@ -460,10 +315,27 @@ class Page:
         axes = self._axes(left, bottom, width, height)
         axes.set_xlim(-half[0], half[0])
         axes.set_ylim(-half[1], half[1])
-        stage = Stage(axes, view, half, points, self)
+        stage = self._stage(axes, view, half, points)
         corners = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))) * half
         stage.fill(Outline(corners), GROUND, z=WINDOW)
         return stage
+
+    def _stage(
+        self, axes: Axes, view: MapWindow, half: tuple[float, float], points: float
+    ) -> Stage:
+        return Stage(axes, view, half, points, self)
+
+    def add(self, axes: Axes, artist: Artist) -> None:
+        """Draw an artist of the drawing package on the sheet or in a window, in its own measure."""
+        axes.add_artist(artist)
+
+    def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
+        """Paint in a box of the sheet where nothing else is; what has a key is always the same.
+
+        A page that is drawn again and again paints it only once.
+        """
+        del key, box
+        paint()
 
     def text(self, x: float, y: float, text: str, **look: Any) -> None:
         """Write on the sheet.
@@ -475,16 +347,7 @@ class Page:
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
         """Write on a sheet or in a window, in its own measure."""
         gid = look.pop("gid", None)
-        style: dict[str, Any] = {"fontsize": 7.0, "color": INK, "va": "baseline", **look}
-        text = printable(text)
-        if self._sprites is None:
-            axes.text(x, y, text, parse_math=False, **style).set_gid(gid)
-        elif text:
-            z = style.pop("zorder", Text.zorder)
-            key = text, repr(style)
-            if key not in self._sprites:
-                self._sprites[key] = drawn_text(text, self._dpi, style)
-            axes.add_artist(DrawnText(self._sprites[key], axes, x, y, z))
+        axes.text(x, y, printable(text), parse_math=False, **(TEXT | look)).set_gid(gid)
 
     def text_size(self, text: str, size: float, weight: str = "normal") -> tuple[float, float]:
         """Width and height of a text; points."""
@@ -558,21 +421,8 @@ class Page:
         indexed(Image.fromarray(self.pixels())).save(written, "PNG")
         return written.getvalue()
 
-    def clear(self) -> None:
-        """Take all from the page that was drawn; windows of the same places are used again."""
-        for axes in self._figure.axes:
-            drawn = (*axes.artists, *axes.patches, *axes.collections, *axes.lines, *axes.images)
-            for artist in drawn:
-                artist.remove()
-        for share, axes in self._windows.items():
-            if axes in self._figure.axes:
-                self._figure.delaxes(axes)
-                self._free[share] = axes
-        self._windows = {}
-
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        share = self._share(left, bottom, width, height)
-        axes = self._windows[share] = self._figure.add_axes(self._free.pop(share, share))
+        axes = self._figure.add_axes(self._share(left, bottom, width, height))
         axes.set_axis_off()
         axes.set_autoscale_on(False)
         # Each artist that is clipped asks for it, and would have it made anew; it follows the axes by itself.
@@ -591,29 +441,6 @@ def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, 
     ismath = False
     width, height, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(text, font, ismath)
     return width, height
-
-
-@cache
-def _nowhere(dpi: float) -> Figure:
-    """A figure for what is measured and drawn outside of all pages."""
-    return Figure(dpi=dpi)
-
-
-def drawn_text(text: str, dpi: float, style: dict[str, Any]) -> Sprite:
-    """A text, and what is under it, drawn alone; ``style`` as of a text of the drawing package."""
-    written = Text(0, 0, text, parse_math=False, **style)
-    written.set_figure(_nowhere(dpi))
-    written.set_transform(IdentityTransform())
-    renderer = RendererAgg(1, 1, dpi)
-    slip = written.get_bbox_patch()
-    written.update_bbox_position_size(renderer)
-    boxes = [written.get_window_extent(renderer)]
-    boxes += [slip.get_window_extent(renderer)] if slip is not None else []
-    left, below, right, above = map(round, Bbox.union(boxes).padded(3).extents)
-    renderer = RendererAgg(right - left, above - below, dpi)
-    written.set_position((-left, -below))
-    written.draw(renderer)
-    return np.array(renderer.buffer_rgba())[::-1], left, below  # as images are drawn, from below
 
 
 def check_format(to: str | Path) -> str:

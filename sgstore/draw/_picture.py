@@ -146,7 +146,8 @@ def diagram_page(
     box = (middle, bottom, middle + _WINDOW, bottom + _WINDOW)
     told = paint_diagram(page, box, scene, relations)
     _paint_title(page, "Its scene graph", f"{told}  ·  {_READ_DIAGRAM}", left=middle)
-    paint_key(page, key, (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2))
+    foot_box = (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2)
+    page.once(("key", *key), foot_box, lambda: paint_key(page, key, foot_box))
     return page
 
 
@@ -294,4 +295,5 @@ def _paint_panel(
     if scene.matched:
         side.paint_matches(panel, scene)
     side.paint_surroundings(panel, scene, bottom + side.legend_height(entries))
-    side.paint_legend(panel, entries)
+    box = (left, bottom, page.width, panel.y)
+    page.once(("legend", *entries, panel.y), box, lambda: side.paint_legend(panel, entries))

@@ -506,7 +506,7 @@ def lamps(
 
 def _paint_lamp(stage: Stage, body: Body) -> None:
     for patch in lamps(body.x, body.y, body.light, stage.metre, f"node-{body.node}"):
-        stage.axes.add_artist(patch)
+        stage.page.add(stage.axes, patch)
 
 
 def _paint_dot(stage: Stage, body: Body, colour: str, edge: dict[str, Any]) -> None:

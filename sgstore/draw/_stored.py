@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.draw._animation import Gif
+from sgstore.draw._film import FilmPage
 from sgstore.draw._legend import entries_of
-from sgstore.draw._page import Gif, Page, own_style
+from sgstore.draw._page import own_style
 from sgstore.draw._picture import (
     check_installed,
     checked,
@@ -90,10 +92,10 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     if to.suffix.lower() != ENDING:
         raise ExportError(f"cannot draw a clip into {to.name!r}: end the name in {ENDING}")
     reach = checked(radius) or scale_of(samples)
-    pages: list[Page] = []
+    pages: list[FilmPage] = []
 
-    def blank(width: float, height: float) -> Page:
-        pages[:] = pages or [Page(width, height, DPI, {})]
+    def blank(width: float, height: float) -> FilmPage:
+        pages[:] = pages or [FilmPage(width, height, DPI)]
         pages[0].clear()
         return pages[0]
 
@@ -144,7 +146,7 @@ NO_CAMERA: Final = "none"
 FPS: Final = 10.0
 """Pictures a second of an animation."""
 MOST_FPS: Final = 50.0
-"""Players show no more: see :data:`sgstore.draw._page.LEAST_DELAY`."""
+"""Players show no more: see :data:`sgstore.draw._animation.LEAST_DELAY`."""
 SAMPLES: Final = 8
 """Frames of a clip that are looked at before it is drawn."""
 AT_ONCE: Final = 8
@@ -286,7 +288,10 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
 
     with store.file.snapshot():
         chosen = _chosen(store, frames, fps)
-        road_map = map_of(store, chosen[0].trace)
+        trace = chosen[0].trace
+        road_map = map_of(store, trace)
+        if camera is None and not _camera_of(store, trace):
+            camera = NO_CAMERA
     spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
     samples = [*shots([chosen[number] for number in spread], seen=False)]
     look: dict[str, Any] = {"relations": relations, "radius": radius}
