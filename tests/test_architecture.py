@@ -63,6 +63,7 @@ OWNERS = {
     "highspy": {"selection"},
     "matplotlib": {"draw"},
     "PIL": {"draw", "exporters"},
+    "av": {"draw"},
     "pytest": {"pytest_plugin"},
     "torch": {"exporters"},
     "torch_geometric": {"exporters"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +14,14 @@ from PIL import Image
 
 from sgstore.cli import run
 from sgstore.draw import draw_clip, draw_stored, range_of
-from sgstore.draw._animation import Gif, changed
+from sgstore.draw._animation import Gif, animation, changed
 from sgstore.draw._film import FilmPage, TextSprites
 from sgstore.draw._page import TEXT, Page, own_style, printable
 from sgstore.draw._picture import diagram_page, frame_page
 from sgstore.draw._scene import DrawnFrame
 from sgstore.draw._stored import Shot, filmed, scale_of
 from sgstore.draw._view import view_of
-from sgstore.errors import ExportError, StoreError
+from sgstore.errors import ExportError, MissingExtraError, StoreError
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -225,6 +226,82 @@ def test_a_page_of_a_film_has_the_pixels_of_a_page(relations: Any, diagram: bool
                 for blank in (again, slow)
             ]
             assert (pages[0].pixels() == pages[1].pixels()).all()
+
+
+# Videos -------------------------------------------------------------------------------------------
+
+
+def decoded(path: Path) -> tuple[list[NDArray[np.uint8]], list[float], float]:
+    """Pictures of a video, when each is shown, and how long all of it is; s."""
+    av = pytest.importorskip("av", reason="the extra [video] is not installed")
+    with av.open(str(path)) as container:
+        frames = [*container.decode(video=0)]
+        pictures = [frame.to_ndarray(format="rgb24") for frame in frames]
+        times = [float(frame.pts * frame.time_base) for frame in frames]
+        return pictures, times, container.duration / 1e6
+
+
+def blocks(seed: int) -> NDArray[np.uint8]:
+    """A picture of large areas, of odd height and width, that a video keeps."""
+    rng = np.random.default_rng(seed)
+    return np.kron(rng.integers(0, 256, (5, 7, 3)), np.ones((33, 33, 1))).astype(np.uint8)
+
+
+@pytest.mark.parametrize("ending", ["mp4", "webm"])
+def test_a_video_has_its_pictures_at_their_times(tmp_path: Path, ending: str) -> None:
+    pytest.importorskip("av", reason="the extra [video] is not installed")
+    times = [0.0, 0.1, 0.204, 0.25, 1.0, 1.04]
+    with animation(tmp_path / f"a.{ending}") as video:
+        for number, time in enumerate(times):
+            video.add(blocks(number), time)
+    pictures, shown, seconds = decoded(tmp_path / f"a.{ending}")
+
+    assert video.frames == len(pictures) == len(times)
+    assert shown == pytest.approx(times, abs=1e-3)
+    assert seconds == pytest.approx(1.08, abs=0.002)  # the last one as long as the one before
+    for number, picture in enumerate(pictures):
+        whole = blocks(number).astype(int)
+        assert picture.shape == (166, 232, 3)  # of even sides
+        apart = np.abs(picture[:165, :231] - whole)
+        assert np.median(apart) <= 6
+        assert (apart[16::33, 16::33] <= 24).all()  # middles of the areas
+
+
+@pytest.mark.parametrize("ending", ["mp4", "webm"])
+def test_a_video_that_is_broken_off_leaves_what_was_there(tmp_path: Path, ending: str) -> None:
+    pytest.importorskip("av", reason="the extra [video] is not installed")
+    to = tmp_path / f"a.{ending}"
+    to.write_bytes(b"precious")
+
+    def broken_off() -> None:
+        with animation(to) as video:
+            for number in range(12):
+                video.add(blocks(number), number / 10)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        broken_off()
+
+    assert [(f.name, f.read_bytes()) for f in tmp_path.iterdir()] == [(to.name, b"precious")]
+
+
+def test_a_video_without_the_package_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(MissingExtraError, match=r"videos: pip install 'sgstore\[video\]'"):
+        next(filmed(tmp_path / "a.mp4", None, shots(), shots()))
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_clip_is_a_video_by_its_ending(tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="the extra [video] is not installed")
+    assert len([*filmed(tmp_path / "a.MP4", None, shots(), shots())]) == len(shots())
+
+    pictures, times, seconds = decoded(tmp_path / "a.MP4")
+    assert times == pytest.approx([0.0, 0.2, 0.4], abs=1e-3)
+    assert seconds == pytest.approx(0.6, abs=0.002)
+    assert len({picture.shape for picture in pictures}) == 1
 
 
 # Films --------------------------------------------------------------------------------------------

@@ -229,7 +229,7 @@ def show(
         Option(
             "--output",
             "-o",
-            help="The picture: .png or .svg; of a clip: .gif.",
+            help="The picture: .png or .svg; of a clip: .gif, .mp4 or .webm.",
             show_default="frame.png, clip.gif",
         ),
     ] = None,

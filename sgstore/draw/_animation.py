@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import gc
-from typing import TYPE_CHECKING, Final, Self
+from abc import ABC, abstractmethod
+from collections import deque
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, ClassVar, Final, Self, cast
 
 import numpy as np
 from PIL import Image
@@ -18,11 +23,15 @@ from sgstore.draw._page import (
     packed,
     with_palette,
 )
+from sgstore.errors import ExportError, MissingExtraError
 from sgstore.files import OutputFile
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
     from pathlib import Path
 
+    from av import VideoFrame, VideoStream
+    from av.container import OutputContainer
     from numpy.typing import NDArray
 
     from sgstore.draw._page import Colours, Pixels
@@ -31,6 +40,14 @@ if TYPE_CHECKING:
 LEAST_DELAY: Final = 2
 """Hundredths of a second that a frame is shown at least: players take less for a tenth of a second."""
 MOST_DELAY: Final = 65535
+CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
+    ".mp4": (("libx264", "libopenh264"), {"preset": "veryfast", "crf": "20", "rc-lookahead": "8"}),
+    ".webm": (
+        ("libvpx-vp9",),
+        {"crf": "30", "deadline": "good", "cpu-used": "6", "lag-in-frames": "8"},
+    ),
+}
+"""Encoders of each kind of video, the best first, and how they are set."""
 _AREA: Final = 250
 """Pixels of one colour that are an area."""
 _CLOSE: Final = 10.0
@@ -41,8 +58,8 @@ _KEPT_FREE: Final = 32
 """Places of a palette for colours of later pictures."""
 
 
-class Gif:
-    """Writes an animation that repeats for ever; to be used in a ``with``.
+class Animation(ABC):
+    """Writes pictures that follow one another; to be used in a ``with``.
 
     Parameters
     ----------
@@ -50,13 +67,13 @@ class Gif:
         Gets its name when all is written; a file that is there is replaced.
     """
 
+    TICKS: ClassVar[int]
+    """Units of its time in a second."""
+
     def __init__(self, to: Path) -> None:
         self._output = OutputFile(to)
-        self._stream = self._output.stream()
         self._waiting: tuple[Pixels, int] | None = None
-        self._last: Pixels | None = None
-        self._palette = LastingPalette()
-        self._shown = 100  # the last frame is shown as long as the one before
+        self._shown = self.TICKS  # the last frame is shown as long as the one before
         self.frames = 0
 
     def __enter__(self) -> Self:
@@ -67,19 +84,68 @@ class Gif:
             if kind is None and self._waiting is not None:
                 pixels, _ = self._waiting
                 self._write(pixels, self._shown)
-                self._stream.write(b";")  # the trailer of a GIF
+                self._end()
                 self._output.keep()
         finally:
+            self._drop()
             self._output.discard()
 
     def add(self, pixels: Pixels, time_s: float) -> None:
         """Show a picture, (height, width, 3), from a time on; s. All are of one size, and times ascend."""
-        start = round(time_s * 100)
+        start = round(time_s * self.TICKS)
         if self._waiting is not None:
             before, since = self._waiting
-            self._shown = max(start - since, LEAST_DELAY)
+            self._shown = max(start - since, self.TICKS * LEAST_DELAY // 100)
             self._write(before, self._shown)
         self._waiting = (pixels, start)
+
+    @abstractmethod
+    def _write(self, pixels: Pixels, delay: int) -> None:
+        """Write a frame that is shown for so long."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """Write what comes after the last frame."""
+
+    @abstractmethod
+    def _drop(self) -> None:
+        """Let go of all but the file itself."""
+
+
+def animation(to: Path) -> Animation:
+    """What writes an animation, by the ending of its file.
+
+    Raises
+    ------
+    ExportError
+        The ending is another, or the file cannot be written.
+    MissingExtraError
+        The package that writes videos is not installed.
+    """
+    ending = to.suffix.lower()
+    if ending == ".gif":
+        return Gif(to)
+    if ending in CODECS:
+        return Video(to)
+    raise ExportError(f"cannot draw a clip into {to.name!r}: end the name in .gif, .mp4 or .webm")
+
+
+class Gif(Animation):
+    """Writes an animation that repeats for ever."""
+
+    TICKS = 100
+
+    def __init__(self, to: Path) -> None:
+        super().__init__(to)
+        self._stream = self._output.stream()
+        self._last: Pixels | None = None
+        self._palette = LastingPalette()
+
+    def _end(self) -> None:
+        self._stream.write(b";")  # the trailer of a GIF
+
+    def _drop(self) -> None:
+        """The output closes its stream itself."""
 
     def _write(self, pixels: Pixels, delay: int) -> None:
         """Write a frame that is shown for so many hundredths of a second."""
@@ -101,6 +167,89 @@ class Gif:
         gc.collect(0)
         self._last = pixels
         self.frames += 1
+
+
+class Video(Animation):
+    """Writes a video: H.264 in MP4, VP9 in WebM. Each picture is encoded when the next one comes."""
+
+    TICKS = 1000
+
+    def __init__(self, to: Path) -> None:
+        if find_spec("av") is None:
+            raise MissingExtraError("videos", "video")
+        super().__init__(to)
+        self._to = to
+        self._opened: tuple[OutputContainer, VideoStream] | None = None
+        self._until = 0
+        self._delays: deque[int] = deque()
+
+    def _write(self, pixels: Pixels, delay: int) -> None:
+        from av import VideoFrame
+
+        # Colours are sampled for two pixels at once, across and down: a side of an odd length gets one more.
+        height, width, _ = pixels.shape
+        even = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        with self._told():
+            self._opened = self._opened or self._begun(*even.shape[:2])
+            frame = VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709")
+            frame.pts, frame.time_base = self._until, Fraction(1, self.TICKS)
+            self._until += delay
+            self._delays.append(delay)
+            self._mux(*self._opened, frame)
+        self.frames += 1
+
+    def _begun(self, height: int, width: int) -> tuple[OutputContainer, VideoStream]:
+        """Open the file and choose the codec."""
+        import av
+
+        kind = self._to.suffix.lower()
+        codecs, look = CODECS[kind]
+        known = [name for name in codecs if name in av.codecs_available]
+        if not known:
+            raise ExportError(f"{self._to}: the installed av has no encoder {' or '.join(codecs)}")
+        options = {"movflags": "+faststart"} if kind == ".mp4" else {}
+        path = str(self._output.path())
+        container = av.open(path, "w", format=kind[1:], container_options=options)
+        stream = cast("VideoStream", container.add_stream(known[0], rate=25, options=look))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        context = stream.codec_context
+        context.time_base = stream.time_base = Fraction(1, self.TICKS)
+        context.bit_rate = 0
+        context.max_b_frames = 0  # so packets come in the order of the pictures
+        context.colorspace, context.color_range = 1, 1  # BT.709, of 16 to 235
+        context.color_primaries, context.color_trc = 1, 1
+        return container, stream
+
+    def _mux(
+        self, container: OutputContainer, stream: VideoStream, frame: VideoFrame | None
+    ) -> None:
+        """Encode a picture, or what is left, and write what is ready."""
+        for packet in stream.encode(frame):
+            packet.duration = self._delays.popleft()
+            container.mux(packet)
+
+    def _end(self) -> None:
+        if self._opened is not None:
+            with self._told():
+                self._mux(*self._opened, None)
+                self._opened[0].close()
+            self._opened = None
+
+    def _drop(self) -> None:
+        if self._opened is not None:
+            with suppress(Exception):
+                self._opened[0].close()
+
+    @contextmanager
+    def _told(self) -> Generator[None]:
+        """Tell errors of the encoder as ours."""
+        from av.error import FFmpegError
+
+        try:
+            yield
+        except (FFmpegError, OSError) as error:
+            raise ExportError(f"{self._to}: {error.strerror or error}") from error
 
 
 def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.draw._animation import Gif
+from sgstore.draw._animation import animation
 from sgstore.draw._film import FilmPage
 from sgstore.draw._legend import entries_of
 from sgstore.draw._page import own_style
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
 DPI: Final = 85.0
 """Pixels of an inch: an animation is watched and not studied, and has many pictures."""
-ENDING: Final = ".gif"
 
 
 Shot = tuple["SceneGraph", "Mapping[str, int]", "bytes | None"]
@@ -75,7 +74,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     Parameters
     ----------
     to : Path
-        ``….gif``; a file that is there is replaced when all is drawn.
+        ``….gif``, ``….mp4`` or ``….webm``; a file that is there is replaced when all is drawn.
     road_map : RoadMap or None
     samples : sequence of Shot
         Some of the shots, from all of the clip: they tell the scale and what the legend explains.
@@ -87,10 +86,10 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     ------
     ExportError
         The ending is another, or the file cannot be written.
+    MissingExtraError
+        The package that writes videos is not installed.
     """
-    to = Path(to)
-    if to.suffix.lower() != ENDING:
-        raise ExportError(f"cannot draw a clip into {to.name!r}: end the name in {ENDING}")
+    film = animation(Path(to))
     reach = checked(radius) or scale_of(samples)
     pages: list[FilmPage] = []
 
@@ -108,7 +107,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     entries = _legend(map(scene_of, samples))
     seen: bytes | None = None
     start: int | None = None
-    with Gif(to) as gif:
+    with film:
         for shot in shots:
             graph, _, picture = shot
             seen = picture or seen
@@ -119,7 +118,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
                     page = diagram_page(scene, title, relations, entries, blank)
                 else:
                     page = frame_page(scene, title, seen, entries, blank)
-                gif.add(page.pixels(), (graph.time_ns - start) / 1e9)
+                film.add(page.pixels(), (graph.time_ns - start) / 1e9)
             yield shot
 
 
@@ -250,7 +249,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     ----------
     frames : FrameRange
     to : str or Path
-        ``….gif``; a file that is there is replaced.
+        ``….gif``, or with the extra ``video`` ``….mp4`` or ``….webm``; a file that is there is replaced.
     fps : float
         Pictures a second at most; of frames that come faster some are left out.
     on_frame : function, optional
