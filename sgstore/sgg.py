@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from sgstore import compiled
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
 from sgstore.columns import chained
 from sgstore.errors import ConfigError
-from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence
+from sgstore.graph import GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
     IS_SIGNAL,
     NEAR,
@@ -32,6 +32,7 @@ from sgstore.relations import (
     BlockScene,
     Bodies,
     Crowds,
+    EdgeRoom,
     EgoPoses,
     Extent,
     Keeping,
@@ -62,7 +63,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Config
-    from sgstore.graph import SceneGraph
+    from sgstore.graph import Edges, SceneGraph
     from sgstore.mcap import Loss
     from sgstore.relations import Areas, MapContext, Standing
     from sgstore.roads import RoadMap
@@ -71,6 +72,10 @@ if TYPE_CHECKING:
 
     Rows = NDArray[np.intp]
     Gathered = tuple[tuple[Rows, Rows], Bools]
+
+
+_OTHER_EDGES: Final = 8
+"""Edges of a body, beside those of its pairs, for which there is room at once."""
 
 
 class SceneGraphGenerator:
@@ -266,8 +271,10 @@ class SceneGraphGenerator:
         if over_touching.any():
             touching = joined_pairs([touching, contacts_of(bodies, view.ego, over_touching)])
         touching = of_kinds(bodies, view.ego, touching, self._config.pairs.kinds)
-        scene = BlockScene(self._config, bodies, view.ego, pairs, touching, ground)
-        edges = self._keeping.edges(Edges.chained([edges(scene) for edges in self._functions]))
+        room = EdgeRoom(3 * len(pairs) + 2 * len(touching[0]) + _OTHER_EDGES * len(bodies))
+        scene = BlockScene(self._config, bodies, view.ego, pairs, touching, ground, room)
+        edges = room.chained([edges(scene) for edges in self._functions])
+        edges = self._keeping.edges(edges)
         if self._others:
             self._refuse_undeclared(edges)
         return GraphBlock(

@@ -27,6 +27,7 @@ from ._registry import relations_under as relations_under
 from ._scene import IS_SIGNAL as IS_SIGNAL
 from ._scene import BlockScene as BlockScene
 from ._scene import Bodies as Bodies
+from ._scene import EdgeRoom as EdgeRoom
 from ._scene import MapContext as MapContext
 from ._scene import Relation as Relation
 from ._scene import Standing as Standing
@@ -39,6 +40,7 @@ __all__ = [
     "BlockScene",
     "Bodies",
     "Crowds",
+    "EdgeRoom",
     "EgoPoses",
     "Extent",
     "IS_SIGNAL",

@@ -22,9 +22,7 @@ from sgstore.relations._pairs import are_of_kinds
 from sgstore.relations._scene import (
     BlockScene,
     Relation,
-    edge_room,
     edges_between,
-    edges_filled,
     edges_of_pairs,
     even_parts,
     span_up_to,
@@ -82,13 +80,13 @@ def _direction_edges(scene: BlockScene) -> Edges:
     if _in_loops(scene):
         from sgstore.relations import _loops
 
-        columns, unsure = edge_room(len(pairs)), np.empty(len(pairs), np.intp)
+        columns, unsure = scene.room.rest(len(pairs)), np.empty(len(pairs), np.intp)
         many, doubtful = _loops.sectors(*pairs.for_loops, bounds, names, DOUBT, columns, unsure)
         doubtful = unsure[:doubtful]
     else:
         columns, many, doubtful = _sectors(scene, bounds, names)
     rows, sectors = _by_bearing(settings, pairs, doubtful)
-    return edges_filled(columns, many, _looking(scene, rows, names[sectors]))
+    return scene.room.filled(columns, many, _looking(scene, rows, names[sectors]))
 
 
 def _in_loops(scene: BlockScene) -> bool:
@@ -126,7 +124,7 @@ def _sectors(
     doubtful = np.flatnonzero(~holds if wanted is None else ~holds & wanted)
     if wanted is not None:
         holds &= wanted
-    return *edges_of_pairs(pairs, codes, holds, seen_by_a=True), doubtful
+    return *edges_of_pairs(scene, codes, holds, seen_by_a=True), doubtful
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
@@ -164,7 +162,7 @@ def _side_edges(scene: BlockScene) -> Edges:
     if _in_loops(scene):
         from sgstore.relations import _loops
 
-        columns, unsure = edge_room(len(pairs)), np.empty(len(pairs), np.intp)
+        columns, unsure = scene.room.rest(len(pairs)), np.empty(len(pairs), np.intp)
         beside = BESIDE if is_open else -1.0
         many, doubtful = _loops.sides(*pairs.for_loops, beside, names, DOUBT, columns, unsure)
         doubtful = unsure[:doubtful]
@@ -177,7 +175,7 @@ def _side_edges(scene: BlockScene) -> Edges:
     # Closed: to the last bit, as CARLASGG has it.
     holds = off_axis > BESIDE if is_open else ~np.isnan(bearing)
     codes = names[np.where(bearing[holds] >= 0, 0, 1)]
-    return edges_filled(columns, many, _looking(scene, doubtful[holds], codes))
+    return scene.room.filled(columns, many, _looking(scene, doubtful[holds], codes))
 
 
 def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, int, Rows]:
@@ -196,7 +194,7 @@ def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, 
     if wanted is not None:
         doubtful &= wanted
         holds &= wanted
-    return *edges_of_pairs(pairs, codes, holds, seen_by_a=True), np.flatnonzero(doubtful)
+    return *edges_of_pairs(scene, codes, holds, seen_by_a=True), np.flatnonzero(doubtful)
 
 
 def sector(name: str, legend: str = "") -> Relation:

@@ -104,9 +104,19 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
     if settings.ego_within > 0:
         close = distances(bodies, *with_ego, between) <= settings.ego_within
         with_ego = with_ego[0][close], with_ego[1][close]
-    halves = joined_pairs([with_ego, (a[further], b[further])])
+    halves = _behind(with_ego, near, further)
     halves = of_kinds(bodies, ego, halves, settings.kinds)
     return BodyPairs(bodies, *halves, between)
+
+
+def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
+    """Some pairs, and behind them those of others that are in some rows."""
+    count = len(pairs[0])
+    a, b = np.empty((2, count + len(rows)), np.intp)
+    for column, first, rest in zip((a, b), pairs, others, strict=True):
+        column[:count] = first
+        np.take(rest, rows, out=column[count:], mode="clip")  # others go through a copy
+    return a, b
 
 
 def of_kinds(
@@ -187,7 +197,8 @@ def _near_in_loops(
     order = rows[np.lexsort((bodies.x[rows], bodies.frame[rows]))]
     frame = bodies.frame[order]
     end = np.searchsorted(frame, frame, side="right")
-    room = max(CHUNK, int((end - np.arange(len(end))).max(initial=0)))
+    count = end - np.arange(len(end))
+    room = max(min(int(count.sum()), AT_ONCE), CHUNK, int(count.max(initial=0)))
     a, b = found = np.empty(room, np.intp), np.empty(room, np.intp)
     place, limit = (bodies.x, bodies.y, levels(bodies, between)), span_up_to(within, between)
     first = 0
@@ -196,7 +207,10 @@ def _near_in_loops(
             first = int(end[first])
             continue
         many, first = _loops.near_pairs(first, order, end, place, limit, found)
-        yield a[:many].copy(), b[:many].copy()
+        if first == len(order):
+            yield a[:many], b[:many]
+        else:
+            yield a[:many].copy(), b[:many].copy()
 
 
 # Pairs of what never moves: found once, when it appears, and looked up where both of them are in range ----

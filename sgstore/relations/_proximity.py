@@ -14,8 +14,6 @@ from sgstore.relations._pairs import are_of_kinds
 from sgstore.relations._scene import (
     BlockScene,
     Relation,
-    edge_room,
-    edges_filled,
     edges_of_pairs,
     even_parts,
     span_up_to,
@@ -36,9 +34,9 @@ def _edges(scene: BlockScene) -> Edges:
     if bounds and pairs.in_loops and not settings.kinds:
         from sgstore.relations import _loops
 
-        columns = edge_room(len(pairs))
+        columns = scene.room.rest(len(pairs))
         many = _loops.rungs(*pairs.for_loops[:4], np.array(bounds), codes, columns)
-        return edges_filled(columns, many)
+        return scene.room.filled(columns, many)
     found, holds = np.zeros(len(pairs.span), np.int8), np.zeros(len(pairs.span), np.bool_)
     for part in even_parts(len(found) if bounds else 0):
         span, rung = pairs.span[part], np.zeros(part.stop - part.start, np.int8)
@@ -49,7 +47,7 @@ def _edges(scene: BlockScene) -> Edges:
     found, holds = np.concatenate([found, found]), np.concatenate([holds, holds])
     if settings.kinds:
         holds &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)
-    return edges_filled(*edges_of_pairs(pairs, found, holds))
+    return scene.room.filled(*edges_of_pairs(scene, found, holds))
 
 
 def rung(name: str) -> Relation:

@@ -20,7 +20,7 @@ from sgstore.pair_numbers import gap
 from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -388,6 +388,75 @@ class MapContext:
     following: tuple[NDArray[np.intp], NDArray[np.intp], Floats]
 
 
+def _columns_of(count: int) -> Columns:
+    frame, src, dst = np.empty((3, count), np.int32)
+    return frame, np.empty(count, np.int8), src, dst
+
+
+class EdgeRoom:
+    """Columns that the families of relations fill with the edges of a block, one family behind another.
+
+    So edges are written once. A family may as well bring columns of its own: they are copied in the end.
+
+    Parameters
+    ----------
+    count : int
+        For how many edges there is room.
+    """
+
+    def __init__(self, count: int = 0) -> None:
+        self._columns = _columns_of(count)
+        self._parts: list[Edges] = []
+        self._used = 0
+
+    def rest(self, count: int) -> Columns:
+        """Columns with room for so many edges, to be filled from their beginning."""
+        if self._used + count > len(self._columns[0]):
+            return _columns_of(count)
+        frame, relation, src, dst = self._columns
+        first = self._used
+        return frame[first:], relation[first:], src[first:], dst[first:]
+
+    def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
+        """The first edges of such columns, and some more behind them if there is room."""
+        if more is not None and len(more):
+            if count + len(more) > len(columns[0]):
+                return Edges.chained([self.filled(columns, count), more])
+            _fill(columns, count, more)
+            count += len(more)
+        edges = _first(columns, count)
+        if count and columns[0].base is self._columns[0].base:
+            self._parts.append(edges)
+            self._used += count
+        return edges
+
+    def chained(self, parts: Sequence[Edges]) -> Edges:
+        """Edges of all parts, one part after another, as :meth:`Edges.chained` does it."""
+        parts = [part for part in parts if len(part)]
+        first, others = parts[: len(self._parts)], parts[len(self._parts) :]
+        count = self._used + sum(map(len, others))
+        in_place = all(one is other for one, other in zip(first, self._parts, strict=False))
+        if not in_place or len(first) < len(self._parts) or count > len(self._columns[0]):
+            return Edges.chained(parts)
+        for part in others:
+            _fill(self._columns, self._used, part)
+            self._used += len(part)
+        return _first(self._columns, count)
+
+
+def _first(columns: Columns, count: int) -> Edges:
+    frame, relation, src, dst = columns
+    return Edges(frame[:count], relation[:count], src[:count], dst[:count])
+
+
+def _fill(columns: Columns, first: int, edges: Edges) -> None:
+    to = slice(first, first + len(edges))
+    for column, values in zip(
+        columns, (edges.frame, edges.relation, edges.src, edges.dst), strict=True
+    ):
+        column[to] = values
+
+
 @dataclass(frozen=True, slots=True)
 class BlockScene:
     """The frames of a block, ready for the families of relations.
@@ -403,6 +472,8 @@ class BlockScene:
         Rows of bodies that touch one another, each pair once.
     ground : MapContext or None
         None without a map.
+    room : EdgeRoom
+        Where families may put their edges.
     """
 
     config: Config
@@ -411,6 +482,7 @@ class BlockScene:
     pairs: BodyPairs
     contacts: tuple[NDArray[np.intp], NDArray[np.intp]]
     ground: MapContext | None
+    room: EdgeRoom = field(default_factory=EdgeRoom)
 
     def parameters(self, relation: Relation) -> Mapping[str, Any]:
         """Settings of a relation's own: those of the config, and the defaults of the others."""
@@ -487,45 +559,36 @@ def edges_between(
     )
 
 
-def edge_room(count: int) -> Columns:
-    """Columns of so many edges, for loops to fill in."""
-    frame, src, dst = np.empty((3, count), np.int32)
-    return frame, np.empty(count, np.int8), src, dst
-
-
-def edges_filled(columns: Columns, count: int, more: Edges | None = None) -> Edges:
-    """The first of these edges, and some more, in the same columns if there is room."""
-    frame, relation, src, dst = columns
-    if more is not None and len(more):
-        if count + len(more) > len(frame):
-            return Edges.chained([edges_filled(columns, count), more])
-        to = slice(count, count + len(more))
-        frame[to], relation[to] = more.frame, more.relation
-        src[to], dst[to] = more.src, more.dst
-        count = to.stop
-    return Edges(frame[:count], relation[:count], src[:count], dst[:count])
-
-
 def edges_of_pairs(
-    pairs: BodyPairs, codes: Codes, holds: Bools, *, seen_by_a: bool = False
+    scene: BlockScene, codes: Codes, holds: Bools, *, seen_by_a: bool = False
 ) -> tuple[Columns, int]:
     """Edges of the related pairs of which something holds, from a to b; or from b, ``seen_by_a``, to a.
 
     Parameters
     ----------
-    pairs : BodyPairs
+    scene : BlockScene
     codes : (K,) int8
         Codes of the relations.
     holds : (K,) bool
     seen_by_a : bool
+
+    Returns
+    -------
+    columns, count
+        As :meth:`EdgeRoom.filled` takes them.
     """
-    frame, src, dst = pairs.ends
+    columns = scene.room.rest(len(codes))
+    frame, src, dst = scene.pairs.ends
     if seen_by_a:
         src, dst = dst, src
-    if holds.all():
-        return (frame, codes, src, dst), len(codes)
-    rows = np.flatnonzero(holds)
-    return (frame[rows], codes[rows], src[rows], dst[rows]), len(rows)
+    rows = None if holds.all() else np.flatnonzero(holds)
+    count = len(codes) if rows is None else len(rows)
+    for column, values in zip(columns, (frame, codes, src, dst), strict=True):
+        if rows is None:
+            column[:count] = values
+        else:
+            np.take(values, rows, out=column[:count], mode="clip")  # others go through a copy
+    return columns, count
 
 
 def edges_to_map(
