@@ -283,21 +283,8 @@ def _row(kind: type[_Row], values: Any, where: str) -> _Row:
 # Cases of a store with the digests of what is in them -------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class CasePart:
-    """Frames that are to be a case.
-
-    Attributes
-    ----------
-    frame_id : int64
-        Ascending, of one trace.
-    log_time_ns : int64
-    split : str
-    """
-
-    frame_id: Ints
-    log_time_ns: Ints
-    split: str = ""
+CasePart = tuple["Ints", "Ints", str]
+"""Frames that are to be a case: their ids, ascending, of one trace; their log times (ns); their split."""
 
 
 def made_with() -> dict[str, Any]:
@@ -340,12 +327,12 @@ def lock_of(
     """
     with store.file.snapshot():
         known = {trace.trace_id: trace for trace in store.info()}
-        of = [known[int(trace_of(part.frame_id[:1])[0])] for part in parts]
+        of = [known[int(trace_of(frame_id[:1])[0])] for frame_id, _, _ in parts]
         pairs = sorted(
-            zip(parts, of, strict=True), key=lambda one: (natural(one[1].name), one[0].frame_id[0])
+            zip(parts, of, strict=True), key=lambda one: (natural(one[1].name), one[0][0][0])
         )
         parts, of = [part for part, _ in pairs], [trace for _, trace in pairs]
-        groups = [part.frame_id for part in parts]
+        groups = [frame_id for frame_id, _, _ in parts]
         graphs = list(graph_digests(store.file, groups))
         read = payload_digests(store, groups) if payloads else iter([None] * len(parts))
         cases: list[LockedCase] = []
@@ -361,16 +348,17 @@ def lock_of(
 
 
 def _case(part: CasePart, trace: str, graph: str, payload: Payload | None) -> LockedCase:
-    first, last = (int(seq) for seq in seq_of(part.frame_id[[0, -1]]))
+    frame_id, log_time_ns, split = part
+    first, last = (int(seq) for seq in seq_of(frame_id[[0, -1]]))
     return LockedCase(
         id=f"{trace}#{first}" if first == last else f"{trace}#{first}-{last}",
         trace=trace,
         first=first,
         last=last,
-        start_ns=int(part.log_time_ns.min()),
-        end_ns=int(part.log_time_ns.max()),
-        frames=len(part.frame_id),
-        split=part.split,
+        start_ns=int(log_time_ns.min()),
+        end_ns=int(log_time_ns.max()),
+        frames=len(frame_id),
+        split=split,
         graph=graph,
         payload=payload,
     )

@@ -403,7 +403,7 @@ def test_a_command_line_knows_its_verb_alone_and_without_one_all_of_them() -> No
 
     every = [" ".join(sorted(chain.from_iterable(VERBS.values()))), " ".join(VERBS)]
     assert known("find", "s.sgstore", "MATCH (export)") == ["find patterns", "queries"]
-    assert known("lock", "verify") == ["lock", "selection"]
+    assert known("lock", "verify") == ["coverage lock", "coverage"]
     assert known() == known("--help") == known("fnd", "find") == every
 
 

@@ -12,7 +12,7 @@ from recordings import drive
 import sgstore
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
-from sgstore.locks import CasePart, lock_of
+from sgstore.locks import lock_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -144,7 +144,7 @@ def lock(here: pytest.Pytester, store: Path) -> dict[str, Any]:
     opened = sgstore.open(store)
     ids = opened.file.arrays("SELECT frame_id, log_time_ns FROM frames ORDER BY frame_id")
     parts = [
-        CasePart(ids["frame_id"][low : low + 11], ids["log_time_ns"][low : low + 11])
+        (ids["frame_id"][low : low + 11], ids["log_time_ns"][low : low + 11], "")
         for low in (0, 30, 60)
     ]
     made = lock_of(opened, parts, {})

@@ -77,7 +77,7 @@ def test_the_old_names_of_options_are_understood(
 
 def test_every_verb_of_locks_is_on_the_page() -> None:
     from sgstore.cli import application
-    from sgstore.cli._selection import lock
+    from sgstore.cli._coverage import lock
 
     application()
     verbs = {command.name for command in lock.registered_commands}

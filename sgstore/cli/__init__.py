@@ -33,8 +33,7 @@ VERBS: Final = {
     "stores": ("verify", "remove", "rebuild", "derive", "map", "payload", "config", "demo"),
     "queries": ("find", "why-not", "like", "translate", "sql", "patterns"),
     "checks": ("check", "monitor", "timeline"),
-    "coverage": ("coverage",),
-    "selection": ("select", "diff", "lock"),
+    "coverage": ("coverage", "select", "diff", "lock"),
     "exports": ("show", "export"),
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.
@@ -76,7 +75,7 @@ _PUBLISHING: Final = ("ingest", "import", "derive")
 def main() -> None:
     """Run the command line of this process and end it with the right exit code."""
     # Numpy starts a thread for each core when it is imported; only what multiplies large tables needs them.
-    if not {*sys.argv[1:2]} & {*VERBS["coverage"], *VERBS["selection"]}:
+    if not {*sys.argv[1:2]} & {*VERBS["coverage"]}:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Nothing of what is imported is ever garbage: to look for some while it comes takes a tenth of a short run.
     gc.set_threshold(50_000)

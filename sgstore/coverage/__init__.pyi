@@ -15,9 +15,9 @@ from ._compare import novel_clips as novel_clips
 from ._compare import novel_frames as novel_frames
 from ._compare import rank_sizes as rank_sizes
 from ._compare import venn as venn
-from ._failures import S3C_THRESHOLD as S3C_THRESHOLD
-from ._failures import failures as failures
-from ._failures import read_outcomes as read_outcomes
+from ._compare import S3C_THRESHOLD as S3C_THRESHOLD
+from ._compare import failures as failures
+from ._compare import read_outcomes as read_outcomes
 from ._features import Combinations as Combinations
 from ._features import Combos as Combos
 from ._features import combined as combined

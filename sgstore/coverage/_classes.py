@@ -6,9 +6,8 @@ What is a class is a choice: that of a frame's graph in an abstraction, or that 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -30,24 +29,15 @@ LONGEST_WINDOW: Final = 10_000
 """Most frames of a window: minutes of a recording, so that windows end in memory and time."""
 
 
-class Missing(StrEnum):
-    """Treatment of windows in which frames are missing: before a trace, at a gap, or without a class.
+Missing = Literal["equal", "distinct", "drop"]
+"""Treatment of windows in which frames are missing: before a trace, at a gap, or without a class.
 
-    ``equal``: what is missing is a class of its own, the same wherever it is missing (S3C); ``distinct``: it is
-    equal to nothing, so every such window is a class of its own; ``drop``: such windows do not count.
-    """
+``equal``: what is missing is a class of its own, the same wherever it is missing (S3C); ``distinct``: it is
+equal to nothing, so every such window is a class of its own; ``drop``: such windows do not count.
+"""
 
-    equal = "equal"
-    distinct = "distinct"
-    drop = "drop"
-
-
-class CountedUnit(StrEnum):
-    """Unit that is counted: frames, runs of consecutive frames of one class, or traces that have the class."""
-
-    frame = "frame"
-    run = "run"
-    trace = "trace"
+CountedUnit = Literal["frame", "run", "trace"]
+"""Unit that is counted: frames, runs of consecutive frames of one class, or traces that have the class."""
 
 
 @dataclass(frozen=True)
@@ -80,21 +70,21 @@ class Classed:
         """Number of frames whose class is not known."""
         return int((self.code == UNKNOWN).sum())
 
-    def sizes(self, unit: CountedUnit = CountedUnit.frame) -> Ints:
+    def sizes(self, unit: CountedUnit = "frame") -> Ints:
         """(len(names),) int64: how many units of each class there are."""
         code = self.code[self._units(unit)]
         return np.bincount(code, minlength=len(self.names)).astype(np.int64)
 
     def samples(self, unit: CountedUnit) -> int:
         """Number of traces, if these are counted; else 0: each unit is a sample of its own."""
-        return len(np.unique(trace_of(self.frame_id))) if unit is CountedUnit.trace else 0
+        return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
         """Rows that stand for units."""
         rows = np.flatnonzero(self.known)
-        if unit is CountedUnit.frame or not len(rows):
+        if unit == "frame" or not len(rows):
             return rows
-        if unit is CountedUnit.trace:
+        if unit == "trace":
             both = np.stack([trace_of(self.frame_id[rows]), self.code[rows]])
             return rows[np.unique(both, axis=1, return_index=True)[1]]
         return rows[self.run_begins()[rows]]
@@ -128,7 +118,7 @@ def classed(
     chosen: ChosenFrames,
     abstraction: str = "RSV",
     window: int = 1,
-    missing: Missing = Missing.equal,
+    missing: Missing = "equal",
     slots: Specification | None = None,
 ) -> Classed:
     """The frames of a selection with their classes.
@@ -192,9 +182,9 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
         _window_name([whole.names[part[row] - 1] if part[row] else "" for part in parts] + none)
         for row in first.tolist()
     ]
-    if missing is Missing.drop:
+    if missing == "drop":
         key = np.where(complete, key, UNKNOWN)
-    elif missing is Missing.distinct:
+    elif missing == "distinct":
         rows = np.flatnonzero(~complete)
         key = key.copy()
         key[rows] = len(names) + np.arange(len(rows))

@@ -1,4 +1,4 @@
-"""Comparison of selections: shared, new and missing classes, and estimates of what is unseen.
+"""Comparison of selections: shared, new and missing classes, estimates of what is unseen, and failures.
 
 How much has not been seen, from how often what was seen was seen.
 
@@ -13,17 +13,23 @@ traces.
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from sgstore.coverage._classes import UNKNOWN, CountedUnit, shared
 from sgstore.coverage._frames import SHARES, ReportTable, names_of, of_unknown, share
+from sgstore.errors import ConfigError
 from sgstore.store import begins, trace_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from sgstore.coverage._classes import Classed
     from sgstore.world import Bools, Floats, Ints
 
@@ -139,7 +145,7 @@ POINTS = 40
 """Rows of a curve of growth."""
 
 
-def classes(a: Classed, unit: CountedUnit = CountedUnit.frame) -> ReportTable:
+def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
     """The classes of a selection, the most frequent first.
 
     Returns
@@ -154,7 +160,7 @@ def classes(a: Classed, unit: CountedUnit = CountedUnit.frame) -> ReportTable:
     order = present[np.lexsort((first[present], -sizes[present]))]
     total = a.samples(unit) or int(sizes.sum())
     cumulative: list[float | None] = (np.cumsum(sizes[order]) / max(total, 1)).tolist()
-    if unit is CountedUnit.trace:  # a trace has many classes: these shares add up to nothing
+    if unit == "trace":  # a trace has many classes: these shares add up to nothing
         cumulative = [None] * len(order)
     rows = zip(
         range(1, len(order) + 1),
@@ -209,19 +215,10 @@ def covered(of: Classed, by: Classed) -> ReportTable:
     sizes, there = of.sizes(), by.sizes() > 0
     both = (sizes > 0) & there
     name, other = of.chosen.text, by.chosen.text
+    many, frames = int((sizes > 0).sum()), int(sizes.sum())
     rows = [
-        share(
-            "classes covered",
-            int(both.sum()),
-            int((sizes > 0).sum()),
-            f"distinct classes of {name}",
-        ),
-        share(
-            "frames covered",
-            int(sizes[both].sum()),
-            int(sizes.sum()),
-            f"frames of {name} with a class",
-        ),
+        share("classes covered", int(both.sum()), many, f"distinct classes of {name}"),
+        share("frames covered", int(sizes[both].sum()), frames, f"frames of {name} with a class"),
     ]
     said = [f"covered: of a class that also occurs in {other}", *of_unknown(of.unknown, name)]
     return ReportTable(SHARES, rows, [*said, *of_unknown(by.unknown, other)])
@@ -327,7 +324,7 @@ def venn(a: Classed, b: Classed) -> ReportTable:
     return ReportTable(("set", "classes", "frames_of_a", "frames_of_b"), rows, said)
 
 
-def growth(a: Classed, unit: CountedUnit = CountedUnit.frame, points: int = POINTS) -> ReportTable:
+def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> ReportTable:
     """Number of classes in the first n units, in the order in which traces came into the store.
 
     Returns
@@ -338,14 +335,8 @@ def growth(a: Classed, unit: CountedUnit = CountedUnit.frame, points: int = POIN
     """
     sizes, found = curve(a, unit)
     total = len(found)
-    at = (
-        np.unique(np.linspace(1, total, min(points, total)).round().astype(np.int64))
-        if total
-        else np.zeros(0, np.int64)
-    )
-    at_random = (
-        expected_classes(sizes, at) if unit is not CountedUnit.trace else np.full(len(at), np.nan)
-    )
+    at = np.unique(np.linspace(1, total, min(points, total)).round().astype(np.int64))
+    at_random = expected_classes(sizes, at) if unit != "trace" else np.full(len(at), np.nan)
     rows: list[tuple[int, int, float, float | None]] = []
     before = (0, 0)
     for n, random in zip(at.tolist(), at_random.tolist(), strict=True):
@@ -353,36 +344,216 @@ def growth(a: Classed, unit: CountedUnit = CountedUnit.frame, points: int = POIN
         rate = (so_far - before[1]) * 1000 / (n - before[0])
         rows.append((n, so_far, rate, _known(random)))
         before = (n, so_far)
-    said = (
-        [unseen(estimate(sizes, a.samples(unit)), unit)]
-        if total
-        else [f"{a.chosen.text}: no frame with a class"]
-    )
+    said = unseen(estimate(sizes, a.samples(unit)), unit)
+    said = said if total else f"{a.chosen.text}: no frame with a class"
     columns = (f"{unit}s", "classes", "new_per_1000", "at_random")
-    return ReportTable(columns, list(rows), said + of_unknown(a.unknown, a.chosen.text))
+    return ReportTable(columns, list(rows), [said, *of_unknown(a.unknown, a.chosen.text)])
 
 
-def curve(a: Classed, unit: CountedUnit = CountedUnit.frame) -> tuple[Ints, Ints]:
+def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
     """Sizes of the classes, and how many of them there are after each unit.
 
     A trace is a unit that brings all its classes at once.
     """
     order = a.in_order()
     order = order[a.code[order] != UNKNOWN]
-    if unit is CountedUnit.run:
+    if unit == "run":
         order = order[a.run_begins()[order]]
     codes = a.code[order]
     new = np.zeros(len(codes), np.int64)
     new[np.unique(codes, return_index=True)[1]] = 1
     found = np.cumsum(new)
-    if unit is CountedUnit.trace and len(order):
+    if unit == "trace" and len(order):
         trace = trace_of(a.frame_id[order])
         found = found[np.flatnonzero(np.append(trace[1:] != trace[:-1], True))]
     return a.sizes(unit), found
 
 
-def rank_sizes(a: Classed, unit: CountedUnit = CountedUnit.frame) -> tuple[Ints, Floats]:
+def rank_sizes(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Floats]:
     """Sizes of the classes, the largest first, and the share of all units that so many classes have."""
     sizes = np.sort(a.sizes(unit))[::-1]
     sizes = sizes[sizes > 0]
     return sizes, np.cumsum(sizes) / max(int(sizes.sum()), 1)
+
+
+# Failures of a system under test by the classes of its inputs: S3C's novel failures --------------
+# Woodlief et al., "S3C: Spatial Semantic Scene Coverage for Autonomous Vehicles" (ICSE 2024), section 4.2. A
+# *novel failure* is a failing test input whose class has no failing training input. PNFNC is the share of novel
+# failures whose class has no training input at all: failures that coverage would have foretold.
+
+S3C_THRESHOLD: Final = 5 / 140
+"""The error beyond which S3C's code counts a steering angle, -1 … 1 for ±70°, as a failure: 2.5°, though its
+paper says 5°."""
+
+_ID: Final = re.compile(r"[0-9]{1,18}")
+
+
+def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:
+    """The outcomes in a CSV file: which inputs of a system failed.
+
+    Parameters
+    ----------
+    path : str or Path
+        Columns ``frame`` (or S3C's ``town`` and ``filename``) and ``failed``, or ``error``, or ``label`` and
+        ``pred``.
+    threshold : float
+        An error above it is a failure; of ``label`` and ``pred`` their difference.
+
+    Returns
+    -------
+    dict
+        Name → whether it failed. A name is ``TRACE#SEQ``, a ``frame_id``, or what an imported file calls a
+        graph.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, a column is missing, or a row is not what it must be.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return dict(_outcomes(path, csv.reader(file, strict=True), threshold))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: no CSV: {error}") from error
+
+
+def _told(outcomes: Mapping[str, bool], a: Classed) -> tuple[Bools, Bools]:
+    """(N,): which frames of a selection failed, and of which an outcome is known."""
+    failed, known = (np.zeros(len(a.frame_id), np.bool_) for _ in range(2))
+    place = {int(frame): row for row, frame in enumerate(a.frame_id.tolist())}
+    store = a.chosen.store
+    ids = store.file.abstracted.times()[0]
+    called = dict(zip(names_of(store, ids), ids.tolist(), strict=True))
+    called |= store.file.abstracted.imported_names()
+    for name, fails in outcomes.items():
+        row = place.get(called.get(name, int(name) if _ID.fullmatch(name) else -1))
+        if row is not None:
+            failed[row], known[row] = fails, True
+    return failed, known
+
+
+def _outcomes(
+    path: Path, rows: Iterator[list[str]], threshold: float
+) -> Iterator[tuple[str, bool]]:
+    header = [name.strip() for name in next(rows, [])]
+    names = ["frame"] if "frame" in header else ["town", "filename"]
+    values = next(
+        (v for v in (["failed"], ["error"], ["label", "pred"]) if set(v) <= set(header)), None
+    )
+    if not set(names) <= set(header) or values is None:
+        raise ConfigError(
+            f"{path}: expected columns 'frame' (or 'town', 'filename') and 'failed' (or 'error', or 'label',"
+            f" 'pred'); found {','.join(header)[:200]}"
+        )
+    at_name = [header.index(name) for name in names]
+    at_value = [header.index(name) for name in values]
+    for number, row in enumerate(rows, start=2):
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise ConfigError(f"{path}: row {number}: {len(row)} columns, expected {len(header)}")
+        told = [row[place].strip() for place in at_value]
+        yield (
+            "/".join(row[place].strip() for place in at_name),
+            _failed(f"{path}: row {number}", values, told, threshold),
+        )
+
+
+_TRUE: Final = frozenset({"1", "true", "yes", "t", "failed", "fail"})
+_FALSE: Final = frozenset({"0", "false", "no", "f", "passed", "pass", ""})
+
+
+def _failed(where: str, columns: list[str], told: list[str], threshold: float) -> bool:
+    if columns == ["failed"]:
+        if told[0].lower() not in _TRUE | _FALSE:
+            raise ConfigError(f"{where}, column failed: expected true or false, found {told[0]!r}")
+        return told[0].lower() in _TRUE
+    try:
+        numbers = [float(text) for text in told]
+    except ValueError:
+        raise ConfigError(f"{where}: expected numbers, found {', '.join(told)!r}") from None
+    return abs(numbers[0] if len(numbers) == 1 else numbers[1] - numbers[0]) > threshold
+
+
+def failures(
+    train: Classed, test: Classed, outcomes: Mapping[str, bool]
+) -> tuple[ReportTable, ReportTable]:
+    """Compare the failures of test inputs with the classes of training inputs.
+
+    Parameters
+    ----------
+    train, test : Classed
+    outcomes : mapping
+        Name of a frame → whether the system failed; see :func:`read_outcomes`.
+
+    Returns
+    -------
+    shares : ReportTable
+        ``measure``, ``part``, ``of``, ``share``, ``denominator``.
+    novel : ReportTable
+        The novel failures: ``frame``, ``class``, ``in_training`` (how many training inputs are of its class).
+
+    Raises
+    ------
+    ConfigError
+        No outcome is about a frame of either.
+    """
+    _, (train, test) = shared(train, test)
+    failed_train, known_train = _told(outcomes, train)
+    failed, known = _told(outcomes, test)
+    if not known.any():
+        raise ConfigError(
+            f"none of the {len(outcomes)} outcomes is about a frame of {test.chosen.text}"
+        )
+    failed &= test.known
+    failed_train &= train.known
+    # Training inputs of the class of each test input.
+    inputs = np.append(train.sizes(), 0)[test.code]
+    fails = np.bincount(train.code[failed_train], minlength=len(train.names) + 1)
+    novel = failed & (fails[test.code] == 0)
+    ours, theirs = test.chosen.text, train.chosen.text
+    classes, first = np.unique(test.code[novel], return_index=True)
+    lacking = inputs[novel][first] == 0
+    told = [f"frames of {name} with an outcome" for name in (ours, theirs)]
+    new = f"failures of {ours}: no failing frame of their class in {theirs}"
+    uncovered, once = novel & (inputs == 0), novel & (inputs == 1)
+    facts = (
+        ("failures", failed, known & test.known, told[0]),
+        ("failures in training", failed_train, known_train & train.known, told[1]),
+        ("novel failures", novel, failed, new),
+        # What follows says how many of them coverage would have foretold.
+        ("PNFNC", uncovered, novel, f"novel failures: their class does not occur in {theirs}"),
+        (
+            "classes of novel failures that are not covered",
+            lacking,
+            np.ones(len(classes)),
+            "distinct classes of novel failures",
+        ),
+        (
+            "novel failures of a class seen once",
+            once,
+            novel,
+            f"novel failures: their class has one frame in {theirs}",
+        ),
+        (
+            "test inputs not covered",
+            test.known & (inputs == 0),
+            test.known,
+            f"frames of {ours} with a class",
+        ),
+    )
+    rows = [share(name, int(part.sum()), int(of.sum()), text) for name, part, of, text in facts]
+    said = of_unknown(test.unknown, ours) + of_unknown(train.unknown, theirs)
+    said += [f"{int((~known).sum())} frames of {ours} have no outcome"] if (~known).any() else []
+    return ReportTable(SHARES, rows, said), _listed(test, novel, inputs)
+
+
+def _listed(test: Classed, novel: Bools, inputs: Ints) -> ReportTable:
+    rows = np.flatnonzero(novel)
+    frames = names_of(test.chosen.store, test.frame_id[rows])
+    columns = zip(frames, test.code[rows].tolist(), inputs[rows].tolist(), strict=True)
+    listed = [(frame, test.names[code], many) for frame, code, many in columns]
+    return ReportTable(("frame", "class", "in_training"), listed)

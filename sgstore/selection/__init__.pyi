@@ -13,9 +13,9 @@ from ._cover import Fitted as Fitted
 from ._cover import minimal as minimal
 from ._cover import within as within
 from ._sets import SetFamily as SetFamily
-from ._splits import parse_split as parse_split
-from ._splits import split as split
-from ._splits import split_table as split_table
+from ._choose import parse_split as parse_split
+from ._choose import split as split
+from ._choose import split_table as split_table
 from ._units import Budget as Budget
 from ._units import Measure as Measure
 from ._units import SelectionUnit as SelectionUnit

@@ -1,10 +1,11 @@
-"""Selection strategies, budgets, and locks of a selection.
+"""Selection strategies, budgets, parts such as train and test, and locks of a selection.
 
 A budget that is spent unit by unit; what units share is paid once.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -12,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.coverage import ReportTable, expected_classes, names_of
+from sgstore.coverage import UNKNOWN, ReportTable, classed, expected_classes, names_of
 from sgstore.errors import ConfigError
-from sgstore.locks import CasePart, lock_of
+from sgstore.locks import lock_of
 from sgstore.selection._cover import affordable, cheapest, has_solver, minimal, within
 from sgstore.selection._units import Budget, Measure, SelectionUnit, holdings, kept, units_of
-from sgstore.store import seq_of
+from sgstore.store import seq_of, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -58,7 +59,7 @@ class BudgetTracker:
     @classmethod
     def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
         """Make a tracker of a budget of which nothing is spent."""
-        shared = units.overlap and measure is not Measure.units
+        shared = units.overlap and measure != "units"
         weights = units.weights(measure) if shared else None
         nothing = np.zeros(len(units.frame_id), np.bool_)
         return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
@@ -150,7 +151,7 @@ class SelectionSpec:
     by: str = ""
     alpha: float = 1.0
     budget: Budget | None = None
-    objective: Measure = Measure.units
+    objective: Measure = "units"
     seed: int = 0
     stride_s: float | None = None
 
@@ -193,7 +194,7 @@ class SelectionSpec:
             "by": self.by or None,
             "temper": self.alpha if self.strategy is Strategy.stratify else None,
             "budget": None if self.budget is None else str(self.budget),
-            "least": self.objective.value if cover else None,
+            "least": self.objective if cover else None,
             "seed": self.seed,
         }
 
@@ -248,7 +249,7 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     found = _selected(spec, units, units.ranks(spec.seed))
     if not units.overlap:
         return found
-    frames, seconds = (units.together(found.picked, m) for m in (Measure.frames, Measure.seconds))
+    frames, seconds = (units.together(found.picked, m) for m in ("frames", "seconds"))
     said = (
         f"together {_number(frames)} of {len(units.frame_id):,} frames, {_number(seconds)} s: what clips share"
         " counts once"
@@ -283,13 +284,13 @@ def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
     each = spec.each if spec.strategy is Strategy.per_class else 1
     shared = units.overlap
-    if shared and spec.objective is not Measure.units:
+    if shared and spec.objective != "units":
         cover = cheapest(units, held, spec.objective, rank)
     else:
         cover = minimal(held.family(units, units.costs(spec.objective), each, rank))
     result = _said_of(held, units, spec)
     met = _met(held, units, cover.chosen)
-    bound = cover.bound if spec.objective is not Measure.units else round(cover.bound)
+    bound = cover.bound if spec.objective != "units" else round(cover.bound)
     result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound, "exact": cover.exact}
     result["greedy"] = cover.greedy
     said = [
@@ -312,7 +313,7 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
     if whole <= budget.most * ROUNDING:
         said.append(f"that is {_number(whole)} {budget.measure}, within {budget}")
         return Selection(spec, units, cover.chosen, held, result | {"kept": met}, said)
-    if shared and budget.measure is not Measure.units:
+    if shared and budget.measure != "units":
         fitted = affordable(units, held, budget.measure, rank, budget.most * ROUNDING)
     else:
         family = held.family(units, units.costs(budget.measure), each, rank)
@@ -341,7 +342,7 @@ def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any
         "of": len(units),
         "elements": held.total,
         "kind": held.kind,
-        "least": spec.objective.value,
+        "least": spec.objective,
     }
 
 
@@ -494,6 +495,115 @@ def listed(selection: Selection) -> ReportTable:
     return ReportTable(("unit", "frames", "holds", "new"), list(rows))
 
 
+# Parts of a selection that share no recording, such as train and test; and what one knows of another ----
+
+
+def parse_split(text: str) -> dict[str, float]:
+    """``train=0.8,test=0.2`` as shares by name.
+
+    Raises
+    ------
+    ConfigError
+        It is not that, or the shares are not 1 together.
+    """
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, value = part.partition("=")
+        try:
+            share = float(value)
+        except ValueError:
+            share = math.nan
+        if not name.strip().isidentifier() or not 0 < share <= 1 or name.strip() in found:
+            raise ConfigError(
+                f"--split {text!r}: expected NAME=SHARE,…, such as train=0.8,test=0.2"
+            )
+        found[name.strip()] = share
+    if not math.isclose(sum(found.values()), 1, abs_tol=1e-6):
+        raise ConfigError(
+            f"--split {text!r}: the shares are {sum(found.values()):g} together; expected 1"
+        )
+    return found
+
+
+def split(selection: Selection, shares: dict[str, float]) -> dict[int, str]:
+    """The part that each selected unit belongs to; all that comes from one recording belongs to one.
+
+    The recordings with the most selected frames come first, each goes to the part that lacks most.
+
+    Returns
+    -------
+    dict
+        Number of unit → name of its part.
+    """
+    units = selection.units
+    recording = {one.trace_id: one.digest for one in units.chosen.store.info()}
+    of = [recording[trace] for trace in trace_of(units.first[selection.picked]).tolist()]
+    rows = units.rows_of(selection.picked)
+    traces, often = np.unique(trace_of(units.frame_id[rows]), return_counts=True)
+    total: dict[str, int] = {}
+    for trace, many in zip(traces.tolist(), often.tolist(), strict=True):
+        total[recording[trace]] = total.get(recording[trace], 0) + many
+    order = sorted(total, key=lambda d: (-total[d], _drawn(d, selection.spec.seed)))
+    lack = {name: share * len(rows) for name, share in shares.items()}
+    part: dict[str, str] = {}
+    for digest in order:
+        part[digest] = max(lack, key=lambda name: lack[name])
+        lack[part[digest]] -= total[digest]
+    return {unit: part[d] for unit, d in zip(selection.picked.tolist(), of, strict=True)}
+
+
+def _drawn(digest: str, seed: int) -> bytes:
+    return hashlib.blake2b(f"{seed} {digest}".encode(), digest_size=8).digest()
+
+
+def split_table(
+    selection: Selection, parts: dict[int, str], shares: dict[str, float]
+) -> ReportTable:
+    """Table of parts: their content, and the share of it that each other part has too.
+
+    Returns
+    -------
+    ReportTable
+        ``split``, ``units``, ``frames``, ``share`` (of the frames), ``wanted``, ``recordings``, ``classes``;
+        and for each other part ``classes_in_…`` and ``frames_in_…``: the share of the classes, and of the
+        frames, whose class occurs there, too. ``None``: of nothing.
+    """
+    units = selection.units
+    of = classed(units.chosen, selection.spec.abstraction)
+    code = np.full(len(units.frame_id), UNKNOWN)
+    code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
+    mine = {
+        name: np.array([unit for unit, part in parts.items() if part == name], np.int64)
+        for name in shares
+    }
+    rows = {name: units.rows_of(own) for name, own in mine.items()}
+    sizes = {
+        name: np.bincount(code[own][code[own] != UNKNOWN], minlength=len(of.names))
+        for name, own in rows.items()
+    }
+    digests = {one.trace_id: one.digest for one in units.chosen.store.info()}
+    columns = ["split", "units", "frames", "share", "wanted", "recordings", "classes"]
+    columns += [f"{what}_in_{name}" for name in shares for what in ("classes", "frames")]
+    listed: list[tuple[object, ...]] = []
+    total = max(sum(len(own) for own in rows.values()), 1)
+    for name, wanted in shares.items():
+        recordings = {digests[trace] for trace in trace_of(units.first[mine[name]]).tolist()}
+        many = len(rows[name])
+        has = sizes[name] > 0
+        row: list[object] = [name, len(mine[name]), many, many / total, wanted]
+        row += [len(recordings), int(has.sum())]
+        for other in shares:
+            both = has & (sizes[other] > 0)
+            told = name != other and has.any()
+            row.append(float(both.sum() / has.sum()) if told else None)
+            row.append(float(sizes[name][both].sum() / sizes[name].sum()) if told else None)
+        listed.append(tuple(row))
+    said = ["by recording: no recording is in two parts"]
+    if len(set(parts.values())) < len(shares):
+        said.append("there are too few recordings: a part is empty")
+    return ReportTable(tuple(columns), listed, said)
+
+
 # A selection as a lock --------------------------------------------------------------------------
 
 
@@ -514,7 +624,7 @@ def locked_selection(
     query : str
         The query whose frames were selected from; empty: all.
     parts : mapping of int to str, optional
-        The part that each unit belongs to: :func:`sgstore.selection._splits.split`.
+        The part that each unit belongs to: :func:`split`.
     parameters : mapping, optional
         Values of ``$name`` in the query.
     payloads : bool
@@ -529,7 +639,7 @@ def locked_selection(
     """
     units = selection.units
     wanted = [
-        CasePart(
+        (
             units.frame_id[units.begin[unit] : units.end[unit]],
             units.log_time_ns[units.begin[unit] : units.end[unit]],
             (parts or {}).get(unit, ""),
@@ -653,7 +763,7 @@ def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[F
     starts = np.flatnonzero(np.append(True, np.diff(pairs[1][order]) != 0))
     own = weight[pairs[1][order][starts]]
     orders = int(np.clip(_WORK // max(len(unit), 1), 20, ORDERS))
-    period = units.weights(Measure.seconds) if units.overlap else None
+    period = units.weights("seconds") if units.overlap else None
     rows = np.arange(len(units.frame_id))
     holding = [
         np.searchsorted(units.end, rows, side="right"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -36,13 +36,8 @@ class SelectionUnit(StrEnum):
     trace = "trace"
 
 
-class Measure(StrEnum):
-    """Measure of the cost of a selection."""
-
-    units = "units"
-    frames = "frames"
-    seconds = "seconds"
-    bytes = "bytes"
+Measure = Literal["units", "frames", "seconds", "bytes"]
+"""Measure of the cost of a selection."""
 
 
 @dataclass(frozen=True)
@@ -80,22 +75,18 @@ class Budget:
 
 
 _BUDGET: Final = re.compile(r"\s*(\d{1,15}(?:\.\d+)?)\s*([A-Za-z]+)\s*")
-_BYTES: Final = {
-    f"{prefix}{ending}": (base ** (power + 1), Measure.bytes)
-    for ending, base in (("b", 1000), ("ib", 1024))
-    for power, prefix in enumerate("kmgt")
-}
 _MEASURES: Final[dict[str, tuple[float, Measure]]] = {
-    "s": (1, Measure.seconds),
-    "min": (60, Measure.seconds),
-    "h": (3600, Measure.seconds),
-    "b": (1, Measure.bytes),
-    **_BYTES,
+    "s": (1, "seconds"),
+    "min": (60, "seconds"),
+    "h": (3600, "seconds"),
+    "b": (1, "bytes"),
     **{
-        name: (1, measure)
-        for measure in (Measure.frames, Measure.units)
-        for name in (measure.value, measure.value[:-1])
+        f"{prefix}{ending}": (base ** (power + 1), "bytes")
+        for ending, base in (("b", 1000), ("ib", 1024))
+        for power, prefix in enumerate("kmgt")
     },
+    **dict.fromkeys(("frame", "frames"), (1, "frames")),
+    **dict.fromkeys(("unit", "units"), (1, "units")),
 }
 
 
@@ -169,11 +160,11 @@ class Units:
     def weights(self, measure: Measure) -> Floats:
         """(N,): what each frame costs; it lasts the median period of its trace."""
         match measure:
-            case Measure.units | Measure.frames:
+            case "units" | "frames":
                 return np.ones(len(self.frame_id))
-            case Measure.seconds:
+            case "seconds":
                 return periods_of(self.chosen.store, self.frame_id) / 1e9
-            case Measure.bytes:
+            case "bytes":
                 found = np.zeros(len(self.frame_id))
                 for frame_id, length in lengths_of_messages(self.chosen.store.file, self.frame_id):
                     np.add.at(found, np.searchsorted(self.frame_id, frame_id), length)
@@ -181,7 +172,7 @@ class Units:
 
     def costs(self, measure: Measure) -> Floats:
         """(U,): what each unit costs alone."""
-        if measure is Measure.units:
+        if measure == "units":
             return np.ones(len(self))
         return self.summed(self.weights(measure), measure)
 
@@ -192,11 +183,11 @@ class Units:
         ranges = np.stack([self.begin, self.end], axis=1).ravel()
         found = np.add.reduceat(np.append(weights, 0.0), ranges)[::2]
         # A trace of one frame has no period, a frame perhaps no message.
-        return np.maximum(found, 1e-3 if measure is Measure.seconds else 1.0)
+        return np.maximum(found, 1e-3 if measure == "seconds" else 1.0)
 
     def together(self, picked: Ints, measure: Measure) -> float:
         """Cost of some units together: a frame that is in several of them costs once."""
-        if measure is Measure.units:
+        if measure == "units":
             return float(len(picked))
         if not self.overlap:
             return float(self.costs(measure)[picked].sum())
