@@ -477,9 +477,8 @@ def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
     check(near, name, corners, f"corners up to {MOST_LENGTH:.0f} m away")
     from sgstore.geometry import is_simple  # it comes with numpy, which most configs need not
 
-    check(
-        is_simple(corners), name, corners, "sides that meet at the corners only, one after another"
-    )
+    right = "sides that meet at the corners only, one after another"
+    check(is_simple(corners), name, corners, right)
 
 
 def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # noqa: FBT001
@@ -512,10 +511,13 @@ def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
 
 def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """The settings of relations, with the defaults of those that are not given."""
-    checked, others = dict[str, dict[str, Any]](), plugins.RELATIONS.others() if given else {}
+    registry, checked = plugins.RELATIONS, dict[str, dict[str, Any]]()
+    others = registry.others() if given else {}
     for name, values in sorted(given.items()):
-        check(name in others, "relations", name, _expected(name, others) if others else "no table")
-        relation = plugins.RELATIONS.load_other(others[name], ConfigError)
+        own = registry.load(name) if name in registry.own else None
+        right = _expected(name, others) if others else "no table"
+        check(name in others or bool(getattr(own, "parameters", {})), "relations", name, right)
+        relation = own or registry.load_other(others[name], ConfigError)
         known: Mapping[str, Any] = getattr(relation, "parameters", {})
         for key in values:
             if key not in known:
@@ -797,10 +799,8 @@ def as_toml(config: Config) -> str:
         elif one.name == "relations":
             tables += ["", *_comment(one), *([] if value else ["[relations]"])]
             for name, values in value.items():
-                tables += [
-                    f"[relations.{name}]",
-                    *(f"{k} = {_literal(v)}" for k, v in values.items()),
-                ]
+                tables.append(f"[relations.{name}]")
+                tables += [f"{k} = {_literal(v)}" for k, v in values.items()]
         elif isinstance(value, Mapping):
             tables += ["", *_comment(one), f"[{one.name}]"]
             tables += [f"{_text(key)} = {_meaning(asdict(v))}" for key, v in value.items()]

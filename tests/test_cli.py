@@ -255,6 +255,26 @@ BAD: list[tuple[str, list[str], int, str]] = [
     ("no such picture format", ["show", "{store}", "town#3", "-o", "{out}.bmp"], 1, ".png"),
     ("a time that is none", ["export", "{store}", "MATCH (e:Ego)", "--before", "soon"], 2, "2s"),
     ("no such verb", ["fnd", "{store}"], 2, "fnd"),
+    ("a recording without a store", ["ingest", "{sample}"], 2, "'TRACE…'. The store comes first."),
+    (
+        "a frame before the store",
+        ["why-not", "town#3", "{store}", "MATCH (e:Ego)"],
+        2,
+        "town#3 is no store, but",
+    ),
+    (
+        "a recording before the store",
+        ["ingest", "{sample}", "{store}"],
+        2,
+        "is: the store comes first",
+    ),
+    (
+        "a limit that is an option",
+        ["find", "{store}", "MATCH (e)", "--limit", "3"],
+        2,
+        "--limit; write LIMIT 10 at the end of the query",
+    ),
+    ("the same of SQL", ["sql", "{store}", "SELECT 1", "--limit", "3"], 2, "end of the SQL"),
 ]
 
 

@@ -223,11 +223,22 @@ def test_the_same_question_of_two_checks_is_asked_once() -> None:
     assert len(monitor._questions[0]._all) == 1
 
 
-def test_the_program_of_the_page_runs() -> None:
+def programs() -> list[str]:
     page = (Path(__file__).parents[1] / "docs" / "online.md").read_text(encoding="utf-8")
-    (program,) = [
-        block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "RULES" in block
-    ]
+    return re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+
+
+def test_the_first_program_of_the_page_runs_as_it_stands() -> None:
+    names: dict[str, Any] = {}
+    exec(compile(programs()[0], "online.md", "exec"), names)
+
+    idents = {about["ident"] for about in names["graph"].nodes.values()}
+    assert idents == {"hero", "p7", "tl3", "house"}
+    assert {relation for _, relation, *_ in names["graph"].edges} >= {"toRightOf"}
+
+
+def test_the_program_of_the_page_runs() -> None:
+    (program,) = [block for block in programs() if "RULES" in block]
     frames = [car(t / 10, 15 if t > 5 else 0, ("v", 30.0 - t)) for t in range(40)]
     told: list[tuple[Any, ...]] = []
     names: dict[str, Any] = {

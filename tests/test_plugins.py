@@ -221,6 +221,22 @@ def test_a_relation_of_another_package_has_settings(
     assert from_dict(json.loads(json.dumps(config.as_dict()))) == config
 
 
+def test_a_relation_that_the_tree_lists_has_settings(
+    names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(plugins.RELATIONS.own, "abreast_of", "unused:ABREAST_OF")
+    monkeypatch.setitem(plugins.RELATIONS._loaded, "abreast_of", NEAR_ENOUGH)
+    registry.relations.cache_clear()
+
+    config = from_dict({"relations": {"abreast_of": {"reach": 3}}})
+
+    assert config.relations == {"abreast_of": {"reach": 3.0, "loud": False}}
+    with pytest.raises(ConfigError, match="expected a number"):
+        from_dict({"relations": {"abreast_of": {"reach": "far"}}})
+    with pytest.raises(ConfigError, match="'relations' is 'near'; expected no table"):
+        from_dict({"relations": {"near": {}}})
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

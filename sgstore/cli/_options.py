@@ -36,7 +36,9 @@ class Verb(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read a command line; what follows of it is none of the verb's."""
-        if not ctx.resilient_parsing:  # which completes a command line that is not whole yet
+        if ctx.resilient_parsing:  # which completes a command line that is not whole yet
+            return super().parse_args(ctx, args)
+        try:
             _, _, order = self.make_parser(ctx).parse_args(args=list(args))
             given: Counter[Any] = Counter(order)
             for parameter, times in given.items():
@@ -44,8 +46,54 @@ class Verb(TyperCommand):
                     raise typer.BadParameter(
                         f"given {times} times, but it takes one value", ctx=ctx, param=parameter
                     )
-        _spare(self.get_params(ctx))
-        return super().parse_args(ctx, args)
+            _spare(self.get_params(ctx))
+            rest = super().parse_args(ctx, args)
+        except Exception as error:
+            _advise(error, self)
+            raise
+        _refuse_late_store(self, ctx)
+        return rest
+
+
+_LIMITED: Final = {"find": "the query", "sql": "the SQL"}
+"""Verbs whose text says itself how many rows are wanted."""
+
+
+def _advise(error: Any, verb: Verb) -> None:
+    """Add to an error of usage what is to be done, if that is plain; each typer has another class for these."""
+    if getattr(error, "option_name", "") == "--limit" and verb.name in _LIMITED:
+        error.possibilities = None
+        error.message = f"{error.message}; write LIMIT 10 at the end of {_LIMITED[verb.name]}"
+    places = _places(verb)
+    if type(error).__name__ == "MissingParameter" and error.param.name in places[1:]:
+        error.message = "The store comes first."
+
+
+def _places(verb: Verb) -> list[str]:
+    """Names of the arguments of a verb whose first one is a store; nothing of another verb."""
+    names = [one.name or "" for one in verb.params if one.param_type_name == "argument"]
+    return names if names[:1] == ["store"] else []
+
+
+def _refuse_late_store(verb: Verb, ctx: Any) -> None:
+    """Refuse a store that stands where something else is expected, and something else in its place."""
+    values = [ctx.params[name] for name in _places(verb)]
+    if not values or _is_database(values[0]):
+        return
+    later = [one for value in values[1:] for one in (value if isinstance(value, list) else [value])]
+    found = next((one for one in later if one is not None and _is_database(one)), None)
+    if found is not None:
+        raise typer.BadParameter(
+            f"{values[0]} is no store, but {found} is: the store comes first", ctx=ctx
+        )
+
+
+def _is_database(place: str | Path) -> bool:
+    try:
+        with Path(place).open("rb") as file:
+            return file.read(12)[8:] == b"DUCK"
+    except (OSError, ValueError):  # a query is no name of a file
+        return False
 
 
 class Application(TyperGroup):
