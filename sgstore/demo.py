@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,24 +21,8 @@ if TYPE_CHECKING:
     Say = Callable[[str], object]
 
 
-@dataclass(frozen=True, slots=True)
-class DemoQuestion:
-    """A question of a test engineer, as a sentence and as a pattern.
-
-    Attributes
-    ----------
-    name : str
-        Of the picture that answers it.
-    sentence, pattern : str
-    """
-
-    name: str
-    sentence: str
-    pattern: str
-
-
 QUESTIONS: Final = (
-    DemoQuestion(
+    (
         "crossing-at-red",
         "Does anybody cross in front of the ego, in its own lane, while the light is red?",
         """\
@@ -47,7 +30,7 @@ MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(p:Person),
       (light:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(lane)
 WHERE abs(bearing(e, p)) < 45""",
     ),
-    DemoQuestion(
+    (
         "cut-in",
         "Does anybody come over from the lane beside, closely before the ego?",
         """\
@@ -55,7 +38,7 @@ MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(v:Vehicle)-[:isIn]->(beside:Lane),
       (beside)-[:laneChange]->(lane)
 WHERE abs(bearing(e, v)) < 45 AND gap(e, v) < 12 AND v.speed > 1""",
     ),
-    DemoQuestion(
+    (
         "jaywalking",
         "Does anybody walk on a driving lane, near the ego and on no crosswalk?",
         """\
@@ -63,7 +46,9 @@ MATCH (e:Ego), (p:Person)-[at:isIn]->(lane:Lane {lane_type: 'driving'})
 WHERE dist(e, p) < 25 AND at.overlap > 0.5 AND NOT EXISTS {(p)-[:isIn]->(:Crosswalk)}""",
     ),
 )
-"""Each holds somewhere in the sample; ``samples/town/README.md`` says when and who."""
+"""Questions of a test engineer: name of the picture that answers it, sentence, pattern.
+
+Each holds somewhere in the sample; ``samples/town/README.md`` says when and who."""
 
 STORE: Final = "demo.sgstore"
 
@@ -100,7 +85,7 @@ def run_demo(folder: str | Path, say: Say, recording: str | Path = RECORDING) ->
     _prepare(folder)
     _ingest(folder / STORE, recording, say)
     store = Store(folder / STORE)
-    pictures = [_answer(store, question, folder, say) for question in QUESTIONS]
+    pictures = [_answer(store, folder, say, *question) for question in QUESTIONS]
     clips = _export(store, folder, say)
     _say_what_next(folder, clips, pictures, say)
 
@@ -128,21 +113,23 @@ def _ingest(store: Path, sample: Path, say: Say) -> None:
     say(f"  {outcome.frames} scene graphs in {outcome.seconds:.1f} s, of {kinds}.")
 
 
-def _answer(store: Store, question: DemoQuestion, folder: Path, say: Say) -> Path | None:
+def _answer(
+    store: Store, folder: Path, say: Say, name: str, sentence: str, pattern: str
+) -> Path | None:
     """Ask, print the intervals, and draw the middle of the first one."""
     say("")
-    say(f"{question.sentence}")
+    say(sentence)
     say("")
-    for line in question.pattern.splitlines():
+    for line in pattern.splitlines():
         say(f"    {line}")
     say("")
-    matches = store.find(question.pattern)
+    matches = store.find(pattern)
     found = list(matches.intervals())
     say(f"  {matches.count()} frames:")
     for interval in found:
         who = ", ".join(_bound(interval))
         say(f"  {interval.start:6.1f} s to {interval.end:4.1f} s   {who}")
-    picture = folder / f"{question.name}.png"
+    picture = folder / f"{name}.png"
     middle = (found[0].start_seq + found[0].end_seq) // 2
     try:
         draw_stored(store, f"{found[0].trace}#{middle}", picture, matches=matches)
@@ -163,10 +150,10 @@ def _bound(interval: Interval) -> list[str]:
 
 
 def _export(store: Store, folder: Path, say: Say) -> Path:
-    question = QUESTIONS[0]
+    _, _, pattern = QUESTIONS[0]
     to = folder / "clips"
-    clips = list(store.find(question.pattern).clips(before=2.0, after=2.0))
-    export = Export(store, tuple(clips), provenance={"query": question.pattern})
+    clips = list(store.find(pattern).clips(before=2.0, after=2.0))
+    export = Export(store, tuple(clips), provenance={"query": pattern})
     written = [one for one in write_export(export, to) if isinstance(one, WrittenClip)]
     say("")
     say(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.abstractions import SUBSETS, abstraction_named, abstractions, check_name
@@ -100,19 +101,10 @@ def derive(
     file = StoreFile(store)
     file.settle()
     chosen = [file.trace(ref) for ref in traces] if traces else list(file.traces())
-    known = {
-        one.trace_id: one
-        for one in file.deriving.sets()
-        if normalize_name(one.name) == normalize_name(name)
-    }
-    of_name = next(
-        (
-            one.name
-            for one in file.deriving.sets()
-            if normalize_name(one.name) == normalize_name(name)
-        ),
-        name,
-    )
+    sets = file.deriving.sets()
+    alike = [one for one in sets if normalize_name(one.name) == normalize_name(name)]
+    known = {one.trace_id: one for one in alike}
+    of_name = alike[0].name if alike else name
     plans = [(trace, _settings(trace, config)) for trace in chosen]
     results: list[Derivation] = []
     for trace, settings in plans:
@@ -240,18 +232,9 @@ def _settings(trace: StoredTrace, wanted: Config) -> Config:
     need(dict(new.types) == dict(old.types), "types", dict(old.types), dict(new.types))
     lanes = new.lanes.granularity in {"none", old.lanes.granularity}
     need(lanes, "lanes.granularity", old.lanes.granularity, new.lanes.granularity)
-    need(
-        old.lanes.sections == new.lanes.sections,
-        "lanes.sections",
-        old.lanes.sections,
-        new.lanes.sections,
-    )
-    need(
-        old.lanes.spacing == new.lanes.spacing,
-        "lanes.spacing",
-        old.lanes.spacing,
-        new.lanes.spacing,
-    )
+    for name in ("sections", "spacing"):
+        was, asked = getattr(old.lanes, name), getattr(new.lanes, name)
+        need(was == asked, f"lanes.{name}", was, asked)
     fewer = not old.lanes.types or (
         bool(new.lanes.types)
         and {*map(str.lower, new.lanes.types)} <= {*map(str.lower, old.lanes.types)}
@@ -300,22 +283,13 @@ def _reaches(old: RangeSettings, new: RangeSettings) -> bool:
         return new.shape == "polygon" and old.polygon == new.polygon
     if old.shape == "corridor":
         return False
-    if new.shape == "corridor":
-        reach = new.length + new.width + _ASIDE
-        corners: Sequence[Sequence[float]] = (
-            (reach, 0.0),
-            (-reach, 0.0),
-            (0.0, reach),
-            (0.0, -reach),
-        )
-    elif new.shape == "radius":
-        reach = new.radius
+    corners: Sequence[Sequence[float]] = new.polygon
+    if new.shape in {"corridor", "radius"}:
+        round_ = new.shape == "radius"
+        reach = new.radius if round_ else new.length + new.width + _ASIDE
         corners = ((reach, 0.0), (-reach, 0.0), (0.0, reach), (0.0, -reach))
     elif new.shape == "rectangle":
-        ends = (new.front, -new.rear)
-        corners = [(ahead, left) for ahead in ends for left in (new.side, -new.side)]
-    else:
-        corners = new.polygon
+        corners = list(product((new.front, -new.rear), (new.side, -new.side)))
     if old.shape == "radius":
         return all(ahead * ahead + left * left <= old.radius**2 for ahead, left in corners)
     return all(-old.rear <= a <= old.front and abs(left) <= old.side for a, left in corners)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,29 +16,6 @@ from sgstore.mcap import Loss
 from sgstore.readers import on_map, open_recording, open_trace
 from sgstore.segments import TraceTally
 from sgstore.world import BUCKET_FRAMES, TraceReport
-
-if TYPE_CHECKING:
-    from sgstore.world import TraceInfo
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelFound:
-    """A channel of a recording.
-
-    Attributes
-    ----------
-    topic, schema, message_encoding : str
-    messages : int
-        How many of them can be read.
-    role : str
-        ``ground_truth``, ``map``, ``payload``; empty where the recording is of no flavour that is known.
-    """
-
-    topic: str
-    schema: str
-    message_encoding: str
-    messages: int
-    role: str = ""
 
 
 @dataclass(slots=True)
@@ -54,7 +31,9 @@ class Examination:
         Name of the reader that recognises it; empty: none does.
     digest : str
         SHA-256 of the file; empty where it was not read so far.
-    channels : list of ChannelFound
+    channels : list of dict
+        Of each ``topic``, ``schema``, ``message_encoding``, ``messages`` (how many can be read) and ``role``:
+        ``ground_truth``, ``map``, ``payload``; empty where the recording is of no flavour that is known.
     ego : str
         The simulator's id of the ego; empty if there is none.
     road_map : str
@@ -82,7 +61,7 @@ class Examination:
     size: int = 0
     flavour: str = ""
     digest: str = ""
-    channels: list[ChannelFound] = field(default_factory=list[ChannelFound])
+    channels: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     ego: str = ""
     road_map: str = ""
     frames: int = 0
@@ -126,8 +105,7 @@ def examine(
     found = Examination(Path(path))
     report = TraceReport()
     try:
-        channels = _channels(found, report)
-        _read(found, config, maps, channels)
+        _read(found, config, maps, _channels(found, report))
     except SgstoreError as error:
         found.error = str(error)
         found.warnings = found.warnings or report.warnings
@@ -135,8 +113,8 @@ def examine(
     return found
 
 
-def _channels(found: Examination, report: TraceReport) -> dict[int, ChannelFound]:
-    """The channels of a recording and how many messages of each can be read."""
+def _channels(found: Examination, report: TraceReport) -> Counter[int]:
+    """Take note of the channels of a recording; how many messages of each, by its id, can be read."""
     counts: Counter[int] = Counter()
     recording = open_recording(found.path)
     try:
@@ -146,26 +124,33 @@ def _channels(found: Examination, report: TraceReport) -> dict[int, ChannelFound
                 ids, numbers = np.unique(run.channel, return_counts=True)
                 counts.update(dict(zip(ids.tolist(), numbers.tolist(), strict=True)))
         finally:
-            channels: dict[int, ChannelFound] = {}
-            for number, record in sorted(recording.channels.items()):
-                schema = recording.schemas.get(record.schema_id)
-                name = schema.name if schema else ""
-                channels[number] = ChannelFound(
-                    record.topic, name, record.message_encoding, counts[number]
-                )
-            found.channels = list(channels.values())
+            schemas = recording.schemas
+            found.channels = [
+                {
+                    "topic": one.topic,
+                    "schema": schemas[one.schema_id].name if one.schema_id in schemas else "",
+                    "message_encoding": one.message_encoding,
+                    "messages": counts[number],
+                    "role": "",
+                }
+                for number, one in sorted(recording.channels.items())
+            ]
     finally:
         recording.close()
-    return channels
+    return counts
 
 
-def _read(
-    found: Examination, config: Config, maps: Maps, channels: dict[int, ChannelFound]
-) -> None:
+def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) -> None:
     tally = TraceTally()
     with open_trace(found.path, ego=config.ego, mapping=config.mapping) as trace:
-        _tell(found, trace.info, channels)
-        used, odd = maps.of(trace.info)
+        info = trace.info
+        found.flavour, found.digest, found.ego = info.flavour, info.digest, info.ego
+        names = ("topic", "schema", "message_encoding", "messages", "role")
+        found.channels = [
+            {name: counts[one.id] if name == "messages" else getattr(one, name) for name in names}
+            for one in info.channels
+        ]
+        used, odd = maps.of(info)
         found.road_map = used.name if used else ""
         on_map(trace, used)
         try:
@@ -178,13 +163,4 @@ def _read(
             found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
             found.unknown_types = config.unknown_of(report.unknown_types)
             found.warnings = [*odd, *report.warnings]
-            found.losses = [*lost_lanes(trace.info, used), *report.losses]
-
-
-def _tell(found: Examination, info: TraceInfo, channels: dict[int, ChannelFound]) -> None:
-    found.flavour, found.digest, found.ego = info.flavour, info.digest, info.ego
-    found.channels = []
-    for channel in info.channels:
-        messages = channels[channel.id].messages if channel.id in channels else 0
-        told = (channel.topic, channel.schema, channel.message_encoding, messages, channel.role)
-        found.channels.append(ChannelFound(*told))
+            found.losses = [*lost_lanes(info, used), *report.losses]

@@ -30,7 +30,7 @@ its tests, not of the session: the others run.
 
 from __future__ import annotations
 
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import pytest
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     import networkx as nx
 
-    from sgstore.locks import Lock
+    from sgstore.locks import LockedCase
     from sgstore.query import Store
     from sgstore.readers import Media
     from sgstore.store import FrameRef
@@ -72,10 +72,28 @@ class ClipScene:
         Its trace, and log times.
     name : str
         Id of its test; empty: its trace and frames.
+
+    Parameters
+    ----------
+    differences : callable, optional
+        Gives the lines of a message if the store lacks what a lock says of it; called with whether the messages
+        of sensors are looked at, and not the graphs.
+    asked : callable, optional
+        Gives the verdict of a check for its trace.
     """
 
-    def __init__(self, store: Store, clip: Clip, name: str = "") -> None:
+    def __init__(
+        self,
+        store: Store,
+        clip: Clip,
+        name: str = "",
+        *,
+        differences: Callable[[bool], list[str]] | None = None,
+        asked: Callable[[], Verdict] | None = None,
+    ) -> None:
         self.store, self.clip, self.name = store, clip, name
+        self._differences, self._asked = differences, asked
+        self._verified: set[bool] = set()
 
     @cached_property
     def frames(self) -> tuple[FrameRef, ...]:
@@ -85,16 +103,21 @@ class ClipScene:
     @property
     def verdict(self) -> Verdict | None:
         """Verdict of the check for the trace; ``None`` if the test is not about a check."""
-        return None
+        return None if self._asked is None else self._asked()
 
     def verify(self, *, messages: bool = False) -> None:
-        """Look whether it is what it is said to be, or fail the test.
+        """Look whether the store has what a lock says, once in a session, or fail the test.
 
         Parameters
         ----------
         messages : bool
             Whether the messages of sensors are looked at, and not the graphs.
         """
+        if self._differences is None or messages in self._verified:
+            return
+        if lines := self._differences(messages):
+            pytest.fail("\n".join(lines), pytrace=False)
+        self._verified.add(messages)
 
     def __repr__(self) -> str:
         return f"<Scene {self.id}>"
@@ -170,71 +193,6 @@ class ClipScene:
             raise IndexError(f"frame {frame} of {len(self.frames)} in {self.id}") from None
 
 
-class LockedScene(ClipScene):
-    """A clip that a lock names.
-
-    Attributes
-    ----------
-    lock : Lock
-    path : Path
-        Of the lock, for messages.
-    number : int
-        Its place among the cases of the lock.
-    """
-
-    def __init__(self, store: Store, clip: Clip, lock: Lock, path: Path, number: int) -> None:
-        super().__init__(store, clip, lock.cases[number].id)
-        self.lock, self.path, self.number = lock, path, number
-        self._verified: set[bool] = set()
-
-    def verify(self, *, messages: bool = False) -> None:
-        """Look whether the store has what the lock says, once in a session."""
-        if messages in self._verified:
-            return
-        from sgstore.locks import verify_case
-
-        case = self.lock.cases[self.number]
-        found = verify_case(self.lock, case, self.store, graphs=not messages, payloads=messages)
-        others = [f"  {one.where}: {one.what} {one.detail}" for one in found if one.matters]
-        if others:
-            head = f"{self.path}: {case.id} is not what the lock says:"
-            pytest.fail("\n".join([head, *others]), pytrace=False)
-        self._verified.add(messages)
-
-
-class CheckedTrace(ClipScene):
-    """A trace and a check of it.
-
-    Attributes
-    ----------
-    check : str
-        Name of the check.
-    verdicts : function
-        Gives the verdicts of all checks, by trace and check; they are asked once in a process, and not before
-        a test needs one.
-    """
-
-    def __init__(
-        self,
-        store: Store,
-        clip: Clip,
-        check: str,
-        verdicts: Callable[[], Mapping[tuple[str, str], Verdict]],
-    ) -> None:
-        super().__init__(store, clip, f"{clip.trace}-{check}")
-        self.check, self.verdicts = check, verdicts
-
-    @property
-    def verdict(self) -> Verdict:
-        """Verdict of the check for the trace."""
-        found = self.verdicts().get((self.trace, self.check))
-        if found is None:  # of another ego
-            from sgstore.temporal import Verdict
-
-            found = Verdict(self.check, self.trace, "unknown")
-        return found
-
-
 # What pytest calls ----------------------------------------------------------------------------------------
 
 
@@ -287,14 +245,14 @@ def scene(request: pytest.FixtureRequest) -> ClipScene:
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
     """A violated check fails its test, whatever the body says."""
     found = pyfuncitem.funcargs.get("scene")
-    if not isinstance(found, CheckedTrace):
+    verdict = found.verdict if isinstance(found, ClipScene) else None
+    if verdict is None:
         return
-    verdict = found.verdict
     if verdict.violated:
         pytest.fail(violations_text(verdict), pytrace=False)
     if verdict.verdict == "unknown":
         why = f": {verdict.reason}" if verdict.reason else ""
-        pytest.skip(f"{found.trace} cannot answer {found.check}{why}")
+        pytest.skip(f"{verdict.trace} cannot answer {verdict.check}{why}")
 
 
 def violations_text(verdict: Verdict) -> str:
@@ -370,12 +328,21 @@ def scenes_of(path: Path, store: Store) -> list[ClipScene]:
     SgstoreError
         The lock cannot be read, or the store lacks what it names.
     """
-    from sgstore.locks import cases_of, read_lock
+    from sgstore.locks import cases_of, read_lock, verify_case
     from sgstore.world import Clip
 
     lock = read_lock(path)
+
+    def differences(case: LockedCase, messages: bool) -> list[str]:  # noqa: FBT001 - called by place
+        found = verify_case(lock, case, store, graphs=not messages, payloads=messages)
+        others = [f"  {one.where}: {one.what} {one.detail}" for one in found if one.matters]
+        return [f"{path}: {case.id} is not what the lock says:", *others] if others else []
+
     clips = [Clip(trace, start, end) for trace, start, end, _ in cases_of(lock, store)]
-    return [LockedScene(store, clip, lock, path, number) for number, clip in enumerate(clips)]
+    return [
+        ClipScene(store, clip, case.id, differences=partial(differences, case))
+        for clip, case in zip(clips, lock.cases, strict=True)
+    ]
 
 
 def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> list[ClipScene]:
@@ -388,6 +355,7 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
     OSError
         The file cannot be read.
     """
+    from sgstore.temporal import Verdict
     from sgstore.world import Clip
 
     run = store.check(path.read_text(encoding="utf-8"), **parameters)
@@ -396,12 +364,19 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
     def verdicts() -> Mapping[tuple[str, str], Verdict]:
         return {(one.trace, one.check): one for one in run}
 
+    def verdict(trace: str, check: str) -> Verdict:  # unknown of a trace with another ego
+        return verdicts().get((trace, check)) or Verdict(check, trace, "unknown")
+
     with store.file.snapshot():
         spans = store.file.rows(
             "SELECT trace, min(log_time_ns), max(log_time_ns) FROM frames GROUP BY trace"
         ).values
     clips = [Clip(*span) for span in sorted(spans, key=lambda span: natural(span[0]))]
-    return [CheckedTrace(store, clip, name, verdicts) for clip in clips for name in run.names]
+    return [
+        ClipScene(store, clip, f"{clip.trace}-{name}", asked=partial(verdict, clip.trace, name))
+        for clip in clips
+        for name in run.names
+    ]
 
 
 def _frames(store: Store, clip: Clip) -> tuple[FrameRef, ...]:

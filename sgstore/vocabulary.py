@@ -31,29 +31,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-OWN_ENTITY_KINDS: Final = (
-    "car",
-    "truck",
-    "van",
-    "bus",
-    "motorcycle",
-    "bicycle",
-    "trailer",
-    "train",
+VEHICLES: Final = (
+    *("car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train"),
     "vehicle",
-    "person",
-    "animal",
-    "traffic_light",
-    "stop_sign",
-    "yield_sign",
-    "speed_limit",
-    "sign",
-    "prop",
-    "building",
-    "pole",
-    "barrier",
-    "vegetation",
-    "unknown",
+)
+SIGNALS: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
+
+OWN_ENTITY_KINDS: Final = (
+    *(*VEHICLES, "person", "animal", *SIGNALS),
+    *("prop", "building", "pole", "barrier", "vegetation", "unknown"),
 )
 """Kinds of entities: what has a pose and, mostly, a box. ``vehicle``: a vehicle, and no more is told of it."""
 
@@ -70,19 +56,6 @@ ENTITY_KINDS: Final[Sequence[str]] = _entity_kinds
 _kinds: Final[list[str]] = list(OWN_KINDS)
 KINDS: Final[Sequence[str]] = _kinds
 """All kinds known so far. It grows behind the kinds of this package, and what is in it keeps its place."""
-
-VEHICLES: Final = (
-    "car",
-    "truck",
-    "van",
-    "bus",
-    "motorcycle",
-    "bicycle",
-    "trailer",
-    "train",
-    "vehicle",
-)
-SIGNALS: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
 
 SUPER_KINDS: Final[Mapping[str, Sequence[str]]] = {
     "vehicle": VEHICLES,
@@ -130,40 +103,10 @@ RELATION_ALIASES: Final[Mapping[str, str]] = {
 """``safe_hazard`` is the spelling of CARLASGG's documentation and of SceneFlow."""
 
 LANE_TYPES: Final = (
-    *(
-        "none",
-        "driving",
-        "stop",
-        "shoulder",
-        "biking",
-        "sidewalk",
-        "walking",
-        "border",
-        "restricted",
-    ),
-    *(
-        "parking",
-        "bidirectional",
-        "median",
-        "special1",
-        "special2",
-        "special3",
-        "roadWorks",
-        "tram",
-    ),
-    *(
-        "rail",
-        "entry",
-        "exit",
-        "offRamp",
-        "onRamp",
-        "connectingRamp",
-        "slipLane",
-        "bus",
-        "taxi",
-        "HOV",
-    ),
-    *("mwyEntry", "mwyExit", "curb", "shared", "roadMarks"),
+    *("none", "driving", "stop", "shoulder", "biking", "sidewalk", "walking", "border"),
+    *("restricted", "parking", "bidirectional", "median", "special1", "special2", "special3"),
+    *("roadWorks", "tram", "rail", "entry", "exit", "offRamp", "onRamp", "connectingRamp"),
+    *("slipLane", "bus", "taxi", "HOV", "mwyEntry", "mwyExit", "curb", "shared", "roadMarks"),
 )
 """Types of lanes. (ASAM OpenDRIVE 1.4 to 1.8, ``e_laneType``.)"""
 
@@ -187,17 +130,9 @@ SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service
 """Special kinds, beside the kind: CARLASGG's ``special_type`` and OSI's vehicle roles."""
 
 VEHICLE_LIGHTS: Final = (
-    "light_left",
-    "light_right",
-    "light_brake",
-    "light_reverse",
-    "light_position",
-    "light_low_beam",
-    "light_high_beam",
-    "light_fog",
-    "light_interior",
-    "light_special1",
-    "light_special2",
+    *("light_left", "light_right", "light_brake", "light_reverse", "light_position"),
+    *("light_low_beam", "light_high_beam", "light_fog", "light_interior"),
+    *("light_special1", "light_special2"),
 )
 """Lights of a vehicle; the index is the bit of a light in a mask (hazard lights are left and right)."""
 

@@ -66,22 +66,9 @@ def longest_step_ns(period_ns: int) -> float:
 
 
 POSE: Final = (
-    "x",
-    "y",
-    "z",
-    "heading",
-    "pitch",
-    "roll",
-    "vx",
-    "vy",
-    "vz",
-    "ax",
-    "ay",
-    "az",
-    "yaw_rate",
-    "length",
-    "width",
-    "height",
+    *("x", "y", "z", "heading", "pitch", "roll"),
+    *("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
+    *("length", "width", "height"),
 )
 """Columns of :class:`States` that say where a body is, how it moves and how large it is, in order."""
 

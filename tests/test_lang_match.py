@@ -211,7 +211,7 @@ def town(open_town: Store) -> Store:
 @pytest.mark.parametrize(
     "text",
     [
-        *(question.pattern for question in QUESTIONS),
+        *(pattern for _, _, pattern in QUESTIONS),
         "MATCH (e:Ego), (v:Vehicle) WHERE lead(e, v) AND headway(e, v) < 1.5",
         "MATCH (e:Ego), (v:Vehicle) WHERE ttc(e, v) < 3 AND NOT same_lane(e, v)",
         "MATCH (p:Person)-[r:isIn]->(c:Crosswalk)",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import asdict
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from sgstore.matches import Interval
-    from sgstore.temporal import FrameTime, MonitorEvent, Verdict
+    from sgstore.temporal import MonitorEvent, Verdict
 
 PANEL: Final = "Rules over time"
 
@@ -158,7 +159,7 @@ def check(
         ask.write(COLUMNS, (row for one in counted() for row in _rows(one)))
         say(", ".join(f"{count} {word}" for word, count in tally.items()))
     else:
-        ask.write(tuple(_document(None)), (tuple(_document(one).values()) for one in counted()))
+        ask.write(_DOCUMENT, map(_document, counted()))
     say_unknown((one.check, one.trace, one.reason) for one in kept)
     if junit is not None:
         write_junit(junit, kept)
@@ -186,37 +187,29 @@ def _times(violations: tuple[Interval, ...]) -> list[tuple[Any, ...]]:
     ]
 
 
-def _document(verdict: Verdict | None) -> dict[str, Any]:
+_DOCUMENT: Final = (*COLUMNS[:3], "reason", "first_violation", "violations", "witnesses")
+"""Columns of verdicts as a program reads them."""
+
+
+def _document(verdict: Verdict) -> tuple[Any, ...]:
     """A verdict as a program reads it."""
-    return {
-        "check": verdict and verdict.check,
-        "trace": verdict and verdict.trace,
-        "verdict": verdict and verdict.verdict,
-        "reason": (verdict and verdict.reason) or None,
-        "first_violation": verdict and verdict.first_violation and _span(verdict.first_violation),
-        "violations": [_span(one) for one in verdict.violations] if verdict else [],
-        "witnesses": [
-            {
-                "nodes": dict(one.nodes),
-                "names": dict(one.names),
-                "holds": one.holds,
-                "violations": [_span(span) for span in one.violations],
-            }
-            for one in (verdict.witnesses if verdict else ())
-        ],
-    }
+    spans = [_span(one) for one in verdict.violations]
+    witnesses = [
+        {
+            "nodes": dict(one.nodes),
+            "names": dict(one.names),
+            "holds": one.holds,
+            "violations": [_span(span) for span in one.violations],
+        }
+        for one in verdict.witnesses
+    ]
+    head = verdict.check, verdict.trace, verdict.verdict, verdict.reason or None
+    return (*head, spans[0] if spans else None, spans, witnesses)
 
 
 def _span(interval: Interval) -> dict[str, Any]:
-    return {
-        "start_seq": interval.start_seq,
-        "end_seq": interval.end_seq,
-        "start_ns": interval.start_ns,
-        "end_ns": interval.end_ns,
-        "start": interval.start,
-        "end": interval.end,
-        "frames": interval.frames,
-    }
+    names = ("start_seq", "end_seq", "start_ns", "end_ns", "start", "end", "frames")
+    return {name: getattr(interval, name) for name in names}
 
 
 # The verb that watches: checks and patterns over a recording as if it were live, or a running simulator ----
@@ -304,22 +297,8 @@ def _for_people(event: MonitorEvent) -> None:
 
 
 def _as_json(event: MonitorEvent) -> None:
-    about: dict[str, Any] = {
-        "event": event.kind,
-        "name": event.name,
-        "told": _moment(event.told),
-        "start": _moment(event.start),
-        "end": _moment(event.end),
-        "nodes": dict(event.nodes),
-        "names": dict(event.names),
-        "steps": [_moment(step) for step in event.steps],
-        "at_end": event.at_end,
-    }
-    _line(json_text(about))
-
-
-def _moment(moment: FrameTime) -> dict[str, Any]:
-    return {"seq": moment.seq, "time_ns": moment.time_ns, "t": moment.t}
+    about = asdict(event)
+    _line(json_text({"event": about.pop("kind"), **about}))
 
 
 def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:

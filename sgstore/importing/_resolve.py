@@ -424,7 +424,11 @@ _FIXED: Final = frozenset({"speed", "vx", "vy", "vz"})
 _FOLLOWING: Final = frozenset({"accel", "node_id"})
 """Attributes that follow from others."""
 
-_DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
+_BITS: Final = {
+    "lights": VEHICLE_LIGHTS,
+    "derived": ("derived_velocity", "derived_acceleration", "derived_yaw_rate"),
+}
+"""Columns of bits, and the attributes that each bit is."""
 _TEXTS: Final = frozenset({"special", "subkind", "type_name", "type"})
 
 
@@ -446,7 +450,6 @@ def state_of(
     """
     found: dict[str, float] = {}
     own: Own = {}
-    lights = 0
     for name, value in attributes.items():
         if value is None or name in _SAID or name in _FOLLOWING or name in _TEXTS:
             continue
@@ -456,16 +459,9 @@ def state_of(
             found[name] = float(value)
         elif name == "light_state":
             found[name] = _light_state(path, where, value, any_state=any_state)
-        elif name in VEHICLE_LIGHTS or name in _DERIVED:
-            lights |= int(bool(value)) << (
-                VEHICLE_LIGHTS.index(name) if name in VEHICLE_LIGHTS else 0
-            )
-            if name in VEHICLE_LIGHTS:
-                found["lights"] = lights
-            else:
-                found["derived"] = int(found.get("derived", 0)) | int(
-                    bool(value)
-                ) << _DERIVED.index(name)
+        elif column := next((c for c, bits in _BITS.items() if name in bits), ""):
+            bit = int(bool(value)) << _BITS[column].index(name)
+            found[column] = int(found.get(column, 0)) | bit
         elif name == "speed":
             _number(path, where, name, value)
         else:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -327,18 +327,13 @@ def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) 
     texts["lane_type"] = tuple(
         parts[part].get("lane_type", "driving") if part[0] == "lane" else "" for part in order
     )
-    columns = {
-        column: getattr(nodes, column)
-        for column in nodes.__dataclass_fields__
-        if column not in texts
-    }
     none = np.zeros(0, np.int64)
     empty = Ribbons(np.zeros(1, np.int64), *(np.zeros(0) for _ in range(8)))
     return RoadMap(
         name=name,
         text="",
         variant=variant,
-        nodes=MapNodes(**(columns | texts)),
+        nodes=replace(nodes, **texts),
         edges=MapEdges(none.astype(np.int8), none, none),
         ribbons=empty,
         shapes=np.full(len(order), None, object),

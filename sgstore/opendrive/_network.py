@@ -20,7 +20,7 @@ from sgstore.roads import STOREY, LaneChanges, MapNodes, conflicts, mean_widths,
 from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from sgstore.opendrive._document import Document, ElementTable
     from sgstore.opendrive._lanes import LaneTable
@@ -42,11 +42,8 @@ class Target(NamedTuple):
     """``start``, ``end``, ``+`` or ``-`` (within, along or against s), or empty: within, either way."""
 
 
-class _Connection(NamedTuple):
-    """A way through a junction: where it starts, and which lanes it joins to which."""
-
-    target: Target
-    lanes: tuple[tuple[int, int], ...]
+_Connection = tuple[Target, tuple[tuple[int, int], ...]]
+"""A way through a junction: where it starts, and which lanes it joins to which."""
 
 
 @dataclass(slots=True)
@@ -175,9 +172,9 @@ class _Joints:
         if link.get("elementType") == "junction":
             key = (link.get("elementId", ""), self._road_names[road])
             return [
-                (way.target, to)
-                for way in self._junctions.get(key, [])
-                for source, to in way.lanes
+                (start, to)
+                for start, lanes in self._junctions.get(key, [])
+                for source, to in lanes
                 if source == ident
             ]
         target = self._network.target(link)
@@ -221,13 +218,13 @@ def _junctions(document: Document, network: Network) -> dict[tuple[str, str], li
             if onward:
                 network.warnings.append(f"junction {junction!r} leads to a missing road {onward!r}")
             continue
-        ways[junction, incoming].append(_Connection(target, links[row]))
+        ways[junction, incoming].append((target, links[row]))
         if direct and incoming in network.roads:
             for contact in road_ends.get((junction, incoming), []):
                 back = network.target({"elementId": incoming, "contactPoint": contact})
                 if back is not None:
                     turned = tuple((to, source) for source, to in links[row])
-                    ways[junction, onward].append(_Connection(back, turned))
+                    ways[junction, onward].append((back, turned))
     return ways
 
 
@@ -538,6 +535,10 @@ def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
     return not left_is_broken, left_is_broken
 
 
+_Stretch = tuple[float, float, bool, bool]
+"""Part of a border: start and end, and whether a change to the left, and to the right, is permitted."""
+
+
 def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
     """Stretches for a change of lane: driving lanes side by side with traffic in one direction."""
     left, right = wide_pairs(lanes, ribbons)
@@ -546,61 +547,49 @@ def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) ->
     one_way |= lanes.both[left] | lanes.both[right]
     kept = driving[left] & driving[right] & one_way
     left, right = left[kept], right[kept]
-    marks = _Marks(document, lanes)
+    marks = _marks(document, lanes)
     rows: list[tuple[int, int, float, float]] = []
     for a, b in zip(left.tolist(), right.tolist(), strict=True):
-        for start, end, to_left, to_right in marks.between(a, b):
+        for start, end, to_left, to_right in marks(a, b):
             rows += [(b, a, start, end)] * to_left + [(a, b, start, end)] * to_right
     table = np.array(rows, np.float64).reshape(-1, 4)
     lane, to = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
     return _along(ribbons, lane, to, table[:, 2:])
 
 
-class _Marks:
-    """The marks of borders."""
+def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
+    """Return a function that gives the stretches of the border between two lanes, left and right, along s."""
+    kind = "road/laneSection/lane/roadMark"
+    table = document[kind]
+    offsets = document.rough_numbers(kind, "sOffset").tolist()
+    columns = table.parent, offsets, table.texts("type", "none"), table.texts("laneChange")
+    records: dict[int, list[tuple[float, str, str]]] = {}
+    for raw, offset, mark, attribute in zip(*columns, strict=True):
+        if np.isfinite(offset):
+            record = (offset, mark.strip().lower(), attribute.strip().lower())
+            records.setdefault(raw, []).append(record)
+    of_lane = {int(lanes.row[raw]): marks for raw, marks in records.items()}
+    centres = {raw: int(lanes.centre[raw]) for raw in records}
+    of_centre = {centre: records[raw] for raw, centre in centres.items() if centre >= 0}
 
-    def __init__(self, document: Document, lanes: LaneTable) -> None:
-        self._lanes = lanes
-        kind = "road/laneSection/lane/roadMark"
-        table = document[kind]
-        offsets = document.rough_numbers(kind, "sOffset")
-        records: dict[int, list[tuple[float, str, str]]] = {}
-        rows = zip(
-            table.parent,
-            offsets.tolist(),
-            table.texts("type", "none"),
-            table.texts("laneChange"),
-            strict=True,
-        )
-        for raw, offset, mark, attribute in rows:
-            if np.isfinite(offset):
-                record = (offset, mark.strip().lower(), attribute.strip().lower())
-                records.setdefault(raw, []).append(record)
-        self._of_lane = {int(lanes.row[raw]): marks for raw, marks in records.items()}
-        self._of_centre = {
-            int(lanes.centre[raw]): marks
-            for raw, marks in records.items()
-            if lanes.centre[raw] >= 0
-        }
-
-    def between(self, left: int, right: int) -> list[tuple[float, float, bool, bool]]:
-        """Stretches (start, end, to the left permitted, to the right permitted) of a border, along s."""
-        lanes = self._lanes
+    def between(left: int, right: int) -> list[_Stretch]:
         section = int(lanes.section[left])
         idents = int(lanes.ident[left]), int(lanes.ident[right])
         owner = right if idents[1] > 0 else left
         if idents[0] > 0 > idents[1]:
-            records, ident = self._of_centre.get(section, []), 0
+            found, ident = of_centre.get(section, []), 0
         else:
-            records, ident = self._of_lane.get(owner, []), int(lanes.ident[owner])
+            found, ident = of_lane.get(owner, []), int(lanes.ident[owner])
         start, end = float(lanes.sections.start[section]), float(lanes.sections.end[section])
-        records = sorted([(-np.inf, "none", ""), *records], key=lambda record: record[0])
-        cuts = [min(max(start + offset, start), end) for offset, _, _ in records] + [end]
+        found = sorted([(-np.inf, "none", ""), *found], key=lambda record: record[0])
+        cuts = [min(max(start + offset, start), end) for offset, _, _ in found] + [end]
         return [
             (cuts[i], cuts[i + 1], *permitted(kind, attribute, ident))
-            for i, (_, kind, attribute) in enumerate(records)
+            for i, (_, kind, attribute) in enumerate(found)
             if cuts[i + 1] > cuts[i]
         ]
+
+    return between
 
 
 def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
