@@ -20,6 +20,8 @@
 --   * Version 4: recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
 --     Tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     Columns that are always known are NOT NULL; store_info holds a digest of these statements.
+--     Places in lanes and gaps that are the same in frames of a bucket that follow one another are kept once: lane_single, lane_repeated,
+--     gap_single, gap_repeated, put together by the views lane_state and lane_gap. state.repeated.
 --   * Version 3: bucket.joined; the states of the ego lie together (state, lane_state).
 --   * Version 2: events. pairs.lon_gap, pairs.lat_gap, pairs.apparent_heading; lane_dists, by lane_state.is_own and map_reach. roles, by lane_role.
 --   * state.special, state.subkind: constants of the entity, repeated so that the view nodes needs no join with entity
@@ -108,7 +110,7 @@ CREATE TABLE frame (                                           -- ordered by fra
   frame_id BIGINT NOT NULL, bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, map_id BIGINT, seq INTEGER NOT NULL,
   time_ns BIGINT NOT NULL, log_time_ns BIGINT NOT NULL, ego INTEGER); -- ego: node_id, NULL where it is absent
 
-CREATE TABLE state (                                           -- ordered by is_ego (first), kind, bucket, node_id, frame_id
+CREATE TABLE state (                                           -- ordered by is_ego (first), repeated, kind, bucket, node_id, frame_id
   kind kind NOT NULL, frame_id BIGINT NOT NULL, node_id INTEGER NOT NULL, is_ego BOOLEAN NOT NULL,
   x FLOAT, y FLOAT, z FLOAT,                                   -- about the trace's origin
   heading FLOAT, pitch FLOAT, roll FLOAT,                      -- rad
@@ -117,7 +119,8 @@ CREATE TABLE state (                                           -- ordered by is_
   lights SMALLINT, light_state light_state, steer FLOAT, throttle FLOAT, brake FLOAT,
   gear TINYINT, hand_brake BOOLEAN,                            -- gear: below 0 backwards, 0 neutral
   derived TINYINT,
-  special VARCHAR, subkind VARCHAR);                           -- as in entity
+  special VARCHAR, subkind VARCHAR,                            -- as in entity
+  repeated BOOLEAN NOT NULL);                                  -- as its row before or after, in a bucket: such rows lie together, and take little space
 
 CREATE TABLE node (kind kind NOT NULL, bucket BIGINT NOT NULL, node_id INTEGER NOT NULL, mask BIGINT NOT NULL); -- presence of static nodes
 
@@ -125,14 +128,26 @@ CREATE TABLE edge (                                            -- ordered by all
   relation relation NOT NULL, src_is_ego BOOLEAN NOT NULL, dst_is_ego BOOLEAN NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL,
   bucket BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, mask BIGINT NOT NULL);
 
-CREATE TABLE lane_state (                                      -- attributes of isIn edges from entities to lanes
-  kind kind NOT NULL, frame_id BIGINT NOT NULL, node_id INTEGER NOT NULL, lane INTEGER NOT NULL,
+-- Places in lanes and gaps are of one frame, told by bucket and bit: a row of the table …_single. What is the same in frames of a bucket
+-- that follow one another is one row of the table …_repeated, with a mask: of what stands for ever, and of who waits. The views lane_state
+-- and lane_gap put both together again; they, and not the tables, are read by everything else.
+
+CREATE TABLE lane_single (                                     -- attributes of isIn edges from entities to lanes
+  kind kind NOT NULL, bucket BIGINT NOT NULL, bit TINYINT NOT NULL, node_id INTEGER NOT NULL, lane INTEGER NOT NULL,
   overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN NOT NULL, -- offset to the left, m; rad
   along FLOAT,                                                 -- of the centre, from the start of the lane, m
   is_own BOOLEAN NOT NULL, is_ego BOOLEAN NOT NULL);           -- one by which ways along the lanes are told; as in state
 
-CREATE TABLE lane_gap (                                        -- attribute of the edges src follows dst and dst leads src
-  frame_id BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT); -- from bumper to bumper along the lanes, m
+CREATE TABLE lane_repeated (
+  kind kind NOT NULL, bucket BIGINT NOT NULL, mask BIGINT NOT NULL, node_id INTEGER NOT NULL, lane INTEGER NOT NULL,
+  overlap FLOAT, lane_offset FLOAT, heading_error FLOAT, is_primary BOOLEAN NOT NULL, along FLOAT,
+  is_own BOOLEAN NOT NULL, is_ego BOOLEAN NOT NULL);
+
+CREATE TABLE gap_single (                                      -- attribute of the edges src follows dst and dst leads src
+  bucket BIGINT NOT NULL, bit TINYINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT); -- from bumper to bumper along the lanes, m
+
+CREATE TABLE gap_repeated (
+  bucket BIGINT NOT NULL, mask BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT);
 
 CREATE TABLE frame_class (                                     -- ordered by all columns; made at ingest
   abstraction VARCHAR NOT NULL, class UUID, bucket BIGINT NOT NULL, mask BIGINT NOT NULL); -- class: NULL where too symmetric to be told
@@ -155,8 +170,8 @@ CREATE TABLE derived_edge (                                    -- as edge
   set_name VARCHAR NOT NULL, relation relation NOT NULL, src_is_ego BOOLEAN NOT NULL, dst_is_ego BOOLEAN NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL,
   bucket BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, mask BIGINT NOT NULL);
 
-CREATE TABLE derived_gap (                                     -- as lane_gap
-  set_name VARCHAR NOT NULL, frame_id BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT);
+CREATE TABLE derived_gap (                                     -- as gap_single
+  set_name VARCHAR NOT NULL, bucket BIGINT NOT NULL, bit TINYINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT);
 
 CREATE TABLE payload (                                         -- the message of each channel that belongs to a frame
   bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, channel_id INTEGER NOT NULL, log_time_ns BIGINT NOT NULL,
@@ -201,12 +216,27 @@ CREATE TABLE manifest (                                        -- what was publi
 CREATE TABLE bits (bit TINYINT NOT NULL, m BIGINT NOT NULL);   -- 0 … 59 and 1 << bit
 INSERT INTO bits SELECT range::TINYINT, 1::BIGINT << range FROM range(60);
 
+-- Views for everything else: single and repeated rows together ----------------------------------------------------
+
+CREATE VIEW inside.lane_state AS
+SELECT kind, bucket * 64 + bit AS frame_id, bucket, bit, node_id, lane, overlap, lane_offset, heading_error, is_primary, along, is_own, is_ego
+FROM inside.lane_single
+UNION ALL
+SELECT r.kind, r.bucket * 64 + b.bit, r.bucket, b.bit, r.node_id, r.lane, r.overlap, r.lane_offset, r.heading_error, r.is_primary, r.along,
+       r.is_own, r.is_ego
+FROM inside.lane_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
+
+CREATE VIEW inside.lane_gap AS
+SELECT bucket * 64 + bit AS frame_id, bucket, bit, src, dst, gap FROM inside.gap_single
+UNION ALL
+SELECT r.bucket * 64 + b.bit, r.bucket, b.bit, r.src, r.dst, r.gap FROM inside.gap_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
+
 -- The public views -------------------------------------------------------------------------------------------------
 --
 -- No NOT IN: versions of DuckDB write it down in different ways, and views are compared by their text.
 -- One row per thing per frame; metres, seconds, m/s, degrees; a heading or bearing is counter-clockwise, in (-180, 180].
--- They are written so that filters on frame_id, relation and kinds reach the scans of the tables, and so that joining
--- them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).
+-- They are written so that filters on relation and kinds, and on frame_id where a table has it, reach the scans of the tables, and so
+-- that joining them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).
 
 CREATE VIEW main.frames AS
 SELECT f.frame_id, f.trace_id, f.seq, f.time_ns, f.ego, t.name AS trace, (f.time_ns - t.start_ns) / 1e9 AS t, f.log_time_ns, m.name AS map
@@ -260,13 +290,21 @@ FROM inside.frame f JOIN (
 COMMENT ON VIEW main.edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
 
 CREATE VIEW main.lane_states AS
-SELECT frame_id, node_id AS src, lane AS dst, kind AS src_kind, overlap, lane_offset, degrees(heading_error) AS heading_error, is_primary, along, is_own
-FROM inside.lane_state;
+SELECT f.frame_id, l.node_id AS src, l.lane AS dst, l.kind AS src_kind, l.overlap, l.lane_offset, degrees(l.heading_error) AS heading_error,
+       l.is_primary, l.along, l.is_own
+FROM inside.frame f JOIN inside.lane_single l ON l.bucket = f.bucket AND l.bit = f.bit
+UNION ALL
+SELECT f.frame_id, l.node_id, l.lane, l.kind, l.overlap, l.lane_offset, degrees(l.heading_error), l.is_primary, l.along, l.is_own
+FROM inside.frame f JOIN inside.lane_repeated l ON l.bucket = f.bucket AND (l.mask & (1::BIGINT << f.bit)) <> 0;
 
 COMMENT ON VIEW main.lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which lane_dists are told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
 
 CREATE VIEW main.lane_gaps AS
-SELECT frame_id, src, dst, gap FROM inside.lane_gap;
+SELECT f.frame_id, g.src, g.dst, g.gap
+FROM inside.frame f JOIN inside.gap_single g ON g.bucket = f.bucket AND g.bit = f.bit
+UNION ALL
+SELECT f.frame_id, g.src, g.dst, g.gap
+FROM inside.frame f JOIN inside.gap_repeated g ON g.bucket = f.bucket AND (g.mask & (1::BIGINT << f.bit)) <> 0;
 
 COMMENT ON VIEW main.lane_gaps IS 'How far it is along the lanes: one row for each edge src follows dst (and dst leads src). gap: from bumper to bumper along the centre lines, m; 0 where they overlap, NULL where a length is not known.';
 
@@ -282,9 +320,10 @@ SELECT frame_id, src, dst, CASE WHEN behind IS NULL OR ahead <= -behind THEN ahe
 FROM (
   SELECT frame_id, src, dst, src_kind, dst_kind, src_is_ego, dst_is_ego, min(CASE WHEN way >= 0 THEN way END) AS ahead, max(CASE WHEN way < 0 THEN way END) AS behind
   FROM (
-    SELECT a.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
+    SELECT f.frame_id, a.node_id AS src, b.node_id AS dst, a.kind AS src_kind, b.kind AS dst_kind, a.is_ego AS src_is_ego, b.is_ego AS dst_is_ego,
         r.start + (b.along::DOUBLE - a.along::DOUBLE) AS way
-    FROM inside.lane_state a JOIN inside.lane_state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id JOIN inside.frame f ON f.frame_id = a.frame_id
+    FROM inside.frame f JOIN inside.lane_state a ON a.bucket = f.bucket AND a.frame_id = f.frame_id
+         JOIN inside.lane_state b ON b.bucket = f.bucket AND b.frame_id = f.frame_id AND b.node_id <> a.node_id
          JOIN inside.map_reach r ON r.map_id = f.map_id AND r.src = a.lane AND r.dst = b.lane
     WHERE a.is_own AND b.is_own)
   WHERE way BETWEEN -200 AND 200

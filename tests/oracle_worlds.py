@@ -471,9 +471,28 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
     )
     insert(connection, "frame", [frame_row(frame) for frame in trace.frames])
     insert(connection, "state", [row for frame in trace.frames for row in state_rows(frame)])
-    insert(connection, "lane_state", [row for frame in trace.frames for row in lane_rows(frame)])
-    insert(connection, "lane_gap", [row for frame in trace.frames for row in gap_rows(frame)])
+    for table, rows_of in (("lane", lane_rows), ("gap", gap_rows)):
+        rows = [row for frame in trace.frames for row in rows_of(frame)]
+        for name, some in parted(rows, rng).items():
+            insert(connection, f"{table}_{name}", some)
     store_masks(connection, trace, rng)
+
+
+def parted(rows: list[dict[str, Any]], rng: random.Random) -> dict[str, list[dict[str, Any]]]:
+    """Rows with their frame as bucket and bit, or as bucket and mask: some alone, equal ones together."""
+    single: list[dict[str, Any]] = []
+    masks: dict[tuple[tuple[str, Any], ...], int] = {}
+    for row in rows:
+        frame_id = row["frame_id"]
+        rest = {key: value for key, value in row.items() if key != "frame_id"}
+        rest |= {"bucket": frame_id >> 6}
+        if rng.random() < 0.5:
+            single.append(rest | {"bit": frame_id & 63})
+        else:
+            key = tuple(rest.items())
+            masks[key] = masks.get(key, 0) | 1 << (frame_id & 63)
+    repeated = [dict(key) | {"mask": mask} for key, mask in masks.items()]
+    return {"single": single, "repeated": repeated}
 
 
 def frame_row(frame: Frame) -> dict[str, Any]:

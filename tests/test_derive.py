@@ -64,7 +64,7 @@ def same(derived: Any, name: Any, ingested: Any) -> None:
     assert made == set(ingested.sql(EDGES).values)
     assert made
     assert set(derived.sql(DERIVED_NODES.format(name)).values) == set(ingested.sql(NODES).values)
-    gaps = "SELECT frame_id, src, dst, gap FROM inside."
+    gaps = "SELECT bucket, bit, src, dst, gap FROM inside."
     kept = derived.sql(f"{gaps}derived_gap WHERE set_name = '{name}'").values
     assert set(kept) == set(ingested.sql(f"{gaps}lane_gap").values)
     (one,) = [s for s in derived.file.deriving.sets() if s.name == name]

@@ -150,7 +150,7 @@ def made() -> duckdb.DuckDBPyConnection:
 
 
 def names(what: str) -> list[str]:
-    return re.findall(rf"^CREATE {what} (?:main\.)?(\w+)", schema_sql(), re.MULTILINE)
+    return re.findall(rf"^CREATE {what} ([\w.]+)", schema_sql(), re.MULTILINE)
 
 
 ALTERED = {
@@ -163,7 +163,7 @@ ALTERED = {
     },
     **{
         f"view {view} says something else": (
-            f"CREATE OR REPLACE VIEW main.{view} AS SELECT * FROM inside.frame",
+            f"CREATE OR REPLACE VIEW {view} AS SELECT * FROM inside.frame",
         )
         for view in names("VIEW")
     },

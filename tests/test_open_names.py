@@ -370,7 +370,8 @@ def test_a_store_opens_whatever_its_names_look_like_and_exact_text_decides(tmp_p
             "UPDATE inside.trace SET answers = list_append(list_append(answers, 'Danger'), 'danger')"
         )
         of_edges = (("edge", "src_kind"), ("edge", "dst_kind"))
-        for table, column in (*((t, "kind") for t in ("entity", "state", "lane_state")), *of_edges):
+        of_lanes = ("lane_single", "lane_repeated")
+        for table, column in (*((t, "kind") for t in ("entity", "state", *of_lanes)), *of_edges):
             connection.execute(
                 f"UPDATE inside.{table} SET {column} = 'wheelchair' WHERE {column} = 'person'"
             )

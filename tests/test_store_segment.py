@@ -18,6 +18,7 @@ import sgstore.store._staging as staging
 from sgstore.config import Config, RangeSettings
 from sgstore.errors import StoreError
 from sgstore.store import StoreFile, trace_id_of
+from sgstore.store._columns import REPEATED
 from sgstore.world import TraceReport
 
 TABLES = (
@@ -32,7 +33,18 @@ TABLES = (
     "node",
     "edge",
 )
-TABLES += ("event", "lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "config")
+TABLES += (
+    "event",
+    *REPEATED,
+    *REPEATED.values(),
+    "lane_state",
+    "lane_gap",
+    "payload",
+    "map",
+    "map_node",
+    "map_edge",
+    "config",
+)
 
 
 def content(store: StoreFile) -> dict[str, list[tuple[Any, ...]]]:

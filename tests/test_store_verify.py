@@ -14,7 +14,7 @@ import sgstore.store._publish as publishing
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
-from sgstore.store._columns import Checksum
+from sgstore.store._columns import REPEATED, Checksum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,7 +54,7 @@ def test_what_was_published_is_without_fault(store: Any) -> None:
     assert found.faults == []
     assert found.traces == 2
     tables = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
-    tables += ("lane_state", "lane_gap", "payload", "map", "map_node", "map_edge", "map_reach")
+    tables += (*REPEATED, *REPEATED.values(), "payload", "map", "map_node", "map_edge", "map_reach")
     tables += ("frame_class", "lane_role", "recording", "config")
     count = sum(store.rows(f"SELECT count(*) FROM {table}").values[0][0] for table in tables)
     assert found.rows == count
@@ -108,7 +108,16 @@ CHANGES = {
     "a bucket": ("UPDATE inside.bucket SET valid = 1", "masks"),
     "an edge from nobody": ("UPDATE inside.edge SET src = 9999 WHERE src >= 0", "references"),
     "an edge to another kind": ("UPDATE inside.edge SET dst_kind = 'animal'", "references"),
-    "a lane that is not in the map": ("UPDATE inside.lane_state SET lane = -9999", "references"),
+    "a lane that is not in the map": ("UPDATE inside.lane_single SET lane = -9999", "references"),
+    "a repeated row beyond the frames": (
+        "INSERT INTO inside.lane_repeated BY NAME SELECT kind, max(bucket) OVER () AS bucket,"
+        " 1::BIGINT << 59 AS mask, node_id, lane, is_primary, is_own, is_ego FROM inside.lane_single LIMIT 1",
+        "masks",
+    ),
+    "a repeated row of no frame": (
+        "INSERT INTO inside.gap_repeated BY NAME SELECT bucket, 0 AS mask, src, dst FROM inside.edge LIMIT 1",
+        "masks",
+    ),
     "an ego that is nobody": ("UPDATE inside.frame SET ego = 9999", "references"),
     "settings that are gone": ("DELETE FROM inside.config", None),
     "a recording that is gone": ("DELETE FROM inside.recording", None),

@@ -68,7 +68,7 @@ _BIT: Final = '"bit"'
 
 def bit_of(frame: str) -> str:
     """The mask of a single frame, given its id or its number in the bucket."""
-    number = frame if frame == _BIT else f"{frame} & 63"
+    number = frame if frame.endswith(_BIT) else f"{frame} & 63"
     return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
 
 
@@ -719,14 +719,14 @@ def _join_conditions(
 
 def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound]) -> None:
     """The frames in which an edge meets conditions on its attributes."""
-    frame = '"l"."frame_id"'
+    bucket, bit = '"l"."bucket"', f'"l".{_BIT}'
     table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
     ends = [f'"l".{quoted(column)}' for column in nodes]
     select = Select(
-        [f'{frame} >> 6 AS "bucket"', *ends, f'bit_or({bit_of(frame)}) AS "mask"'],
+        [bucket, *ends, f'bit_or({bit_of(bit)}) AS "mask"'],
         [f'{quoted(table)} AS "l"'],
-        sql.within(frame, 64),
-        [f"{frame} >> 6", *ends],
+        sql.within(bucket),
+        [bucket, *ends],
     )
     select.where += [
         expression_text(c, lambda leaf: lane_text(leaf, '"l"'), sql.values) for c in conditions

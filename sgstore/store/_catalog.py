@@ -155,7 +155,10 @@ def _derived(
         "SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, mask"
         f" FROM derived_edge WHERE set_name = {word}"
     )
-    shadows["lane_gap"] = f"SELECT frame_id, src, dst, gap FROM derived_gap WHERE set_name = {word}"
+    shadows["lane_gap"] = (
+        "SELECT bucket * 64 + bit AS frame_id, bucket, bit, src, dst, gap"
+        f" FROM derived_gap WHERE set_name = {word}"
+    )
     shadows["node"] = (
         f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = {word} AND NOT moves"
     )

@@ -18,7 +18,7 @@ import numpy as np
 
 from sgstore.errors import StoreError
 from sgstore.quoting import quoted
-from sgstore.store._packing import MISSING, packed
+from sgstore.store._packing import FRAME_BITS, MISSING, packed
 from sgstore.store._schema import INSIDE, code_sql, enums_of, expected, own_labels
 from sgstore.vocabulary import NAMES
 
@@ -121,9 +121,12 @@ def missing_of(table: str, name: str, values: NDArray[Any]) -> NDArray[np.bool_]
 # Orders -----------------------------------------------------------------------------------------------------
 
 ORDERS: Final = {
-    "state": "is_ego DESC, kind, frame_id >> 6, node_id, frame_id",
-    "lane_state": "kind, frame_id >> 6, node_id, frame_id, lane",
-    "lane_gap": "frame_id >> 6, src, dst, frame_id",
+    "state": "is_ego DESC, repeated, kind, frame_id >> 6, node_id, frame_id",
+    "lane_single": "kind, bucket, node_id, lane, bit",
+    "lane_repeated": "kind, bucket, node_id, lane, mask",
+    "gap_single": "bucket, src, dst, bit",
+    "gap_repeated": "bucket, src, dst, mask",
+    "derived_gap": "set_name, bucket, src, dst, bit",
     "frame": "frame_id",
     "payload": "channel_id, bucket, bit",
     "map_node": "node_id DESC",
@@ -135,6 +138,13 @@ MASKS: Final = (
     *("node", "edge", "frame_class", "lane_role", "later_class", "derived_node", "derived_edge"),
 )
 """Tables with a mask: rows that differ in nothing else are one."""
+
+
+REPEATED: Final = {
+    "lane_single": "lane_repeated",
+    "gap_single": "gap_repeated",
+}
+"""Tables with a row a frame, and those with a row for several frames of a bucket."""
 
 
 @cache
@@ -191,6 +201,51 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
     if len(first) < len(order):
         whole["mask"] = np.bitwise_or.reduceat(columns["mask"][order], first)
     return whole
+
+
+def parted(columns: Columns) -> tuple[Columns, Columns]:
+    """Sorted rows, a row a frame, as those that are single and those that are repeated.
+
+    Parameters
+    ----------
+    columns : dict
+        As they are staged, with ``bucket`` and ``bit``.
+
+    Returns
+    -------
+    single, repeated : dict
+        Rows as they came; and, as one row with ``mask``, those that follow one another and differ in
+        nothing but ``bit``.
+    """
+    bit = columns["bit"].astype(np.int64)
+    values = {name: of for name, of in columns.items() if name != "bit"}
+    starts = np.flatnonzero(np.append(True, ~_as_before(values)))
+    lengths = np.diff(starts, append=len(bit))
+    alone, first = starts[lengths == 1], starts[lengths > 1]
+    mask = np.bitwise_or.reduceat(np.left_shift(1, bit), starts)[lengths > 1]
+    single = {name: of[alone] for name, of in columns.items()}
+    return single, {name: of[first] for name, of in values.items()} | {"mask": mask}
+
+
+def marked(columns: Columns) -> Columns:
+    """Sorted states with the column ``repeated``, in the order that has it."""
+    bucket = columns["frame_id"] >> FRAME_BITS
+    values = {name: of for name, of in columns.items() if name != "frame_id"}
+    same = _as_before({"bucket": bucket, **values})
+    repeated = np.append(False, same) | np.append(same, False)
+    order = np.lexsort((repeated, ~columns["is_ego"].astype(np.bool_)))
+    return {name: of[order] for name, of in {**columns, "repeated": repeated}.items()}
+
+
+def _as_before(columns: Columns) -> NDArray[np.bool_]:
+    """Of each row but the first: whether all its values are those of the row before."""
+    same = np.ones(len(next(iter(columns.values()))) - 1, np.bool_)
+    for values in columns.values():
+        if not same.any():
+            break
+        bits = values.view(f"i{values.itemsize}") if values.dtype.kind == "f" else values
+        same &= bits[1:] == bits[:-1]
+    return same
 
 
 def chained(table: str, blocks: Sequence[Columns]) -> Columns:

@@ -196,7 +196,7 @@ class Deriving:
             before = rows(f"{ends} edge WHERE {_HERE}")
             gaps = rows(
                 "SELECT src, dst, gap FROM derived_gap"
-                " WHERE frame_id = $frame AND set_name = $name AND gap IS NOT NULL"
+                " WHERE bucket = $frame >> 6 AND bit = $frame & 63 AND set_name = $name AND gap IS NOT NULL"
             )
         nodes = {node: whole.nodes[node] for (node,) in present if node in whole.nodes}
         about = {(src, relation, dst): more for src, relation, dst, more in whole.edges}
@@ -376,13 +376,10 @@ def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
     connection.execute(
         "DELETE FROM store.inside.derived WHERE name = ? AND trace_id = ?", [name, trace_id]
     )
-    for table, trace in (
-        ("derived_node", "bucket >> 18"),
-        ("derived_edge", "bucket >> 18"),
-        ("derived_gap", "frame_id >> 24"),
-    ):
+    for table in ("derived_node", "derived_edge", "derived_gap"):
         connection.execute(
-            f"DELETE FROM store.inside.{table} WHERE set_name = ? AND {trace} = ?", [name, trace_id]
+            f"DELETE FROM store.inside.{table} WHERE set_name = ? AND bucket >> 18 = ?",
+            [name, trace_id],
         )
 
 

@@ -74,7 +74,7 @@ WHERE e.bucket BETWEEN $first >> 6 AND $last >> 6 AND (e.mask & w.mask) <> 0
 _EGO_LANES: Final = f"""
 SELECT l.frame_id, l.lane FROM lane_state l JOIN frame f ON f.frame_id = l.frame_id AND f.ego = l.node_id
        JOIN {_WANTED} ON w.frame_id = f.frame_id
-WHERE l.is_primary AND l.frame_id BETWEEN $first AND $last
+WHERE l.is_primary AND l.bucket BETWEEN $first >> 6 AND $last >> 6
 """
 _TRACES: Final = """
 SELECT trace_id, origin_x, origin_y, origin_z, coalesce(map_id, -1) AS map_id
@@ -98,12 +98,13 @@ SELECT e.node_id, e.kind, false AS is_ego, e.name, e.special, e.subkind, true AS
 FROM entities e JOIN (SELECT unnest($nodes) AS node_id) w ON w.node_id = e.node_id WHERE e.trace_id = $trace_id
 """
 _LANES: Final = f"""
-SELECT l.frame_id, l.src, l.dst, l.overlap, l.lane_offset, l.heading_error, l.is_primary, l.along, l.is_own
-FROM lane_states l JOIN {_WANTED} ON l.frame_id = w.frame_id WHERE l.frame_id BETWEEN $first AND $last
+SELECT l.frame_id, l.node_id AS src, l.lane AS dst, l.overlap, l.lane_offset,
+       degrees(l.heading_error) AS heading_error, l.is_primary, l.along, l.is_own
+FROM lane_state l JOIN {_WANTED} ON l.frame_id = w.frame_id WHERE l.bucket BETWEEN $first >> 6 AND $last >> 6
 """
 _GAPS: Final = f"""
 SELECT g.frame_id, g.src, g.dst, g.gap
-FROM lane_gaps g JOIN {_WANTED} ON g.frame_id = w.frame_id WHERE g.frame_id BETWEEN $first AND $last
+FROM lane_gap g JOIN {_WANTED} ON g.frame_id = w.frame_id WHERE g.bucket BETWEEN $first >> 6 AND $last >> 6
 """
 _OWN: Final = f"""
 SELECT a.frame_id, a.node_id, a.relation::VARCHAR, a.dst, a.attribute, a.value::VARCHAR

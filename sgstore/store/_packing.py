@@ -181,7 +181,7 @@ def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
 
 
 def state_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds, origin: Origin) -> Columns:
-    """Table ``state``, but for the constants of entities; kinds and states of lights as codes."""
+    """States in each frame, but for the constants of entities; kinds and states of lights as codes."""
     frames, states = graph.frames, graph.frames.states
     row = frames.frame_of
     plain = {name: getattr(states, name) for name in KEPT}
@@ -252,11 +252,13 @@ def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKin
 
 
 def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
-    """Table ``lane_state``; kinds as codes."""
+    """Places in lanes in each frame; kinds as codes."""
     lanes = graph.lanes
+    seq = graph.frames.seq[lanes.frame]
     return {
         "kind": kinds.of(lanes.node),
-        "frame_id": frame_ids(trace_id, graph.frames.seq)[lanes.frame],
+        "bucket": trace_bucket(trace_id, seq),
+        "bit": seq % BUCKET_FRAMES,
         "node_id": lanes.node,
         "lane": lanes.lane,
         "overlap": number(lanes.overlap),
@@ -270,10 +272,12 @@ def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
 
 
 def gap_columns(graph: GraphBlock, trace_id: int) -> Columns:
-    """Table ``lane_gap``."""
+    """Gaps along the lanes in each frame."""
     gaps = graph.gaps
+    seq = graph.frames.seq[gaps.frame]
     return {
-        "frame_id": frame_ids(trace_id, graph.frames.seq)[gaps.frame],
+        "bucket": trace_bucket(trace_id, seq),
+        "bit": seq % BUCKET_FRAMES,
         "src": gaps.src,
         "dst": gaps.dst,
         "gap": number(gaps.gap),

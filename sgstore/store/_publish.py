@@ -18,6 +18,7 @@ from sgstore.quoting import literal, quoted
 from sgstore.store._columns import (
     MASKS,
     ORDERS,
+    REPEATED,
     TEXTS,
     Checksum,
     blank,
@@ -308,7 +309,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
         )
 
 
-_SCATTERED: Final = ("state", "lane_state", "lane_gap", "frame", *MASKS, "derived_gap")
+_SCATTERED: Final = ("state", *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap")
 """The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
 
 

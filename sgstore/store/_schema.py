@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 
 INSIDE: Final = "inside"
-"""Schema of the tables of a store; the public views, and the types of their columns, are in ``main``."""
+"""Schema of the tables of a store, with views of ours. Public views, and types of columns, are in ``main``."""
 
-_VIEWS: Final = "-- The public views "
+_VIEWS: Final = "-- Views for everything else"
 """Where the views begin in ``schema.sql``."""
 
 _ENUM: Final = re.compile(r"CREATE TYPE (\w+) AS ENUM \([^)]*\);")
@@ -98,13 +98,14 @@ class Shape:
     ----------
     tables, types : dict
         The statements, as words that do not depend on who wrote them down.
-    views : dict
-        The texts of the views.
+    views, inner : dict
+        The texts of the public views, and of those among the tables.
     """
 
     tables: dict[str, Tokens]
     types: dict[str, Tokens]
     views: dict[str, str]
+    inner: dict[str, str]
 
 
 @cache
@@ -112,17 +113,17 @@ def expected(*wider: tuple[str, Tokens]) -> Shape:
     """Return the shape that ``schema.sql`` makes, with other values of enumerations if they are given."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
-    views: dict[str, str] = {}
+    views: dict[str, dict[str, str]] = {"main": {}, INSIDE: {}}
     for words in _statements():
         if words[:2] == ("CREATE", "TYPE"):
             types[words[2]] = words[4:]
         elif words[:2] == ("CREATE", "TABLE"):
             tables[words[2]] = words
         elif words[:2] == ("CREATE", "VIEW"):
-            views[words[4]] = " ".join(words[6:])
+            views[words[2]][words[4]] = " ".join(words[6:])
     types |= dict(wider)
     written = {name: tuple(_with_types(words, types)) for name, words in tables.items()}
-    return Shape(written, types, views)
+    return Shape(written, types, views["main"], views[INSIDE])
 
 
 _written: dict[str, Tokens] = {}
@@ -131,7 +132,7 @@ _written: dict[str, Tokens] = {}
 def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
     """The views of ``schema.sql`` as this version of the database writes them down."""
     if not _written:
-        views = expected().views
+        views = expected().views | expected().inner
         rows = connection.execute(
             "SELECT system.main.json_deserialize_sql(system.main.json_serialize_sql(text))"
             " FROM (SELECT unnest($1::VARCHAR[]) AS text)",
@@ -276,7 +277,7 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = {"2.0.0": "d111b24e78e9a9e7f6cb5c29c85ed2d05aee91c0d4e90e3f1dc3711ed6da3b60"}
+KNOWN: Final = {"2.0.0": "91477175e352091c5007ff7c3546d8ada77392aad6f34d0c918d415a7ff42f8b"}
 """Digests of the objects of a store, by the version of DuckDB that tells them: to compare words takes 30 ms.
 
 Others are compared word by word.
@@ -300,7 +301,9 @@ def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
         )
     )
     yield from _differing("table", shape.tables, made["table", INSIDE], made["view", INSIDE])
-    yield from _differing("view", views, made["view", "main"], made["table", "main"])
+    for schema, of in (("main", shape.views), (INSIDE, shape.inner)):
+        wanted = {name: views[name] for name in of}
+        yield from _differing("view", wanted, made["view", schema], made["table", schema])
     yield from _differing("type", shape.types, types, {})
     yield from _misplaced(objects, shape)
     yield from (
@@ -400,7 +403,7 @@ def _strange(objects: Objects) -> Iterator[str]:
 def others(objects: Objects) -> list[str]:
     """Tables and views in a store that are none of ours, sorted."""
     inside = schema_of(objects)
-    ours = {(inside, name) for name in expected().tables}
+    ours = {(inside, name) for name in (*expected().tables, *expected().inner)}
     ours |= {("main", name) for name in expected().views}
     return sorted(
         name if schema == "main" else f"{schema}.{name}"
@@ -515,9 +518,10 @@ def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
     for schema, name in sorted(
         (schema, name) for what, schema, name, _ in objects if what != "type"
     ):
-        ours = {"main": shape.tables, INSIDE: shape.views}.get(schema, {})
+        ours = {"main": shape.tables | shape.inner, INSIDE: shape.views}.get(schema, {})
         if name.lower() in ours:
-            yield f"{schema}.{name} takes the place of {'a table' if schema == 'main' else 'a view'}"
+            what = "a table" if name.lower() in shape.tables else "a view"
+            yield f"{schema}.{name} takes the place of {what}"
 
 
 def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
@@ -545,7 +549,7 @@ def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
 
 def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
     """Triggers and indexes on tables of ours."""
-    ours = {*expected().tables, *expected().views}
+    ours = {*expected().tables, *expected().views, *expected().inner}
     for what in ("trigger", "index"):
         plural = {"trigger": "triggers", "index": "indexes"}[what]
         try:

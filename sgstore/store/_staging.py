@@ -19,6 +19,7 @@ import numpy as np
 from sgstore.errors import StoreError
 from sgstore.records import dataclass
 from sgstore.store._columns import (
+    REPEATED,
     TEXTS,
     Checksum,
     as_summed,
@@ -26,6 +27,8 @@ from sgstore.store._columns import (
     chained,
     in_order,
     kept,
+    marked,
+    parted,
     types_of,
 )
 from sgstore.store._locking import Folder, memory_setting
@@ -251,7 +254,7 @@ MERGE_ROWS: Final = 1 << 19
 """Rows of a table with masks at which the pieces of masks are merged before a bucket is whole."""
 
 _GROWING: Final = (
-    *("state", "lane_state", "lane_gap", "node", "edge", "frame_class", "lane_role"),
+    *("state", "lane_single", "gap_single", "node", "edge", "frame_class", "lane_role"),
     *("later_class", "derived_node", "derived_edge", "derived_gap", "message"),
 )
 """The tables that grow with a trace."""
@@ -424,14 +427,22 @@ class Staging:
                 self._runs[table].append(self._file.append(f"{table} run", self._gathered(table)))
             for columns in self._merged_runs(table, self._runs.pop(table)):
                 self._put(table, columns, texts)
+        elif self._waiting[table] and table in REPEATED:
+            single, repeated = parted(self._gathered(table))
+            self._put(table, single, texts)
+            self._put(REPEATED[table], repeated, texts)
+        elif self._waiting[table] and table == "state":
+            self._put(table, marked(self._gathered(table)), texts)
         elif self._waiting[table]:
             self._put(table, self._gathered(table), texts)
         self._waiting.pop(table, None)
         self._rows[table] = 0
 
     def _put(self, table: str, columns: Columns, texts: list[str]) -> None:
-        self.checksums[table].add(as_summed(table, columns, texts))
         count = len(next(iter(columns.values())))
+        if not count:
+            return
+        self.checksums[table].add(as_summed(table, columns, texts))
         of_text = [name for name in columns if types_of(table)[name] in TEXTS]
         for first in range(0, count, PIECE_ROWS):
             some = {name: values[first : first + PIECE_ROWS] for name, values in columns.items()}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import sgstore.store._schema as shape
 from sgstore.config import from_dict
 from sgstore.errors import SgstoreError, StoreError
-from sgstore.store._columns import Checksum, expressions
+from sgstore.store._columns import REPEATED, Checksum, expressions
 from sgstore.store._locking import Access, translated
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED, checksum_of, owned
@@ -82,6 +82,16 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         """
         SELECT n.bucket >> 18 FROM node n LEFT JOIN bucket b ON b.bucket = n.bucket
         WHERE b.bucket IS NULL OR n.mask = 0 OR (n.mask & ~b.valid) <> 0""",
+    ),
+    *(
+        (
+            "masks",
+            f"a row of {table} is of no frame, or of frames that the trace does not have",
+            f"""
+            SELECT r.bucket >> 18 FROM {table} r LEFT JOIN bucket b ON b.bucket = r.bucket
+            WHERE b.bucket IS NULL OR r.mask = 0 OR (r.mask & ~b.valid) <> 0""",
+        )
+        for table in REPEATED.values()
     ),
     (
         "masks",
@@ -163,8 +173,10 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         "references",
         "an entity lies in a lane that its map does not have, or is none of the trace",
         """
-        SELECT l.frame_id >> 24 FROM lane_state l
-        LEFT JOIN trace t ON t.trace_id = l.frame_id >> 24
+        SELECT l.bucket >> 18
+        FROM (SELECT bucket, node_id, kind, lane FROM lane_single UNION ALL
+              SELECT bucket, node_id, kind, lane FROM lane_repeated) l
+        LEFT JOIN trace t ON t.trace_id = l.bucket >> 18
         LEFT JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = l.node_id
         LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = l.lane
         WHERE e.kind IS DISTINCT FROM l.kind OR m.node_id IS NULL""",

@@ -366,8 +366,8 @@ class Segment:
         insert("node", packing.node_columns(graph, trace_id, kinds))
         for columns in packing.edge_columns(graph, trace_id, kinds):
             insert("edge", columns)
-        insert("lane_state", packing.lane_columns(graph, trace_id, kinds))
-        insert("lane_gap", packing.gap_columns(graph, trace_id))
+        insert("lane_single", packing.lane_columns(graph, trace_id, kinds))
+        insert("gap_single", packing.gap_columns(graph, trace_id))
         insert("event", self._owned(self._happenings.of(graph.frames)))
         for table, columns in abstracted.items():
             insert(table, columns)
