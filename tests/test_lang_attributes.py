@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from thorough import LONG, some
 
 from sgstore.lang import Attribute, Binding, Type
 from sgstore.lang._catalog import (
@@ -210,14 +211,14 @@ def test_an_attribute_in_every_form(
     assert [row[width:] for row in rows] == wanted
     # As conditions, a row being kept where it is true: of each attribute some, of each form some attributes.
     for number, condition in enumerate(asked):
-        if (number + len(name)) % 6:
+        if (number + len(name)) % (6 if LONG else 13):
             continue
         kept = [row[:-1] for row, told in zip(plain, wanted, strict=True) if told[number] is True]
         found = store.find(f"{pattern} AND ({condition}) RETURN {keys}").rows()
         assert found == kept, condition
 
 
-@pytest.mark.parametrize(("name", "attribute", "pattern"), asked_of())
+@pytest.mark.parametrize(("name", "attribute", "pattern"), some(asked_of(), 2))
 def test_an_attribute_in_what_is_returned(
     name: str, attribute: Attribute, pattern: str, store: Store
 ) -> None:

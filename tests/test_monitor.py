@@ -26,7 +26,7 @@ from sgstore.temporal import Monitor
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    """The bundled recording with every other frame; ``make oracle`` compares all of them."""
+    """The bundled recording with every third frame; ``make oracle`` compares all of them."""
     folder = tmp_path_factory.mktemp("town")
     thinned = folder / "town.mcap"
     with RECORDING.open("rb") as source, thinned.open("wb") as stream:
@@ -38,7 +38,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Drive:
             topics=["ground_truth", "ground_truth_map"]
         ):
             count += channel.topic == "ground_truth"
-            if channel.topic == "ground_truth" and count % 2 == 0:
+            if channel.topic == "ground_truth" and count % 3 != 1:
                 continue
             if schema and channel.topic not in numbers:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -290,14 +290,14 @@ def test_what_is_owed_in_every_frame_is_owed_once() -> None:
     monitor = Monitor(f"CHECK slow: EVENTUALLY ego.speed > 99 OR {slow}")
     sizes: list[int] = []
     tracemalloc.start()
-    for t in range(300):
+    for t in range(180):
         monitor.step(car(t / 10, 2))
-        if t % 100 == 99:
+        if t % 60 == 59:
             gc.collect()
             sizes.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
 
-    assert sizes[2] - sizes[1] < 50_000
+    assert sizes[2] - sizes[1] < 30_000
 
 
 def test_what_looks_ahead_has_no_value_at_once() -> None:

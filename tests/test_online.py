@@ -293,8 +293,8 @@ def test_several_egos_have_the_graphs_of_generators_of_their_own() -> None:
 def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(stepping, "REMEMBERED", 60)
-    monkeypatch.setattr(stepping, "SPARE", 60)
+    monkeypatch.setattr(stepping, "REMEMBERED", 40)
+    monkeypatch.setattr(stepping, "SPARE", 40)
     online = generator(None, range=RangeSettings(30))
 
     def run(first: int, count: int) -> int:
@@ -304,11 +304,11 @@ def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
         gc.collect()
         return tracemalloc.get_traced_memory()[0]
 
-    run(0, 120)  # more names than are remembered
+    run(0, 80)  # more names than are remembered
     tracemalloc.start()
     try:
-        run(120, 240)  # what is remembered before was not counted: it is replaced little by little
-        sizes = [run(60 * k, 60) for k in range(6, 12)]
+        run(80, 160)  # what is remembered before was not counted: it is replaced little by little
+        sizes = [run(40 * k, 40) for k in range(6, 12)]
     finally:
         tracemalloc.stop()
     assert max(sizes[3:]) < 1.1 * max(sizes[:3])
