@@ -301,7 +301,7 @@ COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
 _INPUTS: Final = [f"{one}_{name}" for one in "ab" for name in COLUMNS]
 
 
-class PairNumbers:
+class PairNumbers(dict[str, Floats]):
     """Numbers of many ordered pairs by name, each computed when it is first asked for; (K,) float64.
 
     Parameters
@@ -312,16 +312,11 @@ class PairNumbers:
     """
 
     def __init__(self, a: Floats, b: Floats) -> None:
-        self._known = _Known(zip(_INPUTS, (*a.T, *b.T), strict=True))
+        super().__init__(zip(_INPUTS, (*a.T, *b.T), strict=True))
 
-    def __getitem__(self, name: str) -> Floats:
-        with np.errstate(all="ignore"):
-            return self._known[name]
-
-
-class _Known(dict[str, Floats]):
     def __missing__(self, name: str) -> Floats:
-        found = self[name] = _compiled(name)(self)
+        with np.errstate(all="ignore"):
+            found = self[name] = _compiled(name)(self)
         return found
 
 
