@@ -20,6 +20,8 @@ import sgstore.draw._palette as palette
 from sgstore.draw import draw_frame, draw_map
 from sgstore.draw._page import FURTHEST
 from sgstore.draw._picture import title_of
+from sgstore.draw._scene import DrawnFrame
+from sgstore.draw._view import view_of
 from sgstore.errors import ExportError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -477,3 +479,24 @@ def test_without_a_map_the_ego_tells_what_is_a_storey_deeper(tmp_path: Path) -> 
     assert {node for node in nodes if dashed(root, node)} == {2, 3, 4, 5}
     assert any("m below" in text for text in texts(root))
     assert "a storey below" in texts(root)
+
+
+def test_a_line_between_matched_lanes_lies_where_no_entity_is_near(tmp_path: Path) -> None:
+    road_map = Crossing()
+    lanes = {name: road_map.node(f"0/0/{name}") for name in (-1, -2)}
+    nodes: dict[int, Any] = {0: entity("car", 30.0, -1.75, 0.0, is_ego=True)}
+    nodes |= {1: entity("car", 45.0, -1.75), 2: entity("car", 47.0, -5.25)}
+    for node in lanes.values():
+        row = -1 - node
+        place = {"x": float(road_map.nodes.x[row]), "y": float(road_map.nodes.y[row])}
+        nodes[node] = {"kind": "lane", "name": road_map.nodes.name[row], **place}
+    graph = graph_of(nodes, [(lanes[-1], "toLeftOf", lanes[-2], {})])
+    matched = {lanes[-1]: "a", lanes[-2]: "b"}
+    scene = DrawnFrame.of(graph, road_map, matched, view_of(graph, 40.0), "ego")
+    (link,) = scene.links
+    ends = scene.ends(link)
+
+    assert ends is not None
+    assert math.dist(*ends) == pytest.approx(3.5, abs=0.1)  # from middle to middle
+    for body in scene.bodies.values():
+        assert min(math.dist((body.x, body.y), end) for end in ends) >= 12.0

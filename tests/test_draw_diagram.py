@@ -227,6 +227,20 @@ def test_the_diagram_stands_beside_the_view_with_every_node_and_edge_that_is_sho
     )
 
 
+def test_lines_whose_words_find_no_room_are_counted(tmp_path: Path) -> None:
+    graph, road_map = town()
+    _, lines = excerpt_of(graph, NONE, "all")
+
+    draw_frame(graph, road_map, tmp_path / "a.svg", diagram=True, relations="all")
+
+    told = " ".join(texts(tmp_path / "a.svg"))
+    written = {gid for gid in gids(tmp_path / "a.svg") if gid.startswith("words-")}
+    worded = [line for line in lines if line.text and line.family != "entity"]
+    left_out = len(worded) - len(written)
+    assert (f"({left_out} without words)" in told) is (left_out > 0)
+    assert "without words" in told or left_out == 0
+
+
 def test_a_matched_node_bears_its_variable_and_a_light_its_state(tmp_path: Path) -> None:
     draw_frame(small(), None, tmp_path / "a.svg", diagram=True, highlight={"p": 1, "l": 2})
 

@@ -287,6 +287,25 @@ def test_what_must_not_be_confused_differs_for_the_colour_blind(eyes: str) -> No
     assert min(math.dist(seen[a], seen[b]) for a, b in combinations(seen, 2)) > 15
 
 
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def test_types_of_lanes_differ_on_a_map_and_bear_dark_texts() -> None:
+    tints = {kind: palette.lane_tint(kind) for kind in palette.LANE_TINTS}
+    tints |= {"junction": palette.JUNCTION, "ground": palette.GROUND}
+    seen = {name: _lab(colour, IDENTITY) for name, colour in tints.items()}
+    pairs = [(a, b) for a, b in combinations(seen, 2) if tints[a] != tints[b]]
+
+    assert all(math.dist(seen[a], seen[b]) > 4 for a, b in pairs)
+    often = ("driving", "junction", "shoulder", "sidewalk", "median", "parking")
+    for eyes in (IDENTITY, *DICHROMACIES.values()):
+        known = [_lab(tints[name], eyes) for name in often]
+        assert min(math.dist(a, b) for a, b in combinations(known, 2)) > 4.5
+    common = [seen[name] for name in often]
+    assert min(math.dist(a, b) for a, b in combinations(common, 2)) > 8
+    assert min(lab[0] for lab in seen.values()) - _lab(palette.INK, IDENTITY)[0] > 50
+
+
 def _lab(colour: str, eyes: tuple[tuple[float, ...], ...]) -> tuple[float, ...]:
     """CIE 1976 L*a*b* of an sRGB colour (IEC 61966-2-1, D65) as these eyes see it."""
     rgb = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])

@@ -9,7 +9,7 @@ import pytest
 
 from sgstore.cli import run
 from sgstore.demo import RECORDING
-from sgstore.draw import lines_of, timelines
+from sgstore.draw import draw_timelines, lines_of, timelines
 from sgstore.draw._swimlanes import Lane, Timeline
 from sgstore.query import Store
 
@@ -65,6 +65,24 @@ def test_the_verb_prints_lanes_or_draws_them(
     assert "phi6" in drawn
     assert drawn.count("apart · ") == text.count("apart · ")
     assert run(["timeline", str(town)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("spans", "explained"),
+    [
+        ([(0.0, 2.0, False)], ["found"]),
+        ([(0.0, 2.0, True)], ["violated"]),
+        ([(0.0, 2.0, True), (3.0, 4.0, False)], ["found", "violated"]),
+        ([], []),
+    ],
+)
+def test_a_picture_explains_the_colours_that_occur(
+    tmp_path: Path, spans: list[tuple[float, float, bool]], explained: list[str]
+) -> None:
+    draw_timelines([Timeline("drive", 10.0, [Lane("a", "b", "", spans)])], tmp_path / "a.svg")
+
+    drawn = (tmp_path / "a.svg").read_text(encoding="utf-8")
+    assert [word for word in ("found", "violated") if f">{word}<" in drawn] == explained
 
 
 def test_a_recording_is_watched_by_the_verb(capsys: pytest.CaptureFixture[str]) -> None:

@@ -401,6 +401,9 @@ _ARCS: Final = 46.0
 """Height of the arcs between lanes."""
 _GAP: Final = 16.0
 _LINES, _SLIPS, _NODES = 2.0, 3.0, 4.0
+_SPOTS: Final = 0.5 + 0.03 * np.array([step * sign for step in range(13) for sign in (-1, 1)][1:])
+"""Where on a line words may stand, as shares of its way, half way first."""
+_WHOLE: Final = np.linspace(0.0, 1.0, 41)
 _QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
     "entity": (palette.ENTITY_EDGE, 0.5, {"alpha": 0.35}),
     "isIn": (palette.DIAGRAM_TINTS["lane"], 0.8, {"alpha": 0.75}),
@@ -428,11 +431,12 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
     page.add(page.sheet, ground)
     graph = scene.graph
     nodes, lines = excerpt_of(graph, frozenset(scene.matched), relations)
-    _Diagram(page, box, scene, nodes, lines).paint()
+    unwritten = _Diagram(page, box, scene, nodes, lines).paint()
     edges = sum(len(line.relations) + len(line.back) for line in lines)
     return (
         f"shown: {len(nodes)} of {counted(len(graph.nodes), 'node')},"
         f" {edges} of {counted(len(graph.edges), 'edge')}"
+        + (f" ({unwritten} without words)" if unwritten else "")
     )
 
 
@@ -472,14 +476,15 @@ class _Diagram:
             left, bottom, right, top = self._rect(node)
             self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
 
-    def paint(self) -> None:
+    def paint(self) -> int:
+        """Draw nodes, lines and words; returns the number of lines whose words found no room."""
         for line in self._lines:
             self._paint_line(line)
         # What matters most is written first.
-        for line in reversed(self._lines):
-            self._paint_words(line)
+        written = [self._paint_words(line) for line in reversed(self._lines)]
         for node in self._texts:
             self._paint_node(node)
+        return written.count(False)
 
     # Places ---------------------------------------------------------------------------------------
 
@@ -575,19 +580,28 @@ class _Diagram:
         arrow.set_gid(f"edge-{line.a}-{line.b}")
         self._page.add(self._page.sheet, arrow)
 
-    def _paint_words(self, line: DiagramLine) -> None:
+    def _along(self, line: DiagramLine, shares: Floats) -> Floats:
+        """(N, 2): points of a line's curve."""
+        start, control, end = self._course(line)
+        t = shares[:, None]
+        return (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
+
+    def _paint_words(self, line: DiagramLine) -> bool:
+        """Write on a line what it stands for, where the fewest other lines pass; False if there is no room."""
         text = line.text
         if not text or line.family == "entity":
-            return
-        start, control, end = self._course(line)
-        size = np.add(self._page.text_size(text, _WORDS), (2.0, 1.5))
-        spots: list[Point] = []
-        for t in (0.5, 0.42, 0.58, 0.34, 0.66, 0.26, 0.74):
-            x, y = (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
-            spots.append((float(x), float(y)))
-        spot = self._placer.first_free(spots, (float(size[0]), float(size[1])))
+            return True
+        size = np.add(self._page.text_size(text, _WORDS), (3.0, 3.0))
+        spots = self._along(line, _SPOTS)
+        others = [self._along(one, _WHOLE) for one in self._lines if one is not line]
+        away = np.abs(spots[:, None] - np.concatenate([np.zeros((0, 2)), *others]))
+        inside = (away < size / 2 + 1.0).all(axis=2).sum(axis=1)
+        order = np.argsort(inside, kind="stable")
+        spot = self._placer.first_free(
+            [(float(x), float(y)) for x, y in spots[order]], (float(size[0]), float(size[1]))
+        )
         if spot is None:
-            return
+            return False
         slip = {
             "boxstyle": "round,pad=0.1",
             "facecolor": palette.GROUND,
@@ -602,6 +616,7 @@ class _Diagram:
         }
         look |= {"ha": "center", "va": "center_baseline", "gid": f"words-{line.a}-{line.b}"}
         self._page.text(*spot, text, **look)
+        return True
 
     def _paint_node(self, node: int) -> None:
         x, y = self._spots[node]

@@ -24,7 +24,7 @@ RULE: Final = "#d9dce1"
 LANE_MARK: Final = "#ffffff"
 LANE_ARROW: Final = "#f7f9fb"
 CROSSWALK: Final = "#fdfdfb"
-JUNCTION: Final = "#c3cbd8"
+JUNCTION: Final = "#a6b8d4"
 
 EGO: Final = "#e8710a"
 FAR_EDGE: Final = "#e0bd9a"
@@ -56,20 +56,23 @@ TRAVELLED: Final = frozenset(
 """Lane types that motor traffic travels on: these have markings, and arrows along their centre lines."""
 
 LANE_TINTS: Final[Mapping[str, str]] = {
-    **dict.fromkeys(TRAVELLED, "#d3d9e2"),
-    **dict.fromkeys(("bus", "taxi", "HOV", "tram", "rail"), "#d8d3e2"),
-    **dict.fromkeys(("sidewalk", "walking"), "#ece5d8"),
-    "stop": "#dde1e6",
-    "shoulder": "#e2e5e8",
-    "border": "#e6e9e8",
-    "curb": "#dcdcd6",
-    "biking": "#cfe5da",
-    "parking": "#dbe3ee",
-    "median": "#e3e9dc",
-    "restricted": "#e7e2dc",
-    "none": "#eceee9",
+    **dict.fromkeys(TRAVELLED, "#c9d2df"),
+    **dict.fromkeys(("bus", "taxi", "HOV", "tram", "rail"), "#d3c6e4"),
+    **dict.fromkeys(("sidewalk", "walking"), "#efdfbf"),
+    "stop": "#d9cdd4",
+    "shoulder": "#cfc8ba",
+    "border": "#dedfcb",
+    "curb": "#b8b09c",
+    "biking": "#b9e0cd",
+    "parking": "#bfdcf4",
+    "median": "#b9d49c",
+    "restricted": "#ebd0c6",
+    "none": "#e7eae9",
 }
-"""Tint of each OpenDRIVE lane type; :func:`lane_tint` knows what to do with any other."""
+"""Tint of each OpenDRIVE lane type; :func:`lane_tint` knows what to do with any other.
+
+All are so light that dark texts can be read on them, and any two can be told apart (a test measures it).
+"""
 
 ENTITY_TINTS: Final[Mapping[str, str]] = {
     **dict.fromkeys(("car", "vehicle"), "#c2408f"),

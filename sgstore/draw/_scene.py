@@ -56,6 +56,8 @@ LABELLED_LINKS: Final = 10
 _LEADER: Final = 9.0
 """A name further away than this from what it names is tied to it by a line; points."""
 _PEN: Final = 4.5
+_CLEAR: Final = 15.0
+"""Distance from all entities at which a line between parts of the map stands alone; m."""
 
 
 def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect]) -> int:
@@ -135,6 +137,9 @@ def _paint_relations(
     if spot is None and link.family == "matched":
         middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
         spot = placer.beside(*middle, (4.0, 4.0), (width + 3, height + 2))
+        if spot is not None:
+            leader = np.array((middle, spot)) * stage.metre
+            stage.lines([leader], palette.FAINT_INK, z=layers.ARROWS - 0.1, width=0.5)
     if spot is None:
         return
     colour = palette.CLOSENESS["near_coll"][0] if link.family == "ego" else palette.MATCH_EDGE
@@ -268,14 +273,35 @@ class DrawnFrame:
     def ends(self, link: DrawnLink) -> tuple[Point, Point] | None:
         """Ends of a link, or ``None`` where one of its nodes has no place.
 
-        Between an entity and a lane it is the shortest way.
+        Between an entity and a lane it is the shortest way; between matched parts of the map it lies where no
+        entity is near, so that nobody takes it for one of an entity.
         """
+        apart = self._beside_one_another(link) if link.family == "matched" else None
+        if apart is not None:
+            return apart
         a, b = self.place(link.a), self.place(link.b)
         if self.ground is not None and b is not None and link.a not in self.bodies:
             a = (self.ground.nearest(link.a, b) if link.b in self.bodies else None) or a
         if self.ground is not None and a is not None and link.b not in self.bodies:
             b = (self.ground.nearest(link.b, a) if link.a in self.bodies else None) or b
         return None if a is None or b is None else (a, b)
+
+    def _beside_one_another(self, link: DrawnLink) -> tuple[Point, Point] | None:
+        """Ends of a link of two parts of the map, away from entities; ``None`` where there are none."""
+        ground = self.ground
+        if ground is None or link.a in self.bodies or link.b in self.bodies:
+            return None
+        points = ground.middles(link.a)
+        points = points[np.abs(points).max(axis=1, initial=0.0) <= 0.8 * self.view.radius]
+        if not len(points):
+            return None
+        bodies = np.array([(b.x, b.y) for b in self.bodies.values() if b.kind not in SCENERY])
+        away = points[:, None] - bodies.reshape(-1, 2)
+        free = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=_CLEAR)
+        x, y = points[np.argmin(0.05 * np.hypot(*points.T) - free)].tolist()
+        other = ground.nearest(link.b, (x, y))
+        # A lane and its road lie at one place.
+        return None if other is None or math.dist((x, y), other) < 0.5 else ((x, y), other)
 
     def name(self, node: int) -> str:
         """Name of a node, with its variable where it was matched: ``p = person 12``."""

@@ -257,7 +257,8 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
         from sgstore.draw._page import Page
 
         page = Page(_WIDTH, height)
-        _key(page, sum(len(one.lanes) for one in timelines) - MOST_LANES)
+        kinds = {span[2] for one in timelines for lane in one.lanes for span in lane.spans}
+        _key(page, kinds, sum(len(one.lanes) for one in timelines) - MOST_LANES)
         top = height - _TOP
         for timeline, lanes in shown:
             _draw(page, timeline, lanes, top)
@@ -265,11 +266,12 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
         page.save(to)
 
 
-def _key(page: Page, more: int) -> None:
-    """Explain the colours above all lanes, and say how many lanes are not shown."""
+def _key(page: Page, kinds: set[bool], more: int) -> None:
+    """Explain the colours that occur above all lanes, and say how many lanes are not shown."""
     from matplotlib.patches import Patch
 
-    handles = [Patch(color=ROAD_EDGE, label="found"), Patch(color=EGO, label="violated")]
+    known = ((False, ROAD_EDGE, "found"), (True, EGO, "violated"))
+    handles = [Patch(color=colour, label=text) for kind, colour, text in known if kind in kinds]
     if more > 0:
         handles.append(Patch(visible=False, label=f"{more} more lanes are not shown"))
     page.legend(handles, (8, page.height - 6), "upper left", fontsize=8, handlelength=1.6)
