@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +81,12 @@ def is_tried(verb: str, condition: str) -> bool:
 def ended(files: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[Any, Any]:
     """Of each verb and condition that is tried: exit code, length of stdout, and stderr."""
     folder = tmp_path_factory.mktemp("ended")
-    asked, keys = [], []
-    for number, condition in enumerate(CONDITIONS):
-        asked.append([])  # a process for each condition
-        for verb, line in LINES.items():
+    # What a verb has loaded helps it again, so most of what is asked is asked of one process; a process whose
+    # descriptors are closed has it for itself, because files that are opened then take their numbers.
+    asked = {condition: [] for condition in ("", "stdout closed", "stderr closed")}
+    keys = {condition: [] for condition in asked}
+    for verb, line in LINES.items():
+        for number, condition in enumerate(CONDITIONS):
             if not is_tried(verb, condition):
                 continue
             if verb == "demo" and not condition:  # it is run as a whole elsewhere
@@ -94,14 +97,15 @@ def ended(files: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> di
                 if f"{{{name}}}" in line:
                     shutil.copy(files[source], new[name])
             words = [*verb.split(), *(part.format(**files, **new) for part in line)]
-            keys.append((verb, condition))
-            asked[-1].append((words, condition))
+            process = condition if condition in asked else ""
+            keys[process].append((verb, condition))
+            asked[process].append((words, condition))
     program = Path(__file__).with_name("verb_lines.py")
     temporary = folder / "tmp"
     temporary.mkdir()
     done = subprocess.run(
         [sys.executable, program],
-        input=json.dumps(asked),
+        input=json.dumps([*asked.values()]),
         stdout=subprocess.PIPE,
         text=True,
         check=True,
@@ -109,7 +113,7 @@ def ended(files: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> di
         env=os.environ | {"TMPDIR": str(temporary)},
     )
     assert [one for one in temporary.iterdir() if one.name.startswith("sgstore")] == []
-    return dict(zip(keys, map(json.loads, done.stdout.splitlines()), strict=True))
+    return dict(zip(chain(*keys.values()), map(json.loads, done.stdout.splitlines()), strict=True))
 
 
 def test_the_table_has_every_verb() -> None:

