@@ -615,15 +615,9 @@ def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, piec
         raise MapError(f"takes over {MAX_TOTAL:,} points", element="OpenDRIVE")
 
 
-@dataclass(frozen=True, slots=True)
-class _Stations:
-    """Places along sections where cross sections are taken, ordered by section and s; shape (n,)."""
-
-    first: Ints  # (sections + 1,)
-    interval: Ints
-    s: Floats
-    pose: Poses
-    z: Floats
+_Stations = tuple["Ints", "Ints", "Floats", Poses, "Floats"]
+"""Places where cross sections are taken, by section and s: (sections + 1,) where those of each begin; of each
+place its interval, s, pose and z."""
 
 
 def _stations(
@@ -648,7 +642,7 @@ def _stations(
     z = cubic(heights[interval], into)
     kept = Poses(pose.x[keep], pose.y[keep], pose.heading[keep], pose.curvature[keep])
     counts = np.bincount(intervals.section[interval[keep]], minlength=len(intervals.first) - 1)
-    return _Stations(starts_of(counts), interval[keep], s[keep], kept, z[keep])
+    return starts_of(counts), interval[keep], s[keep], kept, z[keep]
 
 
 def _lateral_jumps(
@@ -702,20 +696,21 @@ def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
 def _cross_sections(
     lanes: LaneTable, intervals: _LaneIntervals, borders: _LaneBorders, stations: _Stations
 ) -> Ribbons:
-    counts = np.diff(stations.first)[lanes.section]
+    first, interval, s, pose, z = stations
+    counts = np.diff(first)[lanes.section]
     lane, number = ragged(counts)
     offsets = starts_of(counts)
     forward = lanes.forward[lane]
     number = np.where(forward, number, counts[lane] - 1 - number)
-    at = stations.first[lanes.section[lane]] + number
-    interval = stations.interval[at]
+    at = first[lanes.section[lane]] + number
+    interval, s = interval[at], s[at]
     row = borders.first[lane] + interval - intervals.first[intervals.section[interval]]
-    into = stations.s[at] - intervals.start[interval]
+    into = s - intervals.start[interval]
     inner, outer = cubic(borders.inner[row], into), cubic(borders.outer[row], into)
     middle = (inner + outer) / 2
     slope = (cubic_slope(borders.inner[row], into) + cubic_slope(borders.outer[row], into)) / 2
-    x, y = stations.pose.x[at], stations.pose.y[at]
-    direction, bend = stations.pose.heading[at], stations.pose.curvature[at]
+    x, y = pose.x[at], pose.y[at]
+    direction, bend = pose.heading[at], pose.curvature[at]
     turned = np.arctan2(slope, 1 - bend * middle) + np.where(forward, 0.0, np.pi)
     to_left_x, to_left_y = -np.sin(direction), np.cos(direction)
     inner_is_left = (lanes.ident[lane] < 0) == forward
@@ -730,8 +725,8 @@ def _cross_sections(
         left_y=y + left * to_left_y,
         right_x=x + right * to_left_x,
         right_y=y + right * to_left_y,
-        z=stations.z[at],
+        z=z[at],
         heading=direction + turned,
-        s=stations.s[at],
+        s=s,
         along=run - run[offsets[:-1]][lane],
     )
