@@ -247,7 +247,7 @@ def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None
 PART_ROWS: Final = 20_000
 """Rows of all growing tables together that are kept in memory."""
 
-PIECE_ROWS: Final = 20_000
+PIECE_ROWS: Final = 60_000
 """Most rows of a table that are read and inserted together."""
 
 MERGE_ROWS: Final = 1 << 19
