@@ -330,10 +330,8 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
         else:
             read = _one_by_one(job, paths, folder, meter)
         for number, views in enumerate(read):
-            for outcome, sealed in views:
-                if sealed is not None and outcome.status == "sealed":
-                    file, outcome = _published(job, file, outcome, sealed)  # noqa: PLW2901
-                found.append(outcome)
+            file, outcomes = _published(job, file, views)
+            found += outcomes
             shutil.rmtree(folder / str(number), ignore_errors=True)
             meter.finish(number)
     return found
@@ -351,22 +349,34 @@ def _one_by_one(job: Job, paths: list[Path], folder: Path, meter: _Meter) -> Ite
 
 
 def _published(
-    job: Job, file: StoreFile | None, outcome: TraceOutcome, place: Path
-) -> tuple[StoreFile | None, TraceOutcome]:
-    """The store, made if there is none, with the segment in a folder; and what became of the recording."""
-    outcome.status = "failed"
-    try:
-        file = file or StoreFile.create(job.store)
-        sealed = Sealed.read(place)
-        known = file.has(sealed, as_it_is=False) if job.force else None
-        outcome.name = file.publish(sealed, replace=job.force)
-        outcome.status = "added" if known is None else "replaced"
-    except PresentError as error:  # the same recording twice in one run
-        told = (outcome.path, "present", error.name, outcome.ego, outcome.frames)
-        outcome = TraceOutcome(*told, seconds=outcome.seconds)
-    except SgstoreError as error:
-        outcome.error = error
-    return file, outcome
+    job: Job, file: StoreFile | None, views: Views
+) -> tuple[StoreFile | None, list[TraceOutcome]]:
+    """The store, made if there is none, with the segments of a recording; and what became of each view."""
+    outcomes = [outcome for outcome, _ in views]
+    ready: dict[int, Sealed] = {}
+    known: dict[int, str | None] = {}
+    for number, (outcome, place) in enumerate(views):
+        if place is None or outcome.status != "sealed":
+            continue
+        outcome.status = "failed"
+        try:
+            file = file or StoreFile.create(job.store)
+            sealed = Sealed.read(place)
+            known[number] = file.has(sealed, as_it_is=False) if job.force else None
+            ready[number] = sealed
+        except SgstoreError as error:
+            outcome.error = error
+    told = file.publish_each([*ready.values()], replace=job.force) if file and ready else []
+    for number, name in zip(ready, told, strict=True):
+        outcome = outcomes[number]
+        if isinstance(name, str):
+            outcome.name, outcome.status = name, "added" if known[number] is None else "replaced"
+        elif isinstance(name, PresentError):  # the same recording twice in one run
+            same = (outcome.path, "present", name.name, outcome.ego, outcome.frames)
+            outcomes[number] = TraceOutcome(*same, seconds=outcome.seconds)
+        else:
+            outcome.error = name
+    return file, outcomes
 
 
 class _Meter:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -177,6 +178,35 @@ def test_the_same_trace_is_told_to_be_there(store: Any) -> None:
     publish(store, trace)
 
     assert store.stored(trace.info, Config(), None) == "drive"
+
+
+def test_traces_that_cannot_come_in_cost_no_other_of_those_that_come_with_them(
+    store: Any, tmp_path: Path
+) -> None:
+    seeds = {"a": 0, "b": 1, "c": 2, "d": 4}
+    traces = [RandomTrace(seeds[name], frames=70, path=name) for name in "abcad"]
+    with ExitStack() as stack:
+        sealed: list[Any] = []
+        for trace in traces:
+            segment = stack.enter_context(
+                store.segment(trace.info, Config(), road_map=trace.road_map, answers=trace.answers)
+            )
+            for graph in trace.blocks:
+                segment.append(graph)
+            sealed.append(segment.seal(TraceReport(frames=70)))
+        (sealed[2].folder / staging.FILE).unlink()
+
+        told = store.publish_each(sealed)
+
+    assert [str(one) for one in told[:2]] == ["a", "b"]
+    assert "what waits beside it cannot be opened" in str(told[2])
+    assert "came into the store meanwhile, as 'a'" in str(told[3])
+    assert told[4] == "d"
+    alone = StoreFile.create(tmp_path / "alone.db")
+    for name in "abd":
+        publish(alone, RandomTrace(seeds[name], frames=70, path=name))
+    assert content(store) == content(alone)
+    assert store.verify().faults == []
 
 
 def test_a_trace_that_comes_twice_at_once_comes_once(store: Any) -> None:

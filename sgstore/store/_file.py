@@ -12,7 +12,7 @@ import numpy as np
 
 import sgstore.store._rebuild as anew
 import sgstore.store._rows as rows
-from sgstore.errors import StoreError, TraceError
+from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.store._classes import Abstracted
 from sgstore.store._derive import Deriving
 from sgstore.store._graphs import Graphs
@@ -27,7 +27,7 @@ from sgstore.store._locking import (
 )
 from sgstore.store._packing import plain
 from sgstore.store._payloads import payload_place
-from sgstore.store._publish import publish_in, remove
+from sgstore.store._publish import publish_each, publish_in, remove
 from sgstore.store._rows import BATCH, Batches, Given, Rows, give
 from sgstore.store._staging import scratch
 from sgstore.store._traces import (
@@ -567,6 +567,18 @@ class StoreFile:
             The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
         """
         return publish_in(self.access, sealed, replace=replace)
+
+    def publish_each(
+        self, sealed: Sequence[Sealed], *, replace: bool = False
+    ) -> list[str | SgstoreError]:
+        """Bring traces into the store, each in a transaction of its own; the file is opened once.
+
+        Returns
+        -------
+        list of str or SgstoreError
+            The name of each trace in the store, or why it could not come in.
+        """
+        return publish_each(self.access, sealed, replace=replace)
 
     def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
         """The name under which the store has the trace of a segment; ``None`` if it has it not.

@@ -502,7 +502,7 @@ class Access:
         StoreError
             There is no such file, it cannot be written, or others kept it for too long.
         """
-        with self.attached(connection, *folders), _transaction(connection):
+        with self.attached(connection, *folders), transaction(connection):
             yield
 
     @contextmanager
@@ -570,7 +570,8 @@ class Access:
 
 
 @contextmanager
-def _transaction(connection: DuckDBPyConnection) -> Generator[None]:
+def transaction(connection: DuckDBPyConnection) -> Generator[None]:
+    """A transaction on the attached store; it is undone if the block raises."""
     connection.execute("BEGIN TRANSACTION")
     try:
         yield

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 import sgstore.store._schema as shape
-from sgstore.errors import StoreError
+from sgstore.errors import SgstoreError, StoreError
 from sgstore.quoting import literal, quoted
 from sgstore.store._columns import (
     MASKS,
@@ -27,7 +27,7 @@ from sgstore.store._columns import (
     missing_of,
     types_of,
 )
-from sgstore.store._locking import spill_folder
+from sgstore.store._locking import spill_folder, transaction, translated
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, MISSING, plain
 from sgstore.store._staging import FILE, PIECE_ROWS, Staging, TableFile, scratch
 from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
@@ -35,7 +35,7 @@ from sgstore.vocabulary import NAMES
 from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Iterator, Mapping
+    from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -72,6 +72,27 @@ def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
     """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
     with writing(access) as connection:
         return _publish(connection, access.path, sealed, replace=replace)
+
+
+def publish_each(
+    access: Access, sealed: Sequence[Sealed], *, replace: bool = False
+) -> list[str | SgstoreError]:
+    """Bring traces into a store that is opened once; see :meth:`StoreFile.publish_each`."""
+    found: list[str | SgstoreError] = []
+    while len(found) < len(sealed):
+        try:
+            with scratch(spill_folder()) as connection, access.attached(connection):
+                for one in sealed[len(found) :]:
+                    try:
+                        with translated(access.path), transaction(connection):
+                            name = _publish(connection, access.path, one, replace=replace)
+                        found.append(name)
+                    except PresentError as error:  # nothing is wrong with the store
+                        found.append(error)
+        except SgstoreError as error:
+            if len(found) < len(sealed):  # the others are tried with another connection
+                found.append(error)
+    return found
 
 
 def _publish(connection: DuckDBPyConnection, path: Path, sealed: Sealed, *, replace: bool) -> str:
