@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from bench.measure import Measure
 from bench.patterns import QUESTIONS, REFERENCE, asked, reference
 from bench.replicas import given, replicate, sources
-from bench.store import sizes
+from bench.store import OF_MAPS, sizes
 from sgstore.query import Store
 from sgstore.store import StoreFile
 
@@ -40,8 +40,6 @@ TTC_FRAMES = 140_000
 TTC = "SELECT min(ttc), min(abs(lat_gap)) FROM pairs WHERE src_is_ego"
 MEDIAN_MS, MOST_MS, PEAK_MB, TTC_MS, BYTES = 100, 350, 430, 80, 520
 """What is aimed at: processor times a million frames, memory, and bytes a frame without maps."""
-OF_MAPS = re.compile("map|light_lane")
-"""Tables that grow with the number of maps, not of frames."""
 TIMES = 2
 
 
