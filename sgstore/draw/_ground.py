@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from matplotlib.patches import Circle
@@ -30,6 +31,11 @@ ARROW_SPACING: Final = 14.0
 STOREY_HEIGHT: Final = 4.0
 """Difference of heights at which one lane is drawn over the other; m. Roads cross above this clearance."""
 MOST_STOREYS: Final = 12
+
+_SHAPES: Final[WeakKeyDictionary[RoadMap, dict[int, tuple[Any, Outline | None]]]] = (
+    WeakKeyDictionary()
+)
+"""For each map its outlines in map axes, by row, beside the geometry that they were made of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +112,18 @@ class GroundView:
 
     def outline(self, row: int) -> Outline | None:
         """A node's outline in picture axes; ``None`` where it encloses nothing."""
-        rings = [ring for ring in rings_of(self.outlines[row]) if _is_closed(ring)]
-        paths = [Outline(self.view.place(ring), closed=True) for ring in rings]
-        return Outline.make_compound_path(*paths) if paths else None
+        known = _SHAPES.setdefault(self.road_map, {})
+        shape = self.outlines[row]
+        if row not in known or known[row][0] is not shape:
+            rings = [ring for ring in rings_of(shape) if _is_closed(ring)]
+            paths = [Outline(ring, closed=True) for ring in rings]
+            known[row] = shape, Outline.make_compound_path(*paths) if paths else None
+        path = known[row][1]
+        return (
+            None
+            if path is None
+            else Outline(self.view.place(np.asarray(path.vertices)), path.codes)
+        )
 
     def open_lines(self, rows: Iterable[int]) -> list[Floats]:
         """Lines of several nodes that enclose nothing, a barrier's for example; picture axes."""

@@ -434,12 +434,18 @@ class Page:
         return left / self.width, bottom / self.height, width / self.width, height / self.height
 
 
+@cache
+def _ruler(dpi: float) -> RendererAgg:
+    """A renderer that measures texts and draws nothing."""
+    return RendererAgg(1, 1, dpi)
+
+
 @lru_cache(maxsize=4096)
 def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, float]:
     """Width and height; pixels."""
     font = FontProperties(size=size, weight=weight)
     ismath = False
-    width, height, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(text, font, ismath)
+    width, height, _ = _ruler(dpi).get_text_width_height_descent(text, font, ismath)
     return width, height
 
 
