@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sgstore.store import frame_ids
+from sgstore.store._columns import marked, parted
 from sgstore.store._packing import NodeKinds, edge_columns, masks_of, state_columns
 from sgstore.vocabulary import MOST_RELATIONS
 from sgstore.world import BUCKET_FRAMES, Origin, origin_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 SMALL = st.integers(-3, 3)
 FAR = st.integers(-(1 << 31), 1 << 31)
@@ -134,3 +139,43 @@ def test_a_block_without_positions_has_no_origin() -> None:
 
 def test_relations_fit_their_codes() -> None:
     assert MOST_RELATIONS < 1 << 7
+
+
+def test_rows_that_follow_one_another_and_are_the_same_become_one() -> None:
+    rng = np.random.default_rng(4)
+    seq = np.arange(200)
+    node = np.repeat([3, 5], 200)
+    gap = rng.integers(0, 3, 400).astype(np.float32)
+    gap[rng.random(400) < 0.2] = np.nan
+    seq = np.tile(seq, 2)
+    order = np.lexsort((seq, node, seq // 60))
+    rows = {"bucket": seq // 60, "bit": (seq % 60).astype(np.int32), "src": node, "gap": gap}
+    rows = {name: values[order] for name, values in rows.items()}
+
+    single, repeated = parted(rows)
+
+    def told(of: dict[str, Any], bits: Iterable[Iterable[int]]) -> list[tuple[Any, ...]]:
+        keys = zip(of["bucket"], of["src"], map(str, of["gap"]), bits, strict=True)
+        return [(b, s, g, int(bit)) for b, s, g, some in keys for bit in some]
+
+    masks = [[bit for bit in range(60) if mask >> bit & 1] for mask in repeated["mask"].tolist()]
+    alone = [[bit] for bit in single["bit"].tolist()]
+    assert sorted(told(single, alone) + told(repeated, masks)) == sorted(
+        told(rows, [[bit] for bit in rows["bit"].tolist()])
+    )
+    assert all(len(bits) > 1 for bits in masks)
+    assert 0 < len(single["bit"]) < 400
+
+
+def test_states_that_repeat_lie_together_behind_the_others() -> None:
+    rows: dict[str, Any] = {
+        "is_ego": np.array([1, 1, 1, 0, 0, 0, 0]),
+        "frame_id": np.array([0, 1, 2, 0, 1, 2, 64]),
+        "x": np.array([1.0, 2.0, 2.0, 7.0, 7.0, 8.0, 8.0], np.float32),
+    }
+
+    found = marked(rows)
+
+    assert found["repeated"].tolist() == [False, True, True, False, False, True, True]
+    assert found["is_ego"].tolist() == [1, 1, 1, 0, 0, 0, 0]
+    assert found["frame_id"].tolist() == [0, 1, 2, 2, 64, 0, 1]
