@@ -125,7 +125,8 @@ def views_of(store: Store) -> dict[str, list[str]]:
     """The public views, each with its columns."""
     sql = (
         "SELECT table_name, column_name FROM information_schema.columns WHERE table_name IN"
-        " (SELECT view_name FROM duckdb_views() WHERE NOT internal) ORDER BY table_name, ordinal_position"
+        " (SELECT view_name FROM duckdb_views() WHERE NOT internal AND schema_name = 'main')"
+        " ORDER BY table_name, ordinal_position"
     )
     found: dict[str, list[str]] = {}
     for view, column in store.sql(sql).values:

@@ -21,7 +21,8 @@ def page(now: str) -> str:
     connection = duckdb.connect()
     connection.execute(schema_sql())
     views = connection.execute(
-        "SELECT view_name, comment FROM duckdb_views() WHERE NOT internal ORDER BY view_oid"
+        "SELECT view_name, comment FROM duckdb_views()"
+        " WHERE NOT internal AND schema_name = 'main' ORDER BY view_oid"
     ).fetchall()
     intro, *sections = re.split(r"^## ", now, flags=re.MULTILINE)
     examples = {section.split("\n")[0]: example_of(section) for section in sections}
