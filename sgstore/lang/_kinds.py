@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from sgstore.lang._catalog import DisplayUnit, Home
 from sgstore.lang._operators import COMPARISONS, OPERATORS
@@ -12,10 +12,14 @@ from sgstore.quoting import literal
 from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from sgstore.lang._catalog import Attribute, Catalog
     from sgstore.lang.ir import Edge, Kinds
+
+
+_FEW: Final = 4
+"""Most words that DuckDB compares with one after the other; of more it makes a table, and joins that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +94,14 @@ def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[st
 def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str]:
     if held <= kinds:
         return []
-    return [_one_of(column, [kind for kind in KINDS if kind in kinds])]
+    others = [kind for kind in KINDS if kind in held - kinds]
+    return [_one_of(column, [kind for kind in KINDS if kind in kinds], others)]
 
 
-def _one_of(column: str, words: list[str]) -> str:
+def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
+    """The condition that a column is one of some words; ``others`` are all else that it may be, if known."""
+    if len(words) > _FEW >= len(others) > 0:
+        return " AND ".join(f"{column} <> {literal(word)}" for word in others)
     if len(words) == 1:
         return f"{column} = {literal(words[0])}"
     return f"{column} IN ({', '.join(map(literal, words))})" if words else "FALSE"
@@ -113,13 +121,16 @@ def edge_conditions(
         relations = [relation for relation in RELATIONS if relation in edge.relations]
         conditions += [_one_of(f'{alias}."relation"', relations)]
     ends = (edge.dst, edge.src) if swapped else (edge.src, edge.dst)
-    for side, (end, key) in enumerate(zip(("src", "dst"), ends, strict=True), start=1):
+    sides = [(1, "src", ends[0]), (2, "dst", ends[1])]
+    # What one end is says something of the other; mostly all there is to say, if that is the ego.
+    for side, end, key in sorted(sides, key=lambda one: scope.kinds(one[2]).one_a_frame):
         conditions += kind_conditions(
             scope.kinds(key),
             f'{alias}."{end}_kind"',
             f'{alias}."{end}_is_ego"' if moving else None,
             frozenset(triple[side] for triple in held),
         )
+        held = [triple for triple in held if triple[side] in scope.kinds(key).every]
     return conditions
 
 

@@ -409,6 +409,16 @@ def frames(
     return text
 
 
+def _kinds_of_edges(
+    sql: SqlBuilder, scope: Scope, parts: Phases, needed: list[Leaf]
+) -> dict[Leaf, str]:
+    """Kinds that the rows of edges say, of nodes that need no table for anything else."""
+    found = {leaf: leaf.node for leaf in needed if _is(leaf, "kind")}
+    more = {key for leaf in needed if leaf not in found for key in _valued(leaf)} | parts.late
+    known = told_kinds(sql, scope, parts) - more
+    return {leaf: node for leaf, node in found.items() if node in known}
+
+
 def _by_buckets(
     sql: SqlBuilder,
     scope: Scope,
@@ -520,13 +530,16 @@ def _first_phase(
         rows = Select(['"frame_id"', *keys], [quoted(known.name)], distinct=True)
         name = sql.share(folded(rows.text(), keys), "pattern")
         return join, SharedRelation(name, bound, frozenset())
-    text = masks(sql, scope, parts, given, nodes, ties)
+    told = _kinds_of_edges(sql, scope, parts, needed)
+    join.texts |= {leaf: f"{PATTERN}.{quoted(column_of(leaf))}" for leaf in told}
+    kinds = frozenset(told.values())
+    text = masks(sql, scope, parts, given, nodes, ties, kinds)
     if blocks or scope is sql.query.scope:
         given = SharedRelation(sql.share(text, "pattern"), nodes, ties)
         text = Select(["*"], [quoted(given.name)]).text()
     leader = _leader(sql, scope, parts, nodes, needed)
     if leader is None:
-        join.select.join(nested(expanded(text, nodes, ties), PATTERN[1:-1]), [])
+        join.select.join(nested(expanded(text, nodes, ties, kinds), PATTERN[1:-1]), [])
         join.frame = f'{PATTERN}."frame_id"'
     else:
         join.select.join(nested(text, PATTERN[1:-1]), [])
@@ -599,7 +612,8 @@ def _second_phase(
     given: SharedRelation | None,
     needed: list[Leaf],
 ) -> None:
-    """Join whatever the values come from, and say how each is computed."""
+    """Join whatever the values come from, and say how each is computed that the first phase does not tell."""
+    needed = [leaf for leaf in needed if leaf not in join.texts]
     for key in sorted(parts.late):
         _bind_late(sql, join, scope, key)
     join.select.where += [

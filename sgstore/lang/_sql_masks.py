@@ -50,6 +50,7 @@ from sgstore.lang.ir import (
     Node,
     NodeAttribute,
     Scope,
+    ego_kinds,
 )
 from sgstore.quoting import quoted
 from sgstore.records import dataclass
@@ -381,9 +382,10 @@ class SqlBuilder:
     # The join of edges and nodes
 
 
-def expanded(text: str, nodes: frozenset[str], edges: frozenset[str]) -> str:
-    """A relation of the first phase, one row a frame."""
-    keep = [f'":pattern".{column}' for column in columns_of(nodes, edges)]
+def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: frozenset[str]) -> str:
+    """A relation of the first phase, one row a frame, with the kinds of some nodes."""
+    columns = [*columns_of(nodes, edges), *(quoted(f"{key}.kind") for key in sorted(kinds))]
+    keep = [f'":pattern".{column}' for column in columns]
     select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
     select.join(nested(text, ":pattern"), [])
     select.join('"bits" AS ":bit"', ['(":pattern"."mask" & ":bit"."m") <> 0'])
@@ -467,7 +469,7 @@ def base_rows(
         if key not in parts.late and key not in base.present:
             _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
     for key, conditions in single.items():
-        _join_conditions(sql, base, key, scope.kinds(key), conditions)
+        _join_conditions(sql, base, key, _kinds_to_test(scope, key), conditions)
     for key, conditions in parts.lane.items():
         _join_lane(sql, base, next(e for e in scope.edges if e.key == key), conditions)
     if not base.masks:  # all nodes wait for the second phase
@@ -694,6 +696,13 @@ def _join_presence(
     else:
         on = kind_conditions(kinds, f'{alias}."kind"', None, sql.standing)
         base.join(f'"node" AS {alias}', alias, {key: f'{alias}."node_id"'}, on)
+
+
+def _kinds_to_test(scope: Scope, key: str) -> Kinds:
+    """Kinds that states of a node are kept to: of the ego any, where the rows of an edge say its kind."""
+    kinds = scope.kinds(key)
+    said = any(edge.high == 1 and key in {edge.src, edge.dst} for edge in scope.edges)
+    return ego_kinds() if said and kinds.one_a_frame else kinds
 
 
 def _join_conditions(
