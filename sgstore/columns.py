@@ -9,7 +9,7 @@ from dataclasses import fields
 from itertools import chain
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
+from sgstore.arrays import np
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,26 +11,24 @@ import copy
 import re
 from collections import namedtuple
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.graph import graph_of_records
 from sgstore.lang import (
     TRACE_OF_BUCKET,
     Compiled,
     Layout,
     Window,
-    compared_in_query,
     compile_query,
     extents,
     for_people,
-    notes_on,
     rewritten,
 )
 from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
+from sgstore.records import dataclass
 from sgstore.store import (
     SEQ_BITS,
     FrameRef,
@@ -201,6 +199,8 @@ class Matches(Tabular):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes, such as a text that is compared with names and is none of the store's."""
+        from sgstore.lang import compared_in_query
+
         with self._compiled() as compiled:
             compared = compared_in_query(compiled.bound)
             return notes_in(self._file, compared, self._text, self._parameters)
@@ -263,6 +263,8 @@ class Matches(Tabular):
         :mod:`sgstore.lang._compile`. The graph has the attributes ``frame_id``, ``trace``, ``seq``,
         ``time_ns`` and ``t``, and what stands beside ``RETURN SUBGRAPHS``.
         """
+        from sgstore.graph import graph_of_records
+
         with self._compiled() as compiled:
             layout = Layout.of(compiled.bound)
             ready = replace(compiled, query=rewritten(layout.query, compiled.catalog))
@@ -527,7 +529,9 @@ def notes_in(
     query: str,
     parameters: Mapping[str, object],
 ) -> tuple[str, ...]:
-    """Return notes about the texts of a query that a store has not; see :func:`notes_on`."""
+    """Return notes about the texts of a query that a store has not; see :func:`sgstore.lang.notes_on`."""
+    from sgstore.lang import notes_on
+
     return notes_on(compared, query, parameters, lambda sql, values: file.rows(sql, values).values)
 
 

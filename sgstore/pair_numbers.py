@@ -14,14 +14,16 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache, reduce
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
+from sgstore.arrays import np
+from sgstore.records import dataclass
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Floats: TypeAlias = "NDArray[np.float64]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +303,7 @@ COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
 _INPUTS: Final = [f"{one}_{name}" for one in "ab" for name in COLUMNS]
 
 
-class PairNumbers(dict[str, Floats]):
+class PairNumbers(dict[str, "Floats"]):
     """Numbers of many ordered pairs by name, each computed when it is first asked for; (K,) float64.
 
     Parameters
@@ -390,32 +392,39 @@ def _is_known(value: Any, _: Any) -> Any:
     return ~np.isnan(value)
 
 
-_FUNCTIONS: Final[Mapping[str, Callable[..., Any]]] = {
-    "case": _case,
-    **{name: getattr(np, name) for name in ("abs", "sqrt", "sin", "cos", "degrees", "ceil")},
-    "atan2": np.arctan2,
-    # They pass over what is missing.
-    "greatest": lambda *values: reduce(np.fmax, values),
-    "least": lambda *values: reduce(np.fmin, values),
-    "coalesce": _coalesced,
-    "nullif": _null_if,
-}
-_OPERATORS: Final[Mapping[type[ast.AST], Callable[..., Any]]] = {
-    ast.Add: np.add,
-    ast.Sub: np.subtract,
-    ast.Mult: np.multiply,
-    ast.Div: np.divide,
-    ast.USub: np.negative,
-    ast.Lt: np.less,
-    ast.LtE: np.less_equal,
-    ast.Gt: np.greater,
-    ast.GtE: np.greater_equal,
-    ast.Eq: np.equal,
-    ast.Is: _is_null,
-    ast.IsNot: _is_known,
-    ast.And: np.logical_and,
-    ast.Or: np.logical_or,
-}
+@cache
+def _functions() -> Mapping[str, Callable[..., Any]]:
+    """Functions of expressions by their names."""
+    return {
+        "case": _case,
+        **{name: getattr(np, name) for name in ("abs", "sqrt", "sin", "cos", "degrees", "ceil")},
+        "atan2": np.arctan2,
+        # They pass over what is missing.
+        "greatest": lambda *values: reduce(np.fmax, values),
+        "least": lambda *values: reduce(np.fmin, values),
+        "coalesce": _coalesced,
+        "nullif": _null_if,
+    }
+
+
+@cache
+def _operators() -> Mapping[type[ast.AST], Callable[..., Any]]:
+    return {
+        ast.Add: np.add,
+        ast.Sub: np.subtract,
+        ast.Mult: np.multiply,
+        ast.Div: np.divide,
+        ast.USub: np.negative,
+        ast.Lt: np.less,
+        ast.LtE: np.less_equal,
+        ast.Gt: np.greater,
+        ast.GtE: np.greater_equal,
+        ast.Eq: np.equal,
+        ast.Is: _is_null,
+        ast.IsNot: _is_known,
+        ast.And: np.logical_and,
+        ast.Or: np.logical_or,
+    }
 
 
 @cache
@@ -438,15 +447,15 @@ def _formula(node: ast.expr) -> Formula:  # noqa: PLR0911 - a case each
         case ast.Name(id=name):
             return lambda at: at[name]
         case ast.Call(func=ast.Name(id=word), args=parts):
-            return _applied(_FUNCTIONS[word], parts)
+            return _applied(_functions()[word], parts)
         case ast.UnaryOp(op=op, operand=operand):
-            return _applied(_OPERATORS[type(op)], [operand])
+            return _applied(_operators()[type(op)], [operand])
         case ast.BinOp(op=op, left=left, right=right):
-            return _applied(_OPERATORS[type(op)], [left, right])
+            return _applied(_operators()[type(op)], [left, right])
         case ast.Compare(ops=[op], left=left, comparators=[right]):
-            return _applied(_OPERATORS[type(op)], [left, right])
+            return _applied(_operators()[type(op)], [left, right])
         case ast.BoolOp(op=op, values=parts):
-            combine = _OPERATORS[type(op)]
+            combine = _operators()[type(op)]
             return _applied(lambda *values: reduce(combine, values), parts)
         case _:
             raise TypeError(ast.unparse(node))

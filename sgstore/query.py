@@ -15,8 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
 
-from sgstore.abstractions import abstractions
-from sgstore.graph import named_graph
 from sgstore.lang import CONSTANTS, about_frame, compile_query
 from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import normalize_name
@@ -271,6 +269,9 @@ class Store:
         AbstractionError
             There is no such abstraction.
         """
+        from sgstore.abstractions import abstractions
+        from sgstore.graph import named_graph
+
         if abstraction is None:
             return self.file.graph(_ref(frame)).to_networkx()
         derived = {normalize_name(one.name) for one in self.file.deriving.sets()}

@@ -10,23 +10,24 @@ belong to the road map (:mod:`sgstore.roads`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import field, fields, replace
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
+from sgstore.arrays import np
 from sgstore.columns import taken
 from sgstore.geometry import wrapped
 from sgstore.mcap import Findings
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Codes = NDArray[np.int8]
-Bools = NDArray[np.bool_]
+    from numpy.typing import NDArray
+
+Floats: TypeAlias = "NDArray[np.float64]"
+Ints: TypeAlias = "NDArray[np.int64]"
+Codes: TypeAlias = "NDArray[np.int8]"
+Bools: TypeAlias = "NDArray[np.bool_]"
 
 BUCKET_FRAMES = 60
 """Frames that one mask of the store covers; blocks that start at multiples of it are stored best."""
@@ -437,9 +438,6 @@ class Clip:
 
 # What a store keeps of it: float32 about an origin
 
-_LARGEST: Final = np.nextafter(np.float32(np.pi), np.float32(0))
-"""The largest float32 that is not above π: the float32 nearest to π is."""
-
 KEPT: Final = (
     *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
     *("length", "width", "height", *INPUTS),
@@ -517,7 +515,9 @@ def _as_kept(states: States, origin: Origin) -> States:
 
 def turned(heading: Floats) -> Floats:
     """Headings in (-π, π], and so that they still are when they are cut to float32."""
-    return np.clip(wrapped(heading), -float(_LARGEST), float(_LARGEST))
+    # The largest float32 that is not above π: the float32 nearest to π is.
+    largest = float(np.nextafter(np.float32(np.pi), np.float32(0)))
+    return np.clip(wrapped(heading), -largest, largest)
 
 
 def number(values: Floats) -> NDArray[np.float32]:

@@ -21,6 +21,7 @@ PACKAGE = Path(__file__).parents[1] / "sgstore"
 # From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
 # one another, except that the files of one folder know each other.
 LAYERS: tuple[frozenset[str], ...] = (
+    frozenset({"arrays", "records"}),
     frozenset(
         {
             "columns",
@@ -31,7 +32,6 @@ LAYERS: tuple[frozenset[str], ...] = (
             "plugins",
             "processes",
             "quoting",
-            "records",
         }
     ),
     frozenset({"mcap", "vocabulary"}),

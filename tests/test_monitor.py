@@ -17,7 +17,7 @@ from oracle_over_time import edge_questions
 from oracle_watched import CHECKS, SEQUENCES, Drive, library_checks
 from thorough import LONG
 
-import sgstore.temporal._matches as joins
+import sgstore.temporal._sequences as joins
 from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
 from sgstore.step import Frame

@@ -29,7 +29,7 @@ from sgstore.lang import pattern_named
 from sgstore.lang.ir import BoundHold, Length
 from sgstore.temporal import evaluate
 from sgstore.temporal._formula import And
-from sgstore.temporal._matches import BindingLine, Leg, matches_of
+from sgstore.temporal._sequences import BindingLine, Leg, matches_of
 from sgstore.temporal._signals import Clock, PropositionTable
 from sgstore.temporal._verdicts import STATUS, Settled, known, within_bounds
 

@@ -11,8 +11,8 @@ from ._features import GraphFeatures as GraphFeatures
 from ._features import of_frames as of_frames
 from ._features import without as without
 from ._columns import lane_roles as lane_roles
-from ._literature import SUBSETS as SUBSETS
-from ._literature import Subset as Subset
+from ._subsets import SUBSETS as SUBSETS
+from ._subsets import Subset as Subset
 from ._registry import ABSTRACTIONS as ABSTRACTIONS
 from ._registry import AT_INGEST as AT_INGEST
 from ._registry import Abstraction as Abstraction

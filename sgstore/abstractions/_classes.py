@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.abstractions._columns import ego_lanes, found
-from sgstore.abstractions._literature import OF_JUNCTION
+from sgstore.abstractions._subsets import OF_JUNCTION
 from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE
 
 if TYPE_CHECKING:

@@ -16,14 +16,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from sgstore.abstractions._subsets import BETWEEN_ENTITIES, SCENERY
 from sgstore.records import dataclass
 from sgstore.vocabulary import (
-    DIRECTIONS,
     DRIVING,
     KIND_CODE,
     MOST_KINDS,
     MOST_RELATIONS,
-    PROXIMITY,
     RELATION_CODE,
     RELATIONS,
     are_entities,
@@ -47,12 +46,6 @@ EGO: Final = "ego"
 
 EGOS: Final = (EGO, "ego_car")
 """Labels that one node of a frame has, which is called by it."""
-
-SCENERY: Final = ("building", "pole", "barrier", "vegetation")
-"""Kinds of entities that only ``SG`` has."""
-
-BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
-"""Relations among entities that the literature has."""
 
 _SMALL: Final = np.zeros(MOST_KINDS, np.bool_)
 _SMALL[[KIND_CODE[kind] for kind in SCENERY]] = True

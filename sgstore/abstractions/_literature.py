@@ -24,24 +24,22 @@ that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from sgstore.abstractions._columns import (
-    BETWEEN_ENTITIES,
     EGO,
     NAMELESS,
     OFF_ROAD,
-    SCENERY,
     UNNAMED,
     Labelled,
     ego_lanes,
     repeated,
     role_name,
 )
+from sgstore.abstractions._subsets import BETWEEN_ENTITIES, OF_JUNCTION
 from sgstore.vocabulary import (
     KIND_CODE,
     KINDS,
@@ -49,7 +47,6 @@ from sgstore.vocabulary import (
     MOST_RELATIONS,
     RELATION_CODE,
     RELATIONS,
-    entity_kinds,
 )
 
 if TYPE_CHECKING:
@@ -63,50 +60,6 @@ if TYPE_CHECKING:
 
 ROOT_ROAD: Final = -(1 << 40)
 """Node number of ``Root Road``."""
-
-OF_JUNCTION: Final = (
-    *BETWEEN_ENTITIES,
-    *("isIn", "travelsTo", "laneChange", "opposes", "controlsTrafficOf", "mayAffect"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Subset:
-    """Part of the scene graph that queries see under an abstraction which adds no nodes or edges.
-
-    Attributes
-    ----------
-    parts : frozenset of str or None
-        Kinds of parts of the map among its nodes, beside those of traffic; ``None``: all kinds and relations.
-    moving : frozenset of str
-        Relations of entities, to one another and to parts of the map.
-    lasting : frozenset of str
-        Relations among parts of the map.
-    """
-
-    parts: frozenset[str] | None
-    moving: frozenset[str] = frozenset()
-    lasting: frozenset[str] = frozenset()
-
-    @property
-    def kinds(self) -> frozenset[str] | None:
-        """Kinds of its nodes, as far as they are known now; ``None``: all."""
-        return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
-
-
-_LANES: Final = frozenset({"lane", "off_road"})
-_RELATED: Final = frozenset(BETWEEN_ENTITIES)
-_PARTS: Final = frozenset({*_LANES, "road", "junction"})
-
-SUBSETS: Final[Mapping[str, Subset]] = {
-    "E": Subset(frozenset()),
-    "EL": Subset(_LANES, frozenset({"isIn"})),
-    "ER": Subset(frozenset(), _RELATED),
-    "RSV": Subset(_LANES, _RELATED | {"isIn"}),
-    "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
-    "SG": Subset(None),
-}
-"""In queries lanes keep the names and the sections that they have in the map."""
 
 _MAPS: Final = 4
 """Maps of which what follows from them is remembered."""

@@ -13,10 +13,10 @@ from ._catalog import TableFacts as TableFacts
 from ._catalog import TraceFacts as TraceFacts
 from ._catalog import Triple as Triple
 from ._catalog import Type as Type
-from ._why_not import Compared as Compared
-from ._why_not import compared_in_check as compared_in_check
-from ._why_not import compared_in_query as compared_in_query
-from ._why_not import notes_on as notes_on
+from ._notes import Compared as Compared
+from ._notes import compared_in_check as compared_in_check
+from ._notes import compared_in_query as compared_in_query
+from ._notes import notes_on as notes_on
 from ._compile import Compiled as Compiled
 from ._compile import Layout as Layout
 from ._compile import compile_checks as compile_checks

@@ -13,8 +13,7 @@ import re
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
+from sgstore.arrays import np
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
@@ -242,12 +241,26 @@ def _greatest(*values: Any) -> Any:
     return reduce(np.maximum, values)
 
 
-def _of_texts(function: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda *values: function(*(np.asarray(value).astype(str) for value in values))
+def _ufunc(name: str) -> Callable[..., Any]:
+    """A function of numpy by its name: most questions end without numpy, which takes long to import."""
+
+    def of_columns(*values: Any) -> Any:
+        return getattr(np, name)(*values)
+
+    return of_columns
+
+
+def _of_texts(name: str) -> Callable[..., Any]:
+    """A function of texts of ``numpy.char`` by its name."""
+    return lambda *values: getattr(np.char, name)(*map(_texts, values))
+
+
+def _texts(values: Any) -> Any:
+    return np.asarray(values).astype(str)
 
 
 def _contains(text: Any, part: Any) -> Any:
-    return np.char.find(text, part) >= 0
+    return np.char.find(_texts(text), _texts(part)) >= 0
 
 
 def _matches(text: str, pattern: str) -> bool:
@@ -390,19 +403,17 @@ def _null_test(word: str, *, null: bool) -> Operator:
 
 
 COMPARISONS: Final[Mapping[str, Operator]] = {
-    "=": _strict("{0} = {1}", operator.eq, np.equal, infix=True),
-    "<>": _strict("{0} <> {1}", operator.ne, np.not_equal, infix=True),
-    "<": _strict("{0} < {1}", operator.lt, np.less, infix=True),
-    "<=": _strict("{0} <= {1}", operator.le, np.less_equal, infix=True),
-    ">": _strict("{0} > {1}", operator.gt, np.greater, infix=True),
-    ">=": _strict("{0} >= {1}", operator.ge, np.greater_equal, infix=True),
+    "=": _strict("{0} = {1}", operator.eq, _ufunc("equal"), infix=True),
+    "<>": _strict("{0} <> {1}", operator.ne, _ufunc("not_equal"), infix=True),
+    "<": _strict("{0} < {1}", operator.lt, _ufunc("less"), infix=True),
+    "<=": _strict("{0} <= {1}", operator.le, _ufunc("less_equal"), infix=True),
+    ">": _strict("{0} > {1}", operator.gt, _ufunc("greater"), infix=True),
+    ">=": _strict("{0} >= {1}", operator.ge, _ufunc("greater_equal"), infix=True),
 }
 TEXT_TESTS: Final[Mapping[str, Operator]] = {
-    "STARTS WITH": _strict(
-        "starts_with(...)", str.startswith, _of_texts(np.char.startswith), infix=True
-    ),
-    "ENDS WITH": _strict("ends_with(...)", str.endswith, _of_texts(np.char.endswith), infix=True),
-    "CONTAINS": _strict("contains(...)", operator.contains, _of_texts(_contains), infix=True),
+    "STARTS WITH": _strict("starts_with(...)", str.startswith, _of_texts("startswith"), infix=True),
+    "ENDS WITH": _strict("ends_with(...)", str.endswith, _of_texts("endswith"), infix=True),
+    "CONTAINS": _strict("contains(...)", operator.contains, _contains, infix=True),
     "=~": _strict("regexp_full_match(...)", _matches, _matches_columns, infix=True),
 }
 CONNECTIVES: Final[Mapping[str, Operator]] = {
@@ -413,10 +424,10 @@ CONNECTIVES: Final[Mapping[str, Operator]] = {
     "IMPLIES": _ruled("(NOT {0} OR {1})", _implies, _implies_columns, infix=True),
 }
 NUMERIC: Final[Mapping[str, Operator]] = {
-    "abs": _strict("abs(...)", abs, np.abs),
+    "abs": _strict("abs(...)", abs, _ufunc("abs")),
     "sqrt": _strict("CASE WHEN {0} >= 0 THEN sqrt({0}) END", _root, _root_columns, partial=True),
-    "floor": _strict("floor(...)", math.floor, np.floor),
-    "ceil": _strict("ceil(...)", math.ceil, np.ceil),
+    "floor": _strict("floor(...)", math.floor, _ufunc("floor")),
+    "ceil": _strict("ceil(...)", math.ceil, _ufunc("ceil")),
     "round": _strict("round(...)", _rounded, _rounded_columns),
 }
 """Functions of one number."""
@@ -428,8 +439,8 @@ EXTREMES: Final[Mapping[str, Operator]] = {
 """Functions of two numbers or more."""
 
 OF_TEXT: Final[Mapping[str, Operator]] = {
-    "lower": _strict("lower(...)", str.lower, _of_texts(np.char.lower)),
-    "upper": _strict("upper(...)", str.upper, _of_texts(np.char.upper)),
+    "lower": _strict("lower(...)", str.lower, _of_texts("lower")),
+    "upper": _strict("upper(...)", str.upper, _of_texts("upper")),
 }
 """Functions of one text."""
 
@@ -440,9 +451,9 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     **NUMERIC,
     **EXTREMES,
     **OF_TEXT,
-    "+": _strict("(... + ...)", operator.add, np.add, infix=True),
-    "-": _strict("(... - ...)", operator.sub, np.subtract, infix=True),
-    "*": _strict("(... * ...)", operator.mul, np.multiply, infix=True),
+    "+": _strict("(... + ...)", operator.add, _ufunc("add"), infix=True),
+    "-": _strict("(... - ...)", operator.sub, _ufunc("subtract"), infix=True),
+    "*": _strict("(... * ...)", operator.mul, _ufunc("multiply"), infix=True),
     "/": _strict("({0} / nullif({1}, 0))", _divided, _divided_columns, infix=True, partial=True),
     "%": _strict(
         "({0} % nullif({1}, 0))",
@@ -451,7 +462,7 @@ OPERATORS: Final[Mapping[str, Operator]] = {
         infix=True,
         partial=True,
     ),
-    "negative": _strict("(- {0})", operator.neg, np.negative),
+    "negative": _strict("(- {0})", operator.neg, _ufunc("negative")),
     "coalesce": _ruled("coalesce(...)", _first_known, _first_known_columns),
     "IS NULL": _null_test("IS NULL", null=True),
     "IS NOT NULL": _null_test("IS NOT NULL", null=False),

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.abstractions import SUBSETS
 from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
 from sgstore.quoting import literal
-from sgstore.store._derive import sets_of
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
 from sgstore.vocabulary import NAMES, RELATIONS
@@ -73,12 +72,21 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()
     }
     derived: dict[str, list[DerivedSet]] = {}
-    for one in sets_of(connection):
+    for one in _sets(connection):
         derived.setdefault(one.name, []).append(one)
     for name, of in derived.items():
         changes = _derived(connection, whole, name, of)
         sets[name] = lambda catalog, changes=changes: replace(catalog, **changes)
     return replace(whole, sets=sets)
+
+
+def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
+    """The derived sets of a store; few have any, and what makes them takes long to import."""
+    if connection.execute("SELECT 1 FROM derived LIMIT 1").fetchone() is None:
+        return ()
+    from sgstore.store._derive import sets_of
+
+    return sets_of(connection)
 
 
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:

@@ -1,4 +1,7 @@
-"""A store: one DuckDB file, which stays open for a while after each question."""
+"""A store: one DuckDB file, which stays open for a while after each question.
+
+What only writing or drawing needs is imported where it is used: a question is shorter than its imports.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
-import sgstore.store._rebuild as anew
 import sgstore.store._rows as rows
+from sgstore.arrays import np
 from sgstore.errors import SgstoreError, StoreError, TraceError
-from sgstore.store._classes import Abstracted
-from sgstore.store._derive import Deriving
-from sgstore.store._graphs import Graphs
 from sgstore.store._locking import (
     WAIT_S,
     Access,
@@ -26,10 +24,7 @@ from sgstore.store._locking import (
     translated,
 )
 from sgstore.store._packing import plain
-from sgstore.store._payloads import payload_place
-from sgstore.store._publish import publish_each, publish_in, remove
 from sgstore.store._rows import BATCH, Batches, Given, Rows, give
-from sgstore.store._staging import scratch
 from sgstore.store._traces import (
     FrameRef,
     Identity,
@@ -42,7 +37,6 @@ from sgstore.store._traces import (
     stored_traces,
     trace_named,
 )
-from sgstore.store._write import OnMap, Segment
 from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
@@ -57,12 +51,16 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog
     from sgstore.readers import Media
     from sgstore.roads import RoadMap
+    from sgstore.store._classes import Abstracted
+    from sgstore.store._derive import Deriving
+    from sgstore.store._graphs import Graphs
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
     from sgstore.store._rows import ArrowStream, Parameters
     from sgstore.store._similarity import SimilarFrames
     from sgstore.store._staging import Sealed
     from sgstore.store._verify import Verification
+    from sgstore.store._write import Segment
     from sgstore.world import TraceInfo
 
 
@@ -127,7 +125,7 @@ class StoreFile:
             diagnose=_damage,
         )
         self.access.root = root
-        self._graphs = Graphs()
+        self._graphs: Graphs | None = None
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
         self._known: tuple[Stamp, Catalog] | None = None
@@ -147,12 +145,14 @@ class StoreFile:
         path = Path(path)
         made = not path.exists()
         if made:
-            anew.create(path)
+            from sgstore.store._rebuild import create
+
+            create(path)
         return cls(path, memory=memory, wait_s=wait_s, made=made)
 
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several questions: they see the same state, and cost less."""
-        return self.access.reading()
+        return self.access.reading(public=True)  # nothing is asked by it, so no schema is chosen
 
     def close(self) -> None:
         """Close the file, unless something is asked of it now; it is opened again with the next question."""
@@ -381,12 +381,21 @@ class StoreFile:
         """
         with self.access.reading() as connection:
             frame = frame_named(connection, ref)
-            return next(self._graphs.scenes(connection, np.array([frame.frame_id])))
+            return next(self._reader.scenes(connection, np.array([frame.frame_id])))
 
     def graphs(self, frame_id: NDArray[np.int64]) -> Iterator[SceneGraph]:
         """Scene graphs of some frames of one trace, whose ids ascend; their columns are in memory together."""
         with self.access.reading() as connection:
-            yield from self._graphs.scenes(connection, frame_id)
+            yield from self._reader.scenes(connection, frame_id)
+
+    @property
+    def _reader(self) -> Graphs:
+        """Reads scene graphs, and remembers maps."""
+        if self._graphs is None:
+            from sgstore.store._graphs import Graphs
+
+            self._graphs = Graphs()
+        return self._graphs
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
         """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""
@@ -471,6 +480,8 @@ class StoreFile:
 
     def _payload_place(self, ref: int | str, channel: str) -> tuple[Path, int, dict[str, int]]:
         """Recording, channel's id and place of the message that belongs to a frame."""
+        from sgstore.store._payloads import payload_place
+
         with self.access.reading() as connection:
             frame = frame_named(connection, ref)
             found = payload_place(connection, frame, channel)
@@ -544,6 +555,8 @@ class StoreFile:
         answers : tuple of str
             Relations that they can hold.
         """
+        from sgstore.store._write import OnMap, Segment
+
         identity = Identity.of(info, config, road_map)
         return Segment(self.path, info, identity, OnMap(road_map), answers, access=self.access)
 
@@ -566,6 +579,8 @@ class StoreFile:
         StoreError
             The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
         """
+        from sgstore.store._publish import publish_in
+
         return publish_in(self.access, sealed, replace=replace)
 
     def publish_each(
@@ -578,6 +593,8 @@ class StoreFile:
         list of str or SgstoreError
             The name of each trace in the store, or why it could not come in.
         """
+        from sgstore.store._publish import publish_each
+
         return publish_each(self.access, sealed, replace=replace)
 
     def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
@@ -623,6 +640,9 @@ class StoreFile:
         StoreError
             One of them is not there, or others keep the store for too long.
         """
+        from sgstore.store._publish import remove
+        from sgstore.store._staging import scratch
+
         with self.access.reading():
             gone = {trace.trace_id: trace for trace in map(self.trace, traces)}
         with scratch(spill_folder()) as connection, self.access.writing(connection):
@@ -634,6 +654,8 @@ class StoreFile:
     def abstracted(self) -> Abstracted:
         """Frames as abstractions have them, and their classes."""
         if self._abstracted is None:
+            from sgstore.store._classes import Abstracted
+
             self._abstracted = Abstracted(self.path, self.access)
         return self._abstracted
 
@@ -649,6 +671,8 @@ class StoreFile:
     @property
     def deriving(self) -> Deriving:
         """Sets of relations that were derived from the states."""
+        from sgstore.store._derive import Deriving
+
         return Deriving(self.path, self.access)
 
     def verify(self, *, recordings: bool = False) -> Verification:
@@ -668,7 +692,9 @@ class StoreFile:
 
         Nothing is done if there is nothing, or if others keep the store for too long.
         """
-        anew.settle(self.path, self.access, self._memory)
+        from sgstore.store._rebuild import settle
+
+        settle(self.path, self.access, self._memory)
 
     def compact(self) -> None:
         """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
@@ -682,11 +708,15 @@ class StoreFile:
             Others keep the store for too long, there is no room for a second one, or somebody else's tables are
             in it, too: they would be lost.
         """
-        anew.compact(self.path, self.access, self._memory)
+        from sgstore.store._rebuild import compact
+
+        compact(self.path, self.access, self._memory)
 
     def refuse_others(self) -> None:
         """Raise a StoreError if there are tables or views of somebody else's: compacting would lose them."""
-        anew.refuse_others(self.path, self.access)
+        from sgstore.store._rebuild import refuse_others
+
+        refuse_others(self.path, self.access)
 
     @contextmanager
     def _answered(

@@ -9,24 +9,24 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
+from sgstore.arrays import np
 from sgstore.columns import taken
 from sgstore.world import BUCKET_FRAMES, GAP, KEPT, TOLERANCE_NS, TOLERANCE_SHARE, number, turned
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from numpy.typing import NDArray
+
     from sgstore.graph import Edges, GraphBlock
     from sgstore.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
 
 
-Whole = NDArray[np.signedinteger[Any]]
+Whole: TypeAlias = "NDArray[np.signedinteger[Any]]"
 
-Columns = dict[str, NDArray[Any]]
+Columns: TypeAlias = "dict[str, NDArray[Any]]"
 """A table's columns by name, all of one length. What is missing is not finite, :data:`MISSING`, or empty."""
 
 MISSING: Final = -(1 << 31)

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import duckdb
-import numpy as np
 
+from sgstore.arrays import np
 from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.files import without_controls, working_folder, written_at, written_text
 from sgstore.quoting import literal, quoted

@@ -20,8 +20,8 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
 import duckdb
-import numpy as np
 
+from sgstore.arrays import np
 from sgstore.errors import StoreError
 from sgstore.pair_numbers import pairs_view
 from sgstore.quoting import literal, quoted

@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.lang import (
-    MOTION,
-    TOLD_WEATHER,
     compared_in_check,
     compile_checks,
     entities,
     of_check,
     traces_of,
-    traces_with,
 )
 from sgstore.matches import Interval, notes_in
 from sgstore.temporal._formula import tolerant
+from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, traces
 from sgstore.temporal._plan import plan_of_check, plan_text
 from sgstore.temporal._verdicts import (
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Attribute, Catalog, CheckInCatalog, Need
+    from sgstore.lang import Catalog, CheckInCatalog
     from sgstore.lang.ir import BoundCheck, BoundQuantifier
     from sgstore.store import StoreFile
     from sgstore.world import Bools, Ints
@@ -48,45 +46,6 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
     Statuses = NDArray[np.int8]
     Array = NDArray[Any]
-
-
-def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[int, str]:
-    """The traces that do not know what is needed, by id, with the reason; what was found is remembered.
-
-    Parameters
-    ----------
-    file : StoreFile
-    catalog : Catalog
-    needs : iterable of Need
-    """
-    found: dict[int, list[str]] = {}
-    every = frozenset(trace.trace_id for trace in catalog.traces)
-    for need in needs:
-        key = catalog.name, need.kinds, need.attribute
-        if key not in catalog.lacks:
-            catalog.lacks[key] = every - _knowing(file, every, need)
-        for trace in catalog.lacks[key]:
-            found.setdefault(trace, []).append(need.reason)
-    return {trace: "; ".join(dict.fromkeys(reasons)) for trace, reasons in found.items()}
-
-
-def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[int]:
-    """The traces that know it, or have nothing of which it could be known."""
-    if need.kinds is None:
-        assert need.attribute is not None  # noqa: S101 - of a frame something is known
-        (word,) = need.attribute.columns.values()
-        rows = file.rows(TOLD_WEATHER, [f"(^|, ){word}=[^,]"]).values
-        return frozenset(trace for (trace,) in rows)
-
-    def having(attribute: Attribute | None, *, moving: bool = False) -> frozenset[int]:
-        assert need.kinds is not None  # noqa: S101 - it was looked at above
-        sql = traces_with(need.kinds, attribute, moving=moving)
-        return frozenset(trace for (trace,) in file.rows(sql).values)
-
-    known = having(need.attribute)
-    if need.attribute is None or known >= every:
-        return known
-    return known | ((every - known) - having(None, moving=need.attribute.name in MOTION))
 
 
 # Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----

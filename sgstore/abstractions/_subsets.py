@@ -1,0 +1,62 @@
+"""Abstractions that are parts of the scene graph: queries see them under their names, and need no arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.records import dataclass
+from sgstore.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+SCENERY: Final = ("building", "pole", "barrier", "vegetation")
+"""Kinds of entities that only ``SG`` has."""
+
+BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
+"""Relations among entities that the literature has."""
+
+OF_JUNCTION: Final = (
+    *BETWEEN_ENTITIES,
+    *("isIn", "travelsTo", "laneChange", "opposes", "controlsTrafficOf", "mayAffect"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Subset:
+    """Part of the scene graph that queries see under an abstraction which adds no nodes or edges.
+
+    Attributes
+    ----------
+    parts : frozenset of str or None
+        Kinds of parts of the map among its nodes, beside those of traffic; ``None``: all kinds and relations.
+    moving : frozenset of str
+        Relations of entities, to one another and to parts of the map.
+    lasting : frozenset of str
+        Relations among parts of the map.
+    """
+
+    parts: frozenset[str] | None
+    moving: frozenset[str] = frozenset()
+    lasting: frozenset[str] = frozenset()
+
+    @property
+    def kinds(self) -> frozenset[str] | None:
+        """Kinds of its nodes, as far as they are known now; ``None``: all."""
+        return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
+
+
+_LANES: Final = frozenset({"lane", "off_road"})
+_RELATED: Final = frozenset(BETWEEN_ENTITIES)
+_PARTS: Final = frozenset({*_LANES, "road", "junction"})
+
+SUBSETS: Final[Mapping[str, Subset]] = {
+    "E": Subset(frozenset()),
+    "EL": Subset(_LANES, frozenset({"isIn"})),
+    "ER": Subset(frozenset(), _RELATED),
+    "RSV": Subset(_LANES, _RELATED | {"isIn"}),
+    "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
+    "SG": Subset(None),
+}
+"""In queries lanes keep the names and the sections that they have in the map."""

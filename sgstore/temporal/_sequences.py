@@ -1,0 +1,606 @@
+"""Sequences over a store: the steps of a query joined over time in arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang import ExternalRelation, Window, relation, value_text
+from sgstore.lang.ir import Bound, Query, SignalCall, StepTime, Tense
+from sgstore.records import dataclass
+from sgstore.store import BUCKET_BITS
+from sgstore.temporal._formula import formula_text
+from sgstore.temporal._offline import PlanValues, TimedRelation, TraceReader, traces, words
+from sgstore.temporal._plan import (
+    Test,
+    ask_of_step,
+    hold_text,
+    link_text,
+    needs_text,
+    plan_of_steps,
+    sql_text,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang import Catalog, Column
+    from sgstore.lang.ir import BoundHold, Length
+    from sgstore.store import StoreFile
+    from sgstore.temporal._formula import Formula
+    from sgstore.temporal._plan import Ask
+    from sgstore.temporal._signals import Clock
+    from sgstore.world import Bools, Ints
+
+    Keys = NDArray[np.int64]
+
+
+# Sequences over columns ---------------------------------------------------------------------------
+# A match is a frame for each step, each frame within the bounds that the link before it sets. There is one
+# match for each binding and maximal run of frames of the first step: of all that begin in the run, the one
+# whose frames are the earliest, compared from the first step on.
+#
+# All frames of all bindings stand in one line, with room between bindings, so that every step is one search in
+# a sorted array.
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """The way from one step to the next.
+
+    Attributes
+    ----------
+    kind : str
+        ``then``, ``immediately``, ``until``, ``while``.
+    after, within : Length or None
+        Bounds of ``then``.
+    absent : (R,) int64 or None
+        Places at which something must not happen strictly between the two.
+    places : (R,) int64 or None
+        Where the next step holds, ascending; ``None``: nothing follows, and what must not happen does not up
+        to ``within``.
+    """
+
+    kind: str
+    after: Length | None
+    within: Length | None
+    absent: Ints | None
+    places: Ints | None
+
+
+class BindingLine:
+    """The frames of many bindings in one line: binding b's frame i is at ``b * stride + i``.
+
+    Parameters
+    ----------
+    clock : Clock
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.frames = len(clock.times)
+        self.stride = self.frames + 1
+        breaks = np.ones(self.stride, np.bool_)
+        breaks[1 : self.frames] = clock.gap_before[1:]
+        self._breaks = breaks
+
+    def frame(self, places: Ints) -> Ints:
+        """The frame of each place."""
+        return places % self.stride
+
+    def run_ends(self, places: Ints) -> Ints:
+        """(R,) the last place of the run that each of some ascending places is in."""
+        if not len(places):
+            return places
+        last = np.append(self._starts(places)[1:], True)
+        ends = np.where(last, np.arange(len(places)), len(places))
+        return places[np.minimum.accumulate(ends[::-1])[::-1]]
+
+    def runs(self, places: Ints) -> Ints:
+        """(R,) the number of the run that each of some ascending places is in."""
+        return np.cumsum(self._starts(places)) - 1
+
+    def _starts(self, places: Ints) -> Bools:
+        """Return where runs begin: after a missing frame, a gap, or another binding's last frame."""
+        starts = np.ones(len(places), np.bool_)
+        follows = np.diff(places) == 1
+        starts[1:] = ~follows | self._breaks[self.frame(places[1:])]
+        return starts
+
+    def held(self, places: Ints, hold: BoundHold) -> Ints:
+        """Those places whose run is as long as is asked."""
+        if not len(places):
+            return places
+        runs = self.runs(places)
+        first = np.flatnonzero(np.diff(runs, prepend=-1))
+        last = np.append(first[1:], len(places)) - 1
+        if hold.length.frames:
+            length = last - first + 1
+        else:
+            times = self.clock.times
+            length = times[self.frame(places[last])] - times[self.frame(places[first])]
+            length = length + (self.clock.period if hold.inclusive else 0)
+        return places[hold.fits(length, self.clock.tolerance)[runs]]
+
+    def window(self, leg: Leg, places: Ints) -> tuple[Ints, Ints]:
+        """(R,) and (R,) the first and the last place at which the next step may be, from each place."""
+        frame = self.frame(places)
+        base = places - frame
+        if leg.kind == "while":
+            return places, places
+        if leg.kind == "then":
+            low = np.maximum(self._moved(frame, leg.after, "left"), frame + 1)
+            high = self._moved(frame, leg.within, "right")
+        else:
+            low, high = frame + 1, frame + 1
+            if leg.kind == "until":
+                high = self.run_ends(places) - base + 1
+            high = np.where(self._breaks[high], high - 1, high)  # there is a gap, or no frame
+        low, high = base + low, base + np.minimum(high, self.frames - 1)
+        if leg.absent is not None and len(leg.absent):
+            following = np.searchsorted(leg.absent, places, "right")
+            inside = np.minimum(following, len(leg.absent) - 1)
+            beyond = np.iinfo(np.int64).max
+            high = np.minimum(
+                high, np.where(following < len(leg.absent), leg.absent[inside], beyond)
+            )
+        return low, high
+
+    def _moved(self, frame: Ints, by: Length | None, side: str) -> Ints:
+        """The first frame that is so much later (``left``), or the last that is not more (``right``)."""
+        times = self.clock.times
+        if by is None:
+            return frame if side == "left" else np.full_like(frame, self.frames - 1)
+        if by.frames:
+            return frame + by.amount
+        tolerance = self.clock.tolerance if side == "right" else -self.clock.tolerance
+        amount = max(by.amount + tolerance, 0)
+        then = np.minimum(times[frame], np.iinfo(np.int64).max - amount) + amount
+        return (
+            np.searchsorted(times, then, "left")
+            if side == "left"
+            else np.searchsorted(times, then, "right") - 1
+        )
+
+
+def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str) -> Ints:
+    """The matches of a sequence.
+
+    Parameters
+    ----------
+    line : BindingLine
+    first : (R,) int64
+        Places at which the first step holds, ascending.
+    legs : sequence of Leg
+    policy : str
+        ``all``; ``longest``: of those that begin where the earliest does, the one whose further frames are the
+        latest, compared from the second step on; ``first``: of each binding only the first match.
+
+    Returns
+    -------
+    (M, n) int64
+        Places of the steps that happen, in order of the first.
+    """
+    steps = [first, *(leg.places for leg in legs if leg.places is not None)]
+    onward: list[tuple[Ints, Ints]] = []
+    possible = steps[-1]
+    rest = list(legs)
+    if rest and rest[-1].places is None:
+        possible = _unfollowed(line, rest.pop(), possible)
+    for leg, here in zip(reversed(rest), reversed(steps[:-1]), strict=True):
+        low, high = line.window(leg, here)
+        found, fits = _next(possible, low, high, latest=policy == "longest")
+        onward.insert(0, (here[fits], found[fits]))
+        possible = here[fits]
+    chosen = _one_a_run(line, first, possible)
+    if policy == "first" and len(chosen):
+        chosen = chosen[np.diff(chosen // line.stride, prepend=-1) != 0]
+    columns = [chosen]
+    for here, found in onward:
+        columns.append(found[np.searchsorted(here, columns[-1])])
+    return np.stack(columns, axis=1)
+
+
+def _next(possible: Ints, low: Ints, high: Ints, *, latest: bool) -> tuple[Ints, Bools]:
+    """The earliest (or latest) of some places within each window, and whether there is one."""
+    if not len(possible):
+        return low, np.zeros(len(low), np.bool_)
+    if latest:
+        at = np.searchsorted(possible, high, "right") - 1
+        found = possible[np.clip(at, 0, None)]
+        return found, (at >= 0) & (found >= low) & (found <= high)
+    at = np.searchsorted(possible, low, "left")
+    found = possible[np.clip(at, None, len(possible) - 1)]
+    return found, (at < len(possible)) & (found >= low) & (found <= high)
+
+
+def _unfollowed(line: BindingLine, leg: Leg, places: Ints) -> Ints:
+    """Those places after which something does not happen within a time."""
+    absent = leg.absent if leg.absent is not None else places[:0]
+    low, high = line.window(Leg("then", None, leg.within, None, None), places)
+    _, followed = _next(absent, low, high, latest=False)
+    return places[~followed]
+
+
+def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
+    """The first of the possible places in each run of the first step."""
+    runs = line.runs(first)[np.searchsorted(first, possible)] if len(possible) else possible
+    return possible[np.diff(runs, prepend=-1) != 0] if len(possible) else possible
+
+
+# Bindings of several steps together: those that agree on the variables that they share ----------
+
+ROWS: Final = 2_000_000
+"""Rows of all steps together that are looked at at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class JoinedBindings:
+    """Bindings of several relations together.
+
+    Attributes
+    ----------
+    variables : tuple of str
+    bindings : (J, n) int64
+    places : (J, r) int64
+        For each relation the place of its key.
+    """
+
+    variables: tuple[str, ...]
+    bindings: Keys
+    places: Ints
+
+    def parts(self, relations: Sequence[TimedRelation]) -> Iterator[JoinedBindings]:
+        """The same in parts of which each has not too many rows."""
+        if not len(self.bindings):
+            return
+        rows = np.zeros(len(self.bindings), np.int64)
+        for number, one in enumerate(relations):
+            rows += np.diff(one.starts)[self.places[:, number]]
+        part = np.cumsum(rows) // ROWS
+        starts = np.flatnonzero(np.diff(part, prepend=-1))
+        for low, high in zip(starts, np.append(starts[1:], len(part)), strict=True):
+            yield JoinedBindings(self.variables, self.bindings[low:high], self.places[low:high])
+
+
+def joined(
+    relations: Sequence[tuple[tuple[str, ...], TimedRelation]], apart: Collection[str]
+) -> JoinedBindings:
+    """All bindings of some relations, each with its variables, that agree on what these share.
+
+    Parameters
+    ----------
+    relations : sequence of (variables, TimedRelation)
+    apart : collection of str
+        Variables of which no two may be the same.
+    """
+    variables, first = relations[0]
+    found = JoinedBindings(variables, first.keys, np.arange(len(first.keys))[:, None])
+    for more, other in relations[1:]:
+        found = _with(found, more, other, apart)
+    return found
+
+
+def _with(
+    found: JoinedBindings,
+    variables: tuple[str, ...],
+    relation: TimedRelation,
+    apart: Collection[str],
+) -> JoinedBindings:
+    shared = [name for name in variables if name in found.variables]
+    new = [name for name in variables if name not in found.variables]
+    left = found.bindings[:, [found.variables.index(name) for name in shared]]
+    right = relation.keys[:, [variables.index(name) for name in shared]]
+    rows, others = _pairs(left, right)
+    added = relation.keys[others][:, [variables.index(name) for name in new]]
+    bindings = np.concatenate((found.bindings[rows], added), axis=1)
+    names = (*found.variables, *new)
+    kept = np.ones(len(rows), np.bool_)
+    for at, name in enumerate(found.variables):
+        for column, other in enumerate(new):
+            if name in apart and other in apart:
+                kept &= bindings[:, at] != added[:, column]
+    places = np.column_stack((found.places[rows], others))
+    return JoinedBindings(names, bindings[kept], places[kept])
+
+
+def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
+    """Numbers of the rows of two tables that are equal, ordered by the first."""
+    if not len(left) or not len(right):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    both = np.concatenate((left, right))
+    if both.shape[1]:
+        _, codes = np.unique(both, axis=0, return_inverse=True)
+        codes = codes.reshape(-1)
+    else:
+        codes = np.zeros(len(both), np.int64)
+    one, other = codes[: len(left)], codes[len(left) :]
+    order = np.argsort(other, kind="stable")
+    low = np.searchsorted(other[order], one, "left")
+    counts = np.searchsorted(other[order], one, "right") - low
+    rows = np.repeat(np.arange(len(left)), counts)
+    offset = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return rows, order[np.repeat(low, counts) + offset]
+
+
+# The matches of a query over several frames -------------------------------------------------------
+
+
+_Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
+"""Some matches: ids of their first and last frames, their nodes and edges, and the values of each place."""
+
+
+class Finder:
+    """Finder of the matches of a query over several frames in a store.
+
+    Parameters
+    ----------
+    file : StoreFile
+        It stays as it is while this is used.
+    query : Query
+        With steps.
+    catalog : Catalog
+    """
+
+    def __init__(self, file: StoreFile, query: Query, catalog: Catalog) -> None:
+        self._file, self._query, self._catalog = file, query, catalog
+        self._plan = plan_of_steps(query, query.steps)
+        self._when = [tuple(map(self._plan.formula, step.when)) for step in query.steps]
+        self._kept = tuple(sorted(query.scope.nodes))
+        self._steps = [ask_of_step(query, step, self._kept) for step in query.steps]
+        self._edges = tuple(edge.key for edge in query.scope.edges)
+
+    def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
+        """The matches in a window, or in the whole traces that it is a part of.
+
+        Parameters
+        ----------
+        places : tuple of Bound
+            What is worked out for each match.
+        window : Window or None
+        """
+        if window is not None:
+            high = ((window.high - 1) >> BUCKET_BITS) + 1
+            low = window.low >> BUCKET_BITS << BUCKET_BITS
+            window = Window(low, high << BUCKET_BITS, window.traces)
+        for place in places:
+            if not isinstance(place, StepTime):
+                self._planned(place)  # what it asks of single frames becomes part of the plan
+        asks = self._plan.asks | {f"step {number}": ask for number, ask in enumerate(self._steps)}
+        about = self._file, self._catalog, self._query, asks
+        found = traces(*about, gaps=self._query.gaps, within=window)
+        parts = [part for trace in found if len(trace) for part in self._find(trace, places)]
+        first = [frame for part in parts for frame in part[0].tolist()]
+        last = [frame for part in parts for frame in part[1].tolist()]
+        width = len(self._kept) + len(self._edges)
+        keys = np.concatenate([np.zeros((0, width), np.int64), *(part[2] for part in parts)]).T
+        nodes = dict(zip(self._kept, keys.tolist(), strict=False))
+        edges = dict(zip(self._edges, words()[keys[len(self._kept) :]].tolist(), strict=True))
+        many = len(places) + self._spans * 2
+        values = [[item for part in parts for item in part[3][n]] for n in range(many)]
+        return ExternalRelation(first, last, nodes, edges, values)
+
+    def _planned(self, place: Bound) -> Formula | Test:
+        """The formula, or the test, whose value is asked for at a place."""
+        if isinstance(place, Tense) or (
+            isinstance(place, SignalCall) and place.word == "exists_now"
+        ):
+            return self._plan.formula(place)
+        return self._plan.test(place)
+
+    def text(self, places: tuple[Bound, ...]) -> str:
+        """The questions about single frames, and the formulas over their answers."""
+        lines: list[str] = []
+        for number, (step, ask) in enumerate(zip(self._query.steps, self._steps, strict=True)):
+            if number:
+                lines.append(link_text(self._query.links[number - 1]))
+            lines.append(
+                f"{'not ' * step.absent}step {number + 1}({', '.join(self._named(number))})"
+            )
+            lines += [f"    when {formula_text(formula)}" for formula in self._when[number]]
+            lines += [f"    {hold_text(step.hold)}"] if step.hold else []
+            if not ask.everywhere:
+                lines += sql_text(relation(ask.query, self._catalog, None, (), {*ask.columns}))
+        for place in places:
+            if not isinstance(place, StepTime):
+                asked = self._planned(place)
+                name = asked.name if isinstance(asked, Test) else formula_text(asked)
+                lines.append(f"returned {value_text(place)} = {name}")
+        return "\n".join([*lines, *needs_text(self._plan, self._catalog)])
+
+    @property
+    def _spans(self) -> bool:
+        return len(self._query.steps) > 1
+
+    def _find(self, trace: TraceReader, places: tuple[Bound, ...]) -> Iterator[_Part]:
+        line = BindingLine(trace.clock)
+        held = [self._held(trace, line, number) for number in range(len(self._steps))]
+        if not self._spans:
+            yield self._frames(trace, held[0], places)
+            return
+        happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
+        together = joined([(self._named(n), held[n]) for n in happen], self._apart)
+        for part in together.parts([held[n] for n in happen]):
+            yield from self._matches(trace, line, held, part, places)
+
+    @property
+    def _apart(self) -> tuple[str, ...]:
+        return self._kept if self._query.injective else ()
+
+    def _named(self, number: int) -> tuple[str, ...]:
+        """Return the columns of a step's relation that other steps or results use."""
+        ask = self._steps[number]
+        return (*(n for n in ask.variables if n in self._kept), *ask.edges)
+
+    def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
+        """Return the frames in which a step holds: its pattern, its other conditions, and its duration."""
+        step, ask = self._query.steps[number], self._steps[number]
+        relation = trace.relations[f"step {number}"]
+        owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+        kept = np.ones(len(owners), np.bool_)
+        for formula in self._when[number]:
+            kept &= self._true(trace, relation, ask, formula, owners)
+        keys, frames = relation.keys[owners[kept]], relation.frames[kept]
+        keys = keys[:, [ask.columns.index(name) for name in self._named(number)]]
+        relation = TimedRelation.of(frames, keys)
+        if step.hold is None:
+            return relation
+        owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+        places = line.held(owners * line.stride + relation.frames, step.hold)
+        return TimedRelation.of(line.frame(places), relation.keys[places // line.stride])
+
+    def _true(
+        self, trace: TraceReader, relation: TimedRelation, ask: Ask, formula: Formula, owners: Ints
+    ) -> Any:
+        """Tell whether a formula is true in each row of a relation."""
+        true = np.zeros(len(owners), np.bool_)
+        for low, high, rows in _chunks(relation.starts, trace.together):
+            bindings = relation.keys[low:high, : len(ask.variables)]
+            values = PlanValues(self._plan, trace, ask.variables, bindings).formula(formula)
+            true[rows] = values[owners[rows] - low, relation.frames[rows]]
+        return true
+
+    # Single frames
+
+    def _frames(
+        self, trace: TraceReader, relation: TimedRelation, places: tuple[Bound, ...]
+    ) -> _Part:
+        names = self._named(0)
+        owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+        told = [np.zeros(len(owners), object) for _ in places]
+        for low, high, rows in _chunks(relation.starts, trace.together):
+            at = owners[rows] - low, relation.frames[rows]
+            values = self._values(trace, names, relation.keys[low:high], places)
+            for number, column in enumerate(values):
+                told[number][rows] = _picked(column, at)
+        ids = trace.frame_ids[relation.frames]
+        new = np.ones(len(ids), np.bool_)
+        new[1:] = (np.diff(ids) != 1) | (np.diff(owners) != 0)
+        for column in told:
+            new[1:] |= column[1:] != column[:-1]
+        first = np.flatnonzero(new)
+        last = np.append(first[1:], len(ids))[: len(first)] - 1
+        keys = self._ordered(names, relation.keys[owners[first]])
+        return ids[first], ids[last], keys, [column[first].tolist() for column in told]
+
+    # Sequences
+
+    def _matches(
+        self,
+        trace: TraceReader,
+        line: BindingLine,
+        held: list[TimedRelation],
+        part: JoinedBindings,
+        places: tuple[Bound, ...],
+    ) -> Iterator[_Part]:
+        steps = self._query.steps
+        happen = [n for n, step in enumerate(steps) if not step.absent]
+        at = [self._placed(line, held[n], part.places[:, i]) for i, n in enumerate(happen)]
+        by_step = dict(zip(happen, at, strict=True))
+        absent: dict[int, Ints] = {}
+        for n, step in enumerate(steps):
+            if step.absent:
+                own = part.bindings[:, [part.variables.index(name) for name in self._named(n)]]
+                absent[n] = self._placed(line, held[n], held[n].find(own))
+        told = matches_of(line, by_step[0], self._legs(by_step, absent), self._query.policy)
+        if not len(told):
+            return
+        owners = told[:, 0] // line.stride
+        frames = line.frame(told)
+        ends = frames[:, -1]
+        if steps[happen[-1]].hold is not None:
+            runs = line.run_ends(at[-1])
+            ends = line.frame(runs[np.searchsorted(at[-1], told[:, -1])])
+        keys = self._ordered(part.variables, part.bindings[owners])
+        values = self._at_matches(trace, part, owners, frames, places)
+        values += [trace.frame_ids[frames[:, 0]].tolist(), trace.frame_ids[ends].tolist()]
+        last = trace.frame_ids[frames[:, -1]]
+        yield last, last, keys, values
+
+    def _placed(self, line: BindingLine, relation: TimedRelation, places: Ints) -> Ints:
+        owner, rows = relation.rows_of(places)
+        return owner * line.stride + relation.frames[rows]
+
+    def _legs(self, at: dict[int, Ints], absent: dict[int, Ints]) -> list[Leg]:
+        """The ways between the steps that happen; what must not happen lies on them."""
+        legs: list[Leg] = []
+        links, number = self._query.links, 1
+        while number <= len(links):
+            there = absent.get(number)
+            number += there is not None and number < len(links)
+            link = links[number - 1]
+            legs.append(Leg(link.kind, link.after, link.within, there, at.get(number)))
+            number += 1
+        return legs
+
+    def _at_matches(
+        self,
+        trace: TraceReader,
+        part: JoinedBindings,
+        owners: Ints,
+        frames: Ints,
+        places: tuple[Bound, ...],
+    ) -> list[list[Any]]:
+        happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
+        asked = tuple(place for place in places if not isinstance(place, StepTime))
+        picked: dict[Bound, list[Any]] = {place: [] for place in asked}
+        size = trace.together
+        for low in range(0, len(owners) if asked else 0, size):
+            some = owners[low : low + size]
+            at = np.arange(len(some)), frames[low : low + size, -1]
+            values = self._values(trace, part.variables, part.bindings[some], asked)
+            for place, column in zip(asked, values, strict=True):
+                picked[place] += _picked(column, at).tolist()
+        for place in places:
+            if isinstance(place, StepTime):
+                times = trace.times[frames[:, happen.index(place.step)]] - trace.start
+                picked[place] = (times / 1e9).tolist()
+        return [picked[place] for place in places]
+
+    # Values
+
+    def _values(
+        self,
+        trace: TraceReader,
+        names: tuple[str, ...],
+        bindings: Keys,
+        places: tuple[Bound, ...],
+    ) -> Iterator[Any]:
+        """Values over time of some bindings: (B, F) flags, or columns."""
+        values = PlanValues(self._plan, trace, names, bindings)
+        for asked in map(self._planned, places):
+            yield values.test(asked) if isinstance(asked, Test) else values.formula(asked)
+
+    def _ordered(self, names: tuple[str, ...], keys: Keys) -> Keys:
+        """Bindings with the columns in the order of the query's nodes and edges."""
+        return keys[:, [names.index(name) for name in (*self._kept, *self._edges)]]
+
+
+def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
+    """Keys in parts of so many, with their rows."""
+    for low in range(0, len(starts) - 1, size):
+        high = min(low + size, len(starts) - 1)
+        yield low, high, slice(int(starts[low]), int(starts[high]))
+
+
+def _picked(column: Column | Any, at: tuple[Any, Any]) -> Any:
+    """The values at some places as Python has them; ``None`` where they are unknown."""
+    if isinstance(column, np.ndarray):
+        return np.broadcast_to(column, (len(column), column.shape[1]))[_row(column, at)].astype(
+            object
+        )
+    shape = np.broadcast_shapes(column.values.shape, np.shape(column.known))
+    values, known = np.broadcast_to(column.values, shape), np.broadcast_to(column.known, shape)
+    place = _row(values, at)
+    told = values[place].astype(object)
+    told[~known[place]] = None
+    return told
+
+
+def _row(values: Any, at: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Places in an array that may be the same for all bindings, or for all frames."""
+    rows = at[0] if values.shape[0] > 1 else np.zeros_like(at[0])
+    return rows, (at[1] if values.shape[1] > 1 else np.zeros_like(at[1]))
