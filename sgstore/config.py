@@ -162,9 +162,9 @@ class LaneSettings:
         check(known, "lanes.ahead", self.ahead, "a length of 0 or more, in metres")
         right = self.granularity in GRANULARITIES
         check(right, "lanes.granularity", self.granularity, one_of(GRANULARITIES))
-        known_types = {name.lower() for name in LANE_TYPES}
         for name in self.types:
-            check(name.lower() in known_types, "lanes.types", name, _expected(name, LANE_TYPES))
+            if name.lower() not in {known.lower() for known in LANE_TYPES}:
+                _check_name("lanes.types", name, LANE_TYPES)
         right = 0.1 <= self.spacing <= MOST_LENGTH
         check(right, "lanes.spacing", self.spacing, "a length of 0.1 or more, in metres")
 
@@ -365,8 +365,7 @@ class Config:
         check(not both, "direction.names", self.direction.names, "other names than proximity.names")
         for name in self.without:
             relation_named(name)  # those of other packages are looked for
-            known = [r for r in RELATIONS if r not in MAP_ONLY]
-            check(name in known, "without", name, _expected(name, known))
+            _check_name("without", name, [r for r in RELATIONS if r not in MAP_ONLY])
         right = one_of(ORIENTATIONS)
         check(self.orientation in ORIENTATIONS, "orientation", self.orientation, right)
         object.__setattr__(self, "types", _checked_types(self.types))
@@ -457,8 +456,8 @@ def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
     """Refuse labels that no kind has; ``Ego`` is one where it is allowed."""
     known = [label for label in labels() if ego or label != "Ego"]
     for label in given:
-        meant = kinds_labelled(label) is not None or (ego and normalize_name(label) == "ego")
-        check(meant, name, label, _expected(label, known))
+        if not (kinds_labelled(label) or (ego and normalize_name(label) == "ego")):
+            _check_name(name, label, known)
 
 
 def check_pairs(name: str, pairs: tuple[tuple[str, ...], ...]) -> None:
@@ -485,12 +484,14 @@ def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # 
     check(holds and value <= MOST_LENGTH, name, value, right)
 
 
-def _expected(name: str, known: Iterable[str]) -> str:
+def _check_name(setting: str, name: str, known: Iterable[str], more: str = "") -> None:
+    """Refuse a name that is not among those known, with the one that is most like it."""
     known = list(known)
-    like = suggestion(name, known)
-    alias = relation_named(name)
-    like = alias if alias in known else like
-    return f"'{like}', perhaps" if like else f"one of {', '.join(known)}"
+    if name not in known:
+        alias = relation_named(name)
+        like = alias if alias in known else suggestion(name, known)
+        right = f"'{like}', perhaps" if like else f"one of {', '.join(known)}"
+        check(False, setting, name, right + more)  # noqa: FBT003
 
 
 def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
@@ -498,12 +499,11 @@ def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
     for name, meaning in sorted(types.items(), key=lambda item: item[0].lower()):
         where = f'types."{name}"'
         check(bool(name.strip()), where, name, "the type name of a simulator")
-        right = f"{_expected(meaning.kind, ENTITY_KINDS)}; new_kinds names those of your own"
-        check(meaning.kind in ENTITY_KINDS, f"{where}.kind", meaning.kind, right)
+        more = "; new_kinds names those of your own"
+        _check_name(f"{where}.kind", meaning.kind, ENTITY_KINDS, more)
         for part in ("special", "subkind"):
             word = getattr(meaning, part)
-            plain = _WORD.fullmatch(word) is not None
-            check(plain, f"{where}.{part}", word, "a word of a-z, 0-9 and _")
+            check(bool(_WORD.fullmatch(word)), f"{where}.{part}", word, "a word of a-z, 0-9 and _")
         check(name.lower() not in checked, where, name, "each type name once")
         checked[name.lower()] = meaning
     return checked
@@ -515,8 +515,9 @@ def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict
     others = registry.others() if given else {}
     for name, values in sorted(given.items()):
         own = registry.load(name) if name in registry.own else None
-        right = _expected(name, others) if others else "no table"
-        check(name in others or bool(getattr(own, "parameters", {})), "relations", name, right)
+        if not getattr(own, "parameters", {}):
+            check(bool(others), "relations", name, "no table")
+            _check_name("relations", name, others)
         relation = own or registry.load_other(others[name], ConfigError)
         known: Mapping[str, Any] = getattr(relation, "parameters", {})
         for key in values:
