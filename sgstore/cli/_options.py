@@ -80,7 +80,7 @@ def _refuse_late_store(verb: Verb, ctx: Any) -> None:
     values = [ctx.params[name] for name in _places(verb)]
     if not values or _is_database(values[0]):
         return
-    later = [one for value in values[1:] for one in (value if isinstance(value, list) else [value])]
+    later = [one for v in values[1:] for one in (v if isinstance(v, list | tuple) else [v])]
     found = next((one for one in later if one is not None and _is_database(one)), None)
     if found is not None:
         raise typer.BadParameter(
@@ -90,7 +90,10 @@ def _refuse_late_store(verb: Verb, ctx: Any) -> None:
 
 def _is_database(place: str | Path) -> bool:
     try:
-        with Path(place).open("rb") as file:
+        path = Path(place)
+        if not path.is_file():  # to open a pipe would wait for who writes into it
+            return False
+        with path.open("rb") as file:
             return file.read(12)[8:] == b"DUCK"
     except (OSError, ValueError):  # a query is no name of a file
         return False
