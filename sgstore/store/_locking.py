@@ -384,6 +384,7 @@ class Access:
         where = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
         if where == __name__ or not where.startswith(("sgstore.", "json", "numpy")):
             return ""  # the fault of who called us
+        connection.execute(f"USE {shape.INSIDE}")  # it may have been open for public names
         return self._diagnose(connection, self.path)
 
     def restart(self) -> bool:
