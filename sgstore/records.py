@@ -40,6 +40,7 @@ def _made(cls: type[Any], **how: Any) -> type[Any]:
     frozen, eq = how.get("frozen", False), how.get("eq", True)
     own = {name for name, value in vars(cls).items() if value is not None}
     cls.__doc__ = cls.__doc__ or cls.__name__
+    setattr(cls, "__signature__", _Signature())  # noqa: B010 - for who asks
     bare: dict[str, Any] = {**how, "frozen": False, "init": False, "repr": False, "eq": False}
     made: Any = dataclasses.dataclass(cls, **bare)
     fields = dataclasses.fields(made)
@@ -60,6 +61,17 @@ def _made(cls: type[Any], **how: Any) -> type[Any]:
     if frozen:
         _freeze(made)
     return made
+
+
+class _Signature:
+    """The arguments of a class, as :func:`inspect.signature` asks for them."""
+
+    def __get__(self, record: object, owner: type[Any]) -> Any:
+        import inspect  # for people and tools that make pages; it takes longer than a record
+
+        any_init: Any = _compiled_init(owner, {})
+        arguments = [*inspect.signature(any_init).parameters.values()][1:]
+        return inspect.Signature(arguments)
 
 
 def _init(made: type[Any], how: dict[str, Any]) -> Callable[..., None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 import pickle
 from dataclasses import FrozenInstanceError, field, fields, replace
 from typing import Any
@@ -56,6 +57,7 @@ def test_a_class_is_the_same_as_that_of_the_standard_library(how: dict[str, Any]
             (one == same, one == other, one == 1.0, one != same),
             cls.__hash__ and (hash(one) == hash(same), hash(one) == hash(other)),
             [(f.name, f.type, f.default, f.kw_only) for f in fields(cls)],
+            {**inspect.signature(cls).parameters},
             (cls.__match_args__, cls.__doc__, getattr(cls, "__slots__", None)),
             replace(one, names=("b",)).names,
             copy.deepcopy(other).made,
