@@ -394,7 +394,7 @@ for module in [name for name in sys.modules if name.split(".")[0] in {"rich", "m
     del sys.modules[module]
 assert run(["find", sys.argv[1], "MATCH (e:Ego) WHERE e.speed > 5", "--count"]) == 0
 unloaded(*engine[2:], "pydantic", "rich", "sgstore.readers", "sgstore.roads", "sgstore.relations")
-unloaded("sgstore.coverage", "sgstore.selection", "sgstore.draw", "sgstore.exporters", "sgstore.sgg")
+unloaded("sgstore.coverage", "sgstore.selection", "sgstore.draw", "sgstore.exporters._write", "sgstore.sgg")
 unloaded("sgstore.mcap._chunks", "sgstore.opendrive", "sgstore.config", "sgstore.sandbox")
 """
 

@@ -112,6 +112,7 @@ TABLES = {
         "node_id": "k",
         "is_ego": "k = 0",
         "speed": "(k * bit) % 20",
+        "repeated": "FALSE",
     },
     "edge": {
         "relation": "'near'",

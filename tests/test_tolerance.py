@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -94,7 +95,7 @@ def test_jitter_changes_no_verdict(pair: tuple[Store, Store]) -> None:
     for number in range(30 if LONG else 12):
         end = ("strong", "weak", "pending")[number % 3]
         formula = condition(rng, pair=False, depth=rng.randint(1, 3), temporal=True)
-        formula = formula.replace("(e)", "(ego)").replace("e.", "ego.").replace("(e,", "(ego,")
+        formula = re.sub(r"\be\b", "ego", formula)
         text = f"USING UNKNOWN false, END {end} CHECK c: {formula}"
         even, odd = (
             {
