@@ -19,7 +19,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.text import Text
 from matplotlib.transforms import Affine2D, IdentityTransform
 
-from sgstore.draw._page import TEXT, Page, Stage, printable
+from sgstore.draw._page import TEXT, Page, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Sequence
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from sgstore.draw._page import Pixels, Rect
-    from sgstore.draw._view import MapWindow
-    from sgstore.world import Floats
 
     Draw = Callable[[], None]
 
@@ -128,8 +126,11 @@ class FilmPage(Page):
         place = round(x) + left, round(y) + below
         self._draw(axes, z, partial(self._renderer.draw_image, pen, *place, pixels))
 
-    def fill(self, axes: Axes, outline: Outline, z: float, look: dict[str, Any]) -> None:
+    def fill(
+        self, axes: Axes, outline: Outline, z: float, look: dict[str, Any], gid: str | None = None
+    ) -> None:
         """Fill an outline; ``look`` as of a patch of the drawing package."""
+        del gid
         alpha = look.get("alpha")
         face = to_rgba(look["facecolor"], alpha)
         edge = to_rgba(look.get("edgecolor", "none"), alpha)
@@ -148,7 +149,7 @@ class FilmPage(Page):
     def fill_all(
         self, axes: Axes, outlines: Sequence[Outline], z: float, look: dict[str, Any]
     ) -> None:
-        """Draw outlines in one look, as of a collection of the drawing package."""
+        """Draw outlines in one look, as of a patch of the drawing package."""
         alpha = look.get("alpha")
         face, edge = to_rgba(look["facecolor"], alpha), to_rgba(look["edgecolor"], alpha)
         width, scale = look["linewidth"], self.scale(axes)
@@ -205,54 +206,12 @@ class FilmPage(Page):
     def _draw(self, axes: Axes, z: float, draw: Draw) -> None:
         self._shown[axes].append((z, draw))
 
-    def _stage(
-        self, axes: Axes, view: MapWindow, half: tuple[float, float], points: float
-    ) -> Stage:
-        return FilmStage(axes, view, half, points, self)
-
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
         box = (left, bottom, width, height)
         if box not in self._windows:
             self._windows[box] = super()._axes(*box)
         self._shown[self._windows[box]] = []
         return self._windows[box]
-
-
-class FilmStage(Stage):
-    """A window on the map upon such a page."""
-
-    page: FilmPage
-
-    __slots__ = ()
-
-    def fill(
-        self, outline: Outline, colour: str, *, z: float, gid: str | None = None, **look: Any
-    ) -> None:
-        """Fill an outline; ``look`` goes to the patch."""
-        del gid
-        self.page.fill(self.axes, outline, z, {"facecolor": colour, **look})
-
-    def fill_all(
-        self,
-        outlines: Sequence[Outline],
-        colour: str,
-        *,
-        z: float,
-        edge: float = 0.4,
-        alpha: float = 1.0,
-    ) -> None:
-        """Fill many outlines with one colour, with a hairline of the same that closes the seams."""
-        if outlines:
-            look = {"facecolor": colour, "edgecolor": colour, "linewidth": edge, "alpha": alpha}
-            self.page.fill_all(self.axes, list(outlines), z, look)
-
-    def lines(
-        self, lines: Sequence[Floats], colour: str, *, z: float, width: float, **look: Any
-    ) -> None:
-        """Draw many lines of (N, 2) picture coordinates in one look."""
-        if lines:
-            look |= {"facecolor": "none", "edgecolor": colour, "linewidth": width}
-            self.page.fill_all(self.axes, [Outline(line) for line in lines], z, look)
 
 
 class TextSprites:
@@ -275,9 +234,8 @@ class TextSprites:
         written.set_figure(self._figure)
         written.set_transform(IdentityTransform())
         written.draw(sheet)
-        pixels = np.asarray(sheet.buffer_rgba())[-2 * y :, : 2 * x][
-            ::-1
-        ]  # as images are drawn, from below
+        pixels = np.asarray(sheet.buffer_rgba())[-2 * y :, : 2 * x]
+        pixels = pixels[::-1]  # as images are drawn, from below
         inked = pixels[..., 3] != 0
         lines, columns = (np.flatnonzero(inked.any(axis=axis)) for axis in (1, 0))
         if not len(lines):

@@ -233,9 +233,8 @@ class Stage:
         self, outline: Outline, colour: str, *, z: float, gid: str | None = None, **look: Any
     ) -> None:
         """Fill an outline; ``look`` goes to the patch."""
-        patch = PathPatch(outline, facecolor=colour, zorder=z, **{"linewidth": 0.0, **look})
-        patch.set_gid(gid)
-        self.page.add(self.axes, patch)
+        look = {"facecolor": colour, "linewidth": 0.0, **look}
+        self.page.fill(self.axes, outline, z, look, gid)
 
     def fill_all(
         self,
@@ -248,30 +247,16 @@ class Stage:
     ) -> None:
         """Fill many outlines with one colour, with a hairline of the same that closes the seams."""
         if outlines:
-            filled = PathCollection(
-                list(outlines),
-                facecolors=[colour],
-                edgecolors=[colour],
-                linewidths=[edge],
-                alpha=alpha,
-                zorder=z,
-            )
-            self.page.add(self.axes, filled)
+            look = {"facecolor": colour, "edgecolor": colour, "linewidth": edge, "alpha": alpha}
+            self.page.fill_all(self.axes, list(outlines), z, look)
 
     def lines(
         self, lines: Sequence[Floats], colour: str, *, z: float, width: float, **look: Any
     ) -> None:
         """Draw many lines of (N, 2) picture coordinates in one look."""
         if lines:
-            drawn = PathCollection(
-                [Outline(line) for line in lines],
-                facecolors=["none"],
-                edgecolors=[colour],
-                linewidths=[width],
-                zorder=z,
-                **look,
-            )
-            self.page.add(self.axes, drawn)
+            look |= {"facecolor": "none", "edgecolor": colour, "linewidth": width}
+            self.page.fill_all(self.axes, [Outline(line) for line in lines], z, look)
 
     def text(self, x: float, y: float, text: str, **look: Any) -> None:
         """Write in the window; see :meth:`Page.text`."""
@@ -315,19 +300,30 @@ class Page:
         axes = self._axes(left, bottom, width, height)
         axes.set_xlim(-half[0], half[0])
         axes.set_ylim(-half[1], half[1])
-        stage = self._stage(axes, view, half, points)
+        stage = Stage(axes, view, half, points, self)
         corners = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))) * half
         stage.fill(Outline(corners), GROUND, z=WINDOW)
         return stage
 
-    def _stage(
-        self, axes: Axes, view: MapWindow, half: tuple[float, float], points: float
-    ) -> Stage:
-        return Stage(axes, view, half, points, self)
-
     def add(self, axes: Axes, artist: Artist) -> None:
         """Draw an artist of the drawing package on the sheet or in a window, in its own measure."""
         axes.add_artist(artist)
+
+    def fill(
+        self, axes: Axes, outline: Outline, z: float, look: dict[str, Any], gid: str | None = None
+    ) -> None:
+        """Fill an outline; ``look`` as of a patch of the drawing package."""
+        patch = PathPatch(outline, zorder=z, **look)
+        patch.set_gid(gid)
+        self.add(axes, patch)
+
+    def fill_all(
+        self, axes: Axes, outlines: Sequence[Outline], z: float, look: dict[str, Any]
+    ) -> None:
+        """Draw outlines in one look, as of a patch of the drawing package."""
+        each = {f"{name}s": [look[name]] for name in ("facecolor", "edgecolor", "linewidth")}
+        rest = {name: value for name, value in look.items() if f"{name}s" not in each}
+        self.add(axes, PathCollection(outlines, zorder=z, **each, **rest))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
         """Paint in a box of the sheet where nothing else is; what has a key is always the same.
