@@ -70,8 +70,10 @@ class PresentError(StoreError):
 
 def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
     """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
-    with writing(access) as connection:
-        return _publish(connection, access.path, sealed, replace=replace)
+    (found,) = publish_each(access, [sealed], replace=replace)
+    if isinstance(found, SgstoreError):
+        raise found
+    return found
 
 
 def publish_each(
