@@ -12,6 +12,7 @@ line of points, with a speed that is a number or a list of ``(time, speed)``, st
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from sgstore.roads import RoadMap
+    from sgstore.store._staging import Sealed
 
 Point = tuple[float, float]
 Series = float | list[tuple[float, Any]]
@@ -434,34 +436,49 @@ def store_of(
     traces: Mapping[str, Sequence[Scene]],
     configs: Mapping[str, Config] | None = None,
 ) -> Store:
-    """A store with traces of scenes.
+    """A store, which may be there already, with traces of scenes.
 
     A trace is of one road; its scenes follow one another, :data:`APART`, so that nothing lasts from one to the
     next. Things that never move stay, as they do in recordings. ``configs``: of traces that have one of their
     own.
     """
-    file = StoreFile.create(where)
-    for number, (name, scenes) in enumerate(traces.items()):
-        config = (configs or {}).get(name, Config())
-        info = TraceInfo(
-            path=Path(f"/scenes/{name}.mcap"),
-            size=1,
-            mtime_ns=1,
-            digest=f"{number:064x}"[::-1],
-            flavour="scene",
-            channels=(),
-            ego="ego",
-            map_text="",
-            map_name="",
-            context=NO_MESSAGES,
-        )
-        road = scenes[0].road
-        generator = SceneGraphGenerator(road, config)
-        with file.segment(info, config, road_map=road, answers=generator.answers) as segment:
-            first, seq = 0, 0
-            for place, scene in enumerate(scenes):
-                block = scene.block(place, first, seq)
-                segment.append(generator.block(block))
-                first, seq = first + len(scene.actors), seq + len(block)
-            file.publish(segment.seal(TraceReport(frames=seq), None, generator.parked))
+    file = StoreFile(where) if where.exists() else StoreFile.create(where)
+    with ExitStack() as kept:
+        sealed = [
+            _sealed(file, number, name, scenes, (configs or {}).get(name, Config()), kept)
+            for number, (name, scenes) in enumerate(traces.items())
+        ]
+        assert file.publish_each(sealed) == [*traces]
     return Store(where)
+
+
+def _sealed(
+    file: StoreFile,
+    number: int,
+    name: str,
+    scenes: Sequence[Scene],
+    config: Config,
+    kept: ExitStack,
+) -> Sealed:
+    info = TraceInfo(
+        path=Path(f"/scenes/{name}.mcap"),
+        size=1,
+        mtime_ns=1,
+        digest=f"{number:064x}"[::-1],
+        flavour="scene",
+        channels=(),
+        ego="ego",
+        map_text="",
+        map_name="",
+        context=NO_MESSAGES,
+    )
+    road = scenes[0].road
+    generator = SceneGraphGenerator(road, config)
+    segment = file.segment(info, config, road_map=road, answers=generator.answers)
+    kept.enter_context(segment)
+    first, seq = 0, 0
+    for place, scene in enumerate(scenes):
+        block = scene.block(place, first, seq)
+        segment.append(generator.block(block))
+        first, seq = first + len(scene.actors), seq + len(block)
+    return segment.seal(TraceReport(frames=seq), None, generator.parked)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import shutil
 import subprocess
 import sys
 from contextlib import suppress
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from recordings import drive
 
 from sgstore.cli import VERBS, run
 
@@ -346,7 +346,7 @@ def test_a_folder_stands_for_the_recordings_in_it_and_twice_is_once(
     sgstore: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "drives" / "may").mkdir(parents=True)
-    shutil.copy(SAMPLE, tmp_path / "drives" / "may" / "a.mcap")
+    drive(tmp_path / "drives" / "may" / "a.mcap", frames=5)
 
     first = sgstore("ingest", tmp_path / "new.sgstore", tmp_path / "drives", "--json")
     second = sgstore("ingest", tmp_path / "new.sgstore", tmp_path / "drives", "--json")

@@ -95,20 +95,21 @@ def test_one_frame_of_two_thousand_bodies_in_one_place_takes_little_memory(tmp_p
     assert int(peak.read_text()) < 300 << 10
 
 
-def test_four_egos_of_a_frame_with_as_many_pairs_as_there_may_be_share_their_memory(
-    tmp_path: Path,
+@pytest.mark.parametrize("count", [4] if LONG else [2])
+def test_egos_of_a_frame_with_as_many_pairs_as_there_may_be_share_their_memory(
+    tmp_path: Path, count: int
 ) -> None:
     """720 bodies are 258,840 pairs, and 1.5 million edges for each ego."""
     path = recorded(tmp_path / "crowd.mcap", [720])
     peak, store = tmp_path / "peak", tmp_path / "s.sgstore"
     command = [sys.executable, "-c", BOUNDED, str(peak), "ingest", str(store), str(path)]
-    egos = [word for ego in "1234" for word in ("--ego", ego)]
+    egos = [word for ego in "1234"[:count] for word in ("--ego", ego)]
     done = subprocess.run([*command, *egos], capture_output=True, text=True, check=False)
 
     assert done.returncode == 0, done.stderr
-    assert int(peak.read_text()) < 500 << 10
+    assert int(peak.read_text()) < (500 if count > 2 else 350) << 10
     edges = sgstore.open(store).sql("SELECT count(*) FROM inside.edge GROUP BY bucket >> 18").values
-    assert [count > 1_500_000 for (count,) in edges] == [True] * 4
+    assert [many > 1_500_000 for (many,) in edges] == [True] * count
 
 
 STEPS = """
@@ -127,9 +128,9 @@ for step in range(2):
             z=0.7, heading=7.0 * i, length=9.0, width=9.0, height=1.4,
         )
     graphs = generator.steps(frame, ["", "v1", "v2", "v3"][: int(sys.argv[1])])
-    told = sum(1 for graph in graphs for _ in graph.edges)
-    assert told == sum(len(graph.edges) for graph in graphs) > 1_500_000 * len(graphs)
+    assert sum(len(graph.edges) for graph in graphs) > 1_500_000 * len(graphs)
     assert not generator.losses
+assert all(sum(1 for _ in graph.edges) == len(graph.edges) for graph in graphs)
 assert generator.class_of("RSV")
 """
 
@@ -184,10 +185,10 @@ def test_edges_that_stay_columns_are_the_same_edges(monkeypatch: pytest.MonkeyPa
 def test_edges_that_are_kept_in_pieces_are_the_same_edges(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = recorded(tmp_path / "r.mcap", [9, 12, 5] * 21, box=4.0)
+    path = recorded(tmp_path / "r.mcap", [9, 12, 5] * 9, box=4.0)
     config = configured(egos=("1", "2", "3"))
     ingest(tmp_path / "whole.sgstore", [path], config=config)
-    monkeypatch.setattr(packing, "EDGE_ROWS", 1000)
+    monkeypatch.setattr(packing, "EDGE_ROWS", 400)
     ingest(tmp_path / "pieces.sgstore", [path], config=config)
 
     whole, pieces = (sgstore.open(tmp_path / f"{name}.sgstore") for name in ("whole", "pieces"))
@@ -334,7 +335,7 @@ TWO_EGOS = configured(
 
 @pytest.mark.parametrize(
     ("config", "times"),
-    [(Config(), 10), (TWO_EGOS, 5)],
+    [(Config(), 10), (TWO_EGOS, 3)],
     ids=["as it is", "two egos, footprints"],
 )
 def test_a_recording_that_is_read_in_pieces_gives_the_same_store(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -294,15 +295,28 @@ def of_trace(store: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
     }
 
 
+SMALL = Config(range=RangeSettings(25.0))
+
+
+@pytest.fixture(scope="module")
+def alone(crowd: Path) -> dict[str, dict[str, list[tuple[Any, ...]]]]:
+    """The trace of each of three egos in a store of its own."""
+    found: dict[str, dict[str, list[tuple[Any, ...]]]] = {}
+    for ego in ("5", "1", "6"):
+        store = crowd.with_name(f"{ego}.db")
+        ingest(store, [crowd], config=replace(SMALL, ego=ego))
+        found[ego] = of_trace(store, "crowd")
+    return found
+
+
 @pytest.mark.parametrize("at_once", [2, 8])
 def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(
-    crowd: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
+    crowd: Any, alone: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
 ) -> None:
     """In one reading, or in several that share the rows of the map and the classes of their frames."""
     monkeypatch.setattr(segments, "EGOS_AT_ONCE", at_once)
-    small = Config(range=RangeSettings(25.0))
 
-    outcomes = ingest(tmp_path / "s.db", [crowd], config=small, egos=["5", "1", "6"])
+    outcomes = ingest(tmp_path / "s.db", [crowd], config=SMALL, egos=["5", "1", "6"])
 
     assert [(o.ego, o.status, o.name) for o in outcomes] == [
         ("5", "added", "crowd"),
@@ -310,10 +324,8 @@ def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(
         ("6", "added", "crowd~3"),
     ]
     for outcome in outcomes:
-        alone = tmp_path / f"{outcome.ego}.db"
-        ingest(alone, [crowd], config=Config(range=RangeSettings(25.0), ego=outcome.ego))
-        assert of_trace(tmp_path / "s.db", outcome.name) == of_trace(alone, "crowd")
-    again = ingest(tmp_path / "s.db", [crowd], config=small, egos=["1", "2"])
+        assert of_trace(tmp_path / "s.db", outcome.name) == alone[outcome.ego]
+    again = ingest(tmp_path / "s.db", [crowd], config=SMALL, egos=["1", "2"])
     assert [(o.ego, o.status) for o in again] == [("1", "present"), ("2", "added")]
 
 

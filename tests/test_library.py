@@ -14,17 +14,15 @@ from scenes import APART, store_of
 from test_sample import told
 from test_temporal import FORMULAS, FORMULAS_OF_TIME, never, property_named
 
-from sgstore.demo import RECORDING
 from sgstore.errors import QueryError, QueryNameError
-from sgstore.ingest import ingest
 from sgstore.lang import parse, pattern_named, patterns
 from sgstore.lang.library import entries, predicates
 from sgstore.lang.syntax import CheckClause, Define, MatchClause
-from sgstore.query import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from sgstore.query import Store
     from sgstore.temporal import Formula, Verdict
 
 FOUND = [name for name, one in patterns().items() if one.kind in {"concept", "scenario"}]
@@ -32,12 +30,9 @@ RULES = [name for name, one in patterns().items() if one.kind == "property"]
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
-    """A store of all scenes, and of the bundled recording; it stays open."""
-    path = tmp_path_factory.mktemp("library") / "scenes.sgstore"
-    store_of(path, TRACES)
-    ingest(path, [RECORDING])
-    store = Store(path)
+def store(town_store: Path) -> Iterator[Store]:
+    """A store of the bundled recording, and of all scenes; it stays open."""
+    store = store_of(town_store, TRACES)
     with store.file.snapshot():
         yield store
 

@@ -117,20 +117,33 @@ def test_what_was_there_survives_a_full_disk_and_a_pipe_gets_what_a_file_gets(
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-def test_what_is_called_stdout_is_stdout(tmp_path: Path) -> None:
-    line = [sys.executable, "-m", "sgstore", "patterns", "show", "cut_in", "-o"]
-    expected = subprocess.run(line[:-1], capture_output=True, check=True).stdout
+INTO_EACH = """
+import sys
+from sgstore.cli import run
+for name in sys.argv[1:]:
+    print(f"into {name}", flush=True)
+    assert run(["patterns", "show", "cut_in", "-o", name]) == 0
+"""
+
+
+def test_what_is_called_stdout_is_stdout(tmp_path: Path, capfdbinary: Any) -> None:
+    assert run(["patterns", "show", "cut_in"]) == 0
+    shown = capfdbinary.readouterr().out
+    assert shown
     file, other = tmp_path / "out.txt", tmp_path / "link"
     other.symlink_to("/dev/stdout")
+    places = ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", str(other)]
+    expected = b"".join(f"into {place}\n".encode() + shown for place in places)
+    command = [sys.executable, "-c", INTO_EACH, *places]
 
-    for name in ("/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", str(other)):
-        piped = subprocess.run([*line, name], capture_output=True, check=True)
-        with file.open("wb") as stream:
-            stream.write(b"first\n")
-            stream.flush()
-            subprocess.run([*line, name], stdout=stream, check=True)
-        assert piped.stdout == expected
-        assert file.read_bytes() == b"first\n" + expected
+    piped = subprocess.run(command, capture_output=True, check=True).stdout
+    with file.open("wb") as stream:
+        stream.write(b"first\n")
+        stream.flush()
+        subprocess.run(command, stdout=stream, check=True)
+
+    assert piped == expected
+    assert file.read_bytes() == b"first\n" + expected
     assert other.is_symlink()
 
 

@@ -143,12 +143,11 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_change_is_found_and_named(store: Any, what: Any) -> None:
     statement, check = CHANGES[what]
-    before = store.rows("SELECT count(*) FROM inside.trace").values
 
     change(store, statement)
 
     found = faults(store)
-    assert store.rows("SELECT count(*) FROM inside.trace").values == before
+    assert store.rows("SELECT count(*) FROM inside.trace").values == [(2,)]
     if check is None:  # without its settings no trace is listed any more
         assert {fault.check for fault in found} == {"references"}
     else:
