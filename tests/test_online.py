@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 import pytest
 from builders import PaperMap, Patch, Recording, Thing, thing
+from thorough import LONG
 
 from sgstore import step as stepping
 from sgstore.config import Config, RangeSettings
@@ -293,8 +294,8 @@ def test_several_egos_have_the_graphs_of_generators_of_their_own() -> None:
 def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(stepping, "REMEMBERED", 40)
-    monkeypatch.setattr(stepping, "SPARE", 40)
+    monkeypatch.setattr(stepping, "REMEMBERED", 20)
+    monkeypatch.setattr(stepping, "SPARE", 20)
     online = generator(None, range=RangeSettings(30))
 
     def run(first: int, count: int) -> int:
@@ -304,11 +305,11 @@ def test_memory_does_not_grow_with_steps_though_ids_come_and_go(
         gc.collect()
         return tracemalloc.get_traced_memory()[0]
 
-    run(0, 80)  # more names than are remembered
+    run(0, 40)  # more names than are remembered
     tracemalloc.start()
     try:
-        run(80, 160)  # what is remembered before was not counted: it is replaced little by little
-        sizes = [run(40 * k, 40) for k in range(6, 12)]
+        run(40, 80)  # what is remembered before was not counted: it is replaced little by little
+        sizes = [run(20 * k, 20) for k in range(6, 12)]
     finally:
         tracemalloc.stop()
     assert max(sizes[3:]) < 1.1 * max(sizes[:3])
@@ -345,6 +346,10 @@ def same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
             assert ours[name] == value, name
 
 
+BLOCKS = 6 if LONG else 3
+"""Blocks of the bundled recording, of 60 frames each, that are driven step by step."""
+
+
 def test_the_sample_driven_step_by_step_gives_what_the_store_has(town_store: Path) -> None:
     store = Store(town_store)
     idents = dict(store.sql("SELECT node_id, ident FROM entities").values)
@@ -352,17 +357,17 @@ def test_the_sample_driven_step_by_step_gives_what_the_store_has(town_store: Pat
     with open_trace(RECORDING) as recording, store.file.snapshot():
         road_map = read_map(recording.info.map_text, recording.info.map_name)
         online = SceneGraphGenerator(road_map, Config())
-        for block in islice(recording.blocks(), 6):
+        for block in islice(recording.blocks(), BLOCKS):
             for frame in replay.frames(block):
                 graph = online.step(frame)
-                if graph.seq % 15 == 0:
+                if graph.seq % 8 == 0:
                     stored = store.file.graph(f"town#{graph.seq}")
                     agree(graph, stored, idents)
                     for name in ("E", "RSV", "junction"):
                         known = store.file.abstracted.class_of(stored.frame_id, name)
                         assert online.class_of(name) == known
                     compared += 1
-    assert compared == 24
+    assert compared == math.ceil(60 * BLOCKS / 8)
 
 
 def columns(graph: GraphBlock, row: int, idents: list[str]) -> dict[str, set[Any]]:

@@ -21,7 +21,7 @@ from sgstore.errors import StoreError
 from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest
 from sgstore.rebuild import rebuild
-from sgstore.store import StoreFile
+from sgstore.store import StoreFile, remains_of
 from sgstore.store._schema import schema_sql
 
 if TYPE_CHECKING:
@@ -138,10 +138,12 @@ AMONG_THE_VIEWS = (
 )
 """So stores were made before their tables had a schema of their own."""
 
-HOW = {
-    "as it is": (),
+MADE_BEFORE = {
     "of tables among the views": AMONG_THE_VIEWS,
     "of recordings in traces": OWN_RECORDINGS,
+}
+HOW = {
+    "as it is": (),
     "of an older version": (
         *AMONG_THE_VIEWS,
         "DELETE FROM store_info WHERE key = 'schema_digest'",
@@ -170,6 +172,8 @@ def test_a_store_made_anew_holds_all_that_it_held(
     names = ("made", "store") if how == "as it is" else ("few", "small")
     made, store = map(request.getfixturevalue, names)
     change(store, *HOW[how])
+    if how == "altered":  # and beside it lies what is no store
+        store.with_name(f"{store.name}.rebuild").write_bytes(b"no store")
     code = run(["rebuild", str(store), "--format", "ndjson"])
     told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
@@ -179,6 +183,23 @@ def test_a_store_made_anew_holds_all_that_it_held(
     assert sorted(row["trace"] for row in told) == sorted(made.content["order"])
     assert {row["status"] for row in told} == {"added"}
     assert list(store.parent.iterdir()) == [store]
+
+
+@pytest.mark.parametrize("how", MADE_BEFORE)
+def test_a_store_that_was_made_before_says_what_it_was_made_of(
+    how: str, few: Made, small: Path
+) -> None:
+    """A rebuild asks no more of the old store: from equal remains it makes equal stores."""
+    before = remains_of(small)
+    change(small, *MADE_BEFORE[how])
+
+    with pytest.raises(StoreError, match="'sgstore rebuild' makes it anew"):
+        StoreFile(small).traces()
+    assert remains_of(small) == before
+    assert {one.name for one in before.traces} == set(few.content["order"])
+    assert before.maps
+    assert before.sets
+    assert before.abstractions
 
 
 def test_what_an_older_version_did_not_keep_is_left_out_when_that_is_said(
@@ -284,11 +305,6 @@ def test_a_run_that_was_stopped_goes_on_and_the_old_store_stays_till_then(
 def test_what_a_stopped_run_left_of_another_store_is_not_kept(few: Made, small: Path) -> None:
     fresh = small.with_name(f"{small.name}.rebuild")
     ingest(fresh, [few.folder / "part.mcap"])  # the whole, and under other names
-    rebuild(small)
-
-    assert held(small) == few.content
-
-    fresh.write_bytes(b"no store")
     rebuild(small)
 
     assert held(small) == few.content
