@@ -146,11 +146,12 @@ def answers(store: Store) -> Iterator[tuple[str, Any]]:
                 [(v.verdict, v.violations and str(v.violations)) for v in store.check(one.text)],
             )
         else:
-            yield name, [len(store.find(one.text).rows()), store.find(one.text).left_out]
+            matches = store.find(one.text)
+            yield name, [len(matches.rows()), matches.left_out]
 
 
-def frozen(path: Path, rows: Path | None = None) -> dict[str, Any]:
-    """What is kept of one recording."""
+def frozen(path: Path, rows: Path | None = None, *, asked: bool = True) -> dict[str, Any]:
+    """What is kept of one recording; of one that is not asked, no answers."""
     with tempfile.TemporaryDirectory() as name:
         place = Path(name) / "one.sgstore"
         (outcome,) = ingest(place, [path])
@@ -163,7 +164,7 @@ def frozen(path: Path, rows: Path | None = None) -> dict[str, Any]:
                 view: digest(store, view, columns, rows)
                 for view, columns in views_of(store).items()
             }
-            found = {name: repr(value) for name, value in answers(store)}
+            found = {name: repr(value) for name, value in answers(store)} if asked else {}
         return {"views": views, "answers": found}
 
 
@@ -206,10 +207,12 @@ def differences(kept: dict[str, Any], now: dict[str, Any], where: str) -> Iterat
                 yield f"{where}: {part}: {name}: kept {one}, now {other}"
 
 
-def compared(path: Path) -> list[str]:
-    """What has changed of one recording since it was kept."""
+def compared(path: Path, *, asked: bool = True) -> list[str]:
+    """What has changed of one recording since it was kept; of one that is not asked, of its rows only."""
     kept = json.loads((FROZEN / f"{name_of(path)}.json").read_text())
-    return list(differences(kept, frozen(path), name_of(path)))
+    if not asked:
+        kept["answers"] = {}
+    return list(differences(kept, frozen(path, asked=asked), name_of(path)))
 
 
 def main() -> int:
