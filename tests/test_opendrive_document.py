@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import re
 import time
+import tracemalloc
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from opendrive_maps import (
     a_map,
@@ -26,8 +28,10 @@ from opendrive_maps import (
 
 import sgstore.opendrive._document as document
 import sgstore.opendrive._lanes as lanes
+import sgstore.relations._extent as extent
 from sgstore.errors import MapError
 from sgstore.opendrive import read_map
+from sgstore.relations._extent import LaneHeights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -429,6 +433,56 @@ def test_heavy_maps_take_bounded_time(text: Callable[[], str]) -> None:
         read_map(heavy, "heavy")
 
     assert time.process_time() - start < 3.0
+
+
+def one_lane(*widths: float) -> str:
+    return section(lane(0), lane(-1, width(*widths)))
+
+
+ONE_WRONG_NUMBER = {
+    "a border that runs away": (one_lane(2.5, 0, 0, 50), 120.0),
+    "one as wide as a village": (one_lane(30.0), 1.2e6),
+    "a road around the world": (one_lane(3.5), 4e7),
+}
+
+
+@pytest.mark.parametrize(("lanes", "length"), ONE_WRONG_NUMBER.values(), ids=ONE_WRONG_NUMBER)
+def test_one_wrong_number_takes_bounded_memory(lanes: str, length: float) -> None:
+    """A look-up of lanes took up to 2.4 kB a cross section, of which one road could have a million."""
+    text = a_map(GOOD, a_road("wrong", line(length, y=50.0), sections=lanes))
+    tracemalloc.start()
+
+    road_map = read_map(text, "wrong")
+    hits = road_map.lanes_of(np.array([[50.0, -1.5, 0.0, 4.0, 2.0]]), np.zeros(1))
+
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 300 << 20
+    assert hits.lane.tolist() == [-2]
+    assert not road_map.warnings or "road 'wrong', <road>: so bent" in road_map.warnings[0]
+
+
+def test_heights_of_endless_lanes_are_looked_at_farther_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    far = read_map(a_map(GOOD, a_road("far", line(100_000.0, y=50.0))), "far")
+    assert len(LaneHeights.of(far).points) == 51 + 50_001
+    monkeypatch.setattr(extent, "MOST_POINTS", 1000)
+
+    found = LaneHeights.of(far)
+
+    assert 1000 <= len(found.points) <= 1002
+    assert np.diff(found.first).tolist() == [1, 1000]
+
+
+def test_a_longer_text_may_tell_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    roads = [a_road(str(i), line(100.0, y=9 * i)) for i in range(20)]  # 22 cross sections each
+    monkeypatch.setattr(lanes, "MAX_OF_SMALL", 400)
+
+    assert not read_map(a_map(*roads), "long").warnings
+    monkeypatch.setattr(lanes, "CHARACTERS", 50)
+    with pytest.raises(MapError, match="over 400 points"):
+        read_map(a_map(*roads), "short")
 
 
 def test_lanes_that_lead_in_circles_have_an_end() -> None:

@@ -29,8 +29,8 @@ from opendrive_maps import (
 )
 
 from sgstore.opendrive import read_map
-from sgstore.roads import OFF_ROAD, LaneGraph, LaneHits, RoadMap
-from sgstore.roads._footprints import TOUCH
+from sgstore.roads import OFF_ROAD, LaneGraph, LaneHits, Ribbons, RoadMap
+from sgstore.roads._footprints import TOUCH, LaneIndex
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -112,6 +112,18 @@ def table(hits: LaneHits) -> dict[tuple[int, int], tuple[float, float, float, bo
 
 def lane_count(road_map: RoadMap) -> int:
     return len(road_map.ribbons)
+
+
+def test_lanes_from_one_end_of_the_world_to_the_other_take_a_coarse_grid() -> None:
+    """Their cells of 4 m are more than a whole number can count: 6 · 10¹⁴ a lane."""
+    n, far = 20_000, np.tile([0.0, 1e8], 20_000)
+    y = far + np.repeat(10.0 * np.arange(n), 2)
+    offsets, heading = np.arange(n + 1) * 2, np.full(2 * n, np.pi / 4)
+    ribbons = Ribbons(offsets, far, y + 4, far, y, np.zeros(2 * n), heading, far, far * 2**0.5)
+
+    found = LaneIndex(ribbons, 2.5).touches(np.array([[5e7, 5e7 + 32, 0.785, 4, 2]]), np.zeros(1))
+
+    assert found.lane.tolist() == [3]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -137,15 +137,20 @@ class Document:
         road on: ``road``, ``road/geometry/arc``, ``road/laneSection/lane/width``.
     ordinals : list of int
         Row of the table of roads → the road's number in the text.
+    characters : int
+        Length of the text.
     blame : dict
         Row of a road → the first thing that was found wrong with it.
     odd : dict
         Record → the first thing that was found wrong with it.
     """
 
-    def __init__(self, tables: dict[str, ElementTable], ordinals: list[int]) -> None:
+    def __init__(
+        self, tables: dict[str, ElementTable], ordinals: list[int], characters: int
+    ) -> None:
         self.tables = tables
         self.ordinals = ordinals
+        self.characters = characters
         self.blame: dict[int, MapError] = {}
         self.odd: dict[Record, MapError] = {}
         self.road_ids = tables["road"].texts("id")
@@ -244,7 +249,7 @@ def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
     if len(text) > MAX_CHARACTERS:
         raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
     tables, ordinals = _parse(text, skip)
-    return Document(tables, ordinals)
+    return Document(tables, ordinals, len(text))
 
 
 _Node = tuple["ElementTable | None", dict[str, "_Node"]]

@@ -284,10 +284,18 @@ RISE: Final = 2e-2
 """The same for heights; m."""
 MAX_STEP: Final = 10.0
 """Greatest length of a piece, so that its bounding box stays small; m."""
-MAX_STATIONS: Final = 1_000_000
-"""Greatest number of cross sections of the lanes of one road."""
+MAX_STATIONS: Final = 250_000
+"""Greatest number of cross sections of the lanes of one road: 100 km of a winding motorway of eight lanes.
+
+A cross section takes up to 700 bytes until its lanes can be looked up.
+"""
 MAX_TOTAL: Final = 4_000_000
 """Greatest number of cross sections of all lanes of a map."""
+MAX_OF_SMALL: Final = 500_000
+"""Greatest number of them in a map of up to :data:`CHARACTERS` times as many characters: a short text in which
+some numbers are wrong does not become a gigabyte. Towns take 70 characters and more for each."""
+CHARACTERS: Final = 8
+"""Characters that each cross section of a larger map has to have."""
 MAX_LANES: Final = 1_000
 """Greatest number of lanes of a section."""
 MAX_COORDINATE: Final = 1e8
@@ -611,8 +619,9 @@ def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, piec
     many = f"so bent, long or finely recorded that it takes over {MAX_STATIONS:,} points"
     document.accuse("road", total > MAX_STATIONS, many)
     document.settle()
-    if points.sum() > MAX_TOTAL:
-        raise MapError(f"takes over {MAX_TOTAL:,} points", element="OpenDRIVE")
+    most = min(max(MAX_OF_SMALL, document.characters // CHARACTERS), MAX_TOTAL)
+    if points.sum() > most:
+        raise MapError(f"takes over {most:,} points", element="OpenDRIVE")
 
 
 _Stations = tuple["Ints", "Ints", "Floats", Poses, "Floats"]

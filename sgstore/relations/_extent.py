@@ -36,6 +36,8 @@ HANG: Final = 6.0
 
 STEP: Final = 2.0
 """From point to point of a lane whose height is looked at; m."""
+MOST_POINTS: Final = 1_000_000
+"""Such points of a map: on 2,000 km of lanes and more they stand farther apart."""
 
 CHUNK: Final = 1 << 18
 """Footprints times lines that are looked at together: bounds the memory of a crowd."""
@@ -84,7 +86,8 @@ class LaneHeights:
     @classmethod
     def of(cls, road_map: RoadMap) -> LaneHeights:
         """The heights of the lanes of a map."""
-        points = road_map.waypoints(STEP)
+        whole = float(road_map.ribbons.lengths.sum())
+        points = road_map.waypoints(max(STEP, whole / MOST_POINTS))
         first = np.searchsorted(points.lane, np.arange(len(road_map.ribbons) + 1))
         low, high = (
             of.reduceat(points.z, first[:-1]) if len(points) else points.z

@@ -33,6 +33,9 @@ _CHUNK: Final = 1 << 13
 """Pairs of a footprint and a cell that are worked on at a time."""
 _MOST_ENTRIES: Final = 32
 """Cells that a quadrangle may lie in on average; the grid is made coarser until it is so."""
+_MOST_IN_ALL: Final = 1 << 21
+"""Quadrangles in all cells together that any grid may have, and a larger one as many as four for each of its
+own: an entry takes some 60 bytes as the grid is made. Lanes of towns need 2 to 7 for each."""
 _POINT: Final = 1e-9
 """Lengths below this are none; m."""
 _MOST_STEPS: Final = 256
@@ -141,19 +144,23 @@ class _Grid:
         high = np.stack((quads.x.max(axis=0), quads.y.max(axis=0)))
         self.origin = low.min(axis=1, initial=np.inf)[:, None]
         self.cell = _CELL
+        n = low.shape[1]
+        most = min(_MOST_ENTRIES * max(n, 64), max(_MOST_IN_ALL, 4 * n))
         while True:
             self.first, last = self.cells(low), self.cells(high)
             self.shape = last.max(axis=1, initial=0)[:, None] + 1
-            entries = (last - self.first + 1).prod(axis=0).sum()
-            if entries <= _MOST_ENTRIES * max(low.shape[1], 64) and self.shape.max() < 1 << 30:
+            # As floats: far lanes have more cells than a whole number can count.
+            entries = (last - self.first + 1).prod(axis=0, dtype=np.float64).sum()
+            if entries <= most and self.shape.max() < 1 << 30:
                 break
             self.cell *= 2
         quad, x, y = _cells_between(self.first, last)
         key = x * self.shape[1] + y
         order = np.argsort(key, kind="stable")
         self.quad = quad[order]
-        self.keys, begin = np.unique(key[order], return_index=True)
-        self.begin = np.append(begin, len(key))
+        key = key[order]
+        begin = np.flatnonzero(np.diff(key, prepend=-1))
+        self.keys, self.begin = key[begin], np.append(begin, len(key))
 
     def cells(self, places: Floats) -> Ints:
         """(2, N) int64: the cells that places (2, N) lie in."""
