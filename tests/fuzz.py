@@ -55,6 +55,8 @@ if TYPE_CHECKING:
 
 SECONDS = 10.0
 """Longest that a case may take, of the process's own time."""
+MEGABYTES = 600
+"""By how much the cases of a flavour may raise the peak of the process's memory."""
 FRAMES = 6
 WHOLE_WAY = 16
 """One of so many recordings goes the whole way."""
@@ -530,11 +532,13 @@ def run(flavours: list[str], runs: int, seed: int, keep: Path) -> dict[str, dict
         for flavour in flavours:
             counts = endings.setdefault(flavour, {})
             path = Path(folder) / f"case{ending_of(flavour)}"
+            bar = peak() + MEGABYTES
             for number in range(seed, seed + runs):
                 try:
                     ending = one_case(flavour, number, path)
+                    assert peak() < bar, f"memory: {peak()} MB, {bar} are too much"
                 except Exception:  # noqa: BLE001  (whatever it is, it is what was sought)
-                    ending = "FAILED"
+                    ending, bar = "FAILED", max(bar, peak() + MEGABYTES)
                     keep.mkdir(parents=True, exist_ok=True)
                     kept = keep / f"{flavour.replace(' ', '_').strip('.')}_{number}{path.name[4:]}"
                     kept.write_bytes(path.read_bytes())
@@ -542,6 +546,12 @@ def run(flavours: list[str], runs: int, seed: int, keep: Path) -> dict[str, dict
                     traceback.print_exc()
                 counts[ending] = counts.get(ending, 0) + 1
     return endings
+
+
+def peak() -> int:
+    """Most memory that the process has had; MB."""
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return size >> (20 if sys.platform == "darwin" else 10)
 
 
 def ending_of(kind: str) -> str:
@@ -583,8 +593,7 @@ def main() -> int:
         told = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
         print(f"{flavour:20} {told}", flush=True)
         failed += counts.get("FAILED", 0)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    print(f"{time.monotonic() - start:.0f} s, at most {peak} MB")
+    print(f"{time.monotonic() - start:.0f} s, at most {peak()} MB")
     return int(failed > 0)
 
 

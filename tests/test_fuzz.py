@@ -63,6 +63,18 @@ def test_looking_at_what_was_hurt_ends_in_a_result_or_an_error(kind: str, tmp_pa
     assert {"whole", "error"} <= set(counts)
 
 
+def test_a_case_that_takes_much_memory_fails_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peaks = iter([150, 400, 900, 900, 1000])  # at the start, and after each case and failure
+    monkeypatch.setattr(fuzz, "peak", lambda: next(peaks, 1000))
+
+    (counts,) = fuzz.run(["sgl"], 4, 0, tmp_path).values()
+
+    assert counts["FAILED"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["sgl_1.py"]
+
+
 @pytest.mark.data
 def test_random_queries_on_many_traces_end_in_rows_or_a_reason(data: Path, tmp_path: Path) -> None:
     store = fuzz_queries.many(tmp_path / "many.sgstore", traces=6, frames=20, egos=1)
