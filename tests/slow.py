@@ -10,7 +10,7 @@ from typing import Final
 
 SECONDS: Final = {
     "importing": 45,
-    "rebuilding": 33,
+    "rebuilding": 25,
     "cli_ending": 33,
     "ingest_hardship": 28,
     "cli_streams": 22,

@@ -22,6 +22,7 @@ from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest
 from sgstore.rebuild import rebuild
 from sgstore.store import StoreFile, remains_of
+from sgstore.store._classes import Abstracted
 from sgstore.store._schema import schema_sql
 
 if TYPE_CHECKING:
@@ -183,6 +184,31 @@ def test_a_store_made_anew_holds_all_that_it_held(
     assert sorted(row["trace"] for row in told) == sorted(made.content["order"])
     assert {row["status"] for row in told} == {"added"}
     assert list(store.parent.iterdir()) == [store]
+
+
+@pytest.mark.parametrize("frames", [1, 20])
+def test_classes_of_traces_are_the_same_however_many_come_in_at_once(
+    frames: int, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = StoreFile(small).abstracted.classes("SG")
+    change(small, "DELETE FROM inside.later_class WHERE abstraction = 'SG'")
+    monkeypatch.setattr("sgstore.store._classes._TOGETHER", frames)
+    written: list[int] = []
+    complete = Abstracted._complete
+
+    def counted(self: Abstracted, name: str, traces: list[int]) -> None:
+        written.append(len(traces))
+        complete(self, name, traces)
+
+    monkeypatch.setattr(Abstracted, "_complete", counted)
+    after = StoreFile(small).abstracted.classes("SG")
+
+    assert sum(written) == len(FEW)
+    assert (max(written) == 1) == (frames == 1)
+    assert {name: values.tolist() for name, values in after.items()} == {
+        name: values.tolist() for name, values in before.items()
+    }
+    assert StoreFile(small).verify().faults == []
 
 
 @pytest.mark.parametrize("how", MADE_BEFORE)

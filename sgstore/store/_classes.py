@@ -7,6 +7,7 @@ are made at ingest are published with their trace; others wait until they are as
 from __future__ import annotations
 
 from collections import OrderedDict
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -47,13 +48,15 @@ if TYPE_CHECKING:
 _LATER: Final = "later_class"
 
 _MISSING: Final = """
-SELECT trace_id FROM {0}trace WHERE trace_id NOT IN (
+SELECT trace_id, frames FROM {0}trace WHERE trace_id NOT IN (
   SELECT bucket >> 18 FROM {0}later_class WHERE abstraction = $name UNION ALL
   SELECT bucket >> 18 FROM {0}frame_class WHERE abstraction = $name)
 ORDER BY ingested_at, name
 """
 
 
+_TOGETHER: Final = 2000
+"""Frames of traces whose classes one transaction brings in, about: with short traces it takes longest."""
 _REMEMBERED: Final = 4096
 """Frames whose classes are remembered."""
 
@@ -155,7 +158,8 @@ class Abstracted:
     def complete(self, name: str) -> int:
         """Compute the classes in an abstraction of the traces that lack them, and keep them.
 
-        Each trace is one transaction: what is done stays done, and another call goes on from there.
+        Traces of some thousand frames are one transaction: what is done stays done, and another call goes on
+        from there.
 
         Returns
         -------
@@ -171,27 +175,38 @@ class Abstracted:
         """
         name = abstraction_named(name).name
         with self._access.reading() as connection:
-            traces = _missing(connection, name)
-        for trace_id in traces:
-            self._complete(name, trace_id)
-        return len(traces)
+            missing = _missing(connection, name)
+        together: list[int] = []
+        count = 0
+        for trace_id, frames in missing.items():
+            together.append(trace_id)
+            count += frames
+            if count >= _TOGETHER:
+                self._complete(name, together)
+                together, count = [], 0
+        if together:
+            self._complete(name, together)
+        return len(missing)
 
-    def _complete(self, name: str, trace_id: int) -> None:
-        staging = Staging(self._path)
-        try:
-            classes = TraceClasses((name,))
+    def _complete(self, name: str, traces: Sequence[int]) -> None:
+        with ExitStack() as staged:
+            made: dict[int, Staging] = {}
             with self._access.reading() as connection:
-                for seq, seen in self._graphs.of_trace(connection, trace_id):
-                    staging.settle(whole=True)
-                    staging.insert(_LATER, classes.columns(seen, trace_id, seq))
-            staging.seal()
+                for trace_id in traces:
+                    made[trace_id] = staging = Staging(self._path)
+                    staged.callback(staging.close)
+                    classes = TraceClasses((name,))
+                    for seq, seen in self._graphs.of_trace(connection, trace_id):
+                        staging.settle(whole=True)
+                        staging.insert(_LATER, classes.columns(seen, trace_id, seq))
+                    staging.seal()
             with writing(self._access) as connection:
-                # Another process may have been faster, or have removed the trace.
-                if trace_id in _missing(connection, name, "store.inside."):
-                    add(connection, self._path, staging)
-                    note(connection, trace_id, [_LATER])
-        finally:
-            staging.close()
+                # Another process may have been faster, or have removed a trace.
+                missing = _missing(connection, name, "store.inside.")
+                for trace_id, staging in made.items():
+                    if trace_id in missing:
+                        add(connection, self._path, staging)
+                        note(connection, trace_id, [_LATER])
 
     def classes(self, name: str, trace: int | str | None = None) -> dict[str, NDArray[np.generic]]:
         """The class of each frame in an abstraction, computed where it was not.
@@ -327,10 +342,9 @@ class Abstracted:
         return abstraction.function(seen), about
 
 
-def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> list[int]:
-    """Traces of which the classes in an abstraction are not kept."""
-    found = connection.execute(_MISSING.format(catalog), {"name": name}).fetchall()
-    return [trace_id for (trace_id,) in found]
+def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> dict[int, int]:
+    """Traces of which the classes in an abstraction are not kept, and their numbers of frames."""
+    return dict(connection.execute(_MISSING.format(catalog), {"name": name}).fetchall())
 
 
 # Classes of all frames as numbers, and the features of graphs: what coverage is made of -----------
