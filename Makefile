@@ -122,8 +122,9 @@ pyg: $(VENV)/.base
 	build/pyg/bin/python tests/learning.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := temporal ttc pair_numbers crowds cli_ending cli_streams fuzz carla carla_cut mcap_file lang_attributes lang_counting lang_oracle \
-  doors frozen ingest_data ingest_hardship monitor online sgg_traces store_transactions tolerance
+LONG := temporal ttc pair_numbers crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
+  lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
+  monitor online sgg_traces store_transactions tolerance
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000

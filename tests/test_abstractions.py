@@ -10,6 +10,7 @@ import networkx as nx
 import numpy as np
 import pytest
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
+from thorough import LONG
 
 import sgstore
 from sgstore.abstractions import (
@@ -125,21 +126,20 @@ def test_frames_of_equal_contents_are_of_equal_classes() -> None:
     scenes = [any_scene(rng) for _ in range(1500)]
     seen = together(scenes)
     named = [classes_of(abstraction_named(name).function(seen)) for name in AT_INGEST]
+    contents = contents_of(seen)
     of: dict[bytes, set[tuple[str, ...]]] = {}
-    for content, *names in zip(contents_of(seen), *named, strict=True):
+    for content, *names in zip(contents, *named, strict=True):
         of.setdefault(content, set()).add(tuple(names))
 
     assert all(len(names) == 1 for names in of.values())
     assert 100 < len(of) < 1000
     assert len(set(zip(*named, strict=True))) > len(of) / 4
-    assert [contents_of(one)[0] for one in scenes[:50]] == contents_of(seen)[:50]
+    assert [contents_of(one)[0] for one in scenes[:50]] == contents[:50]
     some = np.arange(3, 1500, 7)
-    assert contents_of(seen.taken(some)) == [contents_of(seen)[i] for i in some.tolist()]
-    for name in AT_INGEST:
+    assert contents_of(seen.taken(some)) == [contents[i] for i in some.tolist()]
+    for name, classes in zip(AT_INGEST, named, strict=True):
         function = abstraction_named(name).function
-        assert classes_of(function(seen.taken(some))) == [
-            classes_of(function(seen))[i] for i in some.tolist()
-        ]
+        assert classes_of(function(seen.taken(some))) == [classes[i] for i in some.tolist()]
 
 
 def lanes_of(seen: GraphColumns) -> dict[str, str]:
@@ -315,7 +315,7 @@ def test_frames_of_a_store_have_equal_classes_exactly_if_networkx_says_isomorphi
 ) -> None:
     classes = store.classes(name)
     ids, found = classes["frame_id"], classes["class"]
-    numbers = np.random.default_rng(3).integers(0, len(ids) - 5, 8)
+    numbers = np.random.default_rng(3).integers(0, len(ids) - 5, 8)[: None if LONG else 4]
     pairs = [(i, i + step) for i in numbers.tolist() for step in (1, 4)]
     with store.file.snapshot():
         graphs = {i: store.graph(int(ids[i]), abstraction=name) for pair in pairs for i in pair}

@@ -13,6 +13,7 @@ from oracle_patterns import Writer
 from oracle_worlds import World, random_world
 from recordings import Recorder, car
 from test_lang_oracle import QUERIES
+from thorough import LONG
 
 from sgstore.demo import QUESTIONS
 from sgstore.errors import QueryError
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from oracle_worlds import Frame
 
     from sgstore.lang.ir import Query
+    from sgstore.store import FrameRef
 
 
 def view_of(frame: Frame) -> FrameView:
@@ -57,7 +59,7 @@ def found(text: str, world: World) -> Counter[tuple[Any, ...]]:
     return rows
 
 
-@pytest.mark.parametrize("first", [0, 100])
+@pytest.mark.parametrize("first", [0, 100] if LONG else [0])
 def test_random_patterns_find_in_memory_what_exhaustive_search_finds(first: int) -> None:
     tried = matched = 0
     for number in range(first, first + 50):
@@ -208,6 +210,13 @@ def town(open_town: Store) -> Store:
     return open_town
 
 
+@pytest.fixture(scope="module")
+def scenes(town: Store) -> list[tuple[FrameRef, SceneGraph]]:
+    """Every sixtieth frame, and its graph."""
+    frames = {frame.frame_id: frame for frame in town.find("MATCH (e:Ego)").frames()}
+    return [(frame, town.file.graph(frame.frame_id)) for frame in [*frames.values()][::60]]
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -219,15 +228,14 @@ def town(open_town: Store) -> Store:
         "MATCH (a:Car)-[d:near|very_near]->(b:Person) WHERE abs(rel_heading(a, b)) > 60",
     ],
 )
-def test_a_graph_of_the_store_gives_in_memory_what_sql_gives(town: Store, text: str) -> None:
+def test_a_graph_of_the_store_gives_in_memory_what_sql_gives(
+    town: Store, scenes: list[tuple[FrameRef, SceneGraph]], text: str
+) -> None:
     matches = town.find(text)
     bound = compile_query(text, town.catalog()).bound
     matcher = Matcher(bound)
-    frames = {frame.frame_id: frame for frame in town.find("MATCH (e:Ego)").frames()}
 
-    for frame_id in list(frames)[::60]:
-        scene = town.file.graph(frame_id)
-        frame = frames[frame_id]
+    for frame, scene in scenes:
         here = [match.nodes for match in matcher.matches(FrameView(scene, {"t": frame.t}))]
         there = [{name: row[name] for name in row} for row in matches.bindings(frame)]
         assert _sorted(here) == _sorted(there), frame
