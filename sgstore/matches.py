@@ -15,10 +15,10 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from sgstore.errors import QueryError
 from sgstore.lang import (
-    TRACE_OF_BUCKET,
     Compiled,
     Layout,
     Window,
@@ -69,6 +69,12 @@ LAST_WINDOW: Final = 16_384
 
 ROWS: Final = 1_000_000
 """Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
+
+
+BLOCK: Final = 50_000
+"""Matches over several frames that the database is given at a time."""
+
+T = TypeVar("T")
 
 
 if TYPE_CHECKING:
@@ -426,7 +432,8 @@ class Matches(Tabular):
             whole_traces=form in {"intervals", "clips"} or bool(compiled.query.steps),
         )
         for window in windows:
-            yield statement(compiled, window), windows
+            for one in windows.parts(window, partial(statement, compiled)):
+                yield one, windows
 
     def _asked(self, statement: SqlStatement) -> dict[str, Any]:
         """A statement as :class:`StoreFile` takes it: its last step, and the tables that it is given before.
@@ -443,9 +450,24 @@ class Matches(Tabular):
     def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
         steps = Windows(extents(self._ready.catalog), whole_traces=True)
         for window in steps:
-            block = gathered.block(window)
-            steps.rows = len(block[0])
-            yield block
+            for block in steps.parts(window, gathered.block):
+                steps.rows += len(block[0])
+                for low in range(0, len(block[0]), BLOCK):
+                    yield [column[low : low + BLOCK] for column in block]
+
+
+class TooMuchError(Exception):
+    """A window has more of something than memory may hold; of several traces, each may be asked alone.
+
+    Attributes
+    ----------
+    reason, hint : str
+        For a person, if it is one trace.
+    """
+
+    def __init__(self, reason: str, hint: str) -> None:
+        super().__init__(reason)
+        self.reason, self.hint = reason, hint
 
 
 @lru_cache(maxsize=64)
@@ -498,14 +520,36 @@ class Windows:
                 yield from self._told(group, used)
                 group, used = [], 0
             if buckets > self._size and not self._whole_traces:
-                yield from self._parts(first, buckets)
+                yield from self._divided(first, buckets)
             else:
                 group.append((first, buckets))
                 used += buckets
         if group:
             yield from self._told(group, used)
 
-    def _parts(self, first: int, buckets: int) -> Iterator[Window]:
+    def parts(self, window: Window | None, ask: Callable[[Window | None], T]) -> Iterator[T]:
+        """What is found in a range, or, where that is too much, in each half of it, and so on.
+
+        Raises
+        ------
+        QueryError
+            It is too much even in one trace.
+        """
+        left = [window]
+        while left:
+            part = left.pop()
+            try:
+                found = ask(part)
+            except TooMuchError as error:
+                inside = [one for one in self._extents if part is None or one[0] in part]
+                if len(inside) < 2:
+                    raise QueryError(error.reason, hint=error.hint) from None
+                half = len(inside) // 2
+                left += [Window.of(inside[half:]), Window.of(inside[:half])]
+            else:
+                yield found
+
+    def _divided(self, first: int, buckets: int) -> Iterator[Window]:
         """Ranges of a trace that is longer than one may be."""
         end = first + buckets
         while first < end:
@@ -515,10 +559,8 @@ class Windows:
 
     def _told(self, group: list[tuple[int, int]], used: int) -> Iterator[Window]:
         """One range; when its rows were read, it is known how long the next one may be."""
-        low, high = min(first for first, _ in group), max(first + many for first, many in group)
-        traces = tuple(first >> TRACE_OF_BUCKET for first, _ in group) if len(group) > 1 else None
         self.rows = 0
-        yield Window(low, high, traces)
+        yield Window.of(group)
         grown = GROWTH * max(used, self._size)
         self._size = max(min(grown, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
 

@@ -27,7 +27,8 @@ from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang import pattern_named
 from sgstore.lang.ir import BoundHold, Length
-from sgstore.temporal import evaluate
+from sgstore.query import Store
+from sgstore.temporal import _offline, _sequences, evaluate
 from sgstore.temporal._formula import And
 from sgstore.temporal._sequences import BindingLine, Leg, matches_of
 from sgstore.temporal._signals import Clock, PropositionTable
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from oracle_worlds import World
-
-    from sgstore.query import Store
 
 PAIR = "MATCH (e:Ego)-[:near|visible]-(v:Entity)"
 
@@ -74,6 +73,70 @@ def test_conditions_over_time_are_what_their_definition_says(asked: tuple[World,
     found = [compare_condition(*asked, rng) for _ in range(12)]
 
     assert sum(found) > 10
+
+
+LOOSE = "MATCH (a), (b), (c) AS s0 THEN MATCH (b), (a), (c) AS s1 RETURN trace.name, a, b, c"
+
+
+@pytest.fixture
+def little_memory(store: Store, monkeypatch: pytest.MonkeyPatch) -> Store:
+    """The store as on a machine that may hold 40,000 rows, 6,000 matches and 100,000 bindings."""
+    monkeypatch.setattr(_offline, "ROW_BYTES", (64 << 20) // 40_000)
+    monkeypatch.setattr(_offline, "MOST_BINDINGS", 100_000)
+    monkeypatch.setattr(_sequences, "MOST_MATCHES", 6_000)
+    return Store(store.file.path, memory=64 << 20)
+
+
+def test_traces_that_hold_too_much_together_are_asked_one_by_one(
+    store: Store, little_memory: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = little_memory.find(LOOSE).rows()
+
+    assert len(found) > 10_000
+    monkeypatch.undo()
+    assert found == store.find(LOOSE).rows()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            LOOSE.replace("(c) AS", "(c), (d) AS"),
+            r"step 1 holds for more than 40,\d+ combinations of nodes and frames of trace1, more",
+        ),
+        (
+            "MATCH (a:Ego) AS s0 THEN MATCH (b), (c), (d), (a), (f), (g) WHERE prev(b.speed) > 0",
+            r"step 2 holds for more than \d+,\d+ combinations of nodes and frames of trace1",
+        ),
+        (
+            "MATCH (a), (b) AS s0 THEN MATCH (x), (y) AS s1",
+            r"trace1 has more than 6,000 matches, more than memory may take",
+        ),
+        (
+            "MATCH (a), (b), (c) AS s0 THEN MATCH (x), (y) AS s1",
+            r"the steps together hold for too much: \d+,\d+ combinations of nodes in one trace",
+        ),
+        (
+            "USING NODES any CHECK FORALL (a:Entity, b:Entity, c:Entity, d:Entity, f:Entity,"
+            " g:Entity, h:Entity, i:Entity) ALWAYS a.speed < 9",
+            r"FORALL a, b, .* is about too much: \d+,\d+ combinations of nodes in one trace",
+        ),
+    ],
+)
+def test_what_holds_for_too_much_of_one_trace_is_refused(
+    little_memory: Store, text: str, told: str
+) -> None:
+    with pytest.raises(QueryError, match=told) as refused:
+        list(little_memory.check(text) if "CHECK" in text else little_memory.find(text))
+    assert "a label, an edge between them" in (refused.value.hint or "")
+
+
+def test_a_step_is_asked_for_no_more_nodes_than_the_others_leave(store: Store) -> None:
+    many = "MATCH (a), (b), (c), (d), (f), (g), (h) WHERE a.speed < b.speed"
+
+    found = store.find(f"MATCH (a:Ego) WHERE a.speed > 9999 THEN {many} RETURN a").rows()
+
+    assert found == []
 
 
 @pytest.mark.parametrize("where", COURSES)

@@ -69,6 +69,7 @@ def relation(
     window: Window | None,
     values: Iterable[Bound] = (),
     bound: Iterable[str] | None = None,
+    most: int | None = None,
 ) -> SqlStatement:
     """The statement for the frames and bindings in which a pattern holds.
 
@@ -83,6 +84,8 @@ def relation(
         Asked of each match.
     bound : iterable of str, optional
         Keys of the nodes and edges that are bound, the others being asked to exist; ``None``: all nodes.
+    most : int, optional
+        How many rows are read at most.
 
     Returns
     -------
@@ -107,6 +110,7 @@ def relation(
         told = expression_text(value, lambda leaf: f'":rows".{quoted(column_of(leaf))}', sql.values)
         columns.append(f'{told} AS ":{number}"')
     body = "SELECT " + ",\n  ".join(columns) + "\nFROM " + nested(text, ":rows")
+    body += "" if most is None else f"\nLIMIT {most}"
     return finished(sql, body, (FRAME, *nodes, *edges, *(f":{n}" for n in range(len(values)))))
 
 

@@ -46,6 +46,17 @@ class Window:
     high: int
     traces: tuple[int, ...] | None = None
 
+    @classmethod
+    def of(cls, extents: Sequence[tuple[int, int]]) -> Window:
+        """The window of whole traces, or of a part of one, by first bucket and number of buckets of each."""
+        low, high = min(first for first, _ in extents), max(first + many for first, many in extents)
+        traces = tuple(first >> TRACE_OF_BUCKET for first, _ in extents)
+        return cls(low, high, traces if len(traces) > 1 else None)
+
+    def __contains__(self, bucket: int) -> bool:
+        inside = self.low <= bucket < self.high
+        return inside and (self.traces is None or bucket >> TRACE_OF_BUCKET in self.traces)
+
 
 @dataclass(frozen=True, slots=True)
 class Gathered:

@@ -12,12 +12,12 @@ from __future__ import annotations
 from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from sgstore.lang._catalog import Attribute, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, Type
 from sgstore.records import dataclass
 from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from sgstore.errors import TextSpan
 
@@ -518,6 +518,13 @@ class Query:
     links: tuple[StepLink, ...] = ()
     policy: str = "all"
     gaps: str = "break"
+
+
+def node_among(node: str, ids: Iterable[int]) -> Operation:
+    """The condition that a node is one of those with some ids."""
+    of = NodeAttribute(node, NODE_ATTRIBUTES["id"], Type.number)
+    choices = Choices(tuple(Value(number, Type.number) for number in ids))
+    return Operation("IN", (of, choices), Type.boolean)
 
 
 def operands_of(expression: Bound) -> tuple[Bound, ...]:

@@ -115,10 +115,10 @@ class StoreFile:
     ) -> None:
         self.path = Path(path)
         self.tables = tables
-        self._memory = memory or default_memory()
+        self.memory = memory or default_memory()
         self.access = Access(
             self.path,
-            memory=self._memory,
+            memory=self.memory,
             wait_s=wait_s,
             tables=tables,
             spill=spill,
@@ -694,7 +694,7 @@ class StoreFile:
         """
         from sgstore.store._rebuild import settle
 
-        settle(self.path, self.access, self._memory)
+        settle(self.path, self.access, self.memory)
 
     def compact(self) -> None:
         """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
@@ -710,7 +710,7 @@ class StoreFile:
         """
         from sgstore.store._rebuild import compact
 
-        compact(self.path, self.access, self._memory)
+        compact(self.path, self.access, self.memory)
 
     def refuse_others(self) -> None:
         """Raise a StoreError if there are tables or views of somebody else's: compacting would lose them."""

@@ -21,7 +21,7 @@ from sgstore.lang import (
 from sgstore.matches import Interval, notes_in
 from sgstore.temporal._formula import tolerant
 from sgstore.temporal._matches import lacking
-from sgstore.temporal._offline import PlanValues, TraceReader, traces
+from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
 from sgstore.temporal._plan import plan_of_check, plan_text
 from sgstore.temporal._verdicts import (
     CERTAINLY_TRUE,
@@ -94,6 +94,11 @@ def levels_of(
         the same.
     counts : function
         Of a quantifier, the variables so far and bindings of these: which of them count.
+
+    Raises
+    ------
+    QueryError
+        They are too many to be worked on.
     """
     variables: tuple[str, ...] = ()
     bindings, levels = np.zeros((1, 0), np.int64), list[Level]()
@@ -103,6 +108,8 @@ def levels_of(
             domain = domains[node]
             if apart is not None:
                 domain = domain[~np.isin(domain, apart)]
+            named = f"{quantifier.word} {', '.join((*variables, node))} is about too much"
+            refuse_many(len(bindings) * len(domain), named)
             rows = np.repeat(np.arange(len(bindings)), len(domain))
             added = np.tile(domain, len(bindings))
             if apart is not None:

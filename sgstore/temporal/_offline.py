@@ -7,37 +7,40 @@ at a time.
 from __future__ import annotations
 
 from dataclasses import field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.errors import QueryError
 from sgstore.lang import (
     CLOCK,
     CLOCK_OF_TRACES,
-    TRACE_OF_BUCKET,
     TRACES,
     Column,
+    Window,
     extents,
     relation,
     traces_of,
 )
-from sgstore.matches import Windows
+from sgstore.matches import TooMuchError, Windows
 from sgstore.records import dataclass
 from sgstore.store import trace_of
 from sgstore.temporal._formula import Formula, propositions, tolerant
+from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
 from sgstore.vocabulary import RELATIONS
 from sgstore.world import longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Window
+    from sgstore.lang import Catalog
     from sgstore.lang.ir import Bound, Query
     from sgstore.store import StoreFile
-    from sgstore.temporal._plan import Ask, Plan, Test
+    from sgstore.temporal._plan import Plan, Test
     from sgstore.world import Bools, Ints
 
     Keys = NDArray[np.int64]
@@ -133,6 +136,21 @@ class TimedRelation:
         return Column(values, known)
 
 
+def refuse_many(bindings: int, told: str) -> None:
+    """Refuse to make too many combinations of nodes.
+
+    Raises
+    ------
+    QueryError
+        It says what they were to be of.
+    """
+    if bindings > MOST_BINDINGS:
+        raise QueryError(
+            f"{told}: {bindings:,} combinations of nodes in one trace, expected at most {MOST_BINDINGS:,}",
+            hint="say more of these nodes: a label, an edge between them, a condition",
+        )
+
+
 # Traces as a plan needs them: the clock, and the relations of atoms and signals, several traces a question
 # ------------------------------------------------------------------------------------------------
 
@@ -144,6 +162,18 @@ def words() -> NDArray[np.str_]:
 
 CELLS: Final = 4_000_000
 """Bindings times frames that are worked on at once."""
+
+ROW_BYTES: Final = 100
+"""Memory that a binding of two or three nodes in a frame takes while it is put in order; bytes."""
+
+EDGE_BYTES: Final = 100
+"""Memory that an edge of a binding takes beside its nodes, as a word; bytes."""
+
+MOST_BINDINGS: Final = 5_000_000
+"""Most combinations of nodes that are made of one trace, whatever frames they have."""
+
+NODES_NAMED: Final = 1_000
+"""Most nodes that a question is narrowed to by their ids: each is a value of its statement."""
 
 
 @dataclass(slots=True)
@@ -254,6 +284,7 @@ def traces(
     """The traces that can answer a query, in order of the catalog, with the relations that are asked.
 
     They are read a few at a time, the more the fewer rows they have, so that memory does not grow with a store.
+    Traces that have too many rows together are read again, half of them at a time.
 
     Parameters
     ----------
@@ -268,15 +299,20 @@ def traces(
         Whether a gap ends a run: ``break``, ``bridge``.
     within : Window, optional
         Buckets of whole traces; by default all.
+
+    Raises
+    ------
+    QueryError
+        What is asked holds for too many nodes in too many frames of one trace.
     """
-    asked = extents(catalog)
-    if within is not None:
-        asked = [one for one in asked if _lies_in(one[0], within)]
+    asked = [one for one in extents(catalog) if within is None or one[0] in within]
     steps = Windows(asked, whole_traces=True)
+    ask = partial(read, file, catalog, whole, asks, gaps=gaps)
     for window in steps:
-        found, steps.rows = read(file, catalog, whole, asks, window or within, gaps=gaps)
-        yield from found
-        del found
+        for found, rows in steps.parts(window or within, ask):
+            steps.rows += rows
+            yield from found
+            found.clear()
 
 
 def read(
@@ -288,20 +324,48 @@ def read(
     *,
     gaps: str,
 ) -> tuple[list[TraceReader], int]:
-    """The traces of a window of whole traces, as :func:`traces` gives them; and how many rows were read."""
+    """The traces of a window of whole traces, as :func:`traces` gives them; and how many rows were read.
+
+    Raises
+    ------
+    TooMuchError
+        They are more than memory may hold.
+    """
     about = {row[0]: row[1:] for row in file.rows(TRACES).values}
     chosen, left = traces_of(whole, catalog)
     asked = (set(about) if chosen is None else chosen) - left
     found = _clocks(file, about, asked, window, gaps)
-    rows = sum(_relate(file, catalog, name, ask, window, found) for name, ask in asks.items())
+    rows, memory = 0, file.memory
+    for name, ask in asks.items():
+        narrower = _narrowed(ask, found.values())
+        if narrower is None:
+            for trace in found.values():
+                trace.relations[name] = _no_rows(ask)
+        else:
+            size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
+            many = _relate(file, catalog, name, narrower, window, found, memory // size)
+            rows, memory = rows + many, memory - many * size
     ordered = (trace.trace_id for trace in catalog.traces)
     return [found[trace] for trace in ordered if trace in found], rows
 
 
-def _lies_in(bucket: int, window: Window) -> bool:
-    traces = window.traces
-    inside = window.low <= bucket < window.high
-    return inside and (traces is None or bucket >> TRACE_OF_BUCKET in traces)
+def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
+    """A question about no more nodes than the steps before it leave; ``None``: they leave none."""
+    ids: dict[str, Ints] = {}
+    for before in ask.after:
+        keys = [trace.relations[before.name].keys for trace in traces]
+        if not sum(map(len, keys)):
+            return None
+        for node in set(before.variables) & set(ask.variables) if ask.loose else ():
+            held = np.unique(np.concatenate([k[:, before.variables.index(node)] for k in keys]))
+            ids[node] = np.intersect1d(ids[node], held) if node in ids else held
+    few = {node: held.tolist() for node, held in ids.items() if len(held) <= NODES_NAMED}
+    return ask.among(few) if few else ask
+
+
+def _no_rows(ask: Ask) -> TimedRelation:
+    keys = np.zeros((0, len(ask.columns)), np.int64)
+    return TimedRelation.of(np.zeros(0, np.int64), keys)
 
 
 def _clocks(
@@ -340,18 +404,26 @@ def _relate(
     ask: Ask,
     window: Window | None,
     found: Mapping[int, TraceReader],
+    most: int,
 ) -> int:
-    """Ask one relation, and give each trace its part."""
+    """Ask one relation, and give each trace its part; how many rows it has, which may be so many at most."""
     if ask.everywhere:
         for trace in found.values():
             every = np.arange(len(trace))
             trace.relations[name] = TimedRelation.of(every, np.zeros((len(trace), 0), np.int64))
         return 0
     asked = () if ask.value is None else (ask.value,)
-    statement = relation(ask.query, catalog, window, asked, {*ask.variables, *ask.edges})
-    *before, (sql, bound) = statement.steps()
-    arrays = file.arrays(sql, bound, given=before)
+    bound = {*ask.variables, *ask.edges}
+    statement = relation(ask.query, catalog, window, asked, bound, most + 1)
+    *before, last = statement.steps()
+    arrays = file.arrays(*last, given=before)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
+    if len(ids) > most:
+        raise TooMuchError(
+            f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
+            f" {', '.join(trace.name for trace in found.values())}, more than memory may take",
+            "say more of its nodes: a label, an edge between them, a condition; or allow more memory",
+        )
     columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
     keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)

@@ -38,7 +38,7 @@ from sgstore.records import dataclass
 from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from sgstore.lang import Catalog, SqlStatement
     from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink
@@ -67,6 +67,8 @@ class Ask:
     edges : tuple of str
         Keys of its edges that a binding speaks of, too. Of a signal those that its value speaks of: of matches
         that differ in these alone, the one counts whose relations come first in the alphabet.
+    after : tuple of Ask
+        Steps that are asked before: where these never hold for a node, this one need not be known.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Ask:
     variables: tuple[str, ...]
     value: b.Bound | None = None
     edges: tuple[str, ...] = ()
+    after: tuple[Ask, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -85,6 +88,23 @@ class Ask:
         """Tell whether it asks nothing, and so holds in every frame."""
         scope = self.query.scope
         return self.value is None and not (scope.nodes or scope.edges or scope.where)
+
+    @property
+    def loose(self) -> bool:
+        """Tell whether its nodes hang together by no edges, so that it may hold for very many of them."""
+        scope = self.query.scope
+        groups = [{node} for node in scope.nodes]
+        for edge in scope.edges:
+            met = [group for group in groups if group & {edge.src, edge.dst}]
+            groups = [group for group in groups if group not in met] + [set().union(*met)]
+        return len(groups) > 1
+
+    def among(self, nodes: Mapping[str, Iterable[int]]) -> Ask:
+        """The same question about those ids alone of some of its nodes."""
+        scope = self.query.scope
+        where = (b.node_among(node, ids) for node, ids in nodes.items())
+        narrower = replace(scope, where=(*scope.where, *where))
+        return replace(self, query=replace(self.query, scope=narrower))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -348,13 +368,26 @@ def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
     return plan, formula, resets, guards
 
 
-def ask_of_step(query: b.Query, step: BoundStep, kept: Iterable[str]) -> Ask:
-    """Return the pattern of a step; all its nodes are bound where its conditions need that, else those kept."""
+def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
+    """Return the patterns of steps, named ``step 1``, ``step 2``, ….
+
+    All nodes of a step are bound where its conditions need that, else those kept.
+    """
+    asks = [_ask_of_step(query, step, kept, n) for n, step in enumerate(steps, start=1)]
+    happen = [ask for ask, step in zip(asks, steps, strict=True) if not step.absent]
+    ordered = sorted(happen, key=lambda ask: ask.loose)
+    for number, (ask, step) in enumerate(zip(asks, steps, strict=True)):
+        before = ordered if step.absent else ordered[: ordered.index(ask)]
+        asks[number] = replace(ask, after=tuple(before))
+    return asks
+
+
+def _ask_of_step(query: b.Query, step: BoundStep, kept: Iterable[str], number: int) -> Ask:
     scope = step.scope
     bound = scope.nodes.keys() if step.when else scope.nodes.keys() & set(kept)
     edges = () if step.absent else sorted(edge.key for edge in scope.edges if edge.named)
     pattern = replace(query, scope=scope, result=b.Result(), steps=(), links=())
-    return Ask("", pattern, tuple(sorted(bound)), None, tuple(edges))
+    return Ask(f"step {number}", pattern, tuple(sorted(bound)), None, tuple(edges))
 
 
 def _all(parts: list[b.Bound]) -> b.Bound:
@@ -426,6 +459,14 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
             f"test {test.name}({', '.join(test.variables)}) = {value_text(test.expression)}"
         )
     return lines
+
+
+def ask_text(ask: Ask) -> str:
+    """What an error calls a question: a step by its number, a signal or a condition as it is written."""
+    if ask.value is not None:
+        return value_text(ask.value)
+    conditions = " AND ".join(value_text(part) for part in ask.query.scope.where)
+    return ask.name if ask.name.startswith("step ") else conditions or ", ".join(ask.variables)
 
 
 def sql_text(statement: SqlStatement) -> list[str]:

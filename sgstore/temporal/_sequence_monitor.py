@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import TextSpan
 from sgstore.lang.ir import BoundStep, Query, StepLink
 from sgstore.temporal._formula import And, Formula, Past, Progression, ProgressionFrame, Term
-from sgstore.temporal._plan import ask_of_step, plan_of_steps
+from sgstore.temporal._plan import asks_of_steps, plan_of_steps
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ class SequenceMonitor:
         self._steps: Sequence[BoundStep] = query.steps or (one,)
         self._named = _named(query)
         self._edges = tuple(edge.key for edge in query.scope.edges if edge.named)
-        asks = [ask_of_step(query, step, self._named) for step in self._steps]
+        asks = asks_of_steps(query, self._steps, self._named)
         self._asks = [(questions.add(ask), ask.columns) for ask in asks]
         self._conditions = _Conditions(query, self._steps, questions, pulse)
         self._columns = [self._projected(number) for number in range(len(self._steps))]

@@ -8,13 +8,21 @@ import numpy as np
 
 from sgstore.lang import ExternalRelation, Window, relation, value_text
 from sgstore.lang.ir import Bound, Query, SignalCall, StepTime, Tense
+from sgstore.matches import TooMuchError
 from sgstore.records import dataclass
 from sgstore.store import BUCKET_BITS
 from sgstore.temporal._formula import formula_text
-from sgstore.temporal._offline import PlanValues, TimedRelation, TraceReader, traces, words
+from sgstore.temporal._offline import (
+    PlanValues,
+    TimedRelation,
+    TraceReader,
+    refuse_many,
+    traces,
+    words,
+)
 from sgstore.temporal._plan import (
     Test,
-    ask_of_step,
+    asks_of_steps,
     hold_text,
     link_text,
     needs_text,
@@ -321,6 +329,7 @@ def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
     order = np.argsort(other, kind="stable")
     low = np.searchsorted(other[order], one, "left")
     counts = np.searchsorted(other[order], one, "right") - low
+    refuse_many(int(counts.sum()), "the steps together hold for too much")
     rows = np.repeat(np.arange(len(left)), counts)
     offset = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, order[np.repeat(low, counts) + offset]
@@ -328,6 +337,9 @@ def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
 
 # The matches of a query over several frames -------------------------------------------------------
 
+
+MOST_MATCHES: Final = 2_000_000
+"""Most matches of one trace over several frames: each takes some 300 bytes until the database has it."""
 
 _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 """Some matches: ids of their first and last frames, their nodes and edges, and the values of each place."""
@@ -350,7 +362,7 @@ class Finder:
         self._plan = plan_of_steps(query, query.steps)
         self._when = [tuple(map(self._plan.formula, step.when)) for step in query.steps]
         self._kept = tuple(sorted(query.scope.nodes))
-        self._steps = [ask_of_step(query, step, self._kept) for step in query.steps]
+        self._steps = asks_of_steps(query, query.steps, self._kept)
         self._edges = tuple(edge.key for edge in query.scope.edges)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
@@ -369,10 +381,19 @@ class Finder:
         for place in places:
             if not isinstance(place, StepTime):
                 self._planned(place)  # what it asks of single frames becomes part of the plan
-        asks = self._plan.asks | {f"step {number}": ask for number, ask in enumerate(self._steps)}
+        ordered = sorted(self._steps, key=lambda ask: len(ask.after))
+        asks = self._plan.asks | {ask.name: ask for ask in ordered}
         about = self._file, self._catalog, self._query, asks
         found = traces(*about, gaps=self._query.gaps, within=window)
-        parts = [part for trace in found if len(trace) for part in self._find(trace, places)]
+        parts: list[_Part] = []
+        for trace in found:
+            for part in self._find(trace, places) if len(trace) else ():
+                parts.append(part)
+                if sum(len(one[0]) for one in parts) > MOST_MATCHES:
+                    raise TooMuchError(
+                        f"{trace.name} has more than {MOST_MATCHES:,} matches, more than memory may take",
+                        "say more of its nodes: a label, an edge between them, a condition",
+                    )
         first = [frame for part in parts for frame in part[0].tolist()]
         last = [frame for part in parts for frame in part[1].tolist()]
         width = len(self._kept) + len(self._edges)
@@ -438,7 +459,7 @@ class Finder:
     def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
         """Return the frames in which a step holds: its pattern, its other conditions, and its duration."""
         step, ask = self._query.steps[number], self._steps[number]
-        relation = trace.relations[f"step {number}"]
+        relation = trace.relations[ask.name]
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
         kept = np.ones(len(owners), np.bool_)
         for formula in self._when[number]:
