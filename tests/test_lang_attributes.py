@@ -24,12 +24,12 @@ from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from sgstore.lang import FrameView
     from sgstore.query import Store
 
-    Found = Callable[[str], list[tuple[Any, ...]]]
+    Found = Callable[[str], Sequence[tuple[Any, ...]]]
 
 SEQ = 300
 
@@ -44,7 +44,7 @@ def found(store: Store) -> Found:
     """Rows of a query; what several tests ask is asked once."""
 
     @cache
-    def rows(query: str) -> list[tuple[Any, ...]]:
+    def rows(query: str) -> Sequence[tuple[Any, ...]]:
         return store.find(query).rows()
 
     return rows
