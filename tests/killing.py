@@ -134,6 +134,8 @@ def serve() -> None:
                 cli.main()
             except SystemExit as end:
                 code = end.code if isinstance(end.code, int) else 0
+            except KeyboardInterrupt:  # before the command line itself heeds it
+                code = ending.exit_code()
             except BaseException:  # noqa: BLE001
                 sys.excepthook(*sys.exc_info())
             finally:

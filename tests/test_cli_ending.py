@@ -584,6 +584,19 @@ def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 143
 
 
+@pytest.mark.parametrize("place", ["ending._hear_of_lost", "run", "ending.clear_deadline"])
+def test_a_signal_at_the_edge_of_a_run_ends_it_like_any_other(place: str) -> None:
+    code = (
+        "import signal, sys; from sgstore import cli; sys.argv = ['sgstore', '--version']\n"
+        f"cli.{place} = lambda *a: signal.raise_signal(signal.SIGTERM)\n"
+        "cli.main()"
+    )
+
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+
+    assert (done.returncode, done.stderr) == (143, "sgstore: ended by SIGTERM\n")
+
+
 def test_what_its_parent_ignores_is_ignored(town_store: Path) -> None:
     code = (
         "import signal, sgstore.cli._process as ending; ending.heed_signals();"

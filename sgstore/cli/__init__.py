@@ -80,9 +80,14 @@ def main() -> None:
     # Nothing of what is imported is ever garbage: to look for some while it comes takes a tenth of a short run.
     gc.set_threshold(50_000)
     take_streams()
-    ending.heed_signals()
-    code = run(sys.argv[1:])
-    ending.ignore_signals()
+    try:
+        ending.heed_signals()
+        code = run(sys.argv[1:])
+        ending.ignore_signals()
+    except KeyboardInterrupt:  # it came before the run began, or once it was over
+        ending.ignore_signals()
+        say(ending.word())
+        code = ending.exit_code()
     sys.exit(code)
 
 
