@@ -66,7 +66,7 @@ ROOMS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "relations": (
         *("test_relations*.py", "test_extent.py", "test_lane_*.py", "test_sgg*.py"),
-        *("test_crowds.py", "test_plugins.py"),
+        *("test_crowds.py", "test_plugins.py", "test_compiled.py"),
     ),
     "temporal": ("test_temporal.py", "test_over_time.py", "test_monitor.py"),
     "lang": ("test_lang_*.py", "test_query.py", "test_like.py", "test_notes.py"),
