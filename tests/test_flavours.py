@@ -322,12 +322,14 @@ def plain_world(i: int) -> dict[str, Any]:
 STREET = a_map(a_road("1", line(200, x=-20)))
 
 
-def plain(path: Path, worlds: list[Any], *, map_text: str = "") -> Path:
+def plain(path: Path, worlds: list[Any], *, map_text: str = "", before: int = 0) -> Path:
+    """A recording of plain frames; the map, if there is one, comes before one of these."""
     with recordings.Recorder(path, chunk_size=3000) as recorder:
-        if map_text:
-            recorder.write(recorder.channel("map", "plain.Map", b"{}"), 0, map_text.encode())
         channel = recorder.channel("/frames", "plain.Frame", b"{}")
         for i, world in enumerate(worlds):
+            if map_text and i == before:
+                map_channel = recorder.channel("map", "plain.Map", b"{}")
+                recorder.write(map_channel, i / 10, map_text.encode())
             data = world if isinstance(world, bytes) else json.dumps(world).encode()
             recorder.write(channel, i / 10, data)
             recorder.camera(i / 10 + 0.02)
@@ -364,6 +366,17 @@ def test_plain_frames_have_the_graphs_of_the_online_mode(
             relations |= {relation for _, relation, _, _ in graph.edges}
     assert {"inDFrontOf", "near"} <= relations
     assert ("isIn" in relations) == bool(text)
+
+
+def test_a_map_that_is_told_late_is_the_map_of_all_frames(
+    tmp_path: Path, plain_reader: None
+) -> None:
+    worlds = [plain_world(i) for i in range(40)]
+    path = plain(tmp_path / "plain.mcap", worlds, map_text=STREET, before=30)
+
+    with open_trace(path) as trace:
+        assert trace.info.map_text == STREET
+        assert trace.info.ego == "ego"
 
 
 def test_a_frame_that_contradicts_others_is_a_loss_and_changes_nothing(

@@ -80,6 +80,13 @@ def test_a_set_in_a_set_is_refused_because_two_engines_read_it_differently(text:
         assert sql(f"MATCH (v:Car) WHERE v.ident =~ '{escaped}'")
 
 
+def test_a_list_is_no_value_that_a_row_may_have() -> None:
+    error = refused("MATCH (a:Car) RETURN a.speed, [1, 2] AS both")
+
+    assert error.reason == "a list cannot be returned"
+    assert error.span is not None
+
+
 def test_only_a_value_can_have_been_another_one_before() -> None:
     error = refused("MATCH (v:Vehicle) WHERE prev(v) = 3")
 

@@ -67,6 +67,21 @@ def beside(store: StoreFile) -> list[str]:
     return sorted(p.name for p in store.path.parent.iterdir() if p != store.path)
 
 
+def test_a_trace_of_more_frames_than_their_ids_have_room_for_is_refused(
+    store: StoreFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sgstore.store._write.MAX_FRAMES", 100)
+    trace = RandomTrace(frames=130)
+
+    with store.segment(trace.info, Config()) as segment:
+        segment.append(trace.blocks[0])
+        with pytest.raises(StoreError, match="more than 100 frames in one trace"):
+            segment.append(trace.blocks[1])
+
+    assert store.traces() == ()
+    assert beside(store) == []
+
+
 def test_a_trace_is_not_in_the_store_before_it_is_published(store: Any) -> None:
     trace = RandomTrace(frames=130)
     with store.segment(trace.info, Config()) as segment:
