@@ -19,6 +19,7 @@ from sgstore.config import Config, configured
 from sgstore.demo import RECORDING
 from sgstore.opendrive import read_map
 from sgstore.readers import open_trace
+from sgstore.relations import _loops
 from sgstore.sgg import SceneGraphGenerator
 
 if TYPE_CHECKING:
@@ -118,6 +119,18 @@ def test_frames_that_come_alone_do_not_start_the_compiler() -> None:
     assert not compiled.worth()
     SceneGraphGenerator(None, Config()).block(frames([thing("ego")], [thing("ego")]))
     assert compiled.worth()
+
+
+@pytest.mark.parametrize(("room", "told"), [(9, (1, 3)), (3, (1, 3)), (2, (0, 0))])
+def test_pairs_are_looked_for_while_there_is_room_for_all_of_a_body(
+    room: int, told: tuple[int, int]
+) -> None:
+    loop = getattr(_loops.near_pairs, "py_func", _loops.near_pairs)
+    order, end = np.arange(3), np.full(3, 3)
+    place = (np.array([0.0, 1.0, 9.0]), np.zeros(3), np.zeros(3))
+    found = np.zeros(room, int), np.zeros(room, int)
+
+    assert loop(0, order, end, place, 4.0, found) == told
 
 
 def test_without_numba_nothing_is_compiled() -> None:
