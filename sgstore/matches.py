@@ -456,18 +456,8 @@ class Matches(Tabular):
                     yield [column[low : low + BLOCK] for column in block]
 
 
-class TooMuchError(Exception):
-    """A window has more of something than memory may hold; of several traces, each may be asked alone.
-
-    Attributes
-    ----------
-    reason, hint : str
-        For a person, if it is one trace.
-    """
-
-    def __init__(self, reason: str, hint: str) -> None:
-        super().__init__(reason)
-        self.reason, self.hint = reason, hint
+class TooMuchError(QueryError):
+    """A window has more of something than memory may hold; of several traces, each may be asked alone."""
 
 
 @lru_cache(maxsize=64)
@@ -532,7 +522,7 @@ class Windows:
 
         Raises
         ------
-        QueryError
+        TooMuchError
             It is too much even in one trace.
         """
         left = [window]
@@ -540,10 +530,10 @@ class Windows:
             part = left.pop()
             try:
                 found = ask(part)
-            except TooMuchError as error:
+            except TooMuchError:
                 inside = [one for one in self._extents if part is None or one[0] in part]
                 if len(inside) < 2:
-                    raise QueryError(error.reason, hint=error.hint) from None
+                    raise
                 half = len(inside) // 2
                 left += [Window.of(inside[half:]), Window.of(inside[:half])]
             else:

@@ -23,7 +23,6 @@ from sgstore.lang._catalog import (
 )
 from sgstore.lang.ir import (
     Bound,
-    Choices,
     Kinds,
     LabelTest,
     NodeAttribute,
@@ -33,6 +32,7 @@ from sgstore.lang.ir import (
     Value,
     any_kinds,
     ego_kinds,
+    is_one_of,
 )
 from sgstore.pair_numbers import columns_needed
 from sgstore.vocabulary import (
@@ -76,15 +76,7 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
     if len(of) < 2:
         return _related(a, b, next(iter(of), RelationScope()))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
-    return _or(
-        _and(
-            Operation(
-                "IN", (number, Choices(tuple(Value(i, Type.number) for i in ids))), Type.boolean
-            ),
-            _related(a, b, reach),
-        )
-        for reach, ids in of.items()
-    )
+    return _or(_and(is_one_of(number, ids), _related(a, b, reach)) for reach, ids in of.items())
 
 
 def _related(a: str, b: str, reach: RelationScope | None) -> Bound:

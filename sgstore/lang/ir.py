@@ -520,11 +520,15 @@ class Query:
     gaps: str = "break"
 
 
+def is_one_of(value: Bound, numbers: Iterable[int]) -> Operation:
+    """The condition that a value is one of some numbers."""
+    choices = Choices(tuple(Value(number, Type.number) for number in numbers))
+    return Operation("IN", (value, choices), Type.boolean)
+
+
 def node_among(node: str, ids: Iterable[int]) -> Operation:
     """The condition that a node is one of those with some ids."""
-    of = NodeAttribute(node, NODE_ATTRIBUTES["id"], Type.number)
-    choices = Choices(tuple(Value(number, Type.number) for number in ids))
-    return Operation("IN", (of, choices), Type.boolean)
+    return is_one_of(NodeAttribute(node, NODE_ATTRIBUTES["id"], Type.number), ids)
 
 
 def operands_of(expression: Bound) -> tuple[Bound, ...]:

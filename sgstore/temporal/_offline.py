@@ -422,7 +422,7 @@ def _relate(
         raise TooMuchError(
             f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
             f" {', '.join(trace.name for trace in found.values())}, more than memory may take",
-            "say more of its nodes: a label, an edge between them, a condition; or allow more memory",
+            hint="say more of its nodes: a label, an edge between them, a condition; or allow more memory",
         )
     columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]

@@ -392,7 +392,7 @@ class Finder:
                 if sum(len(one[0]) for one in parts) > MOST_MATCHES:
                     raise TooMuchError(
                         f"{trace.name} has more than {MOST_MATCHES:,} matches, more than memory may take",
-                        "say more of its nodes: a label, an edge between them, a condition",
+                        hint="say more of its nodes: a label, an edge between them, a condition",
                     )
         first = [frame for part in parts for frame in part[0].tolist()]
         last = [frame for part in parts for frame in part[1].tolist()]
