@@ -15,10 +15,10 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from graph_blocks import trace_info
 from opendrive_maps import (
     a_map,
     a_road,
@@ -38,10 +38,11 @@ from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, VEHICLE_LIGHTS
-from sgstore.world import Entities, FrameBlock, MessageRefs, States, TraceInfo, TraceReport
+from sgstore.world import Entities, FrameBlock, MessageRefs, States, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from sgstore.roads import RoadMap
     from sgstore.store._staging import Sealed
@@ -460,16 +461,12 @@ def _sealed(
     config: Config,
     kept: ExitStack,
 ) -> Sealed:
-    info = TraceInfo(
-        path=Path(f"/scenes/{name}.mcap"),
-        size=1,
-        mtime_ns=1,
+    info = trace_info(
+        f"/scenes/{name}.mcap",
         digest=f"{number:064x}"[::-1],
         flavour="scene",
         channels=(),
         ego="ego",
-        map_text="",
-        map_name="",
         context=NO_MESSAGES,
     )
     road = scenes[0].road
