@@ -10,6 +10,7 @@ condition means is written down once more, from the documentation.
 
 from __future__ import annotations
 
+import cmath
 import math
 import sys
 import time
@@ -263,7 +264,7 @@ class Search:
         attributes = self.graph.nodes[node]
         return attributes.get("lane_type" if name == "type" else name)
 
-    def call(self, e: s.Call, binding: Binding) -> Any:
+    def call(self, e: s.Call, binding: Binding) -> Any:  # noqa: PLR0911 - a case each
         name = e.name
         if name == "type":
             return binding[e.arguments[0].name].relation  # type: ignore[union-attr]
@@ -276,6 +277,8 @@ class Search:
             return values[0] is not None
         if name in {"min", "max"}:
             return None if None in values else {"min": min, "max": max}[name](values)
+        if name in NUMBERS:
+            return None if None in values else number_of(name, *values)
         return pair(name, self.graph.nodes[values[0]], self.graph.nodes[values[1]])
 
     def block(self, e: s.BlockExpression, binding: Binding) -> Any:
@@ -292,6 +295,31 @@ class Search:
         if not values:
             return None
         return {"MIN": min, "MAX": max, "AVG": lambda v: sum(v) / len(v)}[e.word](values)
+
+
+NUMBERS = {
+    "sqrt": cmath.sqrt,
+    "sin": lambda a: (cmath.exp(1j * a) - cmath.exp(-1j * a)) / 2j,
+    "cos": lambda a: (cmath.exp(1j * a) + cmath.exp(-1j * a)) / 2,
+    "tan": cmath.tan,
+    "exp": cmath.exp,
+    "log": cmath.log,
+    "sign": lambda a: a / abs(a) if a else 0,
+    "degrees": lambda a: a / math.pi * 180,
+    "radians": lambda a: a / 180 * math.pi,
+    "atan2": lambda a, b: cmath.phase(complex(b, a)),
+    "pow": lambda a, b: complex(a) ** b,
+}
+
+
+def number_of(name: str, *values: float) -> float | None:
+    """A function of complex numbers: unknown where it has no value, or none that is real and finite."""
+    try:
+        found = complex(NUMBERS[name](*values))
+    except (OverflowError, ValueError, ZeroDivisionError):
+        return None
+    real = abs(found.imag) <= 1e-9 * max(abs(found), 1e-300)
+    return found.real if real and math.isfinite(found.real) else None
 
 
 class Everything:

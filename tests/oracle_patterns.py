@@ -44,6 +44,9 @@ PROPERTIES = dict.fromkeys(("", ":Car", ":Vehicle", ":Entity", ":%"), OF_ENTITIE
 PROPERTIES[":Lane"] = ["", "", " {type: 'driving'}"]
 
 
+OF_ONE = ("sin", "cos", "tan", "exp", "log", "sqrt", "sign", "degrees", "radians")
+
+
 class Writer:
     """Writes one query; the same seed writes the same."""
 
@@ -190,6 +193,9 @@ class Writer:
             lambda: f"{a}.width IS {self.rng.choice(('', 'NOT '))}NULL",
             lambda: f"{a}.is_static",
             lambda: f"abs({a}.y - {b}.y) {sign} {number}",
+            lambda: f"{self.rng.choice(OF_ONE)}({a}.y) {self.rng.choice('<>')} {number}",
+            lambda: f"{self.rng.choice(('pow', 'atan2'))}({a}.y, {b}.x) > {number}",
+            lambda: f"{a}.width IS {self.rng.choice(('', 'NOT '))}KNOWN",
         ]
         if self.edges and self.rng.random() < 0.3:
             return f"type({self.rng.choice(self.edges)}) {self.rng.choice(('=', '<>'))} 'near'"

@@ -35,8 +35,10 @@ def number(rng: random.Random, depth: int) -> str:
         return rng.choice(NUMBERS)
     one, other = number(rng, depth - 1), number(rng, depth - 1)
     unary = ("abs({})", "sqrt({})", "floor({})", "ceil({})", "round({})", "-({})")
+    unary += ("sin({})", "cos({})", "tan({})", "log({})", "sign({})", "degrees({})", "radians({})")
+    unary += ("exp({} / 9)",)
     both = ("({} + {})", "({} - {})", "({} * {})", "({} / {})", "({} % {})")
-    both += ("min({}, {})", "max({}, {})")
+    both += ("min({}, {})", "max({}, {})", "pow({}, {})", "atan2({}, {})")
     if rng.random() < 0.4:
         return rng.choice(unary).format(one)
     return rng.choice(both).format(one, other)

@@ -75,6 +75,15 @@ QUERIES = [
         "MATCH (a:Car)<-[r:leads]-(b)-[q:follows]->(c) WHERE r.gap + q.gap < dist(a, c)",
         id="gaps and distances",
     ),
+    pytest.param(
+        "MATCH (a), (b:Car) WHERE cos(radians(a.heading)) * pow(b.x - a.x, 2) > 3 * log(a.y)"
+        " AND b.speed IS KNOWN",
+        id="functions of numbers",
+    ),
+    pytest.param(
+        "MATCH (a), (b:Car) WHERE degrees(atan2(b.y - a.y, b.x - a.x)) > 30 AND sign(tan(a.y)) < exp(-b.x)",
+        id="angles of directions",
+    ),
     pytest.param("MATCH (a)-[:leads]-(b) WHERE a.speed > 1", id="who leads or is led"),
     pytest.param("MATCH (a:Car) WHERE MIN {(a)-[:near]->(b) | b.x} < a.x", id="least of a block"),
     pytest.param("MATCH (a) WHERE SUM {(a)-[:near]-(b) | b.speed} >= 10", id="sum of a block"),

@@ -11,7 +11,7 @@ from sgstore.lang._bind_temporal import course
 from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_NAMES, Type
 from sgstore.lang._hints import said_of
 from sgstore.lang._needs import in_range
-from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT
+from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT, OF_TWO
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
 from sgstore.pair_numbers import PAIR_FUNCTIONS
@@ -28,7 +28,7 @@ _OTHERS: Final = frozenset(
 _COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
-    {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *_OTHERS, *_AGGREGATES, *_COURSES}
+    {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *OF_TWO, *_OTHERS, *_AGGREGATES, *_COURSES}
 )
 
 MAX_CALLS: Final = 30
@@ -148,6 +148,12 @@ def _numeric(e: s.Call, names: SymbolTable) -> b.Operation:
     return b.Operation(normalize_name(e.name), (names.number(e.arguments[0]),), Type.number)
 
 
+def _of_two(e: s.Call, names: SymbolTable) -> b.Operation:
+    _expect(e, 2, 2, names)
+    one, other = map(names.number, e.arguments)
+    return b.Operation(normalize_name(e.name), (one, other), Type.number)
+
+
 def _extreme(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 2, 100, names)
     return b.Operation(
@@ -254,6 +260,7 @@ _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     **dict.fromkeys(PAIR_NAMES, _pair),
     **dict.fromkeys(NUMERIC, _numeric),
     **dict.fromkeys(EXTREMES, _extreme),
+    **dict.fromkeys(OF_TWO, _of_two),
     **dict.fromkeys(OF_TEXT, _text_function),
     "classcount": _class_count,
     "coalesce": _coalesce,

@@ -137,6 +137,15 @@ def _odd(parts: Sequence[str]) -> str:
     return reduce(lambda left, right: f"({left} <> {right})", map(operand_text, parts))
 
 
+def _where(part: str, condition: str) -> str:
+    """SQL of a value where a condition on it (``v``) is true, else NULL.
+
+    The value stands there once: of operators in one another that named theirs twice the text would grow beyond
+    all bounds.
+    """
+    return f"list_filter([{part}], lambda v: {condition})[1]"
+
+
 def _if_all_known(name: str) -> SqlOf:
     def text(parts: Sequence[str]) -> str:
         known = " AND ".join(f"{operand_text(part)} IS NOT NULL" for part in parts)
@@ -222,6 +231,45 @@ def _root(a: float) -> float | None:
 def _root_columns(a: Any) -> tuple[Any, Any]:
     fits = np.greater_equal(a, 0)
     return np.sqrt(np.where(fits, a, 0)), fits
+
+
+def _sign(a: float) -> int:
+    return (a > 0) - (a < 0)
+
+
+def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
+    """A function of :mod:`math` that has no value (``None``) where that is no finite number."""
+
+    def one(*values: float) -> float | None:
+        try:
+            found = function(*values)
+        except (ValueError, OverflowError):
+            return None
+        return found if math.isfinite(found) else None
+
+    return one
+
+
+def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
+    """The columns of a function that is computed of each value by itself.
+
+    numpy's own functions differ in the last bit from those of the C library, which Python and the database use.
+    """
+
+    def of_columns(*values: Any) -> tuple[Any, Any]:
+        told = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in values))
+        found = map(one, *(array.ravel().tolist() for array in told))
+        numbers = np.array([math.nan if v is None else v for v in found], np.float64)
+        numbers = numbers.reshape(told[0].shape)
+        return numbers, ~np.isnan(numbers)
+
+    return of_columns
+
+
+def _computed(sql: str, function: Callable[..., float]) -> Operator:
+    """An operator that is a function of :mod:`math`, unknown where its value is no finite number."""
+    one = _finite(function)
+    return _strict(sql, one, _each(one), partial=True)
 
 
 def _rounded(a: float) -> float:
@@ -402,6 +450,8 @@ def _null_test(word: str, *, null: bool) -> Operator:
     return Operator(_sql(f"{{0}} {word}"), of_one, of_columns)
 
 
+_FINITE: Final = "isfinite(CAST(v AS DOUBLE))"
+
 COMPARISONS: Final[Mapping[str, Operator]] = {
     "=": _strict("{0} = {1}", operator.eq, _ufunc("equal"), infix=True),
     "<>": _strict("{0} <> {1}", operator.ne, _ufunc("not_equal"), infix=True),
@@ -425,10 +475,18 @@ CONNECTIVES: Final[Mapping[str, Operator]] = {
 }
 NUMERIC: Final[Mapping[str, Operator]] = {
     "abs": _strict("abs(...)", abs, _ufunc("abs")),
-    "sqrt": _strict("CASE WHEN {0} >= 0 THEN sqrt({0}) END", _root, _root_columns, partial=True),
+    "sqrt": _strict(f"sqrt({_where('{0}', 'v >= 0')})", _root, _root_columns, partial=True),
     "floor": _strict("floor(...)", math.floor, _ufunc("floor")),
     "ceil": _strict("ceil(...)", math.ceil, _ufunc("ceil")),
     "round": _strict("round(...)", _rounded, _rounded_columns),
+    "sign": _strict("CAST(sign({0}) AS INTEGER)", _sign, _ufunc("sign")),
+    "degrees": _strict("degrees(...)", math.degrees, _ufunc("degrees")),
+    "radians": _strict("radians(...)", math.radians, _ufunc("radians")),
+    "sin": _computed(f"sin({_where('{0}', _FINITE)})", math.sin),
+    "cos": _computed(f"cos({_where('{0}', _FINITE)})", math.cos),
+    "tan": _computed(f"tan({_where('{0}', _FINITE)})", math.tan),
+    "exp": _computed(_where("exp({0})", _FINITE), math.exp),
+    "log": _computed(f"ln({_where('{0}', 'v > 0 AND isfinite(v)')})", math.log),
 }
 """Functions of one number."""
 
@@ -437,6 +495,12 @@ EXTREMES: Final[Mapping[str, Operator]] = {
     "max": _strict(_if_all_known("greatest"), max, _greatest),
 }
 """Functions of two numbers or more."""
+
+OF_TWO: Final[Mapping[str, Operator]] = {
+    "atan2": _computed("atan2(...)", math.atan2),
+    "pow": _computed(_where("pow({0}, {1})", _FINITE), math.pow),
+}
+"""Functions of two numbers."""
 
 OF_TEXT: Final[Mapping[str, Operator]] = {
     "lower": _strict("lower(...)", str.lower, _of_texts("lower")),
@@ -450,6 +514,7 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     **CONNECTIVES,
     **NUMERIC,
     **EXTREMES,
+    **OF_TWO,
     **OF_TEXT,
     "+": _strict("(... + ...)", operator.add, _ufunc("add"), infix=True),
     "-": _strict("(... - ...)", operator.sub, _ufunc("subtract"), infix=True),
