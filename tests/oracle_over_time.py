@@ -6,6 +6,7 @@ every tuple of frames is tried, every operator looks at every frame.
 
 from __future__ import annotations
 
+import math
 import random
 import re
 import sys
@@ -34,6 +35,12 @@ if TYPE_CHECKING:
 
 Binding = dict[str, int]
 GAP = 2.5
+WINDOWS = {
+    "min_over": min,
+    "max_over": max,
+    "sum_over": math.fsum,
+    "avg_over": lambda values: math.fsum(values) / len(values),
+}
 AHEAD = {"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"}
 
 
@@ -48,7 +55,7 @@ def parts_of(expression: Any) -> Iterator[Any]:
 
 
 def is_temporal(expression: Any) -> bool:
-    courses = {"prev", "delta", "run_length", "since_true", "age", "exists_now"}
+    courses = {"prev", "delta", "run_length", "since_true", "age", "exists_now", *WINDOWS}
     return any(
         isinstance(part, s.Temporal) or (isinstance(part, s.Call) and part.name in courses)
         for part in parts_of(expression)
@@ -192,6 +199,11 @@ class Told:
                 return None if i == 0 or self.gap_before(i) else self.value(inner, i - 1, binding)
             case s.Call(name="delta", arguments=(inner, by)):
                 return self.delta(inner, by, i, binding)
+            case s.Call(name=name, arguments=(inner, by)) if name in WINDOWS:
+                frames = self.last_frames(by, i)
+                told = [self.value(inner, j, binding) for j in frames]
+                known = [value for value in told if value is not None]
+                return WINDOWS[name](known) if known else None
             case s.Call(name="run_length", arguments=(inner,)):
                 run = self.run_up_to(inner, i, binding)
                 return (self.times[i] - self.times[run[0]]) / 1e9 if run else 0
@@ -221,6 +233,14 @@ class Told:
                 break
             i -= 1
         return run
+
+    def last_frames(self, by: s.Duration, i: int) -> list[int]:
+        """The frames of a window, back to a gap."""
+        back = next((j for j in range(i, 0, -1) if self.gap_before(j)), 0)
+        if by.unit == "frames":
+            return [j for j in range(back, i + 1) if i - j < by.amount]
+        limit = by.ns + self.slack
+        return [j for j in range(back, i + 1) if self.times[i] - self.times[j] <= limit]
 
     def delta(self, inner: Any, by: s.Duration, i: int, binding: Binding) -> Any:
         if by.unit == "frames":
@@ -445,8 +465,19 @@ COURSES = (
     "delta(e.speed, 0.2s) > 1 - 0.5 * 2",
     "prev(e.speed) < abs(-1) + e.speed / 2",
     "prev(e.speed) * 4 < frame.t + 1",
+    "min_over(e.speed, 0.3s) > 0.5",
+    "max_over(e.speed, 3frames) > e.speed",
+    "avg_over(e.speed, 0.2s) >= e.speed",
+    "sum_over(e.x, 0.5s) > 3 * sum_over(e.speed, 2frames)",
 )
-PAIR_COURSES = ("prev(dist(e, v)) > dist(e, v)", "exists_now(v)", "age(v) >= 0.1s")
+PAIR_COURSES = (
+    "min_over(dist(e, v), 0.4s) < 6",
+    "avg_over(dist(e, v), 3frames) < max_over(dist(e, v), 0.1s)",
+    "sum_over(e.speed - v.speed, 0.3s) > 0",
+    "prev(dist(e, v)) > dist(e, v)",
+    "exists_now(v)",
+    "age(v) >= 0.1s",
+)
 BOUNDS = ("", "", "[0s, 0.3s]", "[0.1s, 1s]", "[1frames, 3frames]", "[0.2s, INF]")
 HOLDS = ("", "", "", " FOR >= 0.1s", " FOR >= 2frames", " FOR < 0.3s", " FOR >= 0.2s INCLUSIVE")
 THEN = (
@@ -591,6 +622,8 @@ def edge_questions(rng: random.Random) -> Iterator[tuple[str, str, list[str]]]:
             asked = [f"ONCE[0frames, 0frames] ({one})" for one in made] + [f"prev({value})"]
             if value[0] == "r" and value not in {"r.primary", "r.is_own"}:
                 asked += [f"delta({value}, {by})" for by in ("0.2s", "2frames")]
+                words = sorted(WINDOWS.keys() - ({"avg_over"} if "heading" in value else set()))
+                asked += [f"{word}({value}, {by})" for word in words for by in ("0.2s", "2frames")]
             yield pattern, rng.choice(made), asked
 
 

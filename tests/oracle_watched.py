@@ -37,6 +37,9 @@ CHECK met: FORALL (b:Bus|Truck) FORSOME (p:Person) EVENTUALLY dist(b, p) < 20;
 CHECK turning: FORALL (v:Vehicle WHERE v.speed > 5)
   ALWAYS (delta(v.heading, 1s) < 20 OR run_length(v.speed < 3) < 2s)
   RESET WHEN age(v) > 3 AND since_true(v.speed > 1) < 1s;
+CHECK steady: FORALL (v:Vehicle)
+  ALWAYS (max_over(v.speed, 1s) - min_over(v.speed, 5frames) < 3 OR avg_over(dist(ego, v), 2s) > 30)
+  RESET WHEN sum_over(v.accel, 1s) > 0;
 CHECK fast: FORALL (v:Vehicle) EVENTUALLY v.speed > 10;
 CHECK lately: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS ONCE[0s, 5s] v.speed > 1;
 CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND ALWAYS ego.speed < 9;

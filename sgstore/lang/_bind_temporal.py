@@ -108,7 +108,7 @@ def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """A call of ``prev``, ``delta``, ``run_length``, ``since_true``, ``age``, ``exists_now`` or ``t``.
+    """A call of one of :data:`COURSES`: ``prev``, ``delta``, a window, ``run_length``, …, or ``t``.
 
     Raises
     ------
@@ -117,11 +117,12 @@ def course(e: s.Call, names: SymbolTable) -> b.Bound:
     """
     word = normalize_name(e.name)
     _refuse_in_block(f"{e.name}()", e.name_span, names)
-    wanted = 2 if word == "delta" else 1
+    wanted = 2 if word == "delta" or word in _WINDOWS else 1
     if len(e.arguments) != wanted:
         found = len(e.arguments)
         reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {found}"
-        names.session.refuse(reason, e.span)
+        hint = f"say how long the window is: {e.name}(x, 2s)" if word in _WINDOWS else None
+        names.session.refuse(reason, e.span, hint)
     return COURSES[word](e, names)
 
 
@@ -136,11 +137,37 @@ def _previous(e: s.Call, names: SymbolTable) -> b.SignalCall:
 def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
     value = names.number(e.arguments[0])
     _refuse_nested(e, value, names)
+    by = _how_far(e, names)
+    return b.SignalCall("delta", value, by.amount, by.frames)
+
+
+def _how_far(e: s.Call, names: SymbolTable) -> o.Length:
+    """The length of time that is the second argument of a call."""
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
         names.session.refuse("expected a length of time such as 2s", back.span)
-    by = length(back, names)
-    return b.SignalCall("delta", value, by.amount, by.frames)
+    return length(back, names)
+
+
+def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    """A number made of the values of the last frames."""
+    word = _WINDOWS[normalize_name(e.name)]
+    value = names.number(e.arguments[0])
+    _refuse_nested(e, value, names)
+    by = _how_far(e, names)
+    if by.frames and not by.amount:
+        names.session.refuse(
+            f"{word}() of no frame has no value",
+            e.arguments[1].span,
+            "1frames is the frame itself, 10frames are the last ten",
+        )
+    if word == "avg_over" and b.is_angle(value):
+        names.session.refuse(
+            "angles have no average: they come round after 360 degrees",
+            e.arguments[0].span,
+            "that of directions is atan2(avg_over(sin(radians(x)), 2s), avg_over(cos(radians(x)), 2s))",
+        )
+    return b.SignalCall(word, value, by.amount, by.frames)
 
 
 def _run_length(e: s.Call, names: SymbolTable) -> b.SignalCall:
@@ -189,9 +216,12 @@ def _moment(e: s.Call, names: SymbolTable) -> b.Bound:
 FUTURE: Final = frozenset({"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"})
 """Operators that look ahead."""
 
+_WINDOWS: Final = {normalize_name(word): word for word in b.WINDOWS}
+
 COURSES: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     "prev": _previous,
     "delta": _delta,
+    **dict.fromkeys(_WINDOWS, _window),
     "runlength": _run_length,
     "sincetrue": _since_true,
     "age": _age,

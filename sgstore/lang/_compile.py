@@ -33,6 +33,7 @@ from sgstore.lang._symbols import traces_in
 from sgstore.lang.ir import (
     FRAME_COLUMNS,
     INTERVAL_COLUMNS,
+    WINDOWS,
     Aggregate,
     BlockValue,
     Bound,
@@ -436,7 +437,8 @@ def _over_time(value: Tense | SignalCall | StepTime, indent: str) -> str:
             left, right = (value_text(operand, indent) for operand in operands)
             return f"({left} {word}{bound} {right})"
         case SignalCall(word=word, operand=operand):
-            by = f", {_length(value.by, frames=value.frames)}" if word == "delta" else ""
+            back = word in {"delta", *WINDOWS}
+            by = f", {_length(value.by, frames=value.frames)}" if back else ""
             counted = " in frames" if word in {"run_length", "since_true"} and value.frames else ""
             return f"{word}({value_text(operand, indent)}{by}){counted}"
         case StepTime(step=step):

@@ -25,7 +25,16 @@ _AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
 _OTHERS: Final = frozenset(
     {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", *OF_TEXT}
 )
-_COURSES: Final = ("prev", "delta", "run_length", "since_true", "t", "age", "exists_now")
+_COURSES: Final = (
+    "prev",
+    "delta",
+    *b.WINDOWS,
+    "run_length",
+    "since_true",
+    "t",
+    "age",
+    "exists_now",
+)
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
     {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *OF_TWO, *_OTHERS, *_AGGREGATES, *_COURSES}

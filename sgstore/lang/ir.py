@@ -291,11 +291,11 @@ class SignalCall:
     Attributes
     ----------
     word : str
-        ``prev``, ``delta``, ``run_length``, ``since_true``, ``age`` or ``exists_now``.
+        ``prev``, ``delta``, one of :data:`WINDOWS`, ``run_length``, ``since_true``, ``age`` or ``exists_now``.
     operand : Bound
         A value, a condition (``run_length``, ``since_true``), or a node (``age``, ``exists_now``).
     by : int
-        How far ``delta`` looks back; ns, or frames.
+        How far ``delta`` looks back, and how long a window is; ns, or frames.
     frames : bool
         Whether ``by``, or the number that it gives, counts frames; else time.
     type : Type
@@ -306,6 +306,15 @@ class SignalCall:
     by: int = 0
     frames: bool = False
     type: Type = Type.number
+
+
+WINDOWS: Final = ("min_over", "max_over", "avg_over", "sum_over")
+"""Functions of the values of the last frames."""
+
+ANGLES: Final = frozenset(
+    {"heading", "pitch", "roll", "bearing", "rel_heading", "apparent_heading", "heading_error"}
+)
+"""Values that come round after 360 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -570,6 +579,17 @@ def conjuncts(expression: Bound) -> list[Bound]:
 def is_temporal(expression: Bound) -> bool:
     """Tell whether an expression looks at more than one frame."""
     return any(isinstance(part, Tense | SignalCall | StepTime) for part in walk(expression))
+
+
+def is_angle(value: Bound) -> bool:
+    """Tell whether a value comes round after 360 degrees."""
+    match value:
+        case NodeAttribute(attribute=attribute) | EdgeAttribute(attribute=attribute):
+            return attribute.name in ANGLES
+        case PairNumber(function=function):
+            return function in ANGLES
+        case _:
+            return False
 
 
 def nodes_of(expression: Bound) -> frozenset[str]:

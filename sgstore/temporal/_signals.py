@@ -30,6 +30,7 @@ from sgstore.temporal._formula import (
     Until,
     propositions,
 )
+from sgstore.temporal._windows import over_columns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -225,15 +226,11 @@ def _at(places: Places, frame: Places | None) -> Places:
     return np.where(inside, told, np.where(frame < 0, -1, frames))
 
 
-# Values over time as columns: ``prev``, ``delta``, ``run_length``, ``since_true``, ``age``, and terms of them
+# Values over time as columns: ``prev``, ``delta``, windows, ``run_length``, ``since_true``, ``age``, and terms
 # ------------------------------------------------------------------------------------------------
 # A column of values, :class:`sgstore.lang.Column`, has a row for each binding and a column for each frame.
-# Gaps in a recording are not bridged: behind one, ``prev`` and ``delta`` are unknown and runs begin anew.
-
-ANGLES: Final = frozenset(
-    {"heading", "pitch", "roll", "bearing", "rel_heading", "apparent_heading", "heading_error"}
-)
-"""Values that come round after 360 degrees."""
+# of them
+# Gaps in a recording are not bridged: behind one, ``prev`` and ``delta`` are unknown, runs and windows begin.
 
 NS: Final = 1e9
 
@@ -304,12 +301,15 @@ class SignalValues:
         return Column(np.atleast_2d(found.values), found.known)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """The value of ``prev``, ``delta``, ``run_length``, ``since_true``, ``age`` or ``exists_now``."""
+        """The value of a :class:`~sgstore.lang.ir.SignalCall`."""
         match course.word:
             case "prev":
                 return self._back(self.signal(test.signals[course.operand]), 1)
             case "delta":
                 return self._delta(self.signal(test.signals[course.operand]), course)
+            case word if word in b.WINDOWS:
+                signal = self.signal(test.signals[course.operand])
+                return over_columns(word, signal, self.window_starts(course))
             case "run_length":
                 return self._run_length(self.condition(course.operand, test), frames=course.frames)
             case "since_true":
@@ -331,6 +331,15 @@ class SignalValues:
         known = np.broadcast_to(column.known, (len(column.known), frames))
         return Column(values[:, inside], known[:, inside] & told)
 
+    def window_starts(self, course: b.SignalCall) -> Ints:
+        """(F,) the first frame of the window of a course at each frame; it does not begin before a gap."""
+        times, here = self.clock.times, np.arange(len(self.clock.times))
+        begun = np.maximum.accumulate(np.where(self.clock.gap_before, here, 0))
+        if course.frames:
+            return np.maximum(here - (course.by - 1), begun)
+        then = times - course.by - self.clock.tolerance
+        return np.maximum(np.searchsorted(times, then, "left"), begun)
+
     def _delta(self, now: Column, course: b.SignalCall) -> Column:
         times = self.clock.times
         by: int | Ints = course.by
@@ -340,7 +349,7 @@ class SignalValues:
         before = self._back(now, by)
         known = now.known & before.known
         change = np.where(known, now.values, 0.0) - np.where(known, before.values, 0.0)
-        if not is_angle(course.operand):
+        if not b.is_angle(course.operand):
             return Column(change, known)
         return Column(self._turned(now, by, change), known)
 
@@ -404,17 +413,6 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
             return compared
         case _:
             return None
-
-
-def is_angle(value: b.Bound) -> bool:
-    """Tell whether a value comes round after 360 degrees."""
-    match value:
-        case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
-            return attribute.name in ANGLES
-        case b.PairNumber(function=function):
-            return function in ANGLES
-        case _:
-            return False
 
 
 def _of_time(operation: b.Operation) -> bool:

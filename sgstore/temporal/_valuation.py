@@ -22,7 +22,8 @@ from sgstore.errors import QueryError
 from sgstore.lang import FUTURE, Binding, Column, ScopeSearch, expression, unnumbered_text
 from sgstore.lang import ir as b
 from sgstore.temporal._formula import Progression, ProgressionFrame, Tick
-from sgstore.temporal._signals import NS, Clock, SignalValues, is_angle, wrapped
+from sgstore.temporal._signals import NS, Clock, SignalValues, wrapped
+from sgstore.temporal._windows import next_window, window_value
 from sgstore.vocabulary import RELATIONS
 from sgstore.world import longest_step_ns, tolerance_ns
 
@@ -279,6 +280,9 @@ def _told(query: b.Query) -> tuple[Any, ...]:
 TIMES: Final = 1001
 """Times between frames of which the median is taken, the latest ones."""
 
+NEVER: Final = 1 << 62
+"""Later than any frame."""
+
 Memory = tuple[Any, ...]
 """What a binding remembers: for each course, and each condition in one, what it needs of former frames."""
 
@@ -369,6 +373,7 @@ class SignalState:
             for condition, formula in test.formulas.items():
                 self.conditions[condition] = Progression(formula)
         self._frames: deque[tuple[int, int]] = deque()  # times and numbers since the last gap
+        self._begun = 0  # the number of the first frame behind it
         deltas = [c for c in self.places if isinstance(c, b.SignalCall) and c.word == "delta"]
         self._back = max((c.by for c in deltas if not c.frames), default=0)
         self._many = max((c.by for c in deltas if c.frames), default=0)
@@ -384,6 +389,7 @@ class SignalState:
         tick = self.pulse.tick
         if self.gap:
             self._frames.clear()
+            self._begun = tick.number
         self._frames.append((tick.time, tick.number))
         while len(self._frames) > self._many + 1 and self._frames[1][0] <= tick.time - self._back:
             self._frames.popleft()
@@ -397,6 +403,13 @@ class SignalState:
     def oldest(self) -> int:
         """The number of the first frame that is still looked back to."""
         return self._frames[0][1]
+
+    def window(self, course: b.SignalCall) -> tuple[int, int]:
+        """Number and time of the oldest frame that the window of a course may have now."""
+        tick = self.pulse.tick
+        if course.frames:
+            return max(tick.number - course.by + 1, self._begun), -NEVER
+        return self._begun, tick.time - course.by - tick.tolerance
 
     def there(self, course: b.SignalCall) -> int:
         """The number of the frame that ``delta`` compares this one with; -1: there is none."""
@@ -515,14 +528,15 @@ class _Now(SignalValues):
 
     def _course(self, course: b.SignalCall, test: Test) -> Column:
         match course.word:
-            case "prev" | "delta":
+            case "prev" | "delta" | "min_over" | "max_over" | "avg_over" | "sum_over":
                 column = self.signal(test.signals[course.operand])
                 known = np.broadcast_to(column.known[:, 0], self._rows).tolist()
                 values = np.broadcast_to(column.values[:, 0], self._rows).tolist()
                 now = [value if told else None for value, told in zip(values, known, strict=True)]
-                return (
-                    self._prev(course, now) if course.word == "prev" else self._changed(course, now)
-                )
+                if course.word == "prev":
+                    return self._prev(course, now)
+                changed = course.word == "delta"
+                return self._changed(course, now) if changed else self._over(course, now)
             case "run_length" | "since_true":
                 flags = self.condition(course.operand, test)[:, 0].tolist()
                 if course.word == "run_length":
@@ -551,7 +565,7 @@ class _Now(SignalValues):
         return column_of(list(known))
 
     def _changed(self, course: b.SignalCall, now: list[Any]) -> Column:
-        there, turns = self._all.there(course), is_angle(course.operand)
+        there, turns = self._all.there(course), b.is_angle(course.operand)
         told: list[float | None] = []
         kept: list[_Trail | None] = []
         for old, value in zip(self._old[course], now, strict=True):
@@ -570,6 +584,14 @@ class _Now(SignalValues):
             told.append(change)
         self._new[course] = kept
         return column_of(told)
+
+    def _over(self, course: b.SignalCall, now: list[Any]) -> Column:
+        oldest, tick = self._all.window(course), self._tick
+        self._new[course] = [
+            next_window(course.word, old, value, tick, oldest)
+            for old, value in zip(self._old[course], now, strict=True)
+        ]
+        return column_of([window_value(course.word, one) for one in self._new[course]])
 
     def _run_now(self, course: b.SignalCall, flags: list[bool]) -> Column:
         tick, gap = self._tick, self._all.gap

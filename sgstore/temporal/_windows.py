@@ -1,0 +1,207 @@
+"""Numbers over stretches of frames: the least, the greatest, the sum and the average.
+
+Over columns a stretch is told by its first frame and by the one behind its last, for each frame, and is worked
+out for all frames at once, in O(n log w) for the longest stretch w. A stream keeps the values that its window
+still has.
+
+**Sums are rounded once**: over columns they are differences of sums of three times the digits, in a stream they
+are whole numbers. So the order in which values are added, and what lies before the window, make no difference.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.lang import Column
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sgstore.temporal._formula import Tick
+    from sgstore.world import Floats
+
+    Places = NDArray[np.int32 | np.int64]
+
+
+# Over columns -------------------------------------------------------------------------------------
+
+
+def over_columns(word: str, column: Column, first: Places) -> Column:
+    """A function of the values known in the window that ends at each frame.
+
+    Parameters
+    ----------
+    word : str
+        One of :data:`sgstore.lang.ir.WINDOWS`.
+    column : Column
+        (B, F) the values.
+    first : (F,) int
+        The first frame of each window.
+
+    Returns
+    -------
+    Column
+        (B, F); unknown where no value in the window is known.
+    """
+    frames = len(first)
+    end = np.arange(1, frames + 1)
+    shape = (*np.shape(column.values)[:-1], frames)
+    values = np.broadcast_to(np.asarray(column.values, np.float64), shape)
+    known = np.broadcast_to(column.known, shape)
+    if word in {"min_over", "max_over"}:
+        sign = 1.0 if word == "max_over" else -1.0
+        found = sign * greatest(np.where(known, sign * values, -np.inf), first, end)
+        return Column(found, _counts(known, first, end) > 0)
+    known = known & np.isfinite(values)
+    count = _counts(known, first, end)
+    total = sums(np.where(known, values, 0.0), first, end)
+    if word == "avg_over":
+        total = total / np.maximum(count, 1)
+    return Column(total, count > 0)
+
+
+def greatest(values: Floats, first: Places, end: Places) -> Floats:
+    """(B, F) the greatest of the values from ``first`` to before ``end``; ``-inf`` of none.
+
+    Parameters
+    ----------
+    values : (B, N) float64
+    first, end : (F,) int
+        From 0 to N.
+    """
+    length = np.maximum(end - first, 0)
+    found = np.full((len(values), len(first)), -np.inf)
+    longest, size = int(length.max(initial=0)), 1
+    most = values
+    # The greatest of so many values is that of two stretches that may overlap.
+    while size <= longest:
+        takes = np.flatnonzero((length >= size) & (length < 2 * size))
+        if len(takes):
+            one, other = first[takes], end[takes] - size
+            found[:, takes] = np.maximum(most[:, one], most[:, other])
+        if 2 * size <= longest:
+            most = np.maximum(most[:, :-size], most[:, size:])
+        size *= 2
+    return found
+
+
+def sums(values: Floats, first: Places, end: Places) -> Floats:
+    """(B, F) the sums of the values from ``first`` to before ``end``, rounded once.
+
+    Parameters
+    ----------
+    values : (B, N) float64
+        Finite.
+    first, end : (F,) int
+        From 0 to N.
+    """
+    total, less = _summed(values)
+    lost, little = _summed(less)
+    rest, _ = _summed(little)
+    whole, more = _difference(total, first, end)
+    part, fraction = _difference(lost, first, end)
+    tail = fraction + (rest[:, end] - rest[:, first])
+    middle = more + part
+    tail += _lost(more, part, middle)
+    found = whole + middle
+    return found + (_lost(whole, middle, found) + tail)
+
+
+def _summed(values: Floats) -> tuple[Floats, Floats]:
+    """(B, N + 1) the sums of the first values, as they are rounded; (B, N) what each addition lost."""
+    total = np.zeros((len(values), values.shape[1] + 1))
+    np.cumsum(values, axis=1, out=total[:, 1:])
+    return total, _lost(total[:, :-1], values, total[:, 1:])
+
+
+def _difference(total: Floats, first: Places, end: Places) -> tuple[Floats, Floats]:
+    """The difference of sums, rounded, and what that lost."""
+    one, other = total[:, end], -total[:, first]
+    found = one + other
+    return found, _lost(one, other, found)
+
+
+def _lost(one: Floats, other: Floats, total: Floats) -> Floats:
+    """What a rounded sum of two lacks, exactly (Knuth's TwoSum)."""
+    part = total - one
+    return (one - (total - part)) + (other - part)
+
+
+def _counts(known: NDArray[np.bool_], first: Places, end: Places) -> NDArray[np.int64]:
+    total = np.zeros((len(known), known.shape[1] + 1), np.int64)
+    np.cumsum(known, axis=1, out=total[:, 1:])
+    return total[:, end] - total[:, first]
+
+
+# Frame by frame -----------------------------------------------------------------------------------
+
+Point = tuple[int, int, float]
+"""A frame in which a value was known: its number, its time (ns), and the value."""
+
+Window = tuple[tuple[Point, ...], int]
+"""What a stream keeps of a window: points, and their exact sum in units of the smallest number there is."""
+
+_UNIT: Final = 1074
+"""The smallest number above 0 is 2 to the power of minus this."""
+
+
+def next_window(
+    word: str, window: Window | None, value: float | None, here: Tick, oldest: tuple[int, int]
+) -> Window | None:
+    """A window with the value of one more frame, and without what it has left behind.
+
+    Parameters
+    ----------
+    word : str
+        As of :func:`over_columns`.
+    window : Window or None
+        ``None``: it is empty.
+    value : float or None
+        ``None``: it is not known.
+    here : Tick
+        The frame.
+    oldest : (int, int)
+        Number and time (ns) of the oldest frame that the window may have.
+    """
+    points, total = window or ((), 0)
+    gone = 0
+    while gone < len(points) and (points[gone][0] < oldest[0] or points[gone][1] < oldest[1]):
+        gone += 1
+    summed = word in {"sum_over", "avg_over"}
+    if summed:
+        total -= sum(_exact(point[2]) for point in points[:gone])
+    points = points[gone:]
+    if value is not None and (math.isfinite(value) or not summed):
+        if summed:
+            total += _exact(value)
+        else:  # what is no less, or no greater, and older is never told again
+            sign = 1 if word == "max_over" else -1
+            kept = len(points)
+            while kept and sign * points[kept - 1][2] <= sign * value:
+                kept -= 1
+            points = points[:kept]
+        points = (*points, (here.number, here.time, value))
+    return (points, total) if points else None
+
+
+def window_value(word: str, window: Window | None) -> float | None:
+    """The number that a window makes; ``None``: no value in it is known."""
+    if window is None:
+        return None
+    points, total = window
+    if word in {"min_over", "max_over"}:
+        return points[0][2]
+    try:
+        found = total / (1 << _UNIT)
+    except OverflowError:
+        found = math.copysign(math.inf, total)
+    return found / len(points) if word == "avg_over" else found
+
+
+def _exact(value: float) -> int:
+    """A number in units of the smallest one."""
+    part, whole = float(value).as_integer_ratio()
+    return part << (_UNIT - whole.bit_length() + 1)
