@@ -41,6 +41,7 @@ WINDOWS = {
     "sum_over": math.fsum,
     "avg_over": lambda values: math.fsum(values) / len(values),
 }
+TIMED = {"run_length", "since_true", "age"}
 AHEAD = {"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"}
 
 
@@ -151,6 +152,66 @@ class Told:
                     for j in near
                 )
 
+    # Margins: by how much a condition is true
+
+    def margin(self, e: Any, i: int, binding: Binding) -> float:
+        """By how much a condition holds at a frame: a comparison of numbers by their difference."""
+        match e:
+            case s.Logic(word=word, operands=operands):
+                margins = [self.margin(operand, i, binding) for operand in operands]
+                one, other = margins[0], margins[-1]
+                return {
+                    "NOT": -one,
+                    "AND": min(margins),
+                    "OR": max(margins),
+                    "XOR": max(min(one, -other), min(-one, other)),
+                    "IMPLIES": max(-one, other),
+                }[word]
+            case s.Temporal():
+                return self.margin_over_time(e, i, binding)
+            case s.Comparison(word=word, left=left, right=right):
+                frames = isinstance(right, s.Duration) and right.unit == "frames"
+                one = self.counted(left, i, binding) if frames else self.value(left, i, binding)
+                other = self.value(right, i, binding)
+                if not all(isinstance(v, int | float) or v is None for v in (one, other)):
+                    return math.inf if self.true(e, i, binding) else -math.inf
+                if one is None or other is None:
+                    return -math.inf
+                timed = isinstance(left, s.Call) and left.name in TIMED and not frames
+                apart = 0.0 if timed and abs(one - other) <= self.slack / 1e9 else one - other
+                signs = {"<": -apart, "<=": -apart, ">": apart, ">=": apart}
+                return {**signs, "=": -abs(apart), "<>": abs(apart)}[word]
+            case _:
+                return math.inf if self.true(e, i, binding) else -math.inf
+
+    def margin_over_time(self, e: s.Temporal, i: int, binding: Binding) -> float:
+        last = len(self.frames) - 1
+        near = [j for j in range(last + 1) if self.within(e, i, j)]
+        left, right = e.operands[0], e.operands[-1]
+
+        def at(operand: Any, frames: Any) -> list[float]:
+            return [self.margin(operand, j, binding) for j in frames]
+
+        match e.word:
+            case "NEXT" | "WEAKNEXT":
+                end = -math.inf if e.word == "NEXT" else math.inf
+                return at(right, [i + 1])[0] if i < last else end
+            case "PREVIOUS":
+                return at(right, [i - 1])[0] if i else -math.inf
+            case "ALWAYS" | "HISTORICALLY":
+                return min(at(right, near), default=math.inf)
+            case "EVENTUALLY" | "ONCE":
+                return max(at(right, near), default=-math.inf)
+            case "RELEASE":
+                return min(
+                    (max(at(right, [j]) + at(left, range(i, j))) for j in near), default=math.inf
+                )
+            case "UNTIL":
+                ways = (min(at(right, [j]) + at(left, range(i, j))) for j in near)
+            case _:
+                ways = (min(at(right, [j]) + at(left, range(j + 1, i + 1))) for j in near)
+        return max(ways, default=-math.inf)
+
     def within(self, e: s.Temporal, i: int, j: int) -> bool:
         sign = 1 if e.word in AHEAD else -1
         if sign * (j - i) < 0:
@@ -175,11 +236,7 @@ class Told:
                 frames = isinstance(right, s.Duration) and right.unit == "frames"
                 one = self.value(left, i, binding) if not frames else self.counted(left, i, binding)
                 other = self.value(right, i, binding)
-                timed = isinstance(left, s.Call) and left.name in {
-                    "run_length",
-                    "since_true",
-                    "age",
-                }
+                timed = isinstance(left, s.Call) and left.name in TIMED
                 same = timed and not frames and one is not None
                 if same and abs(one - other) <= self.slack / 1e9:
                     one = other
@@ -693,7 +750,8 @@ def compare_check(world: World, store: Store, check: str) -> int:
     text = f"USING UNKNOWN false {check}"
     (statement,) = parse(text)
     assert isinstance(statement, s.CheckClause)
-    found = {verdict.trace: verdict.verdict == "true" for verdict in store.check(text)}
+    verdicts = {verdict.trace: verdict for verdict in store.check(f"{text} ROBUSTNESS")}
+    found = {name: verdict.verdict == "true" for name, verdict in verdicts.items()}
     period = periods(store)
     named = (s.Variable, s.NodePattern)
     spoken = {p.name for p in parts_of(statement.formula) if isinstance(p, named)}
@@ -709,6 +767,21 @@ def compare_check(world: World, store: Store, check: str) -> int:
         values = [told.true(statement.formula, 0, binding) for binding in bindings]
         expected = any(values) if "FORSOME" in check else all(values)
         assert found[trace.name] == expected, (text, trace.name, found[trace.name], expected)
+        margins = [told.margin(statement.formula, 0, binding) for binding in bindings]
+        wanted = (
+            max(margins, default=-math.inf)
+            if "FORSOME" in check
+            else min(margins, default=math.inf)
+        )
+        robustness = verdicts[trace.name].robustness
+        assert robustness is not None
+        assert math.isclose(robustness.value, wanted, rel_tol=1e-9, abs_tol=1e-9), (
+            text,
+            trace.name,
+            robustness,
+            wanted,
+        )
+        assert robustness.value == 0 or (robustness.value > 0) == expected, (text, robustness)
     return sum(not holds for holds in found.values())
 
 

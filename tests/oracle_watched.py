@@ -6,6 +6,7 @@ witnesses, and what each pattern of the library finds, must be the same.
 
 from __future__ import annotations
 
+import math
 import sys
 import tempfile
 from collections import Counter
@@ -45,6 +46,21 @@ CHECK lately: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS ONCE[0s, 5s] v.speed > 1;
 CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND ALWAYS ego.speed < 9;
 USING END pending CHECK due: EVENTUALLY ego.speed > 40;
 USING END weak CHECK forgiven: EVENTUALLY ego.speed > 40
+"""
+
+MARGINS = """
+CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 ROBUSTNESS;
+CHECK faster: FORSOME (v:Vehicle) EVENTUALLY (v.speed > 8 AND prev(v.speed) <= 8) ROBUSTNESS;
+CHECK met: FORALL (b:Bus|Truck) FORSOME (p:Person) EVENTUALLY dist(b, p) < 20 ROBUSTNESS;
+CHECK turning: FORALL (v:Vehicle WHERE v.speed > 5)
+  ALWAYS (delta(v.heading, 1s) < 20 OR run_length(v.speed < 3) < 2s) ROBUSTNESS;
+CHECK lately: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS ONCE[0s, 5s] v.speed > 1 ROBUSTNESS;
+CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND ALWAYS ego.speed < 9
+  ROBUSTNESS;
+CHECK again: ALWAYS EVENTUALLY (ego.speed < 2 OR NOT (ego.speed > 1 UNTIL min_over(ego.speed, 1s) > 3))
+  ROBUSTNESS;
+CHECK near: FORALL (v:Vehicle) (EXISTS {(ego)-[:near]->(v)} AND v.speed < 5) SINCE[0s, 2s] v.speed > 9
+  ROBUSTNESS;
 """
 
 SEQUENCES = (
@@ -121,6 +137,22 @@ class Drive:
         alone = {v.check: len(v.violations) for v in wanted if not v.witnesses and v.violated}
         assert {name: violated[name] for name in alone} == alone, (self.name, text)
         return sum(len(v.violations) for v in wanted)
+
+    def compare_margins(self, text: str) -> int:
+        """By how much checks are met, watched and stored; how many numbers are finite."""
+        verdicts, _, monitor = self.watched(text)
+        stored = {verdict.check: verdict.robustness for verdict in self.store.check(text)}
+        seen = {verdict.check: verdict.robustness for verdict in verdicts}
+        assert seen.keys() == stored.keys()
+        for check, one in seen.items():
+            other = stored[check]
+            assert (one is None) == (other is None), (self.name, check)
+            if one is not None and other is not None:
+                near = math.isclose(one.value, other.value, rel_tol=1e-9, abs_tol=1e-9)
+                assert near, (self.name, check, one, other)
+                assert monitor.robustness[check] == one
+                assert bool(one.condition) == bool(other.condition), (self.name, check, one, other)
+        return sum(one is not None and math.isfinite(one.value) for one in seen.values())
 
     def compare_matches(self, texts: Sequence[str]) -> list[int]:
         """What is found, by the frame it begins in and who it is; how often, of each."""

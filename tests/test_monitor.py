@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from oracle_monitor import try_states
 from oracle_over_time import edge_questions
-from oracle_watched import CHECKS, SEQUENCES, Drive, library_checks
+from oracle_watched import CHECKS, MARGINS, SEQUENCES, Drive, library_checks
 from thorough import LONG
 
 import sgstore.temporal._sequences as joins
@@ -68,6 +68,32 @@ def test_a_recording_watched_has_the_verdicts_that_it_has_in_a_store(
     text: str, town: Drive
 ) -> None:
     assert town.compare_checks(text) > 3
+
+
+def test_a_recording_watched_meets_checks_by_as_much_as_in_a_store(town: Drive) -> None:
+    assert town.compare_margins(MARGINS) >= 6
+
+
+def test_by_how_much_a_check_is_met_so_far_is_known_at_any_time() -> None:
+    monitor = Monitor(
+        "CHECK slow: FORALL (v:Vehicle) ALWAYS v.speed < 5 ROBUSTNESS;"
+        " CHECK fast: EVENTUALLY ego.speed > 5 ROBUSTNESS; CHECK plain: ALWAYS ego.speed < 5"
+    )
+    assert monitor.robustness == {}
+    told = []
+    for t, speed in enumerate([1, 3, 2, 6]):
+        monitor.step(moving(t / 10, speed))
+        told.append({name: (one.value, *one.names) for name, one in monitor.robustness.items()})
+
+    assert [one["slow"] for one in told] == [(4, "v"), (2, "v"), (2, "v"), (-1, "v")]
+    assert [one["fast"] for one in told] == [(-5,), (-5,), (-5,), (-5,)]
+    assert "plain" not in told[0]
+
+
+def moving(t: float, speed: float) -> Frame:
+    frame = car(t, 0)
+    frame.add("v", "car", 9.0, 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=speed, vy=0.0)
+    return frame
 
 
 def test_what_sgsm_would_report_is_told_in_the_frames_with_which_the_trace_may_not_end(

@@ -5,6 +5,7 @@ Verdicts as JUnit's XML, which build servers read: a test for each check and tra
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from dataclasses import asdict
@@ -155,11 +156,19 @@ def check(
             tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
             yield verdict
 
+    quantitative = run.quantitative
     if ask.for_people:
-        ask.write(COLUMNS, (row for one in counted() for row in _rows(one)))
+        more = MARGIN_COLUMNS if quantitative else ()
+        told = ((*row, *_margin(one)[: len(more)]) for one in counted() for row in _rows(one))
+        ask.write((*COLUMNS, *more), told)
         say(", ".join(f"{count} {word}" for word, count in tally.items()))
     else:
-        ask.write(_DOCUMENT, map(_document, counted()))
+        more = ("robustness",) if quantitative else ()
+        told = (
+            (*_document(one), _margin_document(one))[: len(_DOCUMENT) + len(more)]
+            for one in counted()
+        )
+        ask.write((*_DOCUMENT, *more), told)
     say_unknown((one.check, one.trace, one.reason) for one in kept)
     if junit is not None:
         write_junit(junit, kept)
@@ -205,6 +214,30 @@ def _document(verdict: Verdict) -> tuple[Any, ...]:
     ]
     head = verdict.check, verdict.trace, verdict.verdict, verdict.reason or None
     return (*head, spans[0] if spans else None, spans, witnesses)
+
+
+MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
+"""Columns of checks with ``ROBUSTNESS``."""
+
+
+def _margin(verdict: Verdict) -> tuple[Any, ...]:
+    """By how much a check is met, as a person reads it: the number, the condition and who, and the frame."""
+    found = verdict.robustness
+    if found is None:
+        return "", "", ""
+    who = ", ".join(f"{variable} = {name}" for variable, name in found.names.items())
+    decided = f"{found.condition} ({who})" if found.condition and who else found.condition or who
+    frame = "" if found.seq is None else f"{verdict.trace}#{found.seq}"
+    return f"{found.value:.4g}", decided, frame
+
+
+def _margin_document(verdict: Verdict) -> dict[str, Any] | None:
+    """The same as a program reads it; no number is infinite in JSON."""
+    found = verdict.robustness
+    if found is None:
+        return None
+    value = found.value if math.isfinite(found.value) else None
+    return {**asdict(found), "value": value}
 
 
 def _span(interval: Interval) -> dict[str, Any]:
@@ -311,11 +344,16 @@ def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
             "violations": len(verdict.violations),
             "reason": verdict.reason or None,
         }
+        if verdict.robustness is not None:
+            about["robustness"] = _margin_document(verdict)
         _line(json_text(about))
     else:
         count = len(verdict.violations)
         more = f"  {count} violation{'s' * (count > 1)}" if count else ""
         why = f"  ({verdict.reason})" if verdict.reason else ""
+        margin, decided, _ = _margin(verdict)
+        more += f"  robustness {margin}" if margin else ""
+        more += f"  {decided}" if decided else ""
         _line(f"{verdict.check}: {verdict.verdict}{more}{why}")
 
 

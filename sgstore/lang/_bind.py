@@ -683,6 +683,12 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
     reset = None
     if written.reset is not None:
         reset = settled(names.condition(written.reset), session)
+    if written.robustness and settings.end == "weak":
+        session.refuse(
+            "USING END weak forgives what is due at the end of a trace, and robustness counts it",
+            written.span,
+            "leave out USING END weak, or ROBUSTNESS; bound the formula: EVENTUALLY[0s, 5s] …",
+        )
     refuse_strange(session, catalog)
     return o.BoundCheck(
         name,
@@ -696,6 +702,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         settings.unknown_is_false,
         settings.end or "strong",
         settings.gaps or "break",
+        written.robustness,
     )
 
 

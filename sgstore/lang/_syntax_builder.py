@@ -387,10 +387,10 @@ def _match(span: TextSpan, children: Children) -> s.MatchClause:
 
 
 def _check(span: TextSpan, children: Children) -> s.CheckClause:
-    settings, name, *quantifiers, formula, reset = children
-    return s.CheckClause(
-        settings or (), name and name.text, tuple(quantifiers), formula, reset, span
-    )
+    settings, name, *quantifiers, formula, reset, robustness = children
+    called = name and name.text
+    asked = robustness is not None
+    return s.CheckClause(settings or (), called, tuple(quantifiers), formula, reset, asked, span)
 
 
 def _quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:

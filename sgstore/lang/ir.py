@@ -760,6 +760,8 @@ class BoundCheck:
     gaps : str
         Whether a gap in the recording ends a run (``break``) or not (``bridge``); with ``unknown`` nothing is
         known of what happened in it.
+    robustness : bool
+        Whether it is asked by how much the formula is true, or false.
     """
 
     name: str
@@ -773,3 +775,4 @@ class BoundCheck:
     unknown_is_false: bool = False
     end: str = "strong"
     gaps: str = "break"
+    robustness: bool = False

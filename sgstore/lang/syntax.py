@@ -463,13 +463,14 @@ class QuantifierClause:
 
 @dataclass(frozen=True, slots=True)
 class CheckClause:
-    """``USING … CHECK name: quantifiers formula RESET WHEN condition``."""
+    """``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS``."""
 
     settings: tuple[Setting, ...]
     name: str | None
     quantifiers: tuple[QuantifierClause, ...]
     formula: Expression
     reset: Expression | None
+    robustness: bool
     span: TextSpan
 
 

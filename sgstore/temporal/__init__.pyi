@@ -7,6 +7,7 @@ from ._formula import Formula as Formula
 from ._matches import TemporalMatches as TemporalMatches
 from ._monitor import Monitor as Monitor
 from ._monitor import opened as opened
+from ._robustness import Robustness as Robustness
 from ._sequence_monitor import FrameTime as FrameTime
 from ._sequence_monitor import MonitorEvent as MonitorEvent
 from ._signals import evaluate as evaluate
@@ -17,6 +18,7 @@ __all__ = [
     "FrameTime",
     "Monitor",
     "MonitorEvent",
+    "Robustness",
     "TemporalMatches",
     "Verdict",
     "evaluate",

@@ -38,6 +38,7 @@ from sgstore.temporal._formula import (
     propositions,
 )
 from sgstore.temporal._plan import plan_of_check
+from sgstore.temporal._robustness_monitor import RobustnessMonitor
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 from sgstore.temporal._verdicts import (
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang.ir import BoundCheck, BoundQuantifier
+    from sgstore.temporal._robustness import Robustness
     from sgstore.temporal._valuation import Key, Memory, QueryCache, StreamClock
     from sgstore.world import Bools
 
@@ -408,6 +410,7 @@ class CheckMonitor:
         nodes = check.scope.nodes.items()
         self._domains = {key: questions.met(node.kinds) for key, node in nodes}
         self._kinds = {node.kinds for _, node in nodes}
+        self._margins = RobustnessMonitor(check, questions, pulse) if check.robustness else None
         self._told: dict[Key, tuple[int, int]] = {}
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
 
@@ -420,6 +423,8 @@ class CheckMonitor:
 
     def step(self, here: FrameTime) -> list[MonitorEvent]:
         """A frame has come, and the questions were asked of it: what is known from it on."""
+        if self._margins is not None:
+            self._margins.step()
         known = self._known
         found = {row: entry for row, entry in known.held.items() if entry.final}
         left = (row for row in known.held if row not in found) if found else known.held
@@ -530,6 +535,11 @@ class CheckMonitor:
 
     # The end
 
+    @property
+    def robustness(self) -> Robustness | None:
+        """Margin by which the check is met if the trace ends now; ``None``: it is not asked."""
+        return None if self._margins is None else self._margins.told(self._levels(), self._domains)
+
     def status(self) -> str:
         """The status of the check for the entities seen so far: one of ``STATUS``."""
         levels = self._levels()
@@ -584,6 +594,8 @@ class CheckMonitor:
             violations,
             _interval(trace, (last, last), {}),
         )
+        if self._margins is not None:
+            found = replace(found, robustness=self._margins.told(levels, self._domains))
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
 
     def _at_end(

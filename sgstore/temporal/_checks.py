@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from heapq import merge
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -19,10 +19,16 @@ from sgstore.lang import (
     traces_of,
 )
 from sgstore.matches import Interval, notes_in
-from sgstore.temporal._formula import tolerant
+from sgstore.temporal._formula import Formula, formula_text, tolerant
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
 from sgstore.temporal._plan import plan_of_check, plan_text
+from sgstore.temporal._robustness import (
+    MarginTable,
+    Robustness,
+    condition_text,
+    margin_columns,
+)
 from sgstore.temporal._verdicts import (
     CERTAINLY_TRUE,
     PRESUMABLY_TRUE,
@@ -41,7 +47,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog, CheckInCatalog
     from sgstore.lang.ir import BoundCheck, BoundQuantifier
     from sgstore.store import StoreFile
-    from sgstore.world import Bools, Ints
+    from sgstore.world import Bools, Floats, Ints
 
     Keys = NDArray[np.int64]
     Statuses = NDArray[np.int8]
@@ -49,6 +55,10 @@ if TYPE_CHECKING:
 
 
 # Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
+
+
+MARGIN_CELLS: Final = 16
+"""Times the memory of a truth value that the margins of a formula take, some being held at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +156,31 @@ def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list
     return found
 
 
+def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int | None]:
+    """The margin of a check, given those of its bindings, and the binding that decides (``None``: none).
+
+    Parameters
+    ----------
+    levels : sequence of Level
+    values : (B,) float64
+        Of the bindings of the last level.
+    """
+    if not levels:
+        return float(values[0]), 0
+    rows = np.arange(len(values))
+    for number in range(len(levels) - 1, -1, -1):
+        level = levels[number]
+        outer = len(levels[number - 1].bindings) if number else 1
+        every = level.word == "FORALL"
+        order = np.lexsort((values if every else -values, level.parents))
+        parents, where = np.unique(level.parents[order], return_index=True)
+        joined = np.full(outer, np.inf if every else -np.inf)
+        chosen = np.full(outer, -1)
+        joined[parents], chosen[parents] = values[order][where], rows[order][where]
+        values, rows = joined, chosen
+    return float(values[0]), int(rows[0]) if rows[0] >= 0 else None
+
+
 # ``CHECK`` over a store: verdicts of its traces, where they are violated, and by whom -----------
 
 
@@ -209,6 +244,8 @@ class Verdict:
         If asked for: what was known at each frame, as places in :data:`sgstore.temporal._verdicts.STATUS`.
     reason : str
         Why the verdict is ``unknown``; else empty.
+    robustness : Robustness or None
+        By how much the check is met, if it asks for that by ``ROBUSTNESS``.
     """
 
     check: str
@@ -218,10 +255,12 @@ class Verdict:
     witnesses: tuple[Witness, ...] = ()
     status: Statuses | None = None
     reason: str = ""
+    robustness: Robustness | None = None
 
     def __repr__(self) -> str:
         number = len(self.violations)
         more = f", {number} violation{'s' * (number > 1)}" if number else ""
+        more += f" by {self.robustness.value:.3g}" if self.robustness else ""
         why = f", {self.reason}" if self.reason else ""
         return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}>"
 
@@ -333,6 +372,11 @@ class CheckRun:
         return tuple(one.check.name for one in self._checks)
 
     @property
+    def quantitative(self) -> bool:
+        """Tell whether it is asked of some check by how much it is met."""
+        return any(one.check.robustness for one in self._checks)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes, such as texts that are compared with names and that no name is equal to."""
         with self._file.snapshot():
@@ -365,6 +409,7 @@ class _Check:
         self._compat, self._want_status = compat, status
         self._plan, self._formula, self._reset, self._guards = plan_of_check(check)
         self._whole, self._variables = self._plan.whole, self._plan.bound
+        self._quantity = self._plan.quantity(check.formula) if check.robustness else None
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     def text(self) -> str:
@@ -372,7 +417,8 @@ class _Check:
         head = [f"---- {self._check.name}"]
         head += [f"{q.word} {', '.join(q.nodes)}" for q in self._check.quantifiers]
         plan = plan_text(self._plan, self._formula, self._reset, self._catalog)
-        return "\n".join([*head, plan])
+        quantity = [] if self._quantity is None else [f"robustness {formula_text(self._quantity)}"]
+        return "\n".join([*head, plan, *quantity])
 
     def verdicts(self) -> Iterator[Verdict]:
         """The verdict of each trace, by name of the trace."""
@@ -418,7 +464,46 @@ class _Check:
             if ends[0] != ends[1]:
                 reason = "it depends on what happened in a gap"
                 return Verdict(self._check.name, trace.name, "unknown", reason=reason)
-        return self._reported(trace, levels, truths, [told[i] for i in members.tolist()])
+        found = self._reported(trace, levels, truths, [told[i] for i in members.tolist()])
+        if self._quantity is None:
+            return found
+        robustness = self._robustness(self._quantity, trace, levels, (kinds, members))
+        return replace(found, robustness=robustness)
+
+    def _robustness(
+        self,
+        quantity: Formula,
+        trace: TraceReader,
+        levels: list[Level],
+        alike: tuple[Keys, Ints],
+    ) -> Robustness:
+        """Margin by which a trace meets the check; ``alike`` is what :meth:`_alike` found."""
+        kinds, members = alike
+        size = max(trace.together // MARGIN_CELLS, 1)
+        parts = [np.zeros(0)]
+        for low in range(0, len(kinds), size):
+            some = kinds[low : low + size]
+            value = self._margins(quantity, trace, some).value(quantity)[:, 0]
+            parts.append(np.broadcast_to(value, len(some)))
+        value, row = folded_margins(levels, np.concatenate(parts)[members])
+        if row is None:
+            return Robustness(value)
+        binding = innermost(levels)[row : row + 1]
+        names = self._people.get(trace.trace_id, {})
+        nodes = dict(zip(self._variables, binding[0].tolist(), strict=True))
+        called = {name: names[name][node] for name, node in nodes.items()}
+        decisive = self._margins(quantity, trace, binding).decisive(quantity, 0, 0)
+        if decisive is None:
+            return Robustness(value, nodes=nodes, names=called)
+        name, at = decisive
+        when = int(trace.numbers[at]), int(trace.times[at]), trace.seconds(at)
+        return Robustness(value, condition_text(self._plan, name), *when, nodes, called)
+
+    def _margins(self, quantity: Formula, trace: TraceReader, bindings: Keys) -> MarginTable:
+        values = PlanValues(self._plan, trace, self._variables, bindings)
+        tolerance = trace.clock.tolerance
+        columns = margin_columns(self._plan, quantity, values.test, values.proposition, tolerance)
+        return MarginTable(columns, trace.clock.times, tolerance)
 
     def _bounds(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, Bools]:
         """The verdict of some bindings, at least and at most, whatever happened in the gaps."""

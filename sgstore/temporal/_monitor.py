@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from sgstore.lang.syntax import Statement
     from sgstore.roads import RoadMap
     from sgstore.step import Frame
+    from sgstore.temporal._robustness import Robustness
 
 
 LIVE: Final = "carla://"
@@ -328,6 +329,13 @@ class Monitor:
             for _, watch, waiting in self._watches
         }
         return known | dict.fromkeys(self._unknown, "unknown")
+
+    @property
+    def robustness(self) -> dict[str, Robustness]:
+        """Margin by which each check with ``ROBUSTNESS`` is met if the trace ends now."""
+        watches = self._watches if self._last is not None else []
+        told = ((w.name, w.robustness) for _, w, waiting in watches if not waiting.reason)
+        return {name: one for name, one in told if one is not None}
 
     def run(
         self, frames: Iterable[Frame], *, duration_s: float | None = None

@@ -38,7 +38,7 @@ from sgstore.records import dataclass
 from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.lang import Catalog, SqlStatement
     from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink
@@ -154,6 +154,8 @@ class Plan:
     atoms, signals : dict of str to Ask
     tests : dict of str to Test
         By name.
+    margins : dict of str to Bound
+        Comparisons, by the name of the test of the difference by which they hold.
     """
 
     whole: b.Query
@@ -162,6 +164,7 @@ class Plan:
     atoms: dict[str, Ask] = field(default_factory=dict[str, Ask])
     signals: dict[str, Ask] = field(default_factory=dict[str, Ask])
     tests: dict[str, Test] = field(default_factory=dict[str, Test])
+    margins: dict[str, b.Bound] = field(default_factory=dict[str, b.Bound])
     _names: dict[str, str] = field(default_factory=dict[str, str])
 
     @property
@@ -178,6 +181,21 @@ class Plan:
         if self._guarded(expression) == things and not things & self.absent and not split:
             return self._atom(expression, things)
         return self._logic(expression)
+
+    def quantity(self, expression: b.Bound) -> f.Formula:
+        """The formula of a condition whose comparisons of numbers are propositions: :attr:`margins`."""
+        match expression:
+            case b.Tense(word=word, operands=operands):
+                bound = f.Bound(expression.low, expression.high, expression.frames)
+                return f.TEMPORAL[word](*map(self.quantity, operands), bound)
+            case b.Operation(word=word, operands=operands) if word in _CONNECTIVES:
+                return f.LOGIC[word](*map(self.quantity, operands))
+            case b.Operation(word=word, operands=operands) if _has_margin(expression):
+                test = self.test(_MARGINS[word](*operands))
+                self.margins.setdefault(test.name, expression)
+                return self._lapsing(test.name, self._things(expression))
+            case _:
+                return self.formula(expression)
 
     @property
     def _manifold(self) -> frozenset[str]:
@@ -355,17 +373,27 @@ PlannedCheck = tuple[Plan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
 
 def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
     """Return a check with the formulas that it is made of; ``reset``: whether what resets it matters."""
-    about = check.relations, check.injective, check.ego, check.unknown_is_false
-    whole = b.Query(check.scope, b.Result(), *about)
-    variables = tuple(node for q in check.quantifiers for node in q.nodes)
-    absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
-    plan = Plan(whole, variables, absent)
+    plan = _empty_plan(check)
     formula = plan.formula(check.formula)
     resets = plan.formula(check.reset) if reset and check.reset is not None else None
     guards = {
         n: plan.formula(q.where) for n, q in enumerate(check.quantifiers) if q.where is not None
     }
     return plan, formula, resets, guards
+
+
+def plan_of_margins(check: BoundCheck) -> tuple[Plan, f.Formula]:
+    """Return what a check is met by: the plan, and the formula over margins."""
+    plan = _empty_plan(check)
+    return plan, plan.quantity(check.formula)
+
+
+def _empty_plan(check: BoundCheck) -> Plan:
+    about = check.relations, check.injective, check.ego, check.unknown_is_false
+    whole = b.Query(check.scope, b.Result(), *about)
+    variables = tuple(node for q in check.quantifiers for node in q.nodes)
+    absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
+    return Plan(whole, variables, absent)
 
 
 def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
@@ -388,6 +416,47 @@ def _ask_of_step(query: b.Query, step: BoundStep, kept: Iterable[str], number: i
     edges = () if step.absent else sorted(edge.key for edge in scope.edges if edge.named)
     pattern = replace(query, scope=scope, result=b.Result(), steps=(), links=())
     return Ask(f"step {number}", pattern, tuple(sorted(bound)), None, tuple(edges))
+
+
+def _operation(word: str, *operands: b.Bound) -> b.Operation:
+    return b.Operation(word, operands, Type.number)
+
+
+def _less(left: b.Bound, right: b.Bound) -> b.Bound:
+    return _operation("-", right, left)
+
+
+def _greater(left: b.Bound, right: b.Bound) -> b.Bound:
+    return _operation("-", left, right)
+
+
+def _apart(left: b.Bound, right: b.Bound) -> b.Bound:
+    return _operation("abs", _operation("-", left, right))
+
+
+def _equal(left: b.Bound, right: b.Bound) -> b.Bound:
+    return _operation("negative", _apart(left, right))
+
+
+_MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
+    "<": _less,
+    "<=": _less,
+    ">": _greater,
+    ">=": _greater,
+    "=": _equal,
+    "<>": _apart,
+}
+"""Margins of comparisons: how far they hold; below zero how far they fail."""
+
+
+def _has_margin(comparison: b.Operation) -> bool:
+    """Tell whether a condition compares numbers, not constants alone."""
+    constants = b.Value | b.Operation
+    return (
+        comparison.word in _MARGINS
+        and all(operand.type is Type.number for operand in comparison.operands)
+        and not all(isinstance(part, constants) for part in b.walk(comparison))
+    )
 
 
 def _all(parts: list[b.Bound]) -> b.Bound:

@@ -227,9 +227,8 @@ def _at(places: Places, frame: Places | None) -> Places:
 
 
 # Values over time as columns: ``prev``, ``delta``, windows, ``run_length``, ``since_true``, ``age``, and terms
-# ------------------------------------------------------------------------------------------------
+# of them --------------------------------------------------------------------------------------------
 # A column of values, :class:`sgstore.lang.Column`, has a row for each binding and a column for each frame.
-# of them
 # Gaps in a recording are not bridged: behind one, ``prev`` and ``delta`` are unknown, runs and windows begin.
 
 NS: Final = 1e9
@@ -402,7 +401,7 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
             return lambda at: at.course(part, test)
         case b.Tense():
             return lambda at: Column(at.condition(part, test))
-        case b.Operation(word=word, operands=operands) if word in _TOLERANT and _of_time(part):
+        case b.Operation(word=word, operands=operands) if word in _TOLERANT and lasts(part):
             compare = _TOLERANT[word]
             left, right = (column_evaluator(o, partial(_over_time, test=test)) for o in operands)
 
@@ -415,9 +414,9 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
             return None
 
 
-def _of_time(operation: b.Operation) -> bool:
-    """Tell whether a comparison is of how long something lasts, or is ago, in seconds."""
-    parts = (part for operand in operation.operands for part in b.walk(operand))
+def lasts(expression: b.Bound) -> bool:
+    """Tell whether an expression is about how long something lasts, or is ago, in seconds."""
+    parts = b.walk(expression)
     return any(isinstance(p, b.SignalCall) and p.word in _TIMES and not p.frames for p in parts)
 
 

@@ -75,9 +75,12 @@ class Lattice:
             if pattern <= bound:
                 yield tuple(n if place in pattern else None for place, n in enumerate(binding))
 
-    def closed(self, bindings: Iterable[Partial]) -> set[Partial]:
-        """Bindings, the one of strangers, and those that say what several of them say."""
-        found = {self.stranger}
+    def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
+        """Bindings, the one of strangers, and those that say what several of them say.
+
+        Those that are ``known`` are closed already.
+        """
+        found = {self.stranger, *known}
         if self.size < 2:
             found.update(bindings)
             return found
@@ -672,6 +675,8 @@ class Valuation:
         The bit of each atom and test.
     begun : Memory
         What is remembered before the first frame.
+    columns : dict of str to Column
+        The values of the tests in the last frame, by name: (B, 1), or (1, 1), of the bindings in order.
     """
 
     def __init__(
@@ -688,6 +693,7 @@ class Valuation:
         self._courses = SignalState(plan, pulse, bridge=bridge)
         self._measured = bool(plan.tests)
         self.begun = self._courses.begun
+        self.columns: dict[str, Column] = {}
         self.bits = {name: 1 << number for number, name in enumerate([*plan.atoms, *plan.tests])}
         asked = {
             name: (questions.add(ask), tuple(map(variables.index, ask.variables)))
@@ -697,7 +703,11 @@ class Valuation:
         self._signals = {name: asked[name] for name in plan.signals}
 
     def read(
-        self, held: Iterable[Partial], memory: Callable[[Partial], Memory | None]
+        self,
+        held: Iterable[Partial],
+        memory: Callable[[Partial], Memory | None],
+        *,
+        closed: bool = False,
     ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
         """A frame has come, and the questions were asked of it.
 
@@ -707,6 +717,8 @@ class Valuation:
             Bindings of which something is known from former frames.
         memory : function
             What a binding remembers; ``None``: nobody asks for it any more.
+        closed : bool
+            Whether those held are all that were told before, so that only new ones are joined with them.
 
         Returns
         -------
@@ -717,7 +729,8 @@ class Valuation:
         """
         told = self._told()
         lattice = self.lattice
-        rows = lattice.closed([*held, *told, *self._told_signals()])
+        new = [*told, *self._told_signals()]
+        rows = lattice.closed(new, held) if closed else lattice.closed([*held, *new])
         if self._measured:
             rows = {row for row in rows if memory(row) is not None}
         if lattice.size < 2:
@@ -773,6 +786,7 @@ class Valuation:
             return column_of([answers.get(tuple(row[p] for p in places)) for row in rows])
 
         tests, memories = self._courses.values([memory(row) or () for row in rows], atom, signal)
+        self.columns = tests
         for name, column in tests.items():
             bit = self.bits[name]
             true = np.broadcast_to(column.true[:, 0], len(rows)).tolist()

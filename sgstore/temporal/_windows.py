@@ -79,9 +79,14 @@ def greatest(values: Floats, first: Places, end: Places) -> Floats:
     # The greatest of so many values is that of two stretches that may overlap.
     while size <= longest:
         takes = np.flatnonzero((length >= size) & (length < 2 * size))
+        whole = len(takes) == len(first)
         if len(takes):
-            one, other = first[takes], end[takes] - size
-            found[:, takes] = np.maximum(most[:, one], most[:, other])
+            one, other = (first, end - size) if whole else (first[takes], end[takes] - size)
+            both = np.take(most, one, axis=1)
+            np.maximum(both, np.take(most, other, axis=1), out=both)
+            if whole:
+                return both
+            found[:, takes] = both
         if 2 * size <= longest:
             most = np.maximum(most[:, :-size], most[:, size:])
         size *= 2
@@ -125,7 +130,7 @@ def _difference(total: Floats, first: Places, end: Places) -> tuple[Floats, Floa
 
 
 def _lost(one: Floats, other: Floats, total: Floats) -> Floats:
-    """What a rounded sum of two lacks, exactly (Knuth's TwoSum)."""
+    """Exact error of a rounded sum of two (Knuth's TwoSum)."""
     part = total - one
     return (one - (total - part)) + (other - part)
 

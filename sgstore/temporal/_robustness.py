@@ -1,0 +1,328 @@
+"""Robustness: by how much a formula is true, or false.
+
+A comparison of numbers has a **margin**: by how much it holds, below zero by how much it fails. Any other
+condition holds infinitely, or fails so. Negation changes the sign, *and* is the least, *or* the greatest, and
+operators of time are these over frames; so what is above zero is true, what is below zero is false, and as long
+as no number in the recording changes by as much, it stays so (Fainekos and Pappas 2009, Donzé and Maler 2010).
+
+Time is that of :mod:`sgstore.temporal._formula`, bounds, ends of the trace and all: a formula of the same form,
+whose propositions are margins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sgstore.lang import value_text
+from sgstore.temporal._formula import (
+    TRUE,
+    And,
+    Formula,
+    Next,
+    Not,
+    Or,
+    Previous,
+    Proposition,
+    Since,
+    TruthConstant,
+    Until,
+    propositions,
+)
+from sgstore.temporal._signals import NS, PropositionTable, lasts
+from sgstore.temporal._windows import greatest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang import Column
+    from sgstore.temporal._plan import Plan, Test
+    from sgstore.world import Bools, Floats, Ints
+
+    Places = NDArray[np.int32 | np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Robustness:
+    """Margin by which a trace meets a check, and what decides it.
+
+    Attributes
+    ----------
+    value : float
+        Above zero it is true, below zero false. Infinite where no comparison of numbers decides.
+    condition : str
+        The comparison, or other condition, whose margin it is; empty where there is none, as in a quantifier
+        over nothing, or where only the end of the trace decides.
+    seq, time_ns, t : int, int, float; or None
+        The frame that decides: its number, its simulation time, and that in seconds since the trace began.
+    nodes : mapping of str to int
+        Node ids by variable, of the entities that decide.
+    names : mapping of str to str
+        Their names.
+    """
+
+    value: float
+    condition: str = ""
+    seq: int | None = None
+    time_ns: int | None = None
+    t: float | None = None
+    nodes: Mapping[str, int] = field(default_factory=dict[str, int])
+    names: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+# Margins of propositions --------------------------------------------------------------------------
+
+
+def margin_of(test: Test, column: Column, tolerance: int) -> Floats:
+    """(B, F) the margin of a comparison; unknown is false.
+
+    Parameters
+    ----------
+    test : Test
+        Its difference.
+    column : Column
+        The values of that.
+    tolerance : int
+        Times that differ by no more are the same; ns.
+    """
+    values = np.asarray(column.values, np.float64)
+    if lasts(test.expression):
+        values = np.where(np.abs(values) <= tolerance / NS, 0.0, values)
+    known = column.known & ~np.isnan(values)
+    return np.where(known, values, -np.inf)
+
+
+def margin_of_flags(flags: Bools) -> Floats:
+    """Margins of what is true or false and no more."""
+    return np.where(flags, np.inf, -np.inf)
+
+
+def condition_text(plan: Plan, name: str) -> str:
+    """The condition that a proposition of a plan stands for, as text."""
+    if name in plan.margins:
+        return value_text(plan.margins[name]).removeprefix("(").removesuffix(")")
+    if name in plan.tests:
+        return value_text(plan.tests[name].expression)
+    ask = plan.atoms[name]
+    where = [value_text(part) for part in ask.query.scope.where]
+    told = " ".join(" AND ".join(where).split())
+    return told or f"exists_now({', '.join(ask.variables)})"
+
+
+def margin_columns(
+    plan: Plan,
+    formula: Formula,
+    tests: Callable[[Test], Column],
+    flags: Callable[[str], Bools],
+    tolerance: int,
+) -> dict[str, Floats]:
+    """The margins of the propositions of a formula.
+
+    Parameters
+    ----------
+    plan : Plan
+    formula : Formula
+    tests : function
+        The column of a test.
+    flags : function
+        Where an atom, or a test that is a condition, of some name is true.
+    tolerance : int
+        Of times; ns.
+    """
+    found: dict[str, Floats] = {}
+    for name in sorted(propositions(formula)):
+        if name in plan.margins:
+            found[name] = margin_of(plan.tests[name], tests(plan.tests[name]), tolerance)
+        else:
+            found[name] = margin_of_flags(flags(name))
+    return found
+
+
+# Over columns -------------------------------------------------------------------------------------
+
+
+class MarginTable:
+    """The margins of the propositions of a trace, and of formulas of them.
+
+    Parameters
+    ----------
+    columns : mapping of str to (B, F) float64, or (1, F)
+        For each binding; (1, F): the same for all.
+    times : (F,) int64
+        Ascending; ns. F is at least 1.
+    tolerance : int
+        Times that differ by no more are the same; ns.
+    """
+
+    def __init__(self, columns: Mapping[str, Floats], times: Ints, tolerance: int = 0) -> None:
+        self._columns, self._frames, self._tolerance = columns, len(times), tolerance
+        self._clock = PropositionTable({}, times)
+        self._known: dict[Formula, Floats] = {}
+
+    def value(self, formula: Formula) -> Floats:
+        """(B, F): the margin at each frame; (1, F) if it is the same for all bindings."""
+        if formula not in self._known:
+            self._known[formula] = self._value(formula)
+        return self._known[formula]
+
+    def _value(self, formula: Formula) -> Floats:  # noqa: PLR0911 - a case each
+        match formula:
+            case TruthConstant(value=value):
+                return np.full((1, self._frames), np.inf if value else -np.inf)
+            case Proposition(name=name):
+                return self._columns[name]
+            case Not(operand=operand):
+                return -self.value(operand)
+            case And(operands=operands):
+                return reduce(np.minimum, map(self.value, operands))
+            case Or(operands=operands):
+                return reduce(np.maximum, map(self.value, operands))
+            case Next(operand=operand, weak=weak):
+                shifted = np.roll(self.value(operand), -1, axis=1)
+                shifted[:, -1] = np.inf if weak else -np.inf
+                return shifted
+            case Previous(operand=operand):
+                shifted = np.roll(self.value(operand), 1, axis=1)
+                shifted[:, 0] = -np.inf
+                return shifted
+            case Until(left=left, right=right):
+                first, end = self._asked(formula)
+                sides = None if left == TRUE else self.value(left)
+                return until(sides, self.value(right), first, end)
+            case Since(left=left, right=right):
+                first, end = (self._frames - one[::-1] for one in reversed(self._asked(formula)))
+                sides = None if left == TRUE else self.value(left)[:, ::-1]
+                return until(sides, self.value(right)[:, ::-1], first, end)[:, ::-1]
+
+    def _asked(self, formula: Until | Since) -> tuple[Places, Places]:
+        """(F,) and (F,) the first frame in a bound, and the one behind the last, at each frame."""
+        forward = isinstance(formula, Until)
+        bound = formula.bound.widened(self._tolerance)
+        near, far = self._clock.window(bound, forward=forward)
+        here, frames = self._clock.frames, self._frames
+        near = here if near is None else near
+        if far is None:
+            far = np.full_like(here, frames - 1 if forward else 0)
+        first, last = (near, far) if forward else (far, near)
+        return np.clip(first, 0, frames), np.clip(last + 1, 0, frames)
+
+    # What decides
+
+    def decisive(self, formula: Formula, row: int, frame: int) -> tuple[str, int] | None:  # noqa: PLR0911
+        """The proposition, and the frame, whose margin a formula has, of equal ones the one met first.
+
+        ``None``: no frame decides, but an end of the trace.
+        """
+        match formula:
+            case TruthConstant():
+                return None
+            case Proposition(name=name):
+                return name, frame
+            case Not(operand=operand):
+                return self.decisive(operand, row, frame)
+            case And(operands=operands) | Or(operands=operands):
+                wanted = self._at(formula, row)[frame]
+                chosen = next(o for o in operands if self._at(o, row)[frame] == wanted)
+                return self.decisive(chosen, row, frame)
+            case Next(operand=operand):
+                inside = frame + 1 < self._frames
+                return self.decisive(operand, row, frame + 1) if inside else None
+            case Previous(operand=operand):
+                return self.decisive(operand, row, frame - 1) if frame else None
+            case Until() | Since():
+                return self._decisive_over_time(formula, row, frame)
+
+    def _decisive_over_time(
+        self, formula: Until | Since, row: int, frame: int
+    ) -> tuple[str, int] | None:
+        first, end = (int(one[frame]) for one in self._asked(formula))
+        if first >= end:
+            return None
+        forward = isinstance(formula, Until)
+        frames = np.arange(first, end) if forward else np.arange(end - 1, first - 1, -1)
+        right = self._at(formula.right, row)[frames]
+        way = np.arange(frame, end - 1) if forward else np.arange(frame, first, -1)
+        left = self._at(formula.left, row)[way]
+        # On the way to the first frame of the bound the left side counts, too.
+        least = np.minimum.accumulate(np.concatenate(([np.inf], left)))[
+            len(way) + 1 - len(frames) :
+        ]
+        best = int(np.argmax(np.minimum(right, least)))
+        if right[best] <= least[best]:
+            return self.decisive(formula.right, row, int(frames[best]))
+        before = left[: len(way) + 1 - len(frames) + best]
+        return self.decisive(formula.left, row, int(way[int(np.argmin(before))]))
+
+    def _at(self, formula: Formula, row: int) -> Floats:
+        """(F,) the margins of one binding."""
+        found = self.value(formula)
+        return found[min(row, len(found) - 1)]
+
+
+def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Floats:
+    """(B, F) the margin of an *until*: the greatest, over its bound, of ``right`` and all ``left`` before.
+
+    Parameters
+    ----------
+    left, right : (B, F) float64, or (1, F)
+        The margins of its sides; without ``left``, that is true always.
+    first, end : (F,) int
+        The first frame in the bound, and the one behind the last.
+    """
+    frames = right.shape[1]
+    hit = _greatest_of(right, first, end)
+    if left is None:
+        return hit
+    # Within a bound is what is met within it, and what goes on until it is met (Donzé, Ferrère and Maler 2013).
+    onward = np.take(_behind(_unbounded(left, right)), first, axis=1)
+    found = np.minimum(hit, onward)
+    here = np.arange(frames)
+    if np.any(first > here):
+        found = np.minimum(found, -greatest(-left, here, first))
+    return found
+
+
+def _greatest_of(values: Floats, first: Places, end: Places) -> Floats:
+    frames = values.shape[1]
+    if np.all(end == frames):
+        onward = np.maximum.accumulate(values[:, ::-1], axis=1)[:, ::-1]
+        return np.take(_behind(onward), first, axis=1)
+    return greatest(values, first, end)
+
+
+def _behind(values: Floats) -> Floats:
+    """(B, F + 1) with what is behind the last frame: nothing that could be true."""
+    return np.concatenate((values, np.full((len(values), 1), -np.inf)), axis=1)
+
+
+def _unbounded(left: Floats, right: Floats) -> Floats:
+    """(B, F): at each frame the greater of ``right`` and the least of ``left`` and what is at the next one.
+
+    Such a step is a clamp, and so are several in a row: blocks of frames are clamped side by side, then joined.
+    """
+    left, right = np.broadcast_arrays(left, right)
+    rows, frames = right.shape
+    size = int(np.ceil(np.sqrt(frames)))
+    blocks = -(-frames // size)
+    sides = np.full((2, rows, blocks * size), -np.inf)
+    sides[0, :, :frames], sides[1, :, :frames] = left, right
+    inner, outer = np.ascontiguousarray(sides.reshape(2, rows, blocks, size).transpose(0, 3, 1, 2))
+    low, high = (
+        np.full((size + 1, rows, blocks), -np.inf),
+        np.full((size + 1, rows, blocks), np.inf),
+    )
+    for at in range(size - 1, -1, -1):
+        for ends in (low, high):
+            np.minimum(inner[at], ends[at + 1], out=ends[at])
+            np.maximum(outer[at], ends[at], out=ends[at])
+    later = np.full((rows, blocks), -np.inf)  # what comes behind each block
+    for block in range(blocks - 2, -1, -1):
+        whole = np.minimum(high[0, :, block + 1], later[:, block + 1])
+        later[:, block] = np.maximum(low[0, :, block + 1], whole)
+    found = np.maximum(low[:size], np.minimum(high[:size], later))
+    return found.transpose(1, 2, 0).reshape(rows, blocks * size)[:, :frames]
