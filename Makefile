@@ -128,6 +128,7 @@ LONG := temporal ttc pair_numbers crowds cli_ending cli_streams fuzz carla carla
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000
+	$(BIN)/python tests/oracle_robustness.py 100000
 	$(BIN)/python tests/oracle.py 100000 0 2
 	$(BIN)/python tests/oracle_over_time.py 3000
 	$(BIN)/python tests/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces

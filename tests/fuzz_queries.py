@@ -127,6 +127,8 @@ PREDICATES = (
     ),
     *("in_range", "lane_blocked", "same_junction"),
 )
+WINDOWS = ("min_over", "max_over", "avg_over", "sum_over")
+OF_ONE = ("sin", "cos", "tan", "exp", "log", "sqrt", "sign", "degrees", "radians")
 ALONE = (
     "stopped",
     "moving",
@@ -194,7 +196,8 @@ class Writer:
         head = "FORALL (v:Vehicle) " if self.names else ""
         self.names = [*self.names, "ego"]
         reset = f" RESET WHEN {self.test(0)}" if self.rng.random() < 0.2 else ""
-        return f"CHECK c: {head}{self.timed(2)}{reset}"
+        margin = self.rng.choice(("", " ROBUSTNESS"))
+        return f"CHECK c: {head}{self.timed(2)}{reset}{margin}"
 
     def block(self, depth: int) -> str:
         paths = [self.path(depth) for _ in range(self.rng.choice((1, 1, 2)))]
@@ -266,6 +269,8 @@ class Writer:
             f"frame.t {sign} {value}",
             f"prev({a}.speed) {sign} {a}.speed",
             f"delta({a}.speed, 1s) {sign} {value}",
+            f"{self.rng.choice(WINDOWS)}({a}.speed, {self.rng.choice(('2s', '5frames'))}) {sign} {value}",
+            f"{self.rng.choice(OF_ONE)}({a}.y) {sign} pow({b}.x, {value})",
         ]
         if depth and self.rng.random() < 0.35:
             return self.inner(depth, sign)
