@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -267,3 +268,19 @@ def test_the_class_of_a_frame_is_asked_for_only_where_a_query_asks_and_once() ->
     assert count("frame.class('E') = 'of RSV'", view) == 0
     assert asked == ["RSV", "E"]
     assert count("frame.class IS NULL", FrameView(view.graph)) == 4
+
+
+@pytest.mark.parametrize("shape", ["1 / ({} + 1)", "7 % ({} + 1)", "sqrt({} + 1)", "pow({}, 1)"])
+def test_operators_in_one_another_are_planned_at_once(town: Store, shape: str) -> None:
+    deep, of_nothing = "e.speed", "e.speed * 0 - 1"
+    for _ in range(16):
+        deep, of_nothing = shape.format(deep), shape.format(of_nothing)
+
+    # Of an operator that named its operand twice the statement would be 65,536 times as long.
+    asked = f"MATCH (e:Ego) WHERE frame.seq = 200 RETURN e.speed AS v, {deep} AS deep, {of_nothing} AS n"
+    ((speed, found, nothing),) = town.find(asked).rows()
+
+    for _ in range(16):
+        speed = eval(shape.format("speed"), {"speed": speed, "sqrt": math.sqrt, "pow": pow})
+    assert found == pytest.approx(speed)
+    assert (nothing is None) == ("/" in shape or "%" in shape)

@@ -146,6 +146,23 @@ def _where(part: str, condition: str) -> str:
     return f"list_filter([{part}], lambda v: {condition})[1]"
 
 
+def _not_zero(part: str) -> str:
+    """SQL of a divisor: NULL where it is zero.
+
+    ``nullif`` is the faster one, and a macro that plans its argument twice: of those in one another only the
+    innermost may be one.
+    """
+    return _where(part, "v <> 0") if "nullif(" in part else f"nullif({part}, 0)"
+
+
+def _division(sign: str) -> SqlOf:
+    def text(parts: Sequence[str]) -> str:
+        value, by = map(operand_text, parts)
+        return f"({value} {sign} {_not_zero(by)})"
+
+    return text
+
+
 def _if_all_known(name: str) -> SqlOf:
     def text(parts: Sequence[str]) -> str:
         known = " AND ".join(f"{operand_text(part)} IS NOT NULL" for part in parts)
@@ -519,9 +536,9 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     "+": _strict("(... + ...)", operator.add, _ufunc("add"), infix=True),
     "-": _strict("(... - ...)", operator.sub, _ufunc("subtract"), infix=True),
     "*": _strict("(... * ...)", operator.mul, _ufunc("multiply"), infix=True),
-    "/": _strict("({0} / nullif({1}, 0))", _divided, _divided_columns, infix=True, partial=True),
+    "/": _strict(_division("/"), _divided, _divided_columns, infix=True, partial=True),
     "%": _strict(
-        "({0} % nullif({1}, 0))",
+        _division("%"),
         _remainder,
         _remainder_columns,
         infix=True,
