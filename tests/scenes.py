@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.roads import RoadMap
-    from sgstore.store._staging import Sealed
+    from sgstore.store import Sealed
 
 Point = tuple[float, float]
 Series = float | list[tuple[float, Any]]

@@ -17,8 +17,7 @@ import sgstore
 from sgstore.cli import run
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest, recordings
-from sgstore.mcap import McapFile, digest_of
-from sgstore.mcap._fetch import read_metadata
+from sgstore.mcap import McapFile, digest_of, parts_of
 from sgstore.readers import open_trace, read_message
 from sgstore.world import Clip, TraceReport
 
@@ -295,14 +294,22 @@ def test_in_a_folder_a_bag_is_one_recording(
     ],
     ids=range(5),
 )
-def test_lists_of_files_are_read_as_yaml_writes_them(text: str) -> None:
-    assert read_metadata(text)["relative_file_paths"] == ["a b.mcap", "c.mcap"]
+def test_lists_of_files_are_read_as_yaml_writes_them(tmp_path: Path, text: str) -> None:
+    assert listed(tmp_path, text) == ["a b.mcap", "c.mcap"]
 
 
-def test_quotes_in_names_are_undone() -> None:
+def test_quotes_in_names_are_undone(tmp_path: Path) -> None:
     text = "relative_file_paths:\n  - 'it''s.mcap'\n  - \"a\\\\b\\\"c.mcap\""
 
-    assert read_metadata(text)["relative_file_paths"] == ["it's.mcap", 'a\\b"c.mcap']
+    assert listed(tmp_path, text) == ["it's.mcap", 'a\\b"c.mcap']
+
+
+def listed(folder: Path, metadata: str) -> list[str]:
+    """Names of the files of a bag with these metadata; one of them is there, or it would be refused."""
+    (folder / "metadata.yaml").write_text(metadata, encoding="utf-8", newline="")
+    for name in ("a b.mcap", "it's.mcap"):
+        (folder / name).touch()
+    return [part.path.name for part in parts_of(folder)]
 
 
 def test_the_folder_s_name_before_a_file_is_passed_over(tmp_path: Path, path: Path) -> None:

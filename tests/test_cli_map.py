@@ -12,7 +12,6 @@ from recordings import Recorder, car
 
 from sgstore.cli import run
 from sgstore.roads import lane_text, summary
-from sgstore.roads._map import MapCount
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -158,4 +157,5 @@ def test_types_that_begin_beyond_the_road_hold_from_its_start() -> None:
 
     assert sum(part.length or 0 for part in roads) == pytest.approx(50.0)
     assert {part.kind for part in roads} == {"town", "rural"}
-    assert MapCount("lane", "driving", 1, pytest.approx(50.0)) in summary(road_map)
+    (lanes,) = [part for part in summary(road_map) if (part.part, part.kind) == ("lane", "driving")]
+    assert (lanes.count, lanes.length) == (1, pytest.approx(50.0))

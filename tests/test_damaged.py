@@ -149,7 +149,8 @@ INGEST = """
 import json, os, re, resource, sys
 from pathlib import Path
 from sgstore.cli import application, run
-import sgstore.doctor, sgstore.ingest, sgstore.readers.carla._trace
+import sgstore.doctor, sgstore.ingest
+from sgstore.readers import READERS
 application(["ingest"])
 seconds, to, *files = sys.argv[1:]
 for file in files:

@@ -17,7 +17,6 @@ from opendrive_maps import a_map, a_road, arc, cubic, lane, line, link, section
 from sgstore.config import Config, LaneSettings, PairSettings, RangeSettings, configured
 from sgstore.opendrive import read_map
 from sgstore.relations import EgoPoses, Extent
-from sgstore.relations._extent import STEP
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
 
@@ -434,7 +433,7 @@ def test_a_lane_is_on_the_storey_when_a_point_of_it_in_reach_is(
     others = LEVELS[:2]
     road_map = read_map(a_map(*others[:at], LEVELS[2], *others[at:]), "bridge")
     egos = EgoPoses(*np.array([[0.0], [9.0], [0.0], [ground]]))
-    points, of = road_map.waypoints(STEP), RangeSettings(30.0, height=(-1.0, 1.0))
+    points, of = road_map.waypoints(2.0), RangeSettings(30.0, height=(-1.0, 1.0))
     expected: list[bool] = []
     for i in range(3):
         mine = points.lane == i

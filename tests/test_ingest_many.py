@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 from dataclasses import replace
@@ -14,7 +15,6 @@ from killing import content, made
 from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive, person
 
-import sgstore.mcap._fetch as fetch
 from sgstore import ingest as workers
 from sgstore import readers, segments
 from sgstore.config import Config, RangeSettings
@@ -145,7 +145,7 @@ def test_what_looks_the_same_is_not_hashed_again(
     def hashed(*_: object, **__: object) -> Iterator[None]:
         raise AssertionError("hashed")
 
-    monkeypatch.setattr(fetch.hashlib, "file_digest", hashed)
+    monkeypatch.setattr(hashlib, "file_digest", hashed)
     (outcome,) = ingest(tmp_path / "s.db", [path])
 
     assert outcome.status == "present"

@@ -16,7 +16,6 @@ from sgstore.graph import LaneDistances
 from sgstore.lang import FrameView
 from sgstore.opendrive import read_map
 from sgstore.query import Store
-from sgstore.roads._map import FARTHEST
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 from sgstore.vocabulary import RELATION_CODE
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
     Ways = nx.DiGraph[tuple[int, str]]
+
+FARTHEST = 200.0
+"""Beyond it ``lane_dist`` is NULL, as the page of the language says; m."""
 
 ROADS = map_stub(seed=4)
 DRIVE = RandomTrace(seed=4, frames=70, road_map=ROADS, path="/r/drive.mcap")

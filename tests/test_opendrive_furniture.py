@@ -11,8 +11,6 @@ import shapely
 from opendrive_maps import a_map, a_road, arc, cubic, element, lane, line, section
 
 from sgstore.opendrive import kind_of_object, read_map
-from sgstore.opendrive._objects import PAINT, PARKING
-from sgstore.opendrive._signals import kind_of_signal
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -136,7 +134,10 @@ def test_a_signal_stands_where_the_file_says() -> None:
 def test_the_kind_of_a_signal_is_told_by_its_code(
     code: str, dynamic: bool, name: str, kind: str
 ) -> None:
-    assert kind_of_signal(code, dynamic=dynamic, name=name) == kind
+    told = signal("s", type=code, dynamic="yes" if dynamic else "no", name=name)
+    road_map = read_map(a_map(road_with(told)), "map")
+
+    assert KINDS[road_map.nodes.kind[row_of(road_map, "s")]] == kind
 
 
 @pytest.mark.parametrize(
@@ -299,13 +300,13 @@ def test_what_is_repeated_without_end_is_left_out_and_said() -> None:
         ("rail-pole", "x", "pole"),
         ("railing", "x", "barrier"),
         ("guide-post", "x", "pole"),
-        ("parkingSpace", "", PARKING),
-        ("parkingSpace", "beside the tree", PARKING),
-        ("-1", "ParkingSpace_12", PARKING),
-        ("-1", "StopLine", PAINT),
-        ("-1", "Stencil_ArrowType4R", PAINT),
-        ("-1", "SolidSingleWhite", PAINT),
-        ("roadMark", "stop line of Main Street", PAINT),
+        ("parkingSpace", "", "parking"),
+        ("parkingSpace", "beside the tree", "parking"),
+        ("-1", "ParkingSpace_12", "parking"),
+        ("-1", "StopLine", "paint"),
+        ("-1", "Stencil_ArrowType4R", "paint"),
+        ("-1", "SolidSingleWhite", "paint"),
+        ("roadMark", "stop line of Main Street", "paint"),
         ("none", "Main Street", "prop"),
         ("none", "Postal box", "prop"),
         ("none", "Trailer park", "prop"),

@@ -12,6 +12,7 @@ import pytest
 import sgstore
 from sgstore.demo import RECORDING
 from sgstore.errors import SgstoreError
+from sgstore.opendrive import read_map
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -71,7 +72,6 @@ def test_pictures_are_drawn_into_a_file_that_is_named_by_a_text(
     town_store: Path, tmp_path: Path
 ) -> None:
     from sgstore.draw import draw_clip, draw_map, draw_stored
-    from sgstore.draw._stored import map_of
 
     store = sgstore.open(str(town_store))
     there = [str(tmp_path / name) for name in ("x.png", "x.svg", "x.gif", "map.png")]
@@ -79,9 +79,8 @@ def test_pictures_are_drawn_into_a_file_that_is_named_by_a_text(
     draw_stored(store, "town#3", there[0], camera="none")
     draw_stored(store, "town#3", there[1], camera="none")
     draw_clip(store, ("town#3", "town#4"), there[2], camera="none")
-    road_map = map_of(store, "town")
-    assert road_map is not None
-    draw_map(road_map, there[3])
+    name, text = store.file.road_map_text("town") or ("", "")
+    draw_map(read_map(text, name), there[3])
     store.sql("SELECT 1 AS one").csv(str(tmp_path / "x.csv"))
     store.sql("SELECT 1 AS one").parquet(str(tmp_path / "x.parquet"))
 
