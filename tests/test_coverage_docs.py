@@ -59,7 +59,9 @@ def test_every_verb_of_coverage_and_every_format_is_on_the_page() -> None:
     known = verbs(typer.main.get_command(application()))
     of_coverage = {verb.split()[1] for verb in known if verb.startswith("coverage ")}
 
-    assert {shlex.split(command)[2] for command in COMMANDS if " coverage " in command} == of_coverage
+    assert {
+        shlex.split(command)[2] for command in COMMANDS if " coverage " in command
+    } == of_coverage
     assert set(FORMATS) <= set(re.findall(r"`(\w+)`", PAGE))
 
 

@@ -28,8 +28,9 @@ from opendrive_maps import (
     width,
 )
 
+from sgstore.columns import chained
 from sgstore.opendrive import read_map
-from sgstore.roads import OFF_ROAD, LaneGraph, LaneHits, Ribbons, RoadMap
+from sgstore.roads import OFF_ROAD, LaneHits, MapNodes, Ribbons, RoadMap, edges_of
 from sgstore.roads._footprints import TOUCH, LaneIndex
 from sgstore.vocabulary import KINDS
 
@@ -406,87 +407,52 @@ def test_places_before_and_beyond_a_lane_are_its_ends() -> None:
     assert ribbons.along_at(lanes, end.s) == pytest.approx(ribbons.lengths)
 
 
-def graphs() -> tuple[LaneGraph, nx.DiGraph]:
-    """A random lane graph, and the same for networkx: an edge is as long as the lane it leaves."""
+def test_starts_of_lanes_along_others_are_those_that_dijkstra_finds() -> None:
     rng = np.random.default_rng(4)
-    n = 60
-    lengths = rng.uniform(0, 40, n)
+    n, limit = 60, 200.0
+    lengths = rng.uniform(0, 80, n)
     lengths[::7] = 0.0
     src, dst = rng.integers(0, n, 90), rng.integers(0, n, 90)
-    peer = nx.DiGraph()
+    peer = nx.DiGraph()  # an edge is as long as the lane that it leaves
     peer.add_nodes_from(range(n))
-    for a, b in zip(src.tolist(), dst.tolist(), strict=True):
-        peer.add_edge(a, b, weight=lengths[a])
-    none = np.zeros(0, np.int64)
-    return LaneGraph(lengths, src, dst, none, none), peer
-
-
-def test_lanes_downstream_are_those_that_dijkstra_reaches() -> None:
-    graph, peer = graphs()
-    lengths = graph._lengths
-
-    reach = graph.downstream(70.0)
-
-    found = {
-        (lane, other): distance
-        for lane, other, distance in zip(
-            reach.lane.tolist(), reach.other.tolist(), reach.distance.tolist(), strict=True
-        )
-    }
-    for lane_ in range(len(lengths)):
-        best: dict[int, float] = {}
-        for first in peer.successors(lane_):
-            for other, distance in nx.single_source_dijkstra_path_length(peer, first).items():
-                best[other] = min(distance, best.get(other, np.inf))
-        expected = {other: d for other, d in best.items() if d <= 70.0}
-        assert {o for at, o in found if at == lane_} == set(expected)
-        for other, distance in expected.items():
-            assert found[lane_, other] == pytest.approx(distance)
-    assert graph.downstream(70.0) is reach
-
-
-def test_distances_along_lanes_are_those_of_the_way_ahead() -> None:
-    graph, _ = graphs()
-    reach = graph.downstream(200.0)
-    lane_, other, between = (c[:50] for c in (reach.lane, reach.other, reach.distance))
-    length = graph._lengths[lane_]
-
-    found = graph.distances(lane_, length / 4, other, np.zeros(50), 200.0)
-
-    away = lane_ != other
-    assert found[away] == pytest.approx((length * 3 / 4 + between)[away])
-    same = graph.distances(
-        np.array([1, 1]), np.array([2.0, 9.0]), np.array([1, 1]), np.array([9.0, 2.0]), 0.0
+    peer.add_weighted_edges_from(
+        zip(src.tolist(), dst.tolist(), lengths[src].tolist(), strict=True)
     )
-    assert same[0] == 7.0
-    assert same[1] > 7.0
+    expected = [(lane_, lane_, 0.0) for lane_ in range(n)]
+    for lane_, length in enumerate(lengths.tolist()):
+        beyond: dict[int, float] = {}
+        for first in peer.successors(lane_):
+            for other, away in nx.single_source_dijkstra_path_length(peer, first).items():
+                beyond[other] = min(away, beyond.get(other, np.inf))
+        for other, away in beyond.items():
+            if away <= limit:
+                expected += [(lane_, other, length + away), (other, lane_, -length - away)]
+
+    lane_, other, start = straight_lanes(lengths, src, dst).reach
+
+    told = zip((-2 - lane_).tolist(), (-2 - other).tolist(), start.tolist(), strict=True)
+    np.testing.assert_allclose(sorted(told), sorted(expected), atol=1e-9)
+    assert any(away == 0 and one != two for one, two, away in expected)
+    assert max(abs(start)) > limit
 
 
-def test_a_route_is_a_shortest_path() -> None:
-    graph, peer = graphs()
-    rng = np.random.default_rng(9)
-    for src, dst in rng.integers(0, 60, (40, 2)).tolist():
-        route = graph.route(src, dst)
-
-        if not nx.has_path(peer, src, dst):
-            assert route == ()
-            continue
-        assert (route[0], route[-1]) == (src, dst)
-        length = sum(graph._lengths[lane_] for lane_ in route[:-1])
-        assert length == pytest.approx(nx.dijkstra_path_length(peer, src, dst))
-        assert nx.is_path(peer, route)
-
-
-def test_a_route_may_change_lanes_if_it_is_wanted() -> None:
-    number = {name: row - 1 for row, name in enumerate(TOWN.nodes.name)}
-    src, dst = number["1/0/-2"], number["2/0/-1"]
-
-    assert TOWN.graph.route(src, number["2/0/-2"]) == (src, number["2/0/-2"])
-    assert TOWN.graph.route(src, dst) == ()
-    way = TOWN.graph.route(src, dst, changes=True)
-    assert way[0] == src
-    assert way[-1] == dst
-    assert len(way) == 3
+def straight_lanes(lengths: np.ndarray, src: np.ndarray, dst: np.ndarray) -> RoadMap:
+    """Lanes of these lengths, beside one another, and where traffic flows on."""
+    n = len(lengths)
+    along, y = np.zeros(2 * n), np.repeat(np.arange(n) * 4.0, 2)
+    along[1::2] = lengths
+    zero = np.zeros(2 * n)
+    nodes = chained(
+        [MapNodes.of("off_road", ["off_road"]), MapNodes.of("lane", [*map(str, range(n))])]
+    )
+    return RoadMap(
+        name="lanes",
+        text="",
+        nodes=nodes,
+        edges=edges_of([("travelsTo", 1 + src, 1 + dst)]),
+        ribbons=Ribbons(np.arange(n + 1) * 2, along, y + 2, along, y - 2, zero, zero, along, along),
+        shapes=np.full(n + 1, None),
+    )
 
 
 def test_a_map_is_known_by_its_text() -> None:

@@ -2,7 +2,6 @@
 
 from ._lanes import Sections as Sections
 from ._lanes import run_of as run_of
-from ._map import LaneGraph as LaneGraph
 from ._lane_lines import END as END
 from ._lane_lines import MAX_POINTS as MAX_POINTS
 from ._lane_lines import START as START
@@ -51,7 +50,6 @@ __all__ = [
     "Edge",
     "Joint",
     "LaneChanges",
-    "LaneGraph",
     "LaneHits",
     "LaneLine",
     "LanePoints",

@@ -41,11 +41,6 @@ if TYPE_CHECKING:
 INSIDE: Final = "inside"
 """Schema of the tables of a store, with views of ours. Public views, and types of columns, are in ``main``."""
 
-_VIEWS: Final = "-- Views for everything else"
-"""Where the views begin in ``schema.sql``."""
-
-_ENUM: Final = re.compile(r"CREATE TYPE (\w+) AS ENUM \([^)]*\);")
-
 _HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
 
 _TOKEN: Final = re.compile(
@@ -64,15 +59,6 @@ def schema_sql() -> str:
     text = resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
     pairs, numbers = pairs_view()
     return text.replace("{{pairs}}", pairs).replace("{{numbers}}", numbers.replace("'", "''"))
-
-
-def tables_sql() -> str:
-    """Return the part of it that makes types and tables, for a segment.
-
-    It holds any kind and relation that is known now, and its rows are completed in several steps.
-    """
-    made = schema_sql().partition(_VIEWS)[0].replace(" NOT NULL", "")
-    return _ENUM.sub(lambda found: f"CREATE TYPE {found[1]} AS {_enum(NAMES[found[1]])};", made)
 
 
 def schema_version() -> str:
