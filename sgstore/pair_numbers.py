@@ -1,4 +1,4 @@
-"""Numbers of a pair of entities (a, b): each declared once, for the view ``pairs``, the language and arrays.
+"""Numbers of a pair of entities (a, b): each declared once, for views, the language and arrays.
 
 A number is an expression of SQL over others of the same pair, down to the columns of both entities (``a_x``: x
 of a; conventions of axes and units in :mod:`sgstore.geometry`). The view and the compiler write it into
@@ -6,7 +6,9 @@ statements, layer by layer, because DuckDB shares named columns and not repeated
 :class:`PairNumbers` computes the same expression with arrays, where NaN is NULL. What a number needs of an
 entity follows from its columns.
 
-One more number is one more entry of :data:`PAIR_FUNCTIONS`.
+One more number is one more entry of :data:`PAIR_FUNCTIONS`. Measures of criticality are among them; those
+here look ahead from one moment: at constant velocity, at constant acceleration or at the worst that bounded
+accelerations can do. Names of the usual symbols of that literature (``v1``, ``a2``) are parts.
 """
 
 from __future__ import annotations
@@ -40,8 +42,12 @@ class PairFunction:
         up elsewhere, and is no column of the view.
     note : str
         Special values.
+    source : str
+        Where the literature defines it.
+    view : str
+        The first view that has it as a column: ``pairs``, or ``criticality``, which has all.
     column : str
-        Name in the view ``pairs``, where it differs.
+        Name in the views, where it differs.
     alias : str
         Second name in the language.
     dear : bool
@@ -52,6 +58,8 @@ class PairFunction:
     unit: str
     sql: str
     note: str = ""
+    source: str = ""
+    view: str = "pairs"
     column: str = ""
     alias: str = ""
     dear: bool = False
@@ -66,6 +74,23 @@ def _turned(angle: str) -> str:
     """An angle in degrees, brought into (-180, 180]."""
     return f"{angle} - 360 * ceil(({angle} - 180) / 360)"
 
+
+def _measure(
+    doc: str, unit: str, sql: str, note: str, source: str, alias: str = ""
+) -> PairFunction:
+    """A measure of criticality."""
+    return PairFunction(doc, unit, sql, note, source, "criticality", alias=alias)
+
+
+_AHEAD: Final = "NULL where b is not ahead in a's way"
+_WESTHOFEN: Final = "Westhofen et al., Criticality Metrics for Automated Driving, 2023"
+_JANSSON: Final = "Jansson, Collision Avoidance Theory, 2005"
+_HILLENBRAND: Final = "Hillenbrand et al., A Multilevel Collision Mitigation Approach, 2006"
+_EGGERT: Final = "Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014"
+_ALLEN: Final = "Allen, Shin and Cooper, Analysis of Traffic Conflicts and Collisions, 1978"
+_RSS: Final = (
+    "Shalev-Shwartz et al., On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
+)
 
 LANE_DIST: Final = "lane_dist"
 """The number that is no expression: it is looked up, by lanes and ways between them."""
@@ -162,8 +187,219 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "",
         note="NULL beyond 200 m",
     ),
+    # Measures of criticality -----------------------------------------------------------------------
+    # The distance of two boxes that move is a convex function of time. If they do not meet, the line that b
+    # draws past a is nearest to their Minkowski sum where a corner of that is abreast, or an edge.
+    "dce": _measure(
+        "distance of closest encounter: the least that the gap will be if both keep their velocity and do not"
+        " turn",
+        "m",
+        "CASE WHEN ttc IS NOT NULL THEN 0 WHEN rel_speed >= 1e-6 AND abreast_until >= 0 THEN"
+        " CASE WHEN clears < 0 THEN 0 ELSE clears END WHEN rel_speed IS NOT NULL THEN gap END",
+        "0 where they will meet",
+        _EGGERT,
+    ),
+    "ttce": _measure(
+        "time of closest encounter: when the gap will first be the least",
+        "s",
+        "CASE WHEN ttc IS NOT NULL THEN ttc WHEN rel_speed >= 1e-6 AND abreast_until >= 0 THEN"
+        " CASE WHEN abreast < 0 THEN 0 ELSE abreast END"
+        " WHEN rel_speed IS NOT NULL AND gap IS NOT NULL THEN 0 END",
+        "0 where they are nearest now",
+        _EGGERT,
+    ),
+    "wttc": _measure(
+        "worst-case time to collision: before it they cannot meet, however both steer, brake and accelerate by"
+        " up to 11.5 m/s², being discs around their footprints",
+        "s",
+        "CASE WHEN planar <= discs AND worst_p IS NOT NULL THEN 0"
+        " WHEN worst_p IS NOT NULL AND worst_q IS NOT NULL AND worst_s IS NOT NULL THEN worst_t END",
+        "0 where the discs overlap",
+        "Wachenfeld et al., The Worst-Time-To-Collision Metric for Situation Identification, IV 2016",
+    ),
+    "ttc_accel": _measure(
+        "time until a's front has come to b's rear along a's axis if both keep their acceleration",
+        "s",
+        "CASE WHEN lead <= 0 AND slack IS NOT NULL THEN 0 WHEN closing + slack_root > 0"
+        " THEN 2 * lead / (closing + slack_root) END",
+        f"{_AHEAD} or they do not meet; who brakes is taken to go on so, backwards in the end",
+        "Ozbay et al., Derivation and Validation of New Simulation-Based Surrogate Safety Measure, 2008",
+        alias="mttc",
+    ),
+    "pttc": _measure(
+        "potential time to collision: until a's front has come to b's rear along a's axis if a keeps its speed"
+        " and b goes on braking as it does, until it stands",
+        "s",
+        "CASE WHEN lead <= 0 AND brakes IS NOT NULL AND closing IS NOT NULL THEN 0"
+        " WHEN v2 > 0 AND braking > v2 / brakes"
+        " THEN CASE WHEN v1 > 0 THEN (lead + v2 * v2 / (2 * brakes)) / v1 END ELSE braking END",
+        f"{_AHEAD} or does not brake",
+        "Wakabayashi et al., Traffic Conflict Analysis and Modeling, 2003",
+    ),
+    "ttb": _measure(
+        "time to brake: how long a may wait before it has to brake by 8 m/s² so that it does not run into b,"
+        " which keeps its velocity",
+        "s",
+        "CASE WHEN closing > 0 THEN lead / closing - closing / 16e0 END",
+        f"below 0: too late; {_AHEAD} or they do not close in",
+        _HILLENBRAND,
+    ),
+    "tts": _measure(
+        "time to steer: how long a may wait before it has to accelerate sideways by 8 m/s² so that it gets past"
+        " b, which keeps its velocity",
+        "s",
+        "CASE WHEN short_by > 0 THEN reached - sqrt(abs(short_by) / 4e0) END",
+        f"below 0: too late; {_AHEAD}, they do not close in, or they pass one another anyway",
+        _HILLENBRAND,
+    ),
+    "ttr": _measure(
+        "time to react: the longer one of ttb and tts",
+        "s",
+        "CASE WHEN tts IS NOT NULL THEN greatest(ttb, tts) END",
+        "NULL where tts is",
+        _HILLENBRAND,
+    ),
+    "drac": _measure(
+        "deceleration rate to avoid a crash: that a needs so that it is as slow as b along a's axis when it"
+        " reaches it",
+        "m/s²",
+        "CASE WHEN closing <= 0 AND lead IS NOT NULL THEN 0"
+        " WHEN lead > 0 THEN closing * closing / (2 * lead) END",
+        f"0 where they do not close in; {_AHEAD} or they touch",
+        "Almqvist, Hydén and Risser, Use of Speed Limiters in Cars for Increased Safety, TRR 1318, 1991",
+    ),
+    "decel_to_safety_time": _measure(
+        "deceleration to safety time: that a needs so that it is as slow as b when it is 2 s behind it",
+        "m/s²",
+        "CASE WHEN closing <= 0 AND lead IS NOT NULL THEN 0"
+        " WHEN lead - 2 * v2 > 0 THEN closing * closing / (2 * (lead - 2 * v2)) END",
+        f"0 where they do not close in; {_AHEAD} or the 2 s are lost already",
+        "Hupfer, Deceleration to Safety Time (DST), 1997",
+    ),
+    "a_long_req": _measure(
+        "required longitudinal acceleration: the constant one along its axis by which a just does not run into"
+        " b, which keeps its own until it stands",
+        "m/s²",
+        "CASE WHEN required > 0 THEN 0 ELSE required END",
+        f"0 or less; 0 where they do not close in; {_AHEAD} or they touch",
+        _JANSSON,
+    ),
+    "a_lat_req": _measure(
+        "required lateral acceleration: the constant one across its axis by which a just gets past b after"
+        " ttc_accel, on the nearer side",
+        "m/s²",
+        "CASE WHEN lead IS NOT NULL AND slack IS NOT NULL AND ttc_accel IS NULL THEN 0"
+        " WHEN abs(aside) >= reach2 THEN 0"
+        " WHEN ttc_accel > 0 THEN 2 * (reach2 - abs(aside)) / (ttc_accel * ttc_accel) END",
+        f"0 where they do not meet; {_AHEAD} or they touch",
+        _JANSSON,
+    ),
+    "a_req": _measure(
+        "required acceleration: a_long_req and a_lat_req as one vector",
+        "m/s²",
+        "sqrt(a_long_req * a_long_req + a_lat_req * a_lat_req)",
+        "0 or more; NULL where one of them is",
+        _JANSSON,
+    ),
+    "btn": _measure(
+        "brake threat number: the share of 11.5 m/s² that a_long_req is",
+        "ratio",
+        "abs(a_long_req) / 11.5e0",
+        "from 1 on braking alone does not avoid it",
+        _JANSSON,
+    ),
+    "stn": _measure(
+        "steer threat number: the share of 8 m/s² that a_lat_req is",
+        "ratio",
+        "a_lat_req / 8e0",
+        "from 1 on steering alone does not avoid it",
+        _JANSSON,
+    ),
+    # Of two straight paths that cross, the conflict area is where the strips that both footprints sweep meet.
+    "pret": _measure(
+        "predicted post-encroachment time: from when one has left the area where their straight paths cross to"
+        " when the other one enters it, if both keep their velocity",
+        "s",
+        "CASE WHEN between > 0 THEN CASE WHEN second >= 0 THEN between END"
+        " WHEN least(cross_a + stay_a, cross_b + stay_b) >= 0 THEN 0 END",
+        "0 where both will be in it at once; NULL where directions differ by less than 1°, one stands, or the"
+        " other one is in it already",
+        "Laureshyn, Svensson and Hydén, Evaluation of Traffic Safety, Based on Micro-level Behavioural Data,"
+        " AAP 42, 2010 (time advantage)",
+        alias="time_advantage",
+    ),
+    "spret": _measure(
+        "scaled predictive encroachment time: how far the squares are apart of the times at which their centres"
+        " come to where their straight paths cross",
+        "s²",
+        "CASE WHEN cross_a >= 0 AND cross_b >= 0 THEN abs(cross_a * cross_a - cross_b * cross_b) END",
+        "NULL where directions differ by less than 1°, one stands, or one is past it",
+        _WESTHOFEN,
+    ),
+    "et": _measure(
+        "encroachment time: how long a's footprint will be, in all, on the straight path of b",
+        "s",
+        "CASE WHEN cross_a + stay_a >= 0 THEN 2 * stay_a END",
+        "NULL where directions differ by less than 1°, one stands, or a has left it",
+        _ALLEN,
+    ),
+    "psd": _measure(
+        "proportion of stopping distance: how far a still is from b's straight path, in its way of stopping"
+        " by 11.5 m/s²",
+        "ratio",
+        "CASE WHEN cross_a + stay_a >= 0 AND pace > 0.1e0 THEN greatest(cross_a - stay_a, 0) * 23e0 / pace END",
+        "below 1 it cannot stop before it; NULL where directions differ by less than 1°, one stands, or a has"
+        " left it",
+        _ALLEN,
+    ),
+    "delta_v": _measure(
+        "change of velocity of each in a collision now, both of one mass, after which they stay together",
+        "m/s",
+        "rel_speed / 2",
+        "",
+        "Shelby, Delta-V as a Measure of Traffic Conflict Severity, TRB 2011",
+    ),
+    "ci": _measure(
+        "conflict index: energy that a collision would take from two of 1,500 kg which stay together, over"
+        " exp(pret)",
+        "J",
+        "CASE WHEN pret <= 5 THEN 375 * rel_speed * rel_speed / exp(pret) WHEN pret > 5 THEN 0 END",
+        "0 where pret is above 5 s, NULL where it is",
+        "Alhajyaseen, The Integration of Conflict Probability and Severity for the Safety Assessment of"
+        " Intersections, AJSE 40, 2015",
+    ),
+    # Response 1 s, in it accelerating by 3.5 m/s² (0.2 sideways), then braking by at least 4 m/s² (0.8 aside, 3
+    # in one's own lane against who comes), who is ahead by at most 8; 0.1 m between: as in ad-rss-lib.
+    "rss_lon": _measure(
+        "safe distance of RSS along a's axis: that the one behind, or both who come towards one another, must"
+        " keep",
+        "m",
+        "CASE WHEN toward_a + toward_b IS NULL THEN NULL WHEN least(toward_a, toward_b) >= 0 THEN head_on"
+        " WHEN chase > 0 THEN chase ELSE 0 END",
+        "",
+        _RSS,
+    ),
+    "rss_lat": _measure(
+        "safe distance of RSS across a's axis",
+        "m",
+        "CASE WHEN abeam < 0 THEN 0.1e0 ELSE abeam + 0.1e0 END",
+        "",
+        _RSS,
+    ),
+    "rss_margin": _measure(
+        "how far they are from breaking both safe distances of RSS: the larger one of lon_gap less rss_lon and"
+        " lat_gap less rss_lat",
+        "m",
+        "CASE WHEN reach1 + reach2 IS NOT NULL AND rss_lon + rss_lat IS NOT NULL"
+        " THEN greatest(lon_gap - rss_lon, lat_gap - rss_lat) END",
+        "below 0: dangerous",
+        _RSS,
+    ),
 }
-"""Numbers of two entities by name, in the order of the view; NULL where something that they need is missing."""
+"""Numbers of two entities by name, in the order of the views; NULL where what they need is not known."""
+
+_HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4, 3))
+"""Half extents of both boxes, each with the axis that it lies on and the one across."""
 
 _PARTS: Final[Mapping[str, str]] = {
     **{f"d{axis}": f"b_{axis} - a_{axis}" for axis in ("x", "y", "z", "vx", "vy")},
@@ -218,6 +454,103 @@ _PARTS: Final[Mapping[str, str]] = {
     # rounding), and of two that move straight on the distance shrinks by no more than this in a second.
     "at_least": "planar - sqrt(la * la + wa * wa) - sqrt(lb * lb + wb * wb) - 1e-6",
     "approach": "greatest(coalesce(closing_speed, 0), 0)",
+    # b as a sees it move: how far its line clears the Minkowski sum of both boxes, and from when to when its
+    # centre is abreast of the corner of that which is nearest to the line, or of the edge, if one runs with it.
+    "dotted": "dx * dvx + dy * dvy",
+    "beyond": "dy * dvx - dx * dvy",
+    "swath": "la * abs(drift2) + wa * abs(drift1) + lb * abs(drift4) + wb * abs(drift3)",
+    "clears": "(abs(beyond) - swath) / rel_speed",
+    **{
+        f"edge{i}": f"CASE WHEN abs(drift{over}) <= 1e-9 * rel_speed THEN {half} * abs(drift{on}) ELSE 0 END"
+        for i, half, on, over in _HALVES
+    },
+    **{
+        f"corner{i}": f"CASE WHEN abs(drift{over}) <= 1e-9 * rel_speed THEN 0"
+        f" WHEN drift{over} * {on - over} > 0 THEN {half} * drift{on} ELSE -{half} * drift{on} END"
+        for i, half, on, over in _HALVES
+    },
+    "edges": "edge1 + edge2 + edge3 + edge4",
+    "corners": "corner1 + corner2 + corner3 + corner4",
+    "nearest": "CASE WHEN beyond < 0 THEN -corners ELSE corners END - dotted",
+    "abreast": "(nearest - edges) / nullif(rel_speed * rel_speed, 0)",
+    "abreast_until": "(nearest + edges) / nullif(rel_speed * rel_speed, 0)",
+    # The first time at which discs that grow by 11.5 t²/2 each touch: the least positive root of
+    # t⁴ + pt² + qt + s, where s < 0, by Ferrari: a root z of the resolvent cubic makes two quadratics of it.
+    # Two steps of Newton's take the rounding away. What stands in abs() is not negative where it is used.
+    "discs": "sqrt(la * la + wa * wa) + sqrt(lb * lb + wb * wb)",
+    "worst_p": "(23e0 * discs - rel_speed * rel_speed) / 132.25e0",
+    "worst_q": "-2 * dotted / 132.25e0",
+    "worst_s": "(discs * discs - planar * planar) / 132.25e0",
+    "cubic_c": "(-worst_p * worst_p / 3 - 4 * worst_s) / 3",
+    "cubic_d": "worst_p * (4 * worst_s - worst_p * worst_p / 9) / 3 - worst_q * worst_q / 2",
+    "cubic_e": "cubic_d * cubic_d + cubic_c * cubic_c * cubic_c",
+    "cubic_f": "greatest(cbrt(abs(cubic_d) + sqrt(abs(cubic_e))), 1e-200)",
+    "cubic_y": "CASE WHEN cubic_e >= 0 THEN CASE WHEN cubic_d > 0 THEN cubic_c / cubic_f - cubic_f"
+    " ELSE cubic_f - cubic_c / cubic_f END ELSE 2 * sqrt(abs(cubic_c)) * cos(acos(greatest(-1, least(1,"
+    " -cubic_d / nullif(sqrt(abs(cubic_c * cubic_c * cubic_c)), 0)))) / 3) END",
+    "ferrari_z": "greatest(cubic_y - 2 * worst_p / 3, 0)",
+    "ferrari_g": "worst_p + ferrari_z",
+    "ferrari_h": "(abs(ferrari_g) + sqrt(abs(ferrari_g * ferrari_g - 4 * worst_s))) / 2",
+    "ferrari_l": "CASE WHEN ferrari_g >= 0 THEN worst_s / nullif(ferrari_h, 0) ELSE -ferrari_h END",
+    "ferrari_m": "CASE WHEN ferrari_g >= 0 THEN ferrari_h ELSE -worst_s / nullif(ferrari_h, 0) END",
+    "worst_r": "CASE WHEN worst_q < 0 THEN (sqrt(ferrari_z) + sqrt(abs(ferrari_z - 4 * ferrari_l))) / 2"
+    " ELSE least(-2 * ferrari_l / nullif(sqrt(ferrari_z) + sqrt(abs(ferrari_z - 4 * ferrari_l)), 0),"
+    " CASE WHEN ferrari_z >= 4 * ferrari_m"
+    " THEN 2 * ferrari_m / nullif(sqrt(ferrari_z) + sqrt(abs(ferrari_z - 4 * ferrari_m)), 0) END) END",
+    **{
+        name: f"{t} - coalesce(((({t} * {t} + worst_p) * {t} + worst_q) * {t} + worst_s)"
+        f" / nullif((4 * {t} * {t} + 2 * worst_p) * {t} + worst_q, 0), 0)"
+        for name, t in (("worst_n", "worst_r"), ("worst_t", "worst_n"))
+    },
+    # Along a's axis: speeds and accelerations of both, and how far b's rear is from a's front where b stands in
+    # the strip that a would sweep.
+    "v1": "a_vx * ca + a_vy * sa",
+    "v2": "b_vx * ca + b_vy * sa",
+    "a1": "a_ax * ca + a_ay * sa",
+    "a2": "b_ax * ca + b_ay * sa",
+    "lead": "CASE WHEN lon > 0 AND out2 < 0 THEN lon_gap END",
+    "closing": "v1 - v2",
+    "slack": "closing * closing - 2 * lead * (a2 - a1)",
+    "slack_root": "CASE WHEN slack >= 0 THEN sqrt(slack) END",
+    "brakes": "CASE WHEN a2 < 0 THEN -a2 END",
+    "braking": "2 * lead / nullif(closing + sqrt(closing * closing + 2 * lead * brakes), 0)",
+    "reached": "CASE WHEN closing > 0 THEN lead / closing END",
+    "short_by": "reach2 - abs(lat + drift2 * reached)",
+    "required": "CASE WHEN closing <= 0 AND lead IS NOT NULL AND a2 IS NOT NULL THEN 0 WHEN lead > 0 THEN"
+    " CASE WHEN v2 > 0 AND 2 * lead * brakes > v2 * closing"
+    " THEN -v1 * v1 / (2 * lead + v2 * v2 / brakes) ELSE a2 - closing * closing / (2 * lead) END END",
+    "aside": "lat + drift2 * ttc_accel + (b_ay * ca - b_ax * sa) * ttc_accel * ttc_accel / 2",
+    # Where straight paths cross: when each centre is there, and for how long before and after its box is on the
+    # strip that the other one sweeps. Speeds of both along and across both axes.
+    "slip_a": "a_vy * ca - a_vx * sa",
+    "slip_b": "b_vy * ca - b_vx * sa",
+    "along_a": "a_vx * cb + a_vy * sb",
+    "along_b": "b_vx * cb + b_vy * sb",
+    "across_a": "a_vy * cb - a_vx * sb",
+    "across_b": "b_vy * cb - b_vx * sb",
+    "pace_b": "sqrt(b_vx * b_vx + b_vy * b_vy)",
+    "spin": "a_vx * b_vy - a_vy * b_vx",
+    "crosses": "CASE WHEN abs(spin) > 0.017452406437283512e0 * pace * pace_b THEN spin END",
+    "cross_a": "(dx * b_vy - dy * b_vx) / crosses",
+    "cross_b": "(dx * a_vy - dy * a_vx) / crosses",
+    "stay_a": "(la * abs(slip_b) + wa * abs(v2) + lb * abs(across_b) + wb * abs(along_b)) / abs(crosses)",
+    "stay_b": "(la * abs(slip_a) + wa * abs(v1) + lb * abs(across_a) + wb * abs(along_a)) / abs(crosses)",
+    "between": "abs(cross_a - cross_b) - stay_a - stay_b",
+    "second": "CASE WHEN cross_a <= cross_b THEN cross_b - stay_b ELSE cross_a - stay_a END",
+    # Speeds towards one another, along a's axis and across it. Of two that go apart nobody chases; of one that
+    # goes away sideways even after the response, the way of stopping counts with its sign.
+    "toward_a": "CASE WHEN lon > 0 THEN v1 WHEN lon <= 0 THEN -v1 END",
+    "toward_b": "CASE WHEN lon > 0 THEN -v2 WHEN lon <= 0 THEN v2 END",
+    "faster": "greatest(toward_a, toward_b, 0)",
+    "flees": "CASE WHEN toward_a < 0 AND toward_b < 0 THEN greatest(toward_a, toward_b)"
+    " ELSE least(toward_a, toward_b) END",
+    "chase": "faster + 1.75e0 + (faster + 3.5e0) * (faster + 3.5e0) / 8 - flees * flees / 16",
+    "head_on": "toward_a + 1.75e0 + (toward_a + 3.5e0) * (toward_a + 3.5e0) / 6"
+    " + toward_b + 1.75e0 + (toward_b + 3.5e0) * (toward_b + 3.5e0) / 8",
+    "sideways_a": "CASE WHEN lat < 0 THEN -slip_a WHEN lat >= 0 THEN slip_a END + 0.2e0",
+    "sideways_b": "CASE WHEN lat < 0 THEN slip_b WHEN lat >= 0 THEN -slip_b END + 0.2e0",
+    "abeam": "sideways_a + sideways_b - 0.2e0"
+    " + (sideways_a * abs(sideways_a) + sideways_b * abs(sideways_b)) / 1.6e0",
 }
 """Expressions that numbers share."""
 
@@ -268,12 +601,22 @@ def pair_sql(name: str, column: Callable[[str], str]) -> str:
 
 _KEPT: Final = ("frame_id", "src", "dst", "src_kind", "dst_kind", "src_is_ego", "dst_is_ego")
 _BEFORE_KINDS: Final = 10
-"""Numbers before the kinds in the view, which keeps the order of its columns; new ones come behind."""
+"""Numbers before the kinds in the views, which keep the order of their columns; new ones come behind."""
 
 
-def pairs_view() -> tuple[str, str]:
-    """Return the statement of the view ``pairs``, without its head, and the documentation of its numbers."""
-    listed = [(one.column or name, name) for name, one in PAIR_FUNCTIONS.items() if one.sql]
+def pairs_view(view: str = "pairs") -> tuple[str, str]:
+    """Return the statement of a view of pairs, without its head, and the documentation of what is first in it.
+
+    Parameters
+    ----------
+    view : str
+        ``pairs``, or ``criticality``: its numbers and the measures of criticality.
+    """
+    listed = [
+        (one.column or name, name)
+        for name, one in PAIR_FUNCTIONS.items()
+        if one.sql and one.view in {view, "pairs"}
+    ]
     wanted = frozenset[str]().union(*(needed_for(name) for _, name in listed))
     inputs = sorted(name for name in wanted if not stage_of(name))
     columns = ["b.frame_id", "a.node_id AS src", "b.node_id AS dst"]
@@ -289,7 +632,8 @@ def pairs_view() -> tuple[str, str]:
         text = f"SELECT *, {', '.join(layer)} FROM ({text})"  # noqa: S608
     numbers = [name if column == name else f"{name} AS {column}" for column, name in listed]
     shown = [*_KEPT[:3], *numbers[:_BEFORE_KINDS], *_KEPT[3:], *numbers[_BEFORE_KINDS:]]
-    told = [f"{column}: {PAIR_FUNCTIONS[name].meaning}" for column, name in listed]
+    first = [(column, PAIR_FUNCTIONS[name]) for column, name in listed]
+    told = [f"{column}: {one.meaning}" for column, one in first if one.view == view]
     return f"SELECT {', '.join(shown)} FROM ({text})", ". ".join(told)  # noqa: S608
 
 
@@ -297,10 +641,8 @@ def pairs_view() -> tuple[str, str]:
 
 Formula = Callable[[Mapping[str, Any]], Any]
 
-COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
+COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy", "ax", "ay")
 """Columns of an entity that numbers of pairs are made of."""
-
-_INPUTS: Final = [f"{one}_{name}" for one in "ab" for name in COLUMNS]
 
 
 class PairNumbers(dict[str, "Floats"]):
@@ -308,13 +650,17 @@ class PairNumbers(dict[str, "Floats"]):
 
     Parameters
     ----------
-    a, b : (K, 8) float64
-        ``x, y, z, heading, length, width, vx, vy`` of the two entities of pair k; m, m, m, rad, m, m, m/s, m/s.
-        NaN where one is missing.
+    a, b : (K, 10) float64
+        ``x, y, z, heading, length, width, vx, vy, ax, ay`` of the two entities of pair k; m, m, m, rad, m, m,
+        m/s, m/s, m/s², m/s². NaN where one is missing. Accelerations may be left out: (K, 8).
     """
 
     def __init__(self, a: Floats, b: Floats) -> None:
-        super().__init__(zip(_INPUTS, (*a.T, *b.T), strict=True))
+        super().__init__()
+        for one, states in (("a", a), ("b", b)):
+            told = dict(zip(COLUMNS, states.T, strict=False))
+            unknown = np.broadcast_to(np.nan, len(states))
+            self.update({f"{one}_{name}": told.get(name, unknown) for name in COLUMNS})
 
     def __missing__(self, name: str) -> Floats:
         with np.errstate(all="ignore"):
@@ -397,7 +743,11 @@ def _functions() -> Mapping[str, Callable[..., Any]]:
     """Functions of expressions by their names."""
     return {
         "case": _case,
-        **{name: getattr(np, name) for name in ("abs", "sqrt", "sin", "cos", "degrees", "ceil")},
+        **{
+            name: getattr(np, name)
+            for name in ("abs", "sqrt", "cbrt", "exp", "sin", "cos", "degrees", "ceil")
+        },
+        "acos": np.arccos,
         "atan2": np.arctan2,
         # They pass over what is missing.
         "greatest": lambda *values: reduce(np.fmax, values),

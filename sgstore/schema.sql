@@ -19,7 +19,7 @@
 -- Changes
 --   * Version 4: recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
 --     Tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
---     Columns that are always known are NOT NULL; store_info holds a digest of these statements.
+--     The view criticality. Columns that are always known are NOT NULL; store_info holds a digest of these statements.
 --     Places in lanes and gaps that are the same in frames of a bucket that follow one another are kept once: lane_single, lane_repeated,
 --     gap_single, gap_repeated, put together by the views lane_state and lane_gap. state.repeated.
 --   * Version 3: bucket.joined; the states of the ego lie together (state, lane_state).
@@ -312,7 +312,12 @@ COMMENT ON VIEW main.lane_gaps IS 'How far it is along the lanes: one row for ea
 -- writes the SELECT of this view, with a column for each of them, and what its comment says of them.
 CREATE VIEW main.pairs AS {{pairs}};
 
-COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart; a is src, b is dst. {{numbers}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart; a is src, b is dst. {{numbers of pairs}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+
+-- As many columns again, whose statement takes the database some time to read.
+CREATE VIEW main.criticality AS {{criticality}};
+
+COMMENT ON VIEW main.criticality IS 'The columns of pairs, and measures of how critical it is between src (a) and dst (b), each looking ahead from this frame. {{numbers of criticality}}. NULL also where something that a measure needs is not known.';
 
 -- A view of its own, and no column of pairs: who asks for other numbers should not pay for these joins.
 CREATE VIEW main.lane_dists AS

@@ -17,7 +17,7 @@ from sgstore.errors import QueryError
 from sgstore.lang import SqlStatement, Window, compile_query
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
 from sgstore.matches import FIRST_WINDOW, LAST_WINDOW, Windows
-from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers
+from sgstore.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog
 
 NUMBERS = {name: one.column or name for name, one in PAIR_FUNCTIONS.items() if one.sql}
-"""Functions of pairs, and what the view ``pairs`` calls them; ``lane_dist`` has a file of tests of its own."""
+"""Functions of pairs, and what the view ``criticality`` calls them; ``lane_dist`` has tests of its own."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,6 @@ def found(world: World, text: str, **parameters: Any) -> list[tuple[Any, ...]]:
 
 
 def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
-    columns = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
     calls = ", ".join(f"{function}(a, b)" for function in NUMBERS)
     states = {(frame.frame_id, n): s for frame in world.frames for n, s in frame.states.items()}
 
@@ -54,7 +53,7 @@ def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
 
     def boxes(side: int) -> np.ndarray:
         chosen = [states[row[0], row[side]] for row in rows]
-        return np.array([[np.nan if s[c] is None else s[c] for c in columns] for s in chosen])
+        return np.array([[np.nan if s.get(c) is None else s[c] for c in COLUMNS] for s in chosen])
 
     # FLOAT in the tables, as in every store
     numbers = PairNumbers(
@@ -73,7 +72,7 @@ def test_numbers_of_pairs_are_those_of_the_view(world: World) -> None:
     ours = found(world, f"MATCH (a:Ego), (b:Vehicle) RETURN frame.id, b.id, {calls}")
 
     columns = ", ".join(NUMBERS.values())
-    sql = f"SELECT frame_id, dst, {columns} FROM pairs WHERE src_is_ego"
+    sql = f"SELECT frame_id, dst, {columns} FROM criticality WHERE src_is_ego"
     theirs = {row[:2]: row[2:] for row in world.connection.execute(sql).fetchall()}
     moving = [row for row in ours if row[:2] in theirs]
     assert len(moving) > 10

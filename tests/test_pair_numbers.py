@@ -10,12 +10,12 @@ import duckdb
 import numpy as np
 import pytest
 import shapely
-from contacts import COLUMNS, disagreements, random_movers
+from contacts import disagreements, random_movers
 from test_geometry import random_boxes
 from thorough import LONG
 
 from sgstore.geometry import corners
-from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers, gap, pairs_view
+from sgstore.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers, gap, pairs_view
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -327,6 +327,7 @@ def test_a_number_is_what_its_definition_says(name: str) -> None:
 def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
     a, b = random_movers(2000, seed=4)
     rng = np.random.default_rng(4)
+    a, b = (np.hstack([side, rng.uniform(-8, 4, (len(side), 2))]) for side in (a, b))
     for side in (a, b):  # NULL where NaN, each column now and then
         side[rng.random(side.shape) < 0.03] = np.nan
     state = {c: np.concatenate([a[:, i], b[:, i]]) for i, c in enumerate(COLUMNS)}
@@ -338,7 +339,7 @@ def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
             "CREATE SCHEMA inside; CREATE TABLE inside.state AS"
             f" SELECT frame_id, node_id, 'car' AS kind, FALSE AS is_ego, {read} FROM state"
         )
-        view, _ = pairs_view()
+        view, _ = pairs_view("criticality")
         column = PAIR_FUNCTIONS[name].column or name
         rows = db.execute(
             f"SELECT {column} FROM ({view}) WHERE src = 0 ORDER BY frame_id"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from graph_blocks import RandomTrace, map_stub, publish
 
-from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers
+from sgstore.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers
 from sgstore.store import StoreFile
 from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATIONS
 from sgstore.world import BUCKET_FRAMES
@@ -229,18 +229,16 @@ def test_two_edges_joined_in_plain_sql_are_two_edges_of_one_frame(store: Any) ->
 
 
 NUMBERS = {one.column or name: name for name, one in PAIR_FUNCTIONS.items() if one.sql}
-"""Columns of the view ``pairs`` that are numbers, and what they are called elsewhere."""
+"""Columns of the view ``criticality`` that are numbers, and what they are called elsewhere."""
 
 
 def boxes(store: StoreFile, frame: int) -> tuple[list[int], Any]:
     """Nodes that move and the numbers of their states as they are stored, in radians."""
-    sql = """
-      SELECT node_id, x::DOUBLE, y::DOUBLE, z::DOUBLE, heading::DOUBLE, length::DOUBLE, width::DOUBLE,
-             vx::DOUBLE, vy::DOUBLE
-      FROM inside.state WHERE frame_id = ? ORDER BY node_id
-    """
+    columns = ", ".join(f"{name}::DOUBLE" for name in COLUMNS)
+    sql = f"SELECT node_id, {columns} FROM inside.state WHERE frame_id = ? ORDER BY node_id"
     rows = store.rows(sql, [frame]).values
-    return [row[0] for row in rows], np.array([row[1:] for row in rows], float).reshape(-1, 8)
+    states = np.array([row[1:] for row in rows], float)
+    return [row[0] for row in rows], states.reshape(-1, len(COLUMNS))
 
 
 @pytest.mark.parametrize("name", TRACES)
@@ -251,7 +249,8 @@ def test_numbers_of_pairs_are_those_of_the_geometry(store: Any, name: Any) -> No
         a, b = np.nonzero(~np.eye(len(nodes), dtype=bool))
         expected = PairNumbers(states[a], states[b])
         sql = (
-            f"SELECT src, dst, {', '.join(NUMBERS)} FROM pairs WHERE frame_id = ? ORDER BY src, dst"
+            f"SELECT src, dst, {', '.join(NUMBERS)} FROM criticality WHERE frame_id = ?"
+            " ORDER BY src, dst"
         )
         found = store.rows(sql, [frame]).values
 

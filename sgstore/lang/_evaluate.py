@@ -169,8 +169,11 @@ class FrameView:
 
     @cached_property
     def _boxes(self) -> Floats:
-        """(E, 8) what numbers of pairs are made of."""
-        rows = [[self.nodes[n].get(name, math.nan) for name in COLUMNS] for n in self.rows]
+        """(E, 10) what numbers of pairs are made of; what stands for ever has acceleration 0."""
+        rows: list[list[float]] = []
+        for about in map(self.nodes.__getitem__, self.rows):
+            still: Attributes = {"ax": 0.0, "ay": 0.0} if about.get("is_static") else {}
+            rows.append([about.get(name, still.get(name, math.nan)) for name in COLUMNS])
         boxes = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
         heading = COLUMNS.index("heading")
         boxes[:, heading] = np.radians(boxes[:, heading])

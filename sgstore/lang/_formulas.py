@@ -201,9 +201,9 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
 def raw_text(name: str, at: Aliases) -> str:
     """A raw column of a node, wherever it lives; positions about the trace's origin.
 
-    What stands for ever has no states, and velocity 0.
+    What stands for ever has no states, and velocity and acceleration 0.
     """
-    still = name in {"vx", "vy"}
+    still = name in {"vx", "vy", "ax", "ay"}
     parts: list[str] = []
     if at.state:
         parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")

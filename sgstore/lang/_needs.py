@@ -311,11 +311,11 @@ def _needed(  # noqa: C901, PLR0911 - a case each
             return of_node(node, attribute.name)
         case b.PairNumber(function=function, a=one, b=other):
             of_two = zip((one, other), columns_needed(function), strict=True)
-            # Both parts of a velocity are known, or none.
+            # Both parts of a velocity are known, or none, and of an acceleration.
             return {
                 need
                 for node, parts in of_two
-                for name in parts - {"vy"}
+                for name in parts - {"vy", "ay"}
                 for need in of_node(node, name)
             }
         case b.FrameAttribute(attribute=attribute) if attribute.unit in {
