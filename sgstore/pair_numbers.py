@@ -50,6 +50,8 @@ class PairFunction:
         Name in the views, where it differs.
     alias : str
         Second name in the language.
+    worse : str
+        Which values are the more critical ones: ``low`` or ``high``; empty: neither.
     dear : bool
         Whether a condition on it is tested after those on the others, and a bound on the distance before.
     """
@@ -62,6 +64,7 @@ class PairFunction:
     view: str = "pairs"
     column: str = ""
     alias: str = ""
+    worse: str = ""
     dear: bool = False
 
     @property
@@ -76,10 +79,10 @@ def _turned(angle: str) -> str:
 
 
 def _measure(
-    doc: str, unit: str, sql: str, note: str, source: str, alias: str = ""
+    doc: str, unit: str, sql: str, note: str, source: str, alias: str = "", worse: str = "low"
 ) -> PairFunction:
     """A measure of criticality."""
-    return PairFunction(doc, unit, sql, note, source, "criticality", alias=alias)
+    return PairFunction(doc, unit, sql, note, source, "criticality", alias=alias, worse=worse)
 
 
 _AHEAD: Final = "NULL where b is not ahead in a's way"
@@ -91,6 +94,23 @@ _ALLEN: Final = "Allen, Shin and Cooper, Analysis of Traffic Conflicts and Colli
 _RSS: Final = (
     "Shalev-Shwartz et al., On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
 )
+
+_GAP: Final = (
+    "CASE WHEN reach1 + reach2 IS NULL THEN NULL WHEN greatest(out1, out2, out3, out4) <= 0 THEN 0"
+    " ELSE sqrt(least("
+    + ", ".join(
+        f"CASE WHEN out{i} > 0 THEN out{i} * out{i} + greatest(past{i}, 0) * greatest(past{i}, 0) END"
+        for i in (1, 2, 3, 4)
+    )
+    + ")) END"
+)
+_MOVED: Final = re.compile(r"\b(lon|lat|back|side|(?:out|past)[1-4])\b")
+
+
+def _after_3s(text: str) -> str:
+    """An expression of where b is, of where it will be after 3 s."""
+    return _MOVED.sub(r"\1_3s", text)
+
 
 LANE_DIST: Final = "lane_dist"
 """The number that is no expression: it is looked up, by lanes and ways between them."""
@@ -108,15 +128,10 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     "gap": PairFunction(
         "shortest distance between the footprints",
         "m",
-        "CASE WHEN reach1 + reach2 IS NULL THEN NULL WHEN greatest(out1, out2, out3, out4) <= 0 THEN 0"
-        " ELSE sqrt(least("
-        + ", ".join(
-            f"CASE WHEN out{i} > 0 THEN out{i} * out{i} + greatest(past{i}, 0) * greatest(past{i}, 0) END"
-            for i in (1, 2, 3, 4)
-        )
-        + ")) END",
+        _GAP,
         note="0 where they touch or overlap",
         dear=True,
+        worse="low",
     ),
     "bearing": PairFunction(
         "direction of b's centre in a's axes, positive to the left", "degrees", _turned("course")
@@ -132,6 +147,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "how fast the centres approach one another",
         "m/s",
         "-(dx * dvx + dy * dvy) / nullif(planar, 0)",
+        worse="high",
     ),
     # Two boxes meet where their shadows meet on each axis of both (separating axes: Gottschalk, Lin and
     # Manocha, OBBTree, SIGGRAPH 1996). On one axis the shadows of boxes that move meet in one interval of time;
@@ -144,6 +160,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         note="0 where they overlap, NULL where they never touch or their velocities differ by less than"
         " 1e-6 m/s",
         dear=True,
+        worse="low",
     ),
     "headway": PairFunction(
         "time until a, at its speed, has come as far as b is now, from bumper to bumper",
@@ -151,6 +168,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "CASE WHEN lon > 0 AND pace > 0.1 AND la + lb IS NOT NULL THEN greatest(lon - la - lb, 0) / pace END",
         note="NULL where b is not ahead or a stands",
         alias="thw",
+        worse="low",
     ),
     "rel_speed": PairFunction(
         "length of the difference of the velocities", "m/s", "sqrt(dvx * dvx + dvy * dvy)"
@@ -180,6 +198,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "CASE WHEN closing_speed > 0 THEN gap / closing_speed END",
         note="NULL where the centres do not approach",
         dear=True,
+        worse="low",
     ),
     LANE_DIST: PairFunction(
         "from centre to centre along the lanes, negative where b is behind",
@@ -206,6 +225,14 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         " CASE WHEN abreast < 0 THEN 0 ELSE abreast END"
         " WHEN rel_speed IS NOT NULL AND gap IS NOT NULL THEN 0 END",
         "0 where they are nearest now",
+        _EGGERT,
+        worse="",
+    ),
+    "dce_3s": _measure(
+        "the least that the gap will be within 3 s if both keep their velocity and do not turn",
+        "m",
+        "CASE WHEN ttce <= 3 THEN dce ELSE gap_3s END",
+        "0 where they will meet by then",
         _EGGERT,
     ),
     "wttc": _measure(
@@ -267,6 +294,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         " WHEN lead > 0 THEN closing * closing / (2 * lead) END",
         f"0 where they do not close in; {_AHEAD} or they touch",
         "Almqvist, Hydén and Risser, Use of Speed Limiters in Cars for Increased Safety, TRR 1318, 1991",
+        worse="high",
     ),
     "decel_to_safety_time": _measure(
         "deceleration to safety time: that a needs so that it is as slow as b when it is 2 s behind it",
@@ -275,6 +303,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         " WHEN lead - 2 * v2 > 0 THEN closing * closing / (2 * (lead - 2 * v2)) END",
         f"0 where they do not close in; {_AHEAD} or the 2 s are lost already",
         "Hupfer, Deceleration to Safety Time (DST), 1997",
+        worse="high",
     ),
     "a_long_req": _measure(
         "required longitudinal acceleration: the constant one along its axis by which a just does not run into"
@@ -293,6 +322,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         " WHEN ttc_accel > 0 THEN 2 * (reach2 - abs(aside)) / (ttc_accel * ttc_accel) END",
         f"0 where they do not meet; {_AHEAD} or they touch",
         _JANSSON,
+        worse="high",
     ),
     "a_req": _measure(
         "required acceleration: a_long_req and a_lat_req as one vector",
@@ -300,6 +330,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "sqrt(a_long_req * a_long_req + a_lat_req * a_lat_req)",
         "0 or more; NULL where one of them is",
         _JANSSON,
+        worse="high",
     ),
     "btn": _measure(
         "brake threat number: the share of 11.5 m/s² that a_long_req is",
@@ -307,6 +338,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "abs(a_long_req) / 11.5e0",
         "from 1 on braking alone does not avoid it",
         _JANSSON,
+        worse="high",
     ),
     "stn": _measure(
         "steer threat number: the share of 8 m/s² that a_lat_req is",
@@ -314,6 +346,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "a_lat_req / 8e0",
         "from 1 on steering alone does not avoid it",
         _JANSSON,
+        worse="high",
     ),
     # Of two straight paths that cross, the conflict area is where the strips that both footprints sweep meet.
     "pret": _measure(
@@ -342,6 +375,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "CASE WHEN cross_a + stay_a >= 0 THEN 2 * stay_a END",
         "NULL where directions differ by less than 1°, one stands, or a has left it",
         _ALLEN,
+        worse="high",
     ),
     "psd": _measure(
         "proportion of stopping distance: how far a still is from b's straight path, in its way of stopping"
@@ -358,6 +392,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "rel_speed / 2",
         "",
         "Shelby, Delta-V as a Measure of Traffic Conflict Severity, TRB 2011",
+        worse="high",
     ),
     "ci": _measure(
         "conflict index: energy that a collision would take from two of 1,500 kg which stay together, over"
@@ -367,6 +402,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "0 where pret is above 5 s, NULL where it is",
         "Alhajyaseen, The Integration of Conflict Probability and Severity for the Safety Assessment of"
         " Intersections, AJSE 40, 2015",
+        worse="high",
     ),
     # Response 1 s, in it accelerating by 3.5 m/s² (0.2 sideways), then braking by at least 4 m/s² (0.8 aside, 3
     # in one's own lane against who comes), who is ahead by at most 8; 0.1 m between: as in ad-rss-lib.
@@ -378,6 +414,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         " WHEN chase > 0 THEN chase ELSE 0 END",
         "",
         _RSS,
+        worse="",
     ),
     "rss_lat": _measure(
         "safe distance of RSS across a's axis",
@@ -385,6 +422,7 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
         "CASE WHEN abeam < 0 THEN 0.1e0 ELSE abeam + 0.1e0 END",
         "",
         _RSS,
+        worse="",
     ),
     "rss_margin": _measure(
         "how far they are from breaking both safe distances of RSS: the larger one of lon_gap less rss_lon and"
@@ -400,6 +438,18 @@ PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
 
 _HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4, 3))
 """Half extents of both boxes, each with the axis that it lies on and the one across."""
+
+_BEYOND: Final = {
+    "out1": "abs(lon) - reach1",
+    "out2": "abs(lat) - reach2",
+    "out3": "abs(back) - reach3",
+    "out4": "abs(side) - reach4",
+    "past1": "abs(CASE WHEN lon < 0 THEN -lat ELSE lat END - hand * (lb * si - wb * co)) - wa",
+    "past2": "abs(CASE WHEN lat < 0 THEN -lon ELSE lon END - hand * (lb * co - wb * si)) - la",
+    "past3": "abs(CASE WHEN back < 0 THEN -side ELSE side END + hand * (la * si - wa * co)) - wb",
+    "past4": "abs(CASE WHEN side < 0 THEN -back ELSE back END + hand * (la * co - wa * si)) - lb",
+}
+"""How far b's centre lies beyond edges of the octagon, and past their ends."""
 
 _PARTS: Final[Mapping[str, str]] = {
     **{f"d{axis}": f"b_{axis} - a_{axis}" for axis in ("x", "y", "z", "vx", "vy")},
@@ -429,14 +479,7 @@ _PARTS: Final[Mapping[str, str]] = {
     "reach2": "wa + lb * si + wb * co",
     "reach3": "lb + la * co + wa * si",
     "reach4": "wb + la * si + wa * co",
-    "out1": "abs(lon) - reach1",
-    "out2": "abs(lat) - reach2",
-    "out3": "abs(back) - reach3",
-    "out4": "abs(side) - reach4",
-    "past1": "abs(CASE WHEN lon < 0 THEN -lat ELSE lat END - hand * (lb * si - wb * co)) - wa",
-    "past2": "abs(CASE WHEN lat < 0 THEN -lon ELSE lon END - hand * (lb * co - wb * si)) - la",
-    "past3": "abs(CASE WHEN back < 0 THEN -side ELSE side END + hand * (la * si - wa * co)) - wb",
-    "past4": "abs(CASE WHEN side < 0 THEN -back ELSE back END + hand * (la * co - wa * si)) - lb",
+    **_BEYOND,
     # On each of the four axes, turned so that b moves along it: b's place and speed, and from when to when the
     # boxes overlap. No speed is 0: two that stand on an axis meet there in ages, or have met for ages.
     "drift1": "dvx * ca + dvy * sa",
@@ -469,6 +512,12 @@ _PARTS: Final[Mapping[str, str]] = {
         f" WHEN drift{over} * {on - over} > 0 THEN {half} * drift{on} ELSE -{half} * drift{on} END"
         for i, half, on, over in _HALVES
     },
+    **{
+        f"{name}_3s": f"{name} + 3 * drift{i}"
+        for i, name in enumerate(("lon", "lat", "back", "side"), 1)
+    },
+    **{_after_3s(name): _after_3s(text) for name, text in _BEYOND.items()},
+    "gap_3s": _after_3s(_GAP),
     "edges": "edge1 + edge2 + edge3 + edge4",
     "corners": "corner1 + corner2 + corner3 + corner4",
     "nearest": "CASE WHEN beyond < 0 THEN -corners ELSE corners END - dotted",

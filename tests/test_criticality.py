@@ -73,6 +73,13 @@ def test_the_closest_encounter_is_that_of_sampled_boxes(seed: int) -> None:
     assert (dce <= least + 1e-9).all()
     assert (least <= dce + speed * MS + 1e-9)[soon].all()
     assert np.abs(distances(a, b, np.minimum(ttce, 1e4)) - dce)[ttce < 1e4].max() < 1e-6
+    early = sampled[: len(times)][times <= 3 + 1e-9].min(axis=0)
+    fine = [distances(a, b, np.minimum(around + k * MS, 3)) for k in range(-50, 50, 5)]
+    early = np.minimum(early, np.min(fine, axis=0))
+    assert (numbers["dce_3s"] <= early + 1e-9).all()
+    assert (early <= numbers["dce_3s"] + speed * coarse + 1e-9).all()
+    assert (numbers["dce_3s"] >= dce - 1e-9).all()
+    assert np.abs(numbers["dce_3s"] - distances(a, b, np.minimum(ttce, 3))).max() < 1e-6
     before = (times[:, None] < ttce - coarse) & (sampled[: len(times)] <= dce)
     assert not before.any()
     assert np.array_equal(dce == 0, ~np.isnan(numbers["ttc"]) | (numbers["gap"] == 0))
@@ -400,7 +407,7 @@ def meetings() -> tuple[Floats, Floats]:
 
 
 def test_every_measure_has_a_definition() -> None:
-    assert {*DEFINITIONS, "dce", "ttce", "wttc"} == {*MEASURES}
+    assert {*DEFINITIONS, "dce", "dce_3s", "ttce", "wttc"} == {*MEASURES}
 
 
 @pytest.mark.parametrize("name", DEFINITIONS)

@@ -26,8 +26,8 @@ VIEWS = {
     " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading closing_time",
     "criticality": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
     " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading closing_time"
-    " dce ttce wttc ttc_accel pttc ttb tts ttr drac decel_to_safety_time a_long_req a_lat_req a_req btn stn"
-    " pret spret et psd delta_v ci rss_lon rss_lat rss_margin",
+    " dce ttce dce_3s wttc ttc_accel pttc ttb tts ttr drac decel_to_safety_time a_long_req a_lat_req a_req"
+    " btn stn pret spret et psd delta_v ci rss_lon rss_lat rss_margin",
     "lane_dists": "frame_id src dst lane_dist src_kind dst_kind src_is_ego dst_is_ego",
     "roles": "frame_id node_id role",
     "classes": "frame_id abstraction class",
