@@ -7,6 +7,7 @@ import math
 import os
 import re
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -577,6 +578,38 @@ def test_a_pattern_the_view_and_a_graph_in_memory_say_the_same(open_town: Store)
         np.testing.assert_allclose(same, wanted, rtol=1e-9, atol=1e-9)
     known = dict(zip(MEASURES, zip(*told.values(), strict=True), strict=True))
     assert [name for name, column in known.items() if {*column} == {None}] == []
+
+
+def test_measures_over_a_drive_are_what_the_frames_add_up_to(open_town: Store) -> None:
+    tet, recorded = re.findall(r"```sql\n(SELECT trace, .*?)```", PAGE.read_text(), re.DOTALL)
+    seen: dict[tuple[str, int], list[tuple[float, float | None, float | None]]] = {}
+    sql = "SELECT trace, dst, t, ttc, gap FROM criticality JOIN frames USING (frame_id) WHERE src_is_ego"
+    for trace, other, *row in open_town.sql(f"{sql} ORDER BY t").values:
+        seen.setdefault((trace, other), []).append(tuple(row))
+    exposed: dict[tuple[str, int], tuple[float, float]] = {}
+    nearest: list[tuple[str, float, int, float, float]] = []
+    for key, course in seen.items():
+        low = [
+            (t, until - t, ttc) for (t, ttc, _), (until, *_) in pairwise(course) if ttc is not None
+        ]
+        low = [one for one in low if one[2] <= 2]
+        if low:
+            exposed[key] = sum(dt for _, dt, _ in low), sum((2 - ttc) * dt for _, dt, ttc in low)
+        for place, (t, *_) in enumerate(course):
+            gap, when = min((gap, at) for at, _, gap in course[place:])
+            nearest.append((key[0], t, key[1], gap, when - t))
+
+    told = {row[:2]: row[2:] for row in open_town.sql(tet).values if row[2] is not None}
+
+    assert told == {key: pytest.approx(values) for key, values in exposed.items()}
+    assert len(told) > 0
+    for found, wanted in zip(
+        open_town.sql(recorded).values,
+        sorted(nearest, key=lambda one: (one[0], one[2], one[1])),
+        strict=True,
+    ):
+        assert found[0] == wanted[0]
+        assert found[1:] == pytest.approx(wanted[1:])
 
 
 # The page -----------------------------------------------------------------------------------------
