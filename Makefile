@@ -69,7 +69,7 @@ test: $(VENV)/.dev
 # Files of tests beside the way from a recording to an answer: what is derived, measured and chosen from what is stored,
 # pictures, exports, graphs and simulators of others, plug-ins of other programs, pages of the docs, and parts of the long
 # programs below. A file that is not listed is of the core.
-EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping \
+EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap exports exports_docs timeline \
   carla_live importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \

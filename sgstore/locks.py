@@ -175,6 +175,14 @@ class Lock:
             whole += f',\n  "{name}": [\n{lines}\n  ]' if rows else f',\n  "{name}": []'
         return f"{whole}\n}}\n"
 
+    @property
+    def ordered(self) -> tuple[LockedCase, ...]:
+        """The cases in the order that was made of them, if there is one; others behind, by trace and frame."""
+        order = self.selection.get("order")
+        names = [str(name) for name in order] if isinstance(order, list) else []
+        places = {name: place for place, name in enumerate(names)}
+        return tuple(sorted(self.cases, key=lambda case: places.get(case.id, len(places))))
+
     def write(self, path: str | Path) -> None:
         """Write it to a file.
 
@@ -457,7 +465,8 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
     Returns
     -------
     list of tuple
-        Name of the trace in the store, first and last log time (ns), and id, in the order of the lock.
+        Name of the trace in the store, first and last log time (ns), and id, in the order of
+        :attr:`Lock.ordered`.
 
     Raises
     ------
@@ -467,7 +476,7 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
     """
     known = read_lock(lock) if isinstance(lock, str | Path) else lock
     names = {one.name: _same(one, store).name for one in known.traces}
-    return [(names[case.trace], case.start_ns, case.end_ns, case.id) for case in known.cases]
+    return [(names[case.trace], case.start_ns, case.end_ns, case.id) for case in known.ordered]
 
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:

@@ -341,7 +341,7 @@ def scenes_of(path: Path, store: Store) -> list[ClipScene]:
     clips = [Clip(trace, start, end) for trace, start, end, _ in cases_of(lock, store)]
     return [
         ClipScene(store, clip, case.id, differences=partial(differences, case))
-        for clip, case in zip(clips, lock.cases, strict=True)
+        for clip, case in zip(clips, lock.ordered, strict=True)
     ]
 
 

@@ -43,6 +43,7 @@ NOT_ASKING = {
 ASKING = [verb for verb in LINES if verb not in NOT_ASKING]
 OUTPUTS = {
     "select": ["-o", "{new}.lock", "--no-payloads"],
+    "prioritize": ["-o", "{new}.lock", "--no-payloads"],
     "timeline": ["-o", "{new}.svg"],
     "coverage growth": ["-o", "{new}.csv", "--picture", "{new}.png"],
 } | {verb: [] for verb in ("why-not", "show", "export")}

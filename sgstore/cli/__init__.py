@@ -33,7 +33,7 @@ VERBS: Final = {
     "stores": ("verify", "remove", "rebuild", "derive", "map", "payload", "config", "demo"),
     "queries": ("find", "why-not", "like", "translate", "sql", "patterns"),
     "checks": ("check", "monitor", "timeline"),
-    "coverage": ("coverage", "select", "diff", "lock"),
+    "coverage": ("coverage", "select", "prioritize", "diff", "lock"),
     "exports": ("show", "export"),
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.

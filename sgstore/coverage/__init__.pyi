@@ -18,6 +18,7 @@ from ._compare import venn as venn
 from ._compare import S3C_THRESHOLD as S3C_THRESHOLD
 from ._compare import failures as failures
 from ._compare import read_outcomes as read_outcomes
+from ._compare import told_outcomes as told_outcomes
 from ._features import Combinations as Combinations
 from ._features import Combos as Combos
 from ._features import combined as combined
@@ -71,5 +72,6 @@ __all__ = [
     "shared",
     "slot_coverage",
     "specification",
+    "told_outcomes",
     "venn",
 ]

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.coverage._classes import Classed
+    from sgstore.query import Store
     from sgstore.world import Bools, Floats, Ints
 
 
@@ -420,11 +421,12 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
         raise ConfigError(f"{path}: no CSV: {error}") from error
 
 
-def _told(outcomes: Mapping[str, bool], a: Classed) -> tuple[Bools, Bools]:
-    """(N,): which frames of a selection failed, and of which an outcome is known."""
-    failed, known = (np.zeros(len(a.frame_id), np.bool_) for _ in range(2))
-    place = {int(frame): row for row, frame in enumerate(a.frame_id.tolist())}
-    store = a.chosen.store
+def told_outcomes(
+    outcomes: Mapping[str, bool], store: Store, frame_id: Ints
+) -> tuple[Bools, Bools]:
+    """(N,): which frames failed, and of which an outcome is known; names are those of :func:`read_outcomes`."""
+    failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
+    place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
     ids = store.file.abstracted.times()[0]
     called = dict(zip(names_of(store, ids), ids.tolist(), strict=True))
     called |= store.file.abstracted.imported_names()
@@ -502,8 +504,8 @@ def failures(
         No outcome is about a frame of either.
     """
     _, (train, test) = shared(train, test)
-    failed_train, known_train = _told(outcomes, train)
-    failed, known = _told(outcomes, test)
+    failed_train, known_train = told_outcomes(outcomes, train.chosen.store, train.frame_id)
+    failed, known = told_outcomes(outcomes, test.chosen.store, test.frame_id)
     if not known.any():
         raise ConfigError(
             f"none of the {len(outcomes)} outcomes is about a frame of {test.chosen.text}"

@@ -1,5 +1,7 @@
 # The face of this package: what others may import from it.
 
+from ._apfd import FaultDetection as FaultDetection
+from ._apfd import fault_detection as fault_detection
 from ._choose import Curve as Curve
 from ._choose import Selection as Selection
 from ._choose import SelectionSpec as SelectionSpec
@@ -12,6 +14,13 @@ from ._cover import Cover as Cover
 from ._cover import Fitted as Fitted
 from ._cover import minimal as minimal
 from ._cover import within as within
+from ._prioritize import MEASURES as MEASURES
+from ._prioritize import Prioritized as Prioritized
+from ._prioritize import Priority as Priority
+from ._prioritize import PrioritySpec as PrioritySpec
+from ._prioritize import failed_in_order as failed_in_order
+from ._prioritize import locked_order as locked_order
+from ._prioritize import prioritize as prioritize
 from ._sets import SetFamily as SetFamily
 from ._choose import parse_split as parse_split
 from ._choose import split as split
@@ -26,8 +35,13 @@ __all__ = [
     "Budget",
     "Cover",
     "Curve",
+    "FaultDetection",
     "Fitted",
+    "MEASURES",
     "Measure",
+    "Prioritized",
+    "Priority",
+    "PrioritySpec",
     "Selection",
     "SelectionSpec",
     "SelectionUnit",
@@ -35,10 +49,14 @@ __all__ = [
     "Strategy",
     "Units",
     "curve",
+    "failed_in_order",
+    "fault_detection",
     "listed",
+    "locked_order",
     "locked_selection",
     "minimal",
     "parse_split",
+    "prioritize",
     "select",
     "split",
     "split_table",

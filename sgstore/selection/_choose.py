@@ -478,13 +478,8 @@ def listed(selection: Selection) -> ReportTable:
         ``holds`` and ``new``: of these, how many no unit before it has.
     """
     units, held = selection.units, selection.holdings
-    first = names_of(units.chosen.store, units.first[selection.picked])
-    last = seq_of(units.last[selection.picked]).tolist()
+    names = names_of_units(units, selection.picked)
     frames = units.sizes[selection.picked].tolist()
-    names = [
-        name if name.rpartition("#")[2] == str(end) else f"{name}-{end}"
-        for name, end in zip(first, last, strict=True)
-    ]
     if held is None:
         return ReportTable(("unit", "frames"), list(zip(names, frames, strict=True)))
     unit, element = held.pairs
@@ -493,6 +488,16 @@ def listed(selection: Selection) -> ReportTable:
     new = np.diff(so_far, prepend=0).tolist()
     rows = zip(names, frames, has[selection.picked].tolist(), new, strict=True)
     return ReportTable(("unit", "frames", "holds", "new"), list(rows))
+
+
+def names_of_units(units: Units, picked: Ints) -> list[str]:
+    """Units as a lock calls them: ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` of a single frame."""
+    first = names_of(units.chosen.store, units.first[picked])
+    last = seq_of(units.last[picked]).tolist()
+    return [
+        name if name.rpartition("#")[2] == str(end) else f"{name}-{end}"
+        for name, end in zip(first, last, strict=True)
+    ]
 
 
 # Parts of a selection that share no recording, such as train and test; and what one knows of another ----

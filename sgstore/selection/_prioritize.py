@@ -1,0 +1,425 @@
+"""Order of test cases: the most critical first, the most diverse first, or both.
+
+The *risk* of a case goes by measures of criticality of the ego and others that move, each the worst value
+in its frames. Measures have different units and scales, so cases are ranked by each of them, and the ranks
+are added up (Borda count): no weight, no threshold. A case of which a measure is not known comes last by it.
+
+For *diversity* the class of a case is that of its most critical frame in an abstraction. Cases come in rounds:
+one of each class, then a second one of each that has two, and so on. As each case brings one class, no order of
+the same cases has more classes in its first k cases, whatever k is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.coverage import UNKNOWN, ReportTable, classed, told_outcomes
+from sgstore.errors import ConfigError
+from sgstore.locks import lock_of
+from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.selection._choose import BudgetTracker, names_of_units
+from sgstore.selection._units import Budget, SelectionUnit, units_of
+from sgstore.store import trace_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from sgstore.coverage import ChosenFrames
+    from sgstore.locks import Lock
+    from sgstore.selection._units import Units
+    from sgstore.world import Bools, Floats, Ints
+
+MEASURES: Final = ("closing_time", "dce_3s", "wttc")
+"""Measures of risk by default: what happens at the closing speed, at constant velocity, and at the worst."""
+
+RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
+"""Measures by which cases can be ranked."""
+
+
+class Priority(StrEnum):
+    """What comes first: the most critical, one of each class, or both."""
+
+    risk = "risk"
+    diverse = "diverse"
+    both = "both"
+
+
+@dataclass(frozen=True)
+class PrioritySpec:
+    """Specification of an order.
+
+    Attributes
+    ----------
+    by : Priority
+    measures : tuple of str
+        Numbers of pairs of which it is known which way is worse.
+    unit : SelectionUnit
+    clip_s : float
+        Length of clips; s.
+    stride_s : float or None
+        From the beginning of one clip to that of the next; ``None``: their length.
+    abstraction : str
+        Whose classes are told apart.
+    budget : Budget or None
+        What is ordered ends with it.
+    seed : int
+        Of the order of cases that are equal.
+    """
+
+    by: Priority = Priority.risk
+    measures: tuple[str, ...] = MEASURES
+    unit: SelectionUnit = SelectionUnit.frame
+    clip_s: float = 2.0
+    stride_s: float | None = None
+    abstraction: str = "RSV"
+    budget: Budget | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse measures that are none.
+
+        Raises
+        ------
+        ConfigError
+        """
+        wrong = [name for name in self.measures if name not in RANKED]
+        if wrong or not self.measures:
+            said = f"no measure of criticality: {wrong[0]!r}" if wrong else "no measure is given"
+            raise ConfigError(f"{said}; expected some of {', '.join(RANKED)}")
+
+    def as_dict(self, query: str) -> dict[str, Any]:
+        """All of it as plain values, as a lock says it."""
+        clip = self.unit is SelectionUnit.clip
+        return {
+            "query": query or None,
+            "by": self.by.value,
+            "measures": list(self.measures) if self.by is not Priority.diverse else None,
+            "unit": self.unit.value,
+            "clip_s": self.clip_s if clip else None,
+            "stride_s": self.stride_s if clip else None,
+            "abstraction": self.abstraction if self.by is not Priority.risk else None,
+            "budget": None if self.budget is None else str(self.budget),
+            "seed": self.seed,
+        }
+
+
+@dataclass(frozen=True)
+class WorstValues:
+    """The worst value of a measure in each unit.
+
+    Attributes
+    ----------
+    name : str
+    value : (U,) float64
+        NaN: not known in any frame.
+    row : (U,) int64
+        The first row of the units' frames that has it.
+    other : (U,) int64
+        The entity, beside the ego, by its node id.
+    """
+
+    name: str
+    value: Floats
+    row: Ints
+    other: Ints
+
+    def ranks(self) -> Floats:
+        """(U,): ranks from the worst, 1, on; of those that are equal the mean; unknown ones are last."""
+        sign = -1.0 if RANKED[self.name].worse == "high" else 1.0
+        filled = np.where(np.isnan(self.value), np.inf, sign * self.value)
+        _, place, many = np.unique(filled, return_inverse=True, return_counts=True)
+        return (np.cumsum(many) - (many - 1) / 2)[place]
+
+
+@dataclass(frozen=True)
+class Prioritized:
+    """Units in an order.
+
+    Attributes
+    ----------
+    spec : PrioritySpec
+    units : Units
+    picked : int64
+        Numbers of units, in order, as far as the budget goes.
+    risk : (U,) float64
+        Share of all units that are no more critical, by the sum of ranks; above 0, and 1 for the first.
+    worst : tuple of WorstValues
+        Of each measure.
+    code : (U,) int64
+        Class of each unit, where that was asked; −1 where it is not known.
+    said : list of str
+        What a person must know of the order.
+    """
+
+    spec: PrioritySpec
+    units: Units
+    picked: Ints
+    risk: Floats
+    worst: tuple[WorstValues, ...] = ()
+    code: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    said: list[str] = field(default_factory=list[str])
+
+    def reasons(self) -> list[str]:
+        """Why each unit stands where it does, in the order of :attr:`picked`."""
+        store = self.units.chosen.store
+        rows = np.array([one.row[self.picked] for one in self.worst], np.int64)
+        times = _times(self.units, self.units.frame_id[np.unique(rows)])
+        kinds = {
+            (trace, node): kind
+            for trace, node, kind in store.file.rows(
+                "SELECT trace_id, node_id, kind FROM entities"
+            ).values
+        }
+        traces = trace_of(self.units.first)
+        seen: dict[int, int] = {}
+        many = np.bincount(self.code[self.code >= 0]) if len(self.code) else np.zeros(0, np.int64)
+        told: list[str] = []
+        for unit in self.picked.tolist():
+            parts = [
+                _reason(
+                    one,
+                    unit,
+                    kinds.get((int(traces[unit]), int(one.other[unit]))),
+                    times,
+                    self.units,
+                )
+                for one in self.worst
+                if not np.isnan(one.value[unit])
+            ]
+            code = int(self.code[unit]) if len(self.code) else UNKNOWN
+            if code != UNKNOWN:
+                seen[code] = seen.get(code, 0) + 1
+                parts.append(_of_class(seen[code], int(many[code]), self.units.unit))
+            told.append("; ".join(parts) or "nothing is known of it")
+        return told
+
+    def table(self) -> ReportTable:
+        """The units in order: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
+        names = names_of_units(self.units, self.picked)
+        columns = [one.value[self.picked].tolist() for one in self.worst]
+        known = [[None if v != v else v for v in column] for column in columns]  # noqa: PLR0124 - NaN
+        risk = self.risk[self.picked].tolist() if len(self.risk) else [None] * len(names)
+        rows = zip(range(1, len(names) + 1), names, risk, *known, self.reasons(), strict=True)
+        head = ("place", "unit", "risk", *(one.name for one in self.worst), "reason")
+        return ReportTable(head, list(rows), self.said)
+
+
+def prioritize(chosen: ChosenFrames, spec: PrioritySpec) -> Prioritized:
+    """Order units of some frames.
+
+    Raises
+    ------
+    AbstractionError
+        There is no such abstraction.
+    ConfigError
+        Units have no meaning.
+    """
+    units = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
+    if not len(units):
+        said = [f"{chosen.text}: no frame to put in order"]
+        return Prioritized(spec, units, np.zeros(0, np.int64), np.zeros(0), said=said)
+    rank = units.ranks(spec.seed)
+    worst: tuple[WorstValues, ...] = ()
+    total, risk, key = rank.astype(np.float64), np.zeros(0), units.begin
+    if spec.by is not Priority.diverse:
+        worst = worst_values(units, spec.measures)
+        total = np.sum([one.ranks() for one in worst], axis=0)
+        risk = 1 - _places(total, rank) / len(units)
+        key = worst[0].row
+    order = np.lexsort((rank, total))
+    code = np.zeros(0, np.int64)
+    if spec.by is not Priority.risk:
+        code = _classes(units, spec.abstraction)[key]
+        rounds = _in_rounds(order, code)
+        order = _together(order, rounds) if spec.by is Priority.both else rounds
+    picked = order
+    if spec.budget is not None:
+        tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
+        picked = tracker.fitting(order)
+    said = [_said(spec, units, picked, worst, code)]
+    return Prioritized(spec, units, picked, risk, worst, code, said)
+
+
+def _said(
+    spec: PrioritySpec, units: Units, picked: Ints, worst: Sequence[WorstValues], code: Ints
+) -> str:
+    told = f"{len(picked):,} of {len(units):,} {units.unit}s in order by {spec.by}"
+    if worst:
+        silent = np.all([np.isnan(one.value) for one in worst], axis=0)
+        told += f" ({', '.join(spec.measures)}"
+        told += f"; of {int(silent.sum()):,} none of these is known)" if silent.any() else ")"
+    if len(code):
+        many, here = (len(np.unique(some[some != UNKNOWN])) for some in (code, code[picked]))
+        told += f"; {here:,} of {many:,} classes in {spec.abstraction}"
+    return told
+
+
+def _places(total: Floats, rank: Ints) -> Ints:
+    """(U,): places in the order of a number, from 0 on."""
+    found = np.empty(len(total), np.int64)
+    found[np.lexsort((rank, total))] = np.arange(len(total))
+    return found
+
+
+def _in_rounds(order: Ints, code: Ints) -> Ints:
+    """Units of an order in rounds: the first ones of each class, the second ones, and so on."""
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    by_class = np.lexsort((place, code))
+    fresh = np.append(True, np.diff(code[by_class]) != 0)
+    begins = np.maximum.accumulate(np.where(fresh, np.arange(len(order)), 0))
+    turn = np.empty(len(order), np.int64)
+    turn[by_class] = np.arange(len(order)) - begins
+    turn[code == UNKNOWN] = len(order)  # of no class: they bring none
+    return np.lexsort((place, turn))
+
+
+def _together(*orders: Ints) -> Ints:
+    """One order of several: places are added up; of those that are equal the first order decides."""
+    places = np.empty((len(orders), len(orders[0])), np.int64)
+    for place, order in zip(places, orders, strict=True):
+        place[order] = np.arange(len(order))
+    return np.lexsort((places[0], places.sum(axis=0)))
+
+
+def _classes(units: Units, abstraction: str) -> Ints:
+    """(N,): classes of the frames of units; −1 where one is not known."""
+    of = classed(units.chosen, abstraction)
+    code = np.full(len(units.frame_id), UNKNOWN, np.int64)
+    code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
+    return code
+
+
+def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ...]:
+    """The worst value of each measure in each unit, of the ego and any other that moves."""
+    columns = ["frame_id"]
+    for i, name in enumerate(measures):
+        column = RANKED[name].column or name
+        sign = "-" if RANKED[name].worse == "high" else ""
+        # Of those that are equally bad the one with the least id: the same whatever the order of rows.
+        least = f"min(ROW({sign}{column}, dst)) FILTER (WHERE {column} IS NOT NULL)"
+        columns.append(f"{least} AS worst{i}")
+    parts = ", ".join(
+        f"worst{i}[1] AS value{i}, worst{i}[2] AS other{i}" for i in range(len(measures))
+    )
+    sql = f"""
+      SELECT frame_id, {parts} FROM (
+        SELECT {", ".join(columns)} FROM criticality WHERE src_is_ego GROUP BY frame_id)
+      ORDER BY frame_id
+    """  # noqa: S608  names of ours
+    found = units.chosen.store.file.arrays(sql)
+    frame_id = found["frame_id"].astype(np.int64)
+    at = np.searchsorted(units.frame_id, frame_id)
+    here = at < len(units.frame_id)
+    here[here] = units.frame_id[at[here]] == frame_id[here]
+    here[here] &= units.asked[at[here]]
+    return tuple(
+        _worst_of(units, name, at[here], found[f"value{i}"][here], found[f"other{i}"][here])
+        for i, name in enumerate(measures)
+    )
+
+
+def _worst_of(units: Units, name: str, rows: Ints, value: Any, other: Any) -> WorstValues:
+    frames = np.full(len(units.frame_id), np.inf)
+    frames[rows] = np.ma.filled(np.ma.asarray(value).astype(np.float64), np.inf)
+    who = np.full(len(units.frame_id), -1, np.int64)
+    who[rows] = np.ma.filled(np.ma.asarray(other).astype(np.int64), -1)
+    ranges = np.stack([units.begin, units.end], axis=1).ravel()
+    least = np.minimum.reduceat(np.append(frames, np.inf), ranges)[::2]
+    row = units.begin.copy()
+    for unit in np.flatnonzero(units.sizes > 1).tolist():
+        row[unit] += int(np.argmin(frames[units.begin[unit] : units.end[unit]]))
+    sign = -1.0 if RANKED[name].worse == "high" else 1.0
+    return WorstValues(name, np.where(np.isinf(least), np.nan, sign * least), row, who[row])
+
+
+def _times(units: Units, frame_id: Ints) -> dict[int, float]:
+    """Seconds since their traces began, of some frames."""
+    if not len(frame_id):
+        return {}
+    found = units.chosen.store.file.arrays("SELECT frame_id, t FROM frames ORDER BY frame_id")
+    known = found["frame_id"].astype(np.int64)
+    at = np.searchsorted(known, frame_id)
+    return dict(zip(frame_id.tolist(), found["t"][at].astype(np.float64).tolist(), strict=True))
+
+
+def _reason(
+    worst: WorstValues, unit: int, kind: str | None, times: Mapping[int, float], units: Units
+) -> str:
+    measure = RANKED[worst.name]
+    of = "" if measure.unit == "ratio" else f" {measure.unit}"
+    time = times[int(units.frame_id[worst.row[unit]])]
+    return (
+        f"{worst.name} {worst.value[unit]:.3g}{of} with {kind} {worst.other[unit]} at {time:.1f} s"
+    )
+
+
+def _of_class(turn: int, many: int, unit: str) -> str:
+    if many == 1:
+        return f"the only {unit} of its class"
+    return f"number {turn} of {many:,} {unit}s of its class"
+
+
+def locked_order(
+    order: Prioritized,
+    query: str = "",
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    payloads: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Lock:
+    """The lock of units in an order, with the reasons.
+
+    Parameters
+    ----------
+    order : Prioritized
+    query : str
+        The query whose frames were put in order; empty: all.
+    parameters : mapping, optional
+        Values of ``$name`` in the query.
+    payloads : bool
+        Whether the messages of the recordings count, too; then they must be there.
+    progress : callable, optional
+        Called with the number of cases done and of all.
+
+    Raises
+    ------
+    TraceError
+        A recording is gone, was replaced, or is damaged.
+    """
+    units = order.units
+    parts = [
+        (
+            units.frame_id[units.begin[unit] : units.end[unit]],
+            units.log_time_ns[units.begin[unit] : units.end[unit]],
+            "",
+        )
+        for unit in sorted(order.picked.tolist())
+    ]
+    names = names_of_units(units, order.picked)
+    how = order.spec.as_dict(query) | {"parameters": dict(parameters or {})}
+    how |= {"order": names, "reasons": dict(zip(names, order.reasons(), strict=True))}
+    return lock_of(units.chosen.store, parts, how, payloads=payloads, progress=progress)
+
+
+def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
+    """Which cases failed, in their order, of those of which an outcome is known.
+
+    Parameters
+    ----------
+    order : Prioritized
+    outcomes : mapping of str to bool
+        As :func:`sgstore.coverage.read_outcomes` reads them. A clip or a trace fails if one of its frames does.
+    """
+    units = order.units
+    told = told_outcomes(outcomes, units.chosen.store, units.frame_id)
+    ranges = np.stack([units.begin, units.end], axis=1).ravel()
+    failed, known = (
+        np.logical_or.reduceat(np.append(column, False), ranges)[::2][order.picked]
+        for column in told
+    )
+    return failed[known]

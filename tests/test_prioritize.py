@@ -1,0 +1,233 @@
+"""Orders of cases: risk by ranks, rounds of classes, APFD, locks with order and reasons."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from sgstore.cli import run
+from sgstore.coverage import ChosenFrames, frames_of
+from sgstore.errors import ConfigError
+from sgstore.locks import cases_of, read_lock
+from sgstore.selection import (
+    Budget,
+    Priority,
+    PrioritySpec,
+    SelectionUnit,
+    fault_detection,
+    prioritize,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from sgstore.query import Store
+
+EVERY = "MATCH (e:Ego) WHERE frame.seq % 5 = 0 RETURN FRAMES"
+
+
+@pytest.fixture(scope="module")
+def some(open_town: Store) -> ChosenFrames:
+    return ChosenFrames("town", open_town, frames_of(open_town, EVERY))
+
+
+def worst_by_hand(some: ChosenFrames, name: str, low: bool = True) -> dict[int, tuple[float, int]]:
+    """The worst value of each frame, and with whom: row by row."""
+    assert some.frame_id is not None
+    frames = {*some.frame_id.tolist()}
+    found: dict[int, tuple[float, int]] = {}
+    rows = some.store.sql(
+        f"SELECT frame_id, dst, {name} FROM criticality WHERE src_is_ego ORDER BY frame_id, dst"
+    ).values
+    for frame, other, value in rows:
+        if value is not None and frame in frames:
+            best = found.get(frame, (math.inf if low else -math.inf, -1))[0]
+            if value < best if low else value > best:
+                found[frame] = value, other
+    return found
+
+
+def mean_ranks(values: list[float]) -> list[float]:
+    """Ranks from the least value on; of equal ones the mean, counted one by one."""
+    return [
+        sum(v < one for v in values) + (sum(v == one for v in values) + 1) / 2 for one in values
+    ]
+
+
+def test_risk_is_the_sum_of_the_ranks_of_the_worst_values(some: ChosenFrames) -> None:
+    names = ("closing_time", "dce_3s", "a_req")
+    found = prioritize(some, PrioritySpec(measures=names))
+
+    assert some.frame_id is not None
+    frames = some.frame_id.tolist()
+    total = np.zeros(len(frames))
+    for worst, name in zip(found.worst, names, strict=True):
+        hand = worst_by_hand(some, name, low=name != "a_req")
+        sign = -1 if name == "a_req" else 1
+        total += mean_ranks([sign * hand[f][0] if f in hand else math.inf for f in frames])
+        known = [f in hand for f in frames]
+        assert (~np.isnan(worst.value)).tolist() == known
+        for unit, frame in enumerate(frames):
+            if frame in hand:
+                assert (worst.value[unit], worst.other[unit]) == pytest.approx(hand[frame])
+    assert sorted(found.picked.tolist()) == list(range(len(frames)))
+    assert (np.diff(total[found.picked]) >= 0).all()
+    assert (np.diff(found.risk[found.picked]) < 0).all()
+    assert len(set(total.tolist())) > 10
+
+
+def test_the_worst_of_a_clip_is_that_of_its_frames(open_town: Store) -> None:
+    first = frames_of(open_town, "MATCH (e:Ego) WHERE frame.seq < 100 RETURN FRAMES")
+    beginning = ChosenFrames("town", open_town, first)
+    spec = PrioritySpec(unit=SelectionUnit.clip, clip_s=1.0, measures=("closing_time",))
+    found = prioritize(beginning, spec)
+    hand = worst_by_hand(beginning, "closing_time")
+
+    units = found.units
+    for unit in range(len(units)):
+        frames = units.frame_id[units.begin[unit] : units.end[unit]].tolist()
+        known = [hand[f][0] for f in frames if f in hand]
+        assert found.worst[0].value[unit] == pytest.approx(
+            min(known, default=math.nan), nan_ok=True
+        )
+        if known:
+            row = int(found.worst[0].row[unit])
+            assert hand[int(units.frame_id[row])][0] == min(known)
+    assert 1 < len(units) < len(hand)
+
+
+def test_no_order_has_more_classes_in_its_first_cases_than_the_diverse_one(
+    some: ChosenFrames,
+) -> None:
+    found = prioritize(some, PrioritySpec(Priority.diverse, abstraction="E"))
+
+    codes = found.code[found.picked].tolist()
+    classes = len(set(codes))
+    for many in range(1, len(codes) + 1):
+        assert len(set(codes[:many])) == min(many, classes)
+    left, of = defaultdict(int), {c: codes.count(c) for c in codes}
+    turns = []
+    for code in codes:
+        left[code] += 1
+        turns.append(left[code])
+    assert turns == sorted(turns)
+    assert max(of.values()) > 1
+
+
+def test_risk_and_diversity_together_lie_between_the_two(some: ChosenFrames) -> None:
+    orders = {by: prioritize(some, PrioritySpec(by, abstraction="E")) for by in Priority}
+    half = len(orders[Priority.risk].picked) // 4
+
+    def classes(by: Priority) -> int:
+        both = orders[Priority.both]
+        return len({both.code[unit] for unit in orders[by].picked[:half].tolist()})
+
+    def risk(by: Priority) -> float:
+        return float(orders[Priority.risk].risk[orders[by].picked[:half]].mean())
+
+    assert classes(Priority.risk) <= classes(Priority.both) <= classes(Priority.diverse)
+    assert risk(Priority.diverse) <= risk(Priority.both) <= risk(Priority.risk)
+
+
+def test_a_budget_ends_the_order(some: ChosenFrames) -> None:
+    whole = prioritize(some, PrioritySpec()).picked
+
+    part = prioritize(some, PrioritySpec(budget=Budget(4, "units"))).picked
+
+    assert part.tolist() == whole[:4].tolist()
+
+
+@pytest.mark.parametrize("measures", [("dist",), ("rss_lon",), ("speed",), ()])
+def test_what_has_no_worse_side_is_no_measure_of_risk(measures: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match=r"expected some of .*closing_time"):
+        PrioritySpec(measures=measures)
+
+
+# How soon failures are found ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_apfd_is_that_of_the_textbook(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    failed = rng.random(200) < 0.1
+    failed[3] = True
+
+    found = fault_detection(failed)
+
+    places = [place for place, fails in enumerate(failed.tolist(), start=1) if fails]
+    n, m = len(failed), len(places)
+    assert found.apfd == pytest.approx(1 - sum(places) / (n * m) + 1 / (2 * n))
+    # The area under the curve of failures found over cases run, by trapezia.
+    curve = np.append(0, np.cumsum(failed)) / m
+    assert found.apfd == pytest.approx(np.trapezoid(curve, dx=1 / n))
+    assert found.found[0.1] == pytest.approx(curve[20])
+    assert found.low <= found.apfd <= found.high
+    assert (found.cases, found.failures) == (n, m)
+
+
+def test_failures_that_come_first_come_soonest() -> None:
+    first, last = (fault_detection(np.arange(100) < 5), fault_detection(np.arange(100) >= 95))
+
+    assert first.apfd == pytest.approx(0.975)
+    assert last.apfd == pytest.approx(0.025)
+    assert first.found == {0.05: 1, 0.1: 1, 0.2: 1}
+    with pytest.raises(ConfigError, match="none of 7 cases failed"):
+        fault_detection(np.zeros(7, np.bool_))
+
+
+# The verb -----------------------------------------------------------------------------------------
+
+
+def test_the_verb_says_why_and_locks_the_order(
+    town_store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lock, outcomes = tmp_path / "order.lock", tmp_path / "outcomes.csv"
+    assert run(["prioritize", str(town_store), EVERY, "--json"]) == 0
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    rows: list[dict[str, Any]] = told[0] if isinstance(told[0], list) else told
+    with outcomes.open("w", newline="") as file:
+        write = csv.writer(file)
+        write.writerow(["frame", "failed"])
+        write.writerows([row["unit"], int(row["place"] <= 3)] for row in rows)
+
+    options = ["--budget", "6units", "--outcomes", str(outcomes), "--no-payloads"]
+    assert run(["prioritize", str(town_store), EVERY, *options, "-o", str(lock)]) == 0
+
+    said = capsys.readouterr()
+    assert [row["place"] for row in rows] == list(range(1, len(rows) + 1))
+    assert "closing_time" in rows[0]["reason"]
+    assert " s with " in rows[0]["reason"]
+    assert "APFD 0.750" in said.err
+    assert "of 3 failures in 6 cases" in said.err
+    kept = read_lock(lock)
+    names = [row["unit"] for row in rows[:6]]
+    assert kept.selection["order"] == names
+    assert kept.selection["reasons"][names[0]] == rows[0]["reason"]
+    assert [case.id for case in kept.ordered] == names
+
+
+def test_cases_of_a_lock_come_in_its_order(
+    open_town: Store, town_store: Path, tmp_path: Path
+) -> None:
+    lock = tmp_path / "order.lock"
+    order = ["prioritize", str(town_store), EVERY, "--by", "both", "--budget", "5units"]
+    assert run([*order, "--no-payloads", "-o", str(lock)]) == 0
+
+    cases = cases_of(lock, open_town)
+
+    assert [name for *_, name in cases] == read_lock(lock).selection["order"]
+    assert sorted(name for *_, name in cases) != [name for *_, name in cases]
+
+
+def test_a_measure_that_is_none_is_refused(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["prioritize", str(town_store), "-m", "danger"]) == 1
+
+    assert "no measure of criticality: 'danger'; expected some of" in capsys.readouterr().err
