@@ -20,6 +20,7 @@ TITLES = {
     "temporal": "Time: formulas over columns, and frame by frame",
     "coverage": "Coverage of a million frames",
     "selection": "Small parts of a million frames that keep every class",
+    "prioritize": "Orders of simulator runs by risk, beside their outcomes",
 }
 
 parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)

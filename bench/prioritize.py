@@ -1,0 +1,99 @@
+"""How soon orders of cases find failures: runs of a simulator with known outcomes; time for a million frames.
+
+::
+
+    python -m bench prioritize [--quick]
+
+DeepScenario (Simula-COMPLEX/DeepScenario) tells of each run where everybody is every half second, and whether
+the ego collided. Each run is a case, told by its first way-point alone; the runs of a strategy are the frames
+of one imported file. The data are those of ``SGSTORE_DATA``, by default ``../shared/data``; ``--quick`` takes a
+tenth of the runs. The baseline is chance: an APFD of one half.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from bench.measure import Measure
+from sgstore.coverage import selection_of
+from sgstore.importing import import_graphs
+from sgstore.selection import PrioritySpec, failed_in_order, fault_detection, prioritize
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+STRATEGIES: Final = {"random": "random strategy", "rl_based": "reinforcement learning"}
+SIZES: Final = {
+    "Ego": ("car", 4.7, 1.9),
+    "Sedan": ("car", 4.7, 1.9),
+    "SchoolBus": ("bus", 10.5, 2.6),
+    "BoxTruck": ("truck", 7.5, 2.5),
+    "SUV": ("car", 4.8, 2.0),
+    "Jeep": ("car", 4.4, 1.9),
+    "Hatchback": ("car", 4.2, 1.8),
+}
+"""Kind, length and width of each model, which the data do not tell; m."""
+
+PERSON: Final = ("person", 0.5, 0.5)
+BESIDE: Final = {"closing_time": ("closing_time",), "dce_3s": ("dce_3s",), "wttc": ("wttc",)}
+
+
+def graph_of(number: int, run: dict[str, Any]) -> dict[str, Any]:
+    """The first way-point of a run as a node-link graph; Unity's axes, y up, turned clockwise from z."""
+    nodes: list[dict[str, Any]] = []
+    for name, (model, role) in run["o"].items():
+        _, vx, vz, vy, x, z, y, turned = run["t"][name][0]
+        ego = role == "Ego"
+        kind, length, width = (
+            SIZES["Ego"] if ego else PERSON if role == "Pedestrian" else SIZES[model]
+        )
+        about = {"id": "ego" if ego else f"{number} {name}", "kind": kind, "is_ego": ego}
+        about |= {"x": x, "y": y, "z": z, "heading": 90 - turned, "vx": vx, "vy": vy, "vz": vz}
+        nodes.append(about | {"length": length, "width": width, "height": 1.7})
+    return {"graph": {"name": f"run {number}"}, "nodes": nodes, "edges": []}
+
+
+def written(data: Path, strategy: str, folder: Path, every: int) -> tuple[Path, dict[str, bool]]:
+    """A file of graphs, one for each run, and which of them failed."""
+    graphs, failed = folder / f"{strategy}.jsonl", {}
+    with lzma.open(data / f"{strategy}.jsonl.xz", "rt") as lines, graphs.open("w") as file:
+        for number, line in enumerate(lines):
+            if number % every:
+                continue
+            run = json.loads(line)
+            file.write(json.dumps(graph_of(number, run)) + "\n")
+            failed[f"run {number}"] = run["lab"][0] == "True"
+    return graphs, failed
+
+
+def run(quick: bool = False) -> Iterator[Measure]:
+    """Import, put in order, and compare with the outcomes."""
+    data = Path(os.environ.get("SGSTORE_DATA", "../shared/data")) / "deepscenario"
+    if not data.is_dir():
+        yield Measure("no data", 0, "", f"{data} is not there")
+        return
+    with tempfile.TemporaryDirectory() as name:
+        for strategy, title in STRATEGIES.items():
+            graphs, failed = written(data, strategy, Path(name), 10 if quick else 1)
+            store = Path(name) / f"{strategy}.sgstore"
+            import_graphs(store, [graphs], "nodelink")
+            chosen = selection_of(str(store))
+            for label, measures in {"risk": None, **BESIDE}.items():
+                spec = PrioritySpec() if measures is None else PrioritySpec(measures=measures)
+                begun = time.perf_counter()
+                order = prioritize(chosen, spec)
+                took = time.perf_counter() - begun
+                found = fault_detection(failed_in_order(order, failed))
+                yield Measure(f"{title}, {label}", found.apfd, "APFD", found.said)
+                yield Measure("  for a million frames", took / len(order.units) * 1e6, "s")
+            rng = np.random.default_rng(0)
+            chance = fault_detection(rng.permutation(np.array(list(failed.values()))))
+            yield Measure(f"{title}, in random order", chance.apfd, "APFD", chance.said)
