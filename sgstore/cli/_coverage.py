@@ -565,7 +565,7 @@ class OrderOptions:
             "-m",
             metavar="NAME",
             help="Rank by this measure of criticality; may be repeated.",
-            show_default="closing_time, dce_3s, wttc",
+            show_default="closing_time, dce_3s",
         ),
     ] = None
     budget: Annotated[
