@@ -625,7 +625,7 @@ def rows() -> Iterator[str]:
 
 def test_the_page_lists_the_measures() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    begin, end = "<!-- measures, made from sgstore/pair_numbers.py -->\n", "<!-- end -->"
+    begin, end = "<!-- measures, made from sgstore/pair_numbers -->\n", "<!-- end -->"
     head, rest = page.split(begin)
     expected = f"{head}{begin}{''.join(rows())}{end}{rest.partition(end)[2]}"
     if os.environ.get("SGSTORE_UPDATE_GOLDEN"):

@@ -1,0 +1,29 @@
+# The face of this package: what others may import from it.
+
+from ._arrays import COLUMNS as COLUMNS
+from ._arrays import PairNumbers as PairNumbers
+from ._arrays import gap as gap
+from ._boxes import LANE_DIST as LANE_DIST
+from ._declared import PairFunction as PairFunction
+from ._table import PAIR_FUNCTIONS as PAIR_FUNCTIONS
+from ._table import columns_needed as columns_needed
+from ._table import needed_for as needed_for
+from ._table import pair_sql as pair_sql
+from ._table import pairs_view as pairs_view
+from ._table import parts_of as parts_of
+from ._table import stage_of as stage_of
+
+__all__ = [
+    "COLUMNS",
+    "LANE_DIST",
+    "PAIR_FUNCTIONS",
+    "PairFunction",
+    "PairNumbers",
+    "columns_needed",
+    "gap",
+    "needed_for",
+    "pair_sql",
+    "pairs_view",
+    "parts_of",
+    "stage_of",
+]

@@ -1,0 +1,183 @@
+"""Places, velocities and footprints of two entities: gaps, angles, and when two boxes meet."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.pair_numbers._declared import PairFunction
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+GAP: Final = (
+    "CASE WHEN reach1 + reach2 IS NULL THEN NULL WHEN greatest(out1, out2, out3, out4) <= 0 THEN 0"
+    " ELSE sqrt(least("
+    + ", ".join(
+        f"CASE WHEN out{i} > 0 THEN out{i} * out{i} + greatest(past{i}, 0) * greatest(past{i}, 0) END"
+        for i in (1, 2, 3, 4)
+    )
+    + ")) END"
+)
+"""The distance of b's centre from the octagon."""
+
+LANE_DIST: Final = "lane_dist"
+"""The number that is no expression: it is looked up, by lanes and ways between them."""
+
+BEYOND: Final = {
+    "out1": "abs(lon) - reach1",
+    "out2": "abs(lat) - reach2",
+    "out3": "abs(back) - reach3",
+    "out4": "abs(side) - reach4",
+    "past1": "abs(CASE WHEN lon < 0 THEN -lat ELSE lat END - hand * (lb * si - wb * co)) - wa",
+    "past2": "abs(CASE WHEN lat < 0 THEN -lon ELSE lon END - hand * (lb * co - wb * si)) - la",
+    "past3": "abs(CASE WHEN back < 0 THEN -side ELSE side END + hand * (la * si - wa * co)) - wb",
+    "past4": "abs(CASE WHEN side < 0 THEN -back ELSE back END + hand * (la * co - wa * si)) - lb",
+}
+"""How far b's centre lies beyond edges of the octagon, and past their ends."""
+
+
+def _turned(angle: str) -> str:
+    """An angle in degrees, brought into (-180, 180]."""
+    return f"{angle} - 360 * ceil(({angle} - 180) / 360)"
+
+
+NUMBERS: Final[Mapping[str, PairFunction]] = {
+    "dist": PairFunction(
+        "distance between the centres, in space",
+        "m",
+        "sqrt(dx * dx + dy * dy + dz * dz)",
+        column="distance",
+    ),
+    # The distance of b's centre from the Minkowski sum of both boxes, an octagon around a's centre whose edges
+    # are those of both. Boxes are symmetric about their centres: of two opposite edges only the one on the side
+    # of b's centre can be the nearest, so four remain, two in a's axes and two in b's.
+    "gap": PairFunction(
+        "shortest distance between the footprints",
+        "m",
+        GAP,
+        note="0 where they touch or overlap",
+        dear=True,
+        worse="low",
+    ),
+    "bearing": PairFunction(
+        "direction of b's centre in a's axes, positive to the left", "degrees", _turned("course")
+    ),
+    "rel_heading": PairFunction("b's heading less a's", "degrees", _turned("turned")),
+    "lon": PairFunction(
+        "how far b's centre lies ahead of a's, in a's axes", "m", "dx * ca + dy * sa"
+    ),
+    "lat": PairFunction(
+        "how far b's centre lies to the left of a's, in a's axes", "m", "dy * ca - dx * sa"
+    ),
+    "closing_speed": PairFunction(
+        "how fast the centres approach one another",
+        "m/s",
+        "-(dx * dvx + dy * dvy) / nullif(planar, 0)",
+        worse="high",
+    ),
+    # Two boxes meet where their shadows meet on each axis of both (separating axes: Gottschalk, Lin and
+    # Manocha, OBBTree, SIGGRAPH 1996). On one axis the shadows of boxes that move meet in one interval of time;
+    # what all four intervals have in common is when the boxes do.
+    "ttc": PairFunction(
+        "time until the footprints first touch if both keep their velocity and do not turn",
+        "s",
+        "CASE WHEN meets <= parts AND parts >= 0 AND (rel_speed >= 1e-6 OR meets <= 0)"
+        " AND reach1 + reach2 IS NOT NULL THEN greatest(meets, 0) END",
+        note="0 where they overlap, NULL where they never touch or their velocities differ by less than"
+        " 1e-6 m/s",
+        dear=True,
+        worse="low",
+    ),
+    "headway": PairFunction(
+        "time until a, at its speed, has come as far as b is now, from bumper to bumper",
+        "s",
+        "CASE WHEN lon > 0 AND pace > 0.1 AND la + lb IS NOT NULL THEN greatest(lon - la - lb, 0) / pace END",
+        note="NULL where b is not ahead or a stands",
+        alias="thw",
+        worse="low",
+    ),
+    "rel_speed": PairFunction(
+        "length of the difference of the velocities", "m/s", "sqrt(dvx * dvx + dvy * dvy)"
+    ),
+    # Not by greatest(), which passes over NULL.
+    "lon_gap": PairFunction(
+        "how far the footprints are apart along a's axis",
+        "m",
+        "CASE WHEN out1 < 0 THEN 0 ELSE out1 END",
+        note="0 where they overlap in it",
+    ),
+    "lat_gap": PairFunction(
+        "how far the footprints are apart across a's axis",
+        "m",
+        "CASE WHEN out2 < 0 THEN 0 ELSE out2 END",
+        note="0 where they overlap in it",
+    ),
+    # Scenic's apparent heading of b from a: Fremont et al., PLDI 2019, table 2.
+    "apparent_heading": PairFunction(
+        "b's heading less the direction from a to b: 0 is a tail, 180 a front",
+        "degrees",
+        f"CASE WHEN planar > 0 THEN {_turned('sighted')} END",
+    ),
+    "closing_time": PairFunction(
+        "the gap at the closing speed, whether or not the ways meet",
+        "s",
+        "CASE WHEN closing_speed > 0 THEN gap / closing_speed END",
+        note="NULL where the centres do not approach",
+        dear=True,
+        worse="low",
+    ),
+    LANE_DIST: PairFunction(
+        "from centre to centre along the lanes, negative where b is behind",
+        "m",
+        "",
+        note="NULL beyond 200 m",
+    ),
+}
+
+PARTS: Final[Mapping[str, str]] = {
+    **{f"d{axis}": f"b_{axis} - a_{axis}" for axis in ("x", "y", "z", "vx", "vy")},
+    **{f"l{one}": f"{one}_length / 2" for one in "ab"},
+    **{f"w{one}": f"{one}_width / 2" for one in "ab"},
+    **{f"c{one}": f"cos({one}_heading)" for one in "ab"},
+    **{f"s{one}": f"sin({one}_heading)" for one in "ab"},
+    "planar": "sqrt(dx * dx + dy * dy)",
+    "pace": "sqrt(a_vx * a_vx + a_vy * a_vy)",
+    # The difference of two angles is exact for the headings that people write (0, π/2, π), where the angle of
+    # turned components is not: the cosine of the double nearest to π/2 is 6e-17.
+    "course": "CASE WHEN dx = 0 AND dy = 0 THEN 0 * a_heading ELSE degrees(atan2(dy, dx) - a_heading) END",
+    "turned": "degrees(b_heading - a_heading)",
+    "sighted": "degrees(b_heading - atan2(dy, dx))",
+    # a's centre in b's axes, with the other sign
+    "back": "dx * cb + dy * sb",
+    "side": "dy * cb - dx * sb",
+    # Between the headings; of parallel boxes two corners reach equally far, and each box takes the other one.
+    "cosine": "ca * cb + sa * sb",
+    "sine": "ca * sb - sa * cb",
+    "co": "abs(cosine)",
+    "si": "abs(sine)",
+    "hand": "CASE WHEN cosine * sine < 0 THEN -1 ELSE 1 END",
+    # Edges of the octagon, along and across a's axis and b's: their distance from a's centre, how far b's
+    # centre lies beyond, and how far past their ends
+    "reach1": "la + lb * co + wb * si",
+    "reach2": "wa + lb * si + wb * co",
+    "reach3": "lb + la * co + wa * si",
+    "reach4": "wb + la * si + wa * co",
+    **BEYOND,
+    # On each of the four axes, turned so that b moves along it: b's place and speed, and from when to when the
+    # boxes overlap. No speed is 0: two that stand on an axis meet there in ages, or have met for ages.
+    "drift1": "dvx * ca + dvy * sa",
+    "drift2": "dvy * ca - dvx * sa",
+    "drift3": "dvx * cb + dvy * sb",
+    "drift4": "dvy * cb - dvx * sb",
+    **{
+        f"place{i}": f"CASE WHEN drift{i} < 0 THEN -{at} ELSE {at} END"
+        for i, at in enumerate(("lon", "lat", "back", "side"), 1)
+    },
+    **{f"rate{i}": f"abs(drift{i}) + 1e-200" for i in (1, 2, 3, 4)},
+    "meets": f"greatest({', '.join(f'(-reach{i} - place{i}) / rate{i}' for i in (1, 2, 3, 4))})",
+    "parts": f"least({', '.join(f'(reach{i} - place{i}) / rate{i}' for i in (1, 2, 3, 4))})",
+    # Bounds that are cheap: no two boxes are nearer than their circumscribed circles (a micrometre makes up for
+    # rounding), and of two that move straight on the distance shrinks by no more than this in a second.
+    "at_least": "planar - sqrt(la * la + wa * wa) - sqrt(lb * lb + wb * wb) - 1e-6",
+    "approach": "greatest(coalesce(closing_speed, 0), 0)",
+}

@@ -1,0 +1,57 @@
+"""Declarations of numbers of two entities."""
+
+from __future__ import annotations
+
+from sgstore.records import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class PairFunction:
+    """Declaration of a number of two entities a and b.
+
+    Attributes
+    ----------
+    doc : str
+        Meaning, in terms of a and b.
+    unit : str
+    sql : str
+        Expression over columns of both entities, parts (:data:`_PARTS`) and other numbers; empty: it is looked
+        up elsewhere, and is no column of the view.
+    note : str
+        Special values.
+    source : str
+        Where the literature defines it.
+    view : str
+        The first view that has it as a column: ``pairs``, or ``criticality``, which has all.
+    column : str
+        Name in the views, where it differs.
+    alias : str
+        Second name in the language.
+    worse : str
+        Which values are the more critical ones: ``low`` or ``high``; empty: neither.
+    dear : bool
+        Whether a condition on it is tested after those on the others, and a bound on the distance before.
+    """
+
+    doc: str
+    unit: str
+    sql: str
+    note: str = ""
+    source: str = ""
+    view: str = "pairs"
+    column: str = ""
+    alias: str = ""
+    worse: str = ""
+    dear: bool = False
+
+    @property
+    def meaning(self) -> str:
+        """The documentation in one line."""
+        return f"{self.doc}; {self.unit}" + (f"; {self.note}" if self.note else "")
+
+
+def measure(
+    doc: str, unit: str, sql: str, note: str, source: str, alias: str = "", worse: str = "low"
+) -> PairFunction:
+    """A measure of criticality."""
+    return PairFunction(doc, unit, sql, note, source, "criticality", alias=alias, worse=worse)

@@ -1,0 +1,65 @@
+"""Safe distances of Responsibility-Sensitive Safety (RSS)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.pair_numbers._declared import measure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.pair_numbers._declared import PairFunction
+
+_RSS: Final = (
+    "Shalev-Shwartz et al., On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
+)
+
+NUMBERS: Final[Mapping[str, PairFunction]] = {
+    # Response 1 s, in it accelerating by 3.5 m/s² (0.2 sideways), then braking by at least 4 m/s² (0.8 aside, 3
+    # in one's own lane against who comes), who is ahead by at most 8; 0.1 m between: as in ad-rss-lib.
+    "rss_lon": measure(
+        "safe distance of RSS along a's axis: that the one behind, or both who come towards one another, must"
+        " keep",
+        "m",
+        "CASE WHEN toward_a + toward_b IS NULL THEN NULL WHEN least(toward_a, toward_b) >= 0 THEN head_on"
+        " WHEN chase > 0 THEN chase ELSE 0 END",
+        "",
+        _RSS,
+        worse="",
+    ),
+    "rss_lat": measure(
+        "safe distance of RSS across a's axis",
+        "m",
+        "CASE WHEN abeam < 0 THEN 0.1e0 ELSE abeam + 0.1e0 END",
+        "",
+        _RSS,
+        worse="",
+    ),
+    "rss_margin": measure(
+        "how far they are from breaking both safe distances of RSS: the larger one of lon_gap less rss_lon and"
+        " lat_gap less rss_lat",
+        "m",
+        "CASE WHEN reach1 + reach2 IS NOT NULL AND rss_lon + rss_lat IS NOT NULL"
+        " THEN greatest(lon_gap - rss_lon, lat_gap - rss_lat) END",
+        "below 0: dangerous",
+        _RSS,
+    ),
+}
+
+PARTS: Final[Mapping[str, str]] = {
+    # Speeds towards one another, along a's axis and across it. Of two that go apart nobody chases; of one that
+    # goes away sideways even after the response, the way of stopping counts with its sign.
+    "toward_a": "CASE WHEN lon > 0 THEN v1 WHEN lon <= 0 THEN -v1 END",
+    "toward_b": "CASE WHEN lon > 0 THEN -v2 WHEN lon <= 0 THEN v2 END",
+    "faster": "greatest(toward_a, toward_b, 0)",
+    "flees": "CASE WHEN toward_a < 0 AND toward_b < 0 THEN greatest(toward_a, toward_b)"
+    " ELSE least(toward_a, toward_b) END",
+    "chase": "faster + 1.75e0 + (faster + 3.5e0) * (faster + 3.5e0) / 8 - flees * flees / 16",
+    "head_on": "toward_a + 1.75e0 + (toward_a + 3.5e0) * (toward_a + 3.5e0) / 6"
+    " + toward_b + 1.75e0 + (toward_b + 3.5e0) * (toward_b + 3.5e0) / 8",
+    "sideways_a": "CASE WHEN lat < 0 THEN -slip_a WHEN lat >= 0 THEN slip_a END + 0.2e0",
+    "sideways_b": "CASE WHEN lat < 0 THEN slip_b WHEN lat >= 0 THEN -slip_b END + 0.2e0",
+    "abeam": "sideways_a + sideways_b - 0.2e0"
+    " + (sideways_a * abs(sideways_a) + sideways_b * abs(sideways_b)) / 1.6e0",
+}

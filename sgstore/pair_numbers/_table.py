@@ -1,0 +1,106 @@
+"""All numbers of pairs by name, and their SQL."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import TYPE_CHECKING, Final
+
+from sgstore.pair_numbers import _boxes, _crossing, _encounter, _following, _rss
+from sgstore.pair_numbers._boxes import LANE_DIST
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from sgstore.pair_numbers._declared import PairFunction
+
+_FAMILIES: Final = (_boxes, _encounter, _following, _crossing, _rss)
+
+PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
+    name: one for family in _FAMILIES for name, one in family.NUMBERS.items()
+}
+"""Numbers of two entities by name, in the order of the views; NULL where what they need is not known."""
+
+EXPRESSIONS: Final[Mapping[str, str]] = {
+    **{name: sql for family in _FAMILIES for name, sql in family.PARTS.items()},
+    **{name: one.sql for name, one in PAIR_FUNCTIONS.items() if one.sql},
+}
+"""Expressions of SQL by name: parts that numbers share, and numbers."""
+
+_NAME: Final = re.compile(r"\b[a-z]\w*\b(?!\()")
+"""A part: words of SQL are in capitals, functions have a bracket behind them."""
+
+
+@cache
+def parts_of(name: str) -> tuple[str, ...]:
+    """The numbers, parts and columns that a number of a pair is made of."""
+    return tuple(sorted({*_NAME.findall(EXPRESSIONS[name])}))
+
+
+@cache
+def stage_of(name: str) -> int:
+    """Return the number of layers before a number of a pair; 0 for a column of an entity."""
+    return 1 + max(stage_of(part) for part in parts_of(name)) if name in EXPRESSIONS else 0
+
+
+@cache
+def needed_for(name: str) -> frozenset[str]:
+    """A number of a pair with all that it is made of; nothing for one that is looked up."""
+    if name == LANE_DIST:
+        return frozenset()
+    if name not in EXPRESSIONS:
+        return frozenset({name})
+    return frozenset({name}).union(*(needed_for(part) for part in parts_of(name)))
+
+
+def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
+    """The columns of a and those of b that a number of a pair is made of."""
+    raw = [part for part in needed_for(name) if part not in EXPRESSIONS]
+    a, b = (frozenset(part[2:] for part in raw if part[0] == one) for one in "ab")
+    return a, b
+
+
+# SQL ----------------------------------------------------------------------------------------------
+
+
+def pair_sql(name: str, column: Callable[[str], str]) -> str:
+    """A number of a pair as SQL, given the columns of what it is made of."""
+    return _NAME.sub(lambda found: column(found[0]), EXPRESSIONS[name])
+
+
+_KEPT: Final = ("frame_id", "src", "dst", "src_kind", "dst_kind", "src_is_ego", "dst_is_ego")
+_BEFORE_KINDS: Final = 10
+"""Numbers before the kinds in the views, which keep the order of their columns; new ones come behind."""
+
+
+def pairs_view(view: str = "pairs") -> tuple[str, str]:
+    """Return the statement of a view of pairs, without its head, and the documentation of what is first in it.
+
+    Parameters
+    ----------
+    view : str
+        ``pairs``, or ``criticality``: its numbers and the measures of criticality.
+    """
+    listed = [
+        (one.column or name, name)
+        for name, one in PAIR_FUNCTIONS.items()
+        if one.sql and one.view in {view, "pairs"}
+    ]
+    wanted = frozenset[str]().union(*(needed_for(name) for _, name in listed))
+    inputs = sorted(name for name in wanted if not stage_of(name))
+    columns = ["b.frame_id", "a.node_id AS src", "b.node_id AS dst"]
+    columns += ["a.kind AS src_kind", "b.kind AS dst_kind"]
+    columns += ["a.is_ego AS src_is_ego", "b.is_ego AS dst_is_ego"]
+    columns += [f"{name[0]}.{name[2:]}::DOUBLE AS {name}" for name in inputs]
+    join = (
+        "inside.state a JOIN inside.state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
+    )
+    text = f"SELECT {', '.join(columns)} FROM {join}"  # noqa: S608
+    for stage in range(1, 1 + max(map(stage_of, wanted))):
+        layer = [f"{pair_sql(n, str)} AS {n}" for n in sorted(wanted) if stage_of(n) == stage]
+        text = f"SELECT *, {', '.join(layer)} FROM ({text})"  # noqa: S608
+    numbers = [name if column == name else f"{name} AS {column}" for column, name in listed]
+    shown = [*_KEPT[:3], *numbers[:_BEFORE_KINDS], *_KEPT[3:], *numbers[_BEFORE_KINDS:]]
+    first = [(column, PAIR_FUNCTIONS[name]) for column, name in listed]
+    told = [f"{column}: {one.meaning}" for column, one in first if one.view == view]
+    return f"SELECT {', '.join(shown)} FROM ({text})", ". ".join(told)  # noqa: S608
