@@ -6,6 +6,8 @@ import cmath
 import math
 import os
 import re
+import subprocess
+import sys
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -578,6 +580,35 @@ def test_a_pattern_the_view_and_a_graph_in_memory_say_the_same(open_town: Store)
         np.testing.assert_allclose(same, wanted, rtol=1e-9, atol=1e-9)
     known = dict(zip(MEASURES, zip(*told.values(), strict=True), strict=True))
     assert [name for name, column in known.items() if {*column} == {None}] == []
+
+
+BOUNDED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))
+resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+import sgstore
+path, *names = sys.argv[1:]
+with sgstore.open(path) as store:
+    for name in names:
+        (most, known), = store.sql(f"SELECT max({name}), count({name}) FROM criticality WHERE src_is_ego").values
+        below = f"criticality WHERE src_is_ego AND {name} <= {most}" if known else "criticality WHERE FALSE"
+        found = store.sql(f"SELECT frame_id FROM {below} ORDER BY {name}, frame_id").values
+        assert len(found) == known, name
+        least = f"min(ROW({name}, dst)) FILTER (WHERE {name} IS NOT NULL)"
+        store.sql(f"SELECT frame_id, {least} FROM criticality WHERE src_is_ego GROUP BY frame_id LIMIT 1")
+    tests = " AND ".join(f"({name}(e, v) < 1e300 OR {name}(e, v) IS NULL)" for name in names)
+    print(store.find(f"MATCH (e:Ego), (v:Car) WHERE {tests}").count())
+    print(store.find("MATCH (e:Ego), (v:Car)").count())
+"""
+
+
+def test_a_condition_on_a_measure_takes_no_memory_without_bound(town_store: Path) -> None:
+    command = [sys.executable, "-c", BOUNDED, str(town_store), *MEASURES]
+
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+    assert done.stderr == ""
+    assert len({*done.stdout.split()}) == 1
 
 
 def test_measures_over_a_drive_are_what_the_frames_add_up_to(open_town: Store) -> None:

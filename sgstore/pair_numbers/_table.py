@@ -63,9 +63,35 @@ def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
 # SQL ----------------------------------------------------------------------------------------------
 
 
+_WRITTEN_OUT: Final = 2000
+"""Columns that a number may be spelled out to, before DuckDB is kept from it; ``ttc`` has 1,500."""
+
+
+@cache
+def _spelled(name: str) -> int:
+    """Number of columns that stand in a number of a pair when each part in it is replaced by its expression."""
+    if name not in EXPRESSIONS:
+        return 1
+    return sum(
+        1 if _is_apart(part) else _spelled(part) for part in _NAME.findall(EXPRESSIONS[name])
+    )
+
+
+@cache
+def _is_apart(name: str) -> bool:
+    """Tell whether conditions on a number are not to be replaced by conditions on its parts."""
+    return _spelled(name) > _WRITTEN_OUT
+
+
 def pair_sql(name: str, column: Callable[[str], str]) -> str:
-    """A number of a pair as SQL, given the columns of what it is made of."""
-    return _NAME.sub(lambda found: column(found[0]), EXPRESSIONS[name])
+    """A number of a pair as SQL, given the columns of what it is made of.
+
+    DuckDB moves a condition below a layer by writing the layer's expressions into it, which for ``wttc`` are 21
+    million columns, and a minute's work for some others. It leaves a condition where it is if a column in it is
+    volatile: so a large number is made so, at no cost, because nothing is drawn where the number is known.
+    """
+    text = _NAME.sub(lambda found: column(found[0]), EXPRESSIONS[name])
+    return f"coalesce({text}, CASE WHEN random() > 2 THEN 0 END)" if _is_apart(name) else text
 
 
 _KEPT: Final = ("frame_id", "src", "dst", "src_kind", "dst_kind", "src_is_ego", "dst_is_ego")
