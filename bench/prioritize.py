@@ -1,4 +1,4 @@
-"""How soon orders of cases find failures: runs of a simulator with known outcomes; time for a million frames.
+"""Orders of cases beside known outcomes of simulator runs: APFD, and seconds for a million frames.
 
 ::
 

@@ -590,7 +590,8 @@ import sgstore
 path, *names = sys.argv[1:]
 with sgstore.open(path) as store:
     for name in names:
-        (most, known), = store.sql(f"SELECT max({name}), count({name}) FROM criticality WHERE src_is_ego").values
+        sql = f"SELECT max({name}), count({name}) FROM criticality WHERE src_is_ego"
+        ((most, known),) = store.sql(sql).values
         below = f"criticality WHERE src_is_ego AND {name} <= {most}" if known else "criticality WHERE FALSE"
         found = store.sql(f"SELECT frame_id FROM {below} ORDER BY {name}, frame_id").values
         assert len(found) == known, name
@@ -605,7 +606,7 @@ with sgstore.open(path) as store:
 def test_a_condition_on_a_measure_takes_no_memory_without_bound(town_store: Path) -> None:
     command = [sys.executable, "-c", BOUNDED, str(town_store), *MEASURES]
 
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
 
     assert done.stderr == ""
     assert len({*done.stdout.split()}) == 1
@@ -613,7 +614,7 @@ def test_a_condition_on_a_measure_takes_no_memory_without_bound(town_store: Path
 
 def test_measures_over_a_drive_are_what_the_frames_add_up_to(open_town: Store) -> None:
     tet, recorded = re.findall(r"```sql\n(SELECT trace, .*?)```", PAGE.read_text(), re.DOTALL)
-    seen: dict[tuple[str, int], list[tuple[float, float | None, float | None]]] = {}
+    seen: dict[tuple[str, int], list[tuple[float, float | None, float]]] = {}
     sql = "SELECT trace, dst, t, ttc, gap FROM criticality JOIN frames USING (frame_id) WHERE src_is_ego"
     for trace, other, *row in open_town.sql(f"{sql} ORDER BY t").values:
         seen.setdefault((trace, other), []).append(tuple(row))

@@ -126,7 +126,7 @@ def test_risk_and_diversity_together_lie_between_the_two(some: ChosenFrames) -> 
 
     def classes(by: Priority) -> int:
         both = orders[Priority.both]
-        return len({both.code[unit] for unit in orders[by].picked[:half].tolist()})
+        return len({int(both.code[unit]) for unit in orders[by].picked[:half].tolist()})
 
     def risk(by: Priority) -> float:
         return float(orders[Priority.risk].risk[orders[by].picked[:half]].mean())
@@ -189,8 +189,7 @@ def test_the_verb_says_why_and_locks_the_order(
 ) -> None:
     lock, outcomes = tmp_path / "order.lock", tmp_path / "outcomes.csv"
     assert run(["prioritize", str(town_store), EVERY, "--json"]) == 0
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    rows: list[dict[str, Any]] = told[0] if isinstance(told[0], list) else told
+    rows: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
     with outcomes.open("w", newline="") as file:
         write = csv.writer(file)
         write.writerow(["frame", "failed"])
@@ -228,6 +227,29 @@ def test_cases_of_a_lock_come_in_its_order(
 def test_a_measure_that_is_none_is_refused(
     town_store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["prioritize", str(town_store), "-m", "danger"]) == 1
+    assert run(["prioritize", str(town_store), "-m", "danger"]) == 2
 
     assert "no measure of criticality: 'danger'; expected some of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("unit", "status", "told"),
+    [
+        ("town#0", 0, "none of the 1 cases with a known outcome failed"),
+        ("nowhere#0", 2, "none of the 1 outcomes is about a case of"),
+    ],
+)
+def test_outcomes_without_a_failure_are_told(
+    town_store: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    unit: str,
+    status: int,
+    told: str,
+) -> None:
+    outcomes = tmp_path / "outcomes.csv"
+    outcomes.write_text(f"frame,failed\n{unit},0\n")
+
+    assert run(["prioritize", str(town_store), EVERY, "--outcomes", str(outcomes)]) == status
+
+    assert told in capsys.readouterr().err

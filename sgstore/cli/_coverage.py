@@ -632,7 +632,9 @@ def prioritize(
     for text in found.said:
         say(text)
     if known is not None:
-        say(fault_detection(failed_in_order(found, known), spec.seed).said)
+        failed = failed_in_order(found, known)
+        none = f"none of the {len(failed):,} cases with a known outcome failed"
+        say(fault_detection(failed, spec.seed).said if failed.any() else none)
     out.report(found.table())
     if output is not None:
         values = parameters_of(parameters)

@@ -33,7 +33,7 @@ BEYOND: Final = {
     "past3": "abs(CASE WHEN back < 0 THEN -side ELSE side END + hand * (la * si - wa * co)) - wb",
     "past4": "abs(CASE WHEN side < 0 THEN -back ELSE back END + hand * (la * co - wa * si)) - lb",
 }
-"""How far b's centre lies beyond edges of the octagon, and past their ends."""
+"""Distances of b's centre beyond edges of the octagon, and past their ends."""
 
 
 def _turned(angle: str) -> str:

@@ -1,4 +1,4 @@
-"""Who drives behind whom: times and accelerations along a's axis, and across it to get past."""
+"""One behind the other: times and accelerations along a's axis, and across it to get past."""
 
 from __future__ import annotations
 

@@ -6,15 +6,18 @@ import re
 from functools import cache
 from typing import TYPE_CHECKING, Final
 
-from sgstore.pair_numbers import _boxes, _crossing, _encounter, _following, _rss
-from sgstore.pair_numbers._boxes import LANE_DIST
+import sgstore.pair_numbers._boxes as boxes
+import sgstore.pair_numbers._crossing as crossing
+import sgstore.pair_numbers._encounter as encounter
+import sgstore.pair_numbers._following as following
+import sgstore.pair_numbers._rss as rss
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from sgstore.pair_numbers._declared import PairFunction
 
-_FAMILIES: Final = (_boxes, _encounter, _following, _crossing, _rss)
+_FAMILIES: Final = (boxes, encounter, following, crossing, rss)
 
 PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     name: one for family in _FAMILIES for name, one in family.NUMBERS.items()
@@ -46,7 +49,7 @@ def stage_of(name: str) -> int:
 @cache
 def needed_for(name: str) -> frozenset[str]:
     """A number of a pair with all that it is made of; nothing for one that is looked up."""
-    if name == LANE_DIST:
+    if name == boxes.LANE_DIST:
         return frozenset()
     if name not in EXPRESSIONS:
         return frozenset({name})

@@ -1,4 +1,4 @@
-"""How soon an order of cases finds failures: the average percentage of faults detected.
+"""Average percentage of faults detected (APFD): a number for how soon an order of cases finds failures.
 
 Rothermel, Untch, Chu and Harrold, "Prioritizing Test Cases for Regression Testing" (TSE 2001), where each
 failing case is a fault of its own: with failures at the places p of n cases, 1 - mean(p) / n + 1 / (2 n). In
@@ -25,7 +25,7 @@ _DRAWS: Final = 2_000
 
 @dataclass(frozen=True)
 class FaultDetection:
-    """How soon an order finds the failures.
+    """Measured speed at which an order finds the failures.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class FaultDetection:
 
 
 def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
-    """How soon an order finds the failures.
+    """Measure how soon an order finds the failures.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
 
     Examples
     --------
-    >>> fault_detection(np.array([True, False, False, True, False])).apfd
-    0.6
+    >>> fault_detection(np.array([True, False, False, False])).apfd
+    0.875
     """
     where = np.flatnonzero(failed)
     if not len(where):

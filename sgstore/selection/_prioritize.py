@@ -41,7 +41,7 @@ RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql an
 
 
 class Priority(StrEnum):
-    """What comes first: the most critical, one of each class, or both."""
+    """Rule of an order: the most critical first, one of each class first, or both."""
 
     risk = "risk"
     diverse = "diverse"
@@ -164,7 +164,7 @@ class Prioritized:
     said: list[str] = field(default_factory=list[str])
 
     def reasons(self) -> list[str]:
-        """Why each unit stands where it does, in the order of :attr:`picked`."""
+        """Reasons for the place of each unit, in the order of :attr:`picked`."""
         store = self.units.chosen.store
         rows = np.array([one.row[self.picked] for one in self.worst], np.int64)
         times = _times(self.units, self.units.frame_id[np.unique(rows)])
@@ -407,13 +407,18 @@ def locked_order(
 
 
 def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
-    """Which cases failed, in their order, of those of which an outcome is known.
+    """Outcomes of the cases in their order, as far as they are known: true where one failed.
 
     Parameters
     ----------
     order : Prioritized
     outcomes : mapping of str to bool
         As :func:`sgstore.coverage.read_outcomes` reads them. A clip or a trace fails if one of its frames does.
+
+    Raises
+    ------
+    ConfigError
+        No outcome is about a case.
     """
     units = order.units
     told = told_outcomes(outcomes, units.chosen.store, units.frame_id)
@@ -422,4 +427,8 @@ def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
         np.logical_or.reduceat(np.append(column, False), ranges)[::2][order.picked]
         for column in told
     )
+    if not known.any():
+        raise ConfigError(
+            f"none of the {len(outcomes)} outcomes is about a case of {units.chosen.text}"
+        )
     return failed[known]
