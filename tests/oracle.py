@@ -241,6 +241,11 @@ class Search:
                 return None if value is None else -value
             case s.Call():
                 return self.call(e, binding)
+            case s.Case(branches=branches, otherwise=otherwise):
+                for branch in branches:
+                    if self.value(branch.condition, binding) is True:
+                        return self.value(branch.value, binding)
+                return None if otherwise is None else self.value(otherwise, binding)
             case s.BlockExpression():
                 return self.block(e, binding)
         raise NotImplementedError(e)

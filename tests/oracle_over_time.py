@@ -252,6 +252,10 @@ class Told:
                 for sign, term in rest:
                     result = arithmetic(sign, result, self.value(term, i, binding))
                 return result
+            case s.Case(branches=branches, otherwise=otherwise) if is_temporal(e):
+                told = (b for b in branches if self.either(b.condition, i, binding) is True)
+                chosen = next((branch.value for branch in told), otherwise)
+                return None if chosen is None else self.value(chosen, i, binding)
             case s.Call(name="prev", arguments=(inner,)):
                 return None if i == 0 or self.gap_before(i) else self.value(inner, i - 1, binding)
             case s.Call(name="delta", arguments=(inner, by)):
@@ -526,6 +530,8 @@ COURSES = (
     "max_over(e.speed, 3frames) > e.speed",
     "avg_over(e.speed, 0.2s) >= e.speed",
     "sum_over(e.x, 0.5s) > 3 * sum_over(e.speed, 2frames)",
+    "CASE WHEN prev(e.speed) < e.speed THEN delta(e.x, 0.2s) WHEN ONCE e.speed > 2 THEN e.x END > 1",
+    "CASE run_length(e.speed > 0.5) WHEN 0 THEN prev(e.speed) ELSE 2 END > 1",
 )
 PAIR_COURSES = (
     "min_over(dist(e, v), 0.4s) < 6",

@@ -55,6 +55,7 @@ SECONDS: Final = {
     "draw_clip": 10,
     "store_sharing": 9,
     "frozen": 9,
+    "lang_after": 8,
     "lang_oracle": 8,
     "lang_match": 8,
     "query": 8,

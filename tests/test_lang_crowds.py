@@ -39,6 +39,8 @@ def number(rng: random.Random, depth: int) -> str:
     unary += ("exp({} / 9)",)
     both = ("({} + {})", "({} - {})", "({} * {})", "({} / {})", "({} % {})")
     both += ("min({}, {})", "max({}, {})", "pow({}, {})", "atan2({}, {})")
+    if rng.random() < 0.1:
+        return f"CASE WHEN {condition(rng, depth - 1)} THEN {one} ELSE {other} END"
     if rng.random() < 0.4:
         return rng.choice(unary).format(one)
     return rng.choice(both).format(one, other)

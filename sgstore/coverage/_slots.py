@@ -88,9 +88,10 @@ def _with_frames(query: str) -> str:
     if found is None or found.returns is None:
         return query
     returns = found.returns
-    if returns.limit is not None or returns.sample is not None:
+    chosen = (returns.limit, returns.sample, returns.top, returns.skip or None, returns.having)
+    if any(part is not None for part in chosen):
         raise QueryError(
-            "a specification counts all matches, and has no LIMIT and no SAMPLE",
+            "a specification counts all matches, and has no LIMIT, SKIP, SAMPLE or HAVING",
             text=query,
             span=returns.span,
         )

@@ -14,7 +14,7 @@ from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
 from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
-from sgstore.lang._catalog import Catalog, Type
+from sgstore.lang._catalog import TRACE_ATTRIBUTES, Catalog, Type
 from sgstore.lang._functions import FUNCTIONS, call
 from sgstore.lang._symbols import (
     RESERVED,
@@ -40,7 +40,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.lang.syntax import QuantifierClause, Statement
 
@@ -512,20 +512,23 @@ def _result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
     form = item.form if item is not None else "value"
     result = b.Result(
         form=_FORMS.get(form, "rows"),
-        columns=tuple(_column(item, inner) for item in returns.items if item.form == "value"),
+        columns=_columns(returns, inner),
         whole=any(item.form == "all" for item in returns.items),
         framed=form == "frames",
         distinct=returns.distinct,
+        skip=returns.skip,
         limit=returns.limit,
         before=item.before if item else 0,
         after=item.after if item else 0,
     )
+    result = replace(result, having=_having(returns.having, result, inner))
     _check_result(result, returns, names.session)
     if result.aggregated or result.form in {"intervals", "clips"}:
         # Each comes once as it is, and DISTINCT must not drop what is counted.
         result = replace(result, distinct=False)
     order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
-    return replace(result, order=order, sample=_sampling(returns.sample, result, inner))
+    sample, top = _sampling(returns.sample, result, inner), _top(returns.top, result, inner)
+    return replace(result, order=order, sample=sample, top=top)
 
 
 def _special(returns: s.Returns, session: Session) -> s.Item | None:
@@ -536,20 +539,47 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
     return special[0] if special else None
 
 
+def _columns(returns: s.Returns, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
+    """The values to return; one that is counted of all matches may speak of those that it stands beside."""
+    items = [item for item in returns.items if item.form == "value"]
+    found = [_column(item, names) for item in items]
+    keys = _group_keys(found)
+    columns: list[b.ReturnColumn] = []
+    for item, column in zip(items, found, strict=True):
+        assert item.value is not None  # noqa: S101 - the form of the item says so
+        value = _of_groups(column.value, keys) if b.is_counted(column.value) else column.value
+        _refuse_mixed(value, item.value.span, names.session)
+        columns.append(replace(column, value=value))
+    return tuple(columns)
+
+
+def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
+    """Return the values by which matches are grouped, and what they are called."""
+    plain = (one for one in columns if not b.is_counted(one.value))
+    return {one.value: one.name for one in plain if not isinstance(one.value, b.Value)}
+
+
+def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
+    """An expression about groups of matches: what tells these apart stands in it by name."""
+    if value in keys:
+        return b.GroupKey(keys[value], value.type)
+    if isinstance(value, b.Operation):
+        return b.with_operands(value, lambda part: _of_groups(part, keys))
+    return value
+
+
 def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
     assert item.value is not None  # noqa: S101 - the form of the item says so
     value = settled(names.bind(item.value), names.session)
-    if value.type is Type.list:
+    if value.type is Type.list and not isinstance(value, b.Aggregate):
         names.session.refuse("a list cannot be returned", item.span)
-    _refuse_mixed(value, item.value.span, names.session)
     text = names.session.text[item.value.span.start : item.value.span.end]
     return b.ReturnColumn(item.name or " ".join(text.split()), value)
 
 
 def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
     """Refuse a value that is of each match and of all matches at once."""
-    counted = any(isinstance(part, b.Aggregate) for part in b.walk(value))
-    if counted and _of_each(value):
+    if b.is_counted(value) and _of_each(value):
         session.refuse(
             "a value of each match cannot stand beside one of all matches",
             span,
@@ -561,7 +591,43 @@ def _of_each(value: b.Bound) -> bool:
     """Tell whether a value speaks of single matches, but for what is counted of all."""
     if isinstance(value, b.Operation):
         return any(_of_each(operand) for operand in value.operands)
-    return not isinstance(value, b.Aggregate | b.Value | b.Choices)
+    return not isinstance(value, b.Aggregate | b.GroupKey | b.Value | b.Choices)
+
+
+def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) -> b.Bound | None:
+    """Return the condition on groups of matches, or on intervals."""
+    if written is None:
+        return None
+    session = names.session
+    if result.form in {"intervals", "clips"}:
+        own: dict[str, b.Bound] = {
+            name: b.GroupKey(name, Type.text if name == "trace" else Type.number)
+            for name in result.names
+        }
+        found = settled(replace(names, aliases=own).condition(written), session)
+        if b.is_counted(found) or _of_each(found):
+            session.refuse(
+                f"behind HAVING, {result.form} have their ends and no other values",
+                written.span,
+                f"name one of: {', '.join(own)}; what a match must be stands behind WHERE",
+            )
+        return found
+    own = {column.name: column.value for column in result.columns}
+    found = settled(replace(names, aliases=own).condition(written), session)
+    found = _of_groups(found, _group_keys(result.columns))
+    if not b.is_counted(found) and not result.aggregated:
+        session.refuse(
+            "HAVING chooses among groups of matches, and nothing is counted here",
+            written.span,
+            "what a match must be stands behind WHERE, before RETURN",
+        )
+    if _of_each(found):
+        session.refuse(
+            "behind HAVING stand values of groups: what is counted, and what is returned beside it",
+            written.span,
+            "what a match must be stands behind WHERE, before RETURN",
+        )
+    return found
 
 
 def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
@@ -574,14 +640,20 @@ def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound |
     if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
         names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
     found = settled(replace(names, aliases=own).bind(value), names.session)
+    if result.aggregated and b.is_counted(found):
+        found = _of_groups(found, _group_keys(result.columns))
     _refuse_mixed(found, value.span, names.session)
+    if found.type is Type.list:
+        names.session.refuse("a list puts nothing in an order", value.span)
     if isinstance(found, b.Value):
         hint = f"name a value, or one of: {', '.join(known)}"
         names.session.refuse("a constant puts nothing in an order", value.span, hint)
     same = next((column.name for column in result.columns if column.value == found), None)
+    if result.form in {"intervals", "clips"} and found == _TRACE_NAME:
+        same = "trace"
     if same is not None:
         return same
-    counted = any(isinstance(part, b.Aggregate) for part in b.walk(found))
+    counted = b.is_counted(found)
     one_each = not (result.distinct or result.framed or result.aggregated)
     listed = result.form in {"rows", "subgraphs"}
     if not listed or not (result.aggregated if counted else one_each):
@@ -600,6 +672,24 @@ def _sampling(sample: s.Sample | None, result: b.Result, names: SymbolTable) -> 
         reason = "SAMPLE chooses among matches, and these are not listed"
         names.session.refuse(reason, sample.span, "LIMIT n gives the first ones, by ORDER BY")
     return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))
+
+
+_TRACE_NAME: Final = b.TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+
+
+def _top(top: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
+    """``LIMIT n PER value``: the first rows of each value."""
+    if top is None or top.per is None:
+        return None
+    per = _key(top.per, result, names)
+    rows = result.form == "rows" and not (result.whole or result.framed)
+    if not isinstance(per, str) and rows and (result.aggregated or result.distinct):
+        names.session.refuse(
+            "LIMIT n PER takes what is returned, where it is counted or DISTINCT",
+            top.per.span,
+            f"name one of: {', '.join(column.name for column in result.columns)}",
+        )
+    return b.Sampling(top.number, per)
 
 
 def _check_result(result: b.Result, returns: s.Returns, session: Session) -> None:

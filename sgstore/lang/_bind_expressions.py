@@ -349,7 +349,10 @@ def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTa
             names.session.refuse("a comparison with NULL is never true", written.span, hint)
         if side.type is Type.list:
             hint = f"{where} IN […]" if prop else "write IN"
-            names.session.refuse("a list cannot be compared", written.span, hint)
+            collected = isinstance(side, b.Aggregate)
+            names.session.refuse(
+                "a list cannot be compared", written.span, None if collected else hint
+            )
 
 
 def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> str | None:
@@ -479,6 +482,38 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
     return seen_in(operand, words[0], e.arguments[0].span, session)
 
 
+def _case(e: s.Case, names: SymbolTable) -> b.Operation:
+    """``CASE``: its operands are condition and value of each branch, then what it is otherwise, or NULL."""
+    operands: list[b.Bound] = []
+    written = [branch.value for branch in e.branches]
+    written += [e.otherwise] if e.otherwise is not None else []
+    values = [names.bind(value) for value in written]
+    known = [
+        (value, at)
+        for value, at in zip(values, written, strict=True)
+        if value.type is not Type.null
+    ]
+    for value, at in known:
+        if value.type in {Type.node, Type.list}:
+            hint = f"one of its attributes: {at.name}.name" if isinstance(at, s.Variable) else None
+            names.session.refuse(f"a {value.type.value} is no value of CASE", at.span, hint)
+        if value.type is not known[0][0].type:
+            names.session.refuse(
+                f"CASE has values of one type, and this is a {value.type.value} beside a"
+                f" {known[0][0].type.value}",
+                at.span,
+                comparison_hint(known[0][0].type, value.type, _constants(values)),
+            )
+    for branch, value in zip(e.branches, values, strict=False):
+        operands += [names.condition(branch.condition), value]
+    operands.append(values[-1] if e.otherwise is not None else b.Value(None, Type.null))
+    return b.Operation("case", tuple(operands), known[0][0].type if known else Type.null)
+
+
+def _constants(values: Sequence[b.Bound]) -> list[object]:
+    return [value.value for value in values if isinstance(value, b.Value)]
+
+
 # Numbers ------------------------------------------------------------------------------------------
 
 
@@ -519,5 +554,6 @@ BINDERS: Final[Binders] = {
     s.Membership: _membership,
     s.Arithmetic: _arithmetic,
     s.Negative: _negative,
+    s.Case: _case,
 }
 """The binders of what this file is about; :mod:`~sgstore.lang._bind` adds those of calls, blocks and time."""

@@ -42,6 +42,7 @@ from sgstore.lang.ir import (
     EdgeAttribute,
     EdgeRelation,
     FrameAttribute,
+    GroupKey,
     Kinds,
     LabelTest,
     Node,
@@ -421,9 +422,12 @@ def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case
             return _block(value, indent)
         case Tense() | SignalCall() | StepTime():
             return _over_time(value, indent)
-        case Aggregate(word=word, operand=operand, distinct=distinct):
+        case Aggregate(word=word, operand=operand, distinct=distinct, share=share):
             inner = "*" if operand is None else value_text(operand, indent)
+            inner += f", {share * 100:g}" if word == "percentile" else ""
             return f"{word}({'DISTINCT ' * distinct}{inner})"
+        case GroupKey(name=name):
+            return name
         case _:
             return _leaf(value)
 
@@ -484,6 +488,10 @@ def _operation(operation: Operation, indent: str) -> str:
     word = operation.word
     if word in INFIX:
         return "(" + f" {word} ".join(parts) + ")"
+    if word == "case":
+        pairs = zip(parts[::2], parts[1::2], strict=False)
+        told = " ".join(f"WHEN {condition} THEN {value}" for condition, value in pairs)
+        return f"CASE {told} ELSE {parts[-1]} END"
     if word.startswith("IS "):
         return f"({parts[0]} {word})"
     if word in {"NOT", "negative"}:
@@ -636,13 +644,14 @@ class Compiled:
         result = self.query.result
         framed = result.whole or result.framed or result.form != "rows"
         across = result.distinct and not framed
-        return not (result.order or result.sample or result.aggregated or across)
+        chosen = result.order or result.sample or result.top or result.skip
+        return not (chosen or result.aggregated or across)
 
     @property
     def limited_to_frames(self) -> Compiled | None:
         """If it lists a limited number of rows: the query that says of each its frame and log time."""
         result = self.query.result
-        if result.limit is None or result.form != "rows" or result.aggregated:
+        if not result.chooses or result.form != "rows" or result.aggregated:
             return None
         time = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
         columns = (*result.columns, ReturnColumn(f":{results.LOG_TIME}", time))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import field
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.lang._aggregates import sql_of
 from sgstore.lang._catalog import DERIVED, Attribute, DisplayUnit, Home, Type
 from sgstore.lang._operators import COMPARISONS, COMPILER_SQL, OPERATORS
 from sgstore.lang.ir import (
@@ -15,6 +16,7 @@ from sgstore.lang.ir import (
     EdgeAttribute,
     EdgeRelation,
     FrameAttribute,
+    GroupKey,
     LabelTest,
     NodeAttribute,
     NodeValue,
@@ -108,6 +110,7 @@ class Select:
     having: list[str] = field(default_factory=list[str])
     order: list[str] = field(default_factory=list[str])
     limit: int | None = None
+    offset: int = 0
     distinct: bool = False
     lenient: bool = False
 
@@ -121,6 +124,7 @@ class Select:
         lines += ["HAVING " + "\n  AND ".join(self.having)] if self.having else []
         lines += ["ORDER BY " + ", ".join(self.order)] if self.order else []
         lines += [f"LIMIT {self.limit}"] if self.limit is not None else []
+        lines += [f"OFFSET {self.offset}"] if self.offset else []
         return "\n".join(lines)
 
     def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
@@ -402,6 +406,7 @@ Leaf = (
     | TraceAttribute
     | PairNumber
     | BlockValue
+    | GroupKey
 )
 """What an expression is made of, as far as a statement must bring it as a column."""
 
@@ -415,9 +420,9 @@ def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: Boun
             return _operation(expression, leaf, values)
         case Aggregate(operand=FrameAttribute(attribute=Attribute(name="held")) as held):
             return f"CAST(coalesce(sum({leaf(held)}), 0) AS BIGINT)"
-        case Aggregate(word=name, operand=operand, distinct=distinct):
+        case Aggregate(operand=operand):
             inner = "*" if operand is None else expression_text(operand, leaf, values)
-            return f"{name}({'DISTINCT ' * distinct}{inner})"
+            return sql_of(expression, inner)
         case NodeAttribute(attribute=attribute) if attribute.values:
             return f"CAST({leaf(expression)} AS VARCHAR)"
         case Choices() | LabelTest() | Tense() | SignalCall() | StepTime():
@@ -479,7 +484,7 @@ def _membership(
 def leaves(expression: Bound) -> Iterable[Leaf]:
     """The columns that an expression is made of."""
     match expression:
-        case Value() | Choices() | LabelTest() | Tense() | SignalCall() | StepTime():
+        case Value() | Choices() | LabelTest() | Tense() | SignalCall() | StepTime() | GroupKey():
             return
         case Operation(operands=operands):
             for operand in operands:
@@ -518,6 +523,8 @@ def column_of(leaf: Leaf) -> str:
             return f"{function}({a}, {b})"
         case BlockValue(number=number):
             return f"block {number}"
+        case GroupKey(name=name):
+            return name
     return f"{owner}.{name}"
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NoReturn
 
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
+from sgstore.lang._aggregates import AGGREGATES, aggregate, is_aggregate
 from sgstore.lang._bind_temporal import course
 from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_NAMES, Type
 from sgstore.lang._hints import said_of
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-_AGGREGATES: Final = frozenset({"count", "min", "max", "avg", "sum"})
 _OTHERS: Final = frozenset(
     {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", *OF_TEXT}
 )
@@ -37,7 +37,7 @@ _COURSES: Final = (
 )
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
-    {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *OF_TWO, *_OTHERS, *_AGGREGATES, *_COURSES}
+    {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *OF_TWO, *_OTHERS, *AGGREGATES, *_COURSES}
 )
 
 MAX_CALLS: Final = 30
@@ -55,25 +55,37 @@ def call(e: s.Call, names: SymbolTable) -> b.Bound:
         Its arguments do not fit.
     """
     name = normalize_name(e.name)
+    if e.distinct and not is_aggregate(e):
+        names.session.refuse(
+            f"{e.name}() takes no DISTINCT", e.span, "RETURN DISTINCT, or COUNT(DISTINCT x)"
+        )
     if name in names.session.predicates:
         return _predicate(e, names)
     if name in _TEMPORAL:
         return course(e, names)
-    if names.aggregates and name in _AGGREGATES and len(e.arguments) == 1:
-        return _aggregate(name, e, names)
+    if names.aggregates and is_aggregate(e):
+        return aggregate(e, names)
     if name in _FUNCTIONS:
         return _FUNCTIONS[name](e, names)
-    if name in _AGGREGATES:
-        word = e.name.upper()
-        inner = "(a)-[:near]->(b)" if word == "COUNT" else "(a)-[:near]->(b) | b.speed"
-        if names.aggregated:
-            names.session.refuse("what is counted of all matches cannot stand in another", e.span)
-        names.session.refuse(
-            f"{e.name}() may stand after RETURN only",
-            e.span,
-            f"in a condition: {word} {{{inner}}} > 2",
-        )
+    if name in AGGREGATES:
+        _refuse_aggregate(e, names)
     return _standard(name, e, names)
+
+
+def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
+    """Refuse what is counted of all matches where one match is spoken of."""
+    word = e.name.upper()
+    if names.aggregated:
+        names.session.refuse("what is counted of all matches cannot stand in another", e.span)
+    inner = "(a)-[:near]->(b)" if word == "COUNT" else "(a)-[:near]->(b) | b.speed"
+    of_blocks = word in {"COUNT", "MIN", "MAX", "AVG", "SUM"}
+    names.session.refuse(
+        f"{e.name}() may stand after RETURN only",
+        e.span,
+        f"in a condition: {word} {{{inner}}} > 2"
+        if of_blocks
+        else f"RETURN … HAVING {e.name}(…) > 2",
+    )
 
 
 def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
@@ -219,18 +231,6 @@ def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
     names.session.refuse(
         f"{e.name}() may stand after IN only", e.span, f"write frame.class IN {e.name}('train')"
     )
-
-
-def _aggregate(name: str, e: s.Call, names: SymbolTable) -> b.Aggregate:
-    inner = SymbolTable(names.session, names.scope, names.meanings, names.parent, aggregated=True)
-    if name in {"avg", "sum"}:
-        return b.Aggregate(name, inner.number(e.arguments[0]), distinct=False, type=Type.number)
-    operand = inner.bind(e.arguments[0])
-    if name == "count":
-        return b.Aggregate(name, operand, e.distinct, Type.number)
-    if operand.type not in {Type.number, Type.text}:
-        names.session.refuse(f"{e.name}() takes numbers or texts", e.arguments[0].span)
-    return b.Aggregate(name, operand, distinct=False, type=operand.type)
 
 
 def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:

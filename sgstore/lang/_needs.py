@@ -197,8 +197,8 @@ def _or(conditions: Iterable[Bound]) -> Bound:
 #
 # Only what is measured counts. Of an attribute whose absence says something itself (a lane without ``turn``
 # is in no junction, a car without ``special`` is an ordinary one), nothing is unknown. What stands in
-# ``known``, ``IS NULL`` and ``coalesce`` says what is to be done without it, and variables of blocks are
-# asked to exist.
+# ``known``, ``IS NULL``, ``coalesce`` and ``CASE`` says what is to be done without it, and variables of blocks
+# are asked to exist.
 
 MOTION: Final = frozenset({"speed", "vx", "vy", "vz", "accel", "ax", "ay", "az", "yaw_rate"})
 """What nothing has that never moves."""
@@ -211,7 +211,7 @@ MEASURED: Final = MOTION | {
 }
 """Attributes of nodes that are unknown where nobody told them."""
 
-_TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce"})
+_TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 """What is known even of what is not."""
 
 

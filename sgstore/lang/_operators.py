@@ -455,6 +455,41 @@ def _is_member_columns(parts: Sequence[Column]) -> Column:
     )
 
 
+# ``CASE``: its operands are condition and value of each branch, then what it is otherwise.
+
+
+def _case(parts: Sequence[str]) -> str:
+    *branches, otherwise = parts
+    pairs = zip(branches[::2], branches[1::2], strict=True)
+    told = " ".join(f"WHEN {condition} THEN {value}" for condition, value in pairs)
+    return f"CASE {told} ELSE {otherwise} END"
+
+
+def _chosen(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
+    *branches, otherwise = parts
+    pairs = list(zip(branches[::2], branches[1::2], strict=True))
+
+    def chosen(at: Any) -> Any:
+        found = next((value for condition, value in pairs if condition(at) is True), otherwise)
+        return found(at)
+
+    return chosen
+
+
+def _chosen_columns(parts: Sequence[Column]) -> Column:
+    *branches, found = parts
+    for condition, value in zip(branches[-2::-2], branches[::-2], strict=True):
+        true = condition.true
+        known = True
+        if value.known is not True or found.known is not True:
+            known = np.where(true, value.known, found.known)
+        # NULL has no type of its own.
+        one = found.values if value.known is False else value.values
+        other = value.values if found.known is False else found.values
+        found = Column(np.where(true, one, other), known)
+    return found
+
+
 def _null_test(word: str, *, null: bool) -> Operator:
     def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
         (part,) = parts
@@ -546,6 +581,7 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     ),
     "negative": _strict("(- {0})", operator.neg, _ufunc("negative")),
     "coalesce": _ruled("coalesce(...)", _first_known, _first_known_columns),
+    "case": Operator(_case, _chosen, _chosen_columns),
     "IS NULL": _null_test("IS NULL", null=True),
     "IS NOT NULL": _null_test("IS NOT NULL", null=False),
     "IN": Operator(_member, _is_member, _is_member_columns, infix=True),

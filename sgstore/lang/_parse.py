@@ -424,7 +424,7 @@ _LATER: Final = frozenset(
         "RESET",
         "SEMICOLON",
     }
-    | {"_ARROW"}
+    | {"_ARROW", "HAVING", "SKIP"}
 )
 """What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
 
@@ -493,7 +493,7 @@ def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
 
 def _listed(machine: Tables, names: list[str]) -> str:
     """Return the expected terminals in words; operators, and beginnings of values, count as one."""
-    left = set(names) - _LATER
+    left = set(names) - _LATER or set(names)
     said: list[str] = []
     if left >= _EDGES:
         said.append("an edge")
@@ -503,6 +503,7 @@ def _listed(machine: Tables, names: list[str]) -> str:
     if left >= _STARTS:
         said += ["a value", "a condition"]
         left -= _STARTS | {"NAME", "LPAR", "LSQB", "COUNT", "AGGREGATE", "DURATION", "TEMPORAL"}
+        left -= {"CASE"}
         left -= {"SIGN", "NOT"}
     elif {"SIGN", "STAR"} <= left:
         said.append("an operator")

@@ -197,7 +197,7 @@ def _edge_alone(found: set[Leaf]) -> str | None:
 def _of_null(condition: Bound) -> bool:
     """Tell whether a condition may be true of what has no row: of an edge without attributes."""
     return any(
-        isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce"}
+        isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce", "case"}
         for part in walk(condition)
     )
 

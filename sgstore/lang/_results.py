@@ -43,14 +43,17 @@ from sgstore.lang.ir import (
     Bound,
     EdgeRelation,
     FrameAttribute,
+    GroupKey,
     NodeAttribute,
     NodeValue,
     Operation,
     Query,
     Result,
     ReturnColumn,
+    Sampling,
     TraceAttribute,
     Value,
+    is_counted,
     walk,
     with_operands,
 )
@@ -360,9 +363,12 @@ class _RowStatement:
             self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
         # A row tells of several frames.
         self.grouped = (self.result.distinct or self.result.aggregated) and not self.result.framed
-        self.owners = list[NodeAttribute]()  # of what samples are taken of
-        if (per := _sampled_by(self.result)) is not None:
-            self.owners = owners_of([per], query, writer.catalog)
+        # Of what samples are taken of, and of what the first ones are taken of.
+        self.owners, self.top_owners = (
+            [] if per is None else owners_of([per], query, writer.catalog)
+            for per in (_per(self.result, one) for one in (self.result.sample, self.result.top))
+        )
+        self.texts = dict[str, str]()  # of the columns by which matches are grouped
 
     def statement(self) -> SqlStatement:
         values = [column.value for column in self.result.columns]
@@ -371,13 +377,13 @@ class _RowStatement:
         if self.result.aggregated or (self.result.distinct and not self.result.framed):
             apart = owners_of(keys, self.query, self.writer.catalog)
         values += apart
-        values += [key.value for key in self.result.order if not isinstance(key.value, str)]
-        per = self.result.sample and self.result.sample.per
-        values += [] if per is None or isinstance(per, str) else [per]
-        values += self.owners
+        values += self.result.values[len(self.result.columns) :]
+        values += self.owners + self.top_owners
         values += [name for _, name in self._names()]
         wanted = [leaf for value in values for leaf in leaves(value)]
         relation = frames_of(self.writer, self.query.scope, None, self.nodes, self.edges, wanted)
+        if any(_in_order(part) for value in values for part in walk(value)):
+            relation = self._placed(relation)
         outputs = self._outputs()
         names = [name for name, _ in outputs]
         select = Select([_named(text, name) for name, text in outputs])
@@ -389,11 +395,32 @@ class _RowStatement:
         if self.result.aggregated:
             listed = enumerate(self.result.columns, start=1)
             select.group = [str(place) for place, column in listed if not _aggregates(column)]
-            select.group += [_column(owner) for owner in apart]
-        elif apart:
-            select = _told_apart(select, names, apart)
-        text = self._ordered(select, list(map(quoted, names)))
+            select.group += [_column(owner) for owner in dict.fromkeys([*apart, *self.top_owners])]
+            if self.result.having is not None:
+                select.having.append(self._text(self.result.having))
+        tops = self._tops()
+        select.columns += [f"{text} AS {quoted(name)}" for name, text in tops.items()]
+        if apart and not self.result.aggregated:
+            select = _told_apart(select, [*names, *tops], apart)
+        text = self._ordered(select, list(map(quoted, names)), list(map(quoted, tops)))
         return finished(self.writer, text, tuple(names))
+
+    def _tops(self) -> dict[str, str]:
+        """Columns, beside those that are returned, that tell apart of what the first rows are taken."""
+        top = self.result.top
+        per = [] if top is None or top.per is None or isinstance(top.per, str) else [top.per]
+        values = [*per, *self.top_owners]
+        return {f":top {number}": self._text(value) for number, value in enumerate(values)}
+
+    def _placed(self, relation: str) -> str:
+        """Matches with their places in the order in which they come where nothing else is said."""
+        select = Select([f"{_ROWS}.*"])
+        select.join(nested(relation, ":rows"), [])
+        frame, writer = f'{_ROWS}."frame_id"', self.writer
+        order = [frame_key(select, frame, writer.catalog, writer.window, writer.values)]
+        order += [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
+        select.columns.append(f'row_number() OVER (ORDER BY {", ".join(order)}) AS ":place"')
+        return select.text()
 
     def _outputs(self) -> list[tuple[str, str]]:
         """Names and texts of the columns."""
@@ -405,7 +432,9 @@ class _RowStatement:
         if self.result.whole:
             edges = (edge.key for edge in self.query.scope.edges if edge.key in self.edges)
             texts += [f"{_ROWS}.{quoted(f'{key}.type')}" for key in edges]
-        texts += [self._text(column.value) for column in self.result.columns]
+        for column in self.result.columns:
+            whole = self.result.aggregated and not _aggregates(column)
+            texts.append(self._of_group(column.name) if whole else self._text(column.value))
         return list(zip(names_of(self.query), texts, strict=True))
 
     def _names(self) -> list[tuple[str, Bound]]:
@@ -418,9 +447,19 @@ class _RowStatement:
         ]
 
     def _text(self, value: Bound) -> str:
-        return expression_text(value, _column, self.writer.values)
+        return expression_text(value, self._leaf, self.writer.values)
 
-    def _ordered(self, select: Select, names: list[str]) -> str:
+    def _leaf(self, leaf: Leaf) -> str:
+        return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
+
+    def _of_group(self, name: str) -> str:
+        """The text of a value by which matches are grouped: everywhere the same, with the same bound values."""
+        if name not in self.texts:
+            value = next(c.value for c in self.result.columns if c.name == name)
+            self.texts[name] = self._text(value)
+        return self.texts[name]
+
+    def _ordered(self, select: Select, names: list[str], tops: list[str]) -> str:
         """The statement in the order of the query, or else of traces, frames, bindings; as many as wanted."""
         keys = [_directed(self._key(k.value), k.descending) for k in self.result.order]
         frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
@@ -432,20 +471,25 @@ class _RowStatement:
         moved = framed and len(keys) > own
         bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
         keys += names if framed or grouped else bindings
-        sample = self.result.sample
+        sample, top = self.result.sample, self.result.top
+        named = self._named_traces(keys, own) if grouped else []
         if sample is not None:
             per = [] if sample.per is None else [self._key(sample.per)]
             per += [self._text(owner) for owner in self.owners]
-            text = _sampled(select, names, sample.number, per, frame, keys, first=own)
-            return _limited(text, self.result.limit)
-        named = self._named_traces(keys, own) if grouped else []
-        if moved or named:
+            chosen = _Chosen(sample.number, per, frame, first=own)
+            select, keys = _sampled(select, [*names, *tops], names, keys, chosen)
+        elif moved or named or top is not None:
             order = _keyed(select, names, keys)
-            select = Select(names, [nested(select.text(), ":all")])
+            select = Select([*names, *tops], [nested(select.text(), ":all")])
             for place in named:
                 order[place] = name_key(select, place, keys[place], writer.catalog, writer.values)
             keys = order
-        select.order, select.limit = keys, self.result.limit
+        if top is not None:
+            per = [quoted(top.per)] if isinstance(top.per, str) else []
+            chosen = _Chosen(top.number, [*per, *tops])
+            select, keys = _sampled(select, names, names, keys, chosen)
+        select.order = keys
+        select.limit, select.offset = self.result.limit, self.result.skip
         return select.text()
 
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
@@ -483,8 +527,8 @@ class _IntervalStatement:
         spans = self._spans(wanted)
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
-        named = [f"{self._told(c.value)} AS {quoted(c.name)}" for c in columns]
-        select = Select([_named(text, name) for name, text in own] + named)
+        told = dict(own) | {column.name: self._told(column.value) for column in columns}
+        select = Select([_named(text, name) for name, text in told.items()])
         select.join(nested(self._between(spans), ":runs"), [])
         select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = ":runs"."trace_id"'])
         first = '":runs"."first"'
@@ -493,19 +537,41 @@ class _IntervalStatement:
         order.append(frame_key(select, first, writer.catalog, writer.window, writer.values))
         order += [self._told(column.value) for column in columns]
         names = (*(name for name, _ in own), *(column.name for column in columns))
-        sample = self.result.sample
-        if sample is None:
-            select.order, select.limit = order, self.result.limit
-            return finished(self.writer, select.text(), names)
-        per = [] if sample.per is None else [_named_key(sample.per)]
-        sampled = _sampled_by(self.result)
-        if isinstance(sampled, NodeValue):
-            profile = Profile.of(self.query.scope.kinds(sampled.node), self.writer.catalog)
+        if self.result.having is not None:
+            select.where.append(self._having(self.result.having, told))
+        shown, keys = [quoted(name) for name in names], len(self.result.order)
+        sample, top = self.result.sample, self.result.top
+        tops = {f'":top {n}"': text for n, text in enumerate(self._per(top, told))}
+        select.columns += [f"{text} AS {name}" for name, text in tops.items()]
+        if sample is not None:
+            chosen = _Chosen(sample.number, self._per(sample, told), first, first=keys)
+            select, order = _sampled(select, [*shown, *tops], shown, order, chosen)
+        if top is not None:
+            select, order = _sampled(select, shown, shown, order, _Chosen(top.number, [*tops]))
+        select.order = order
+        select.limit, select.offset = self.result.limit, self.result.skip
+        return finished(self.writer, select.text(), names)
+
+    def _having(self, condition: Bound, columns: dict[str, str]) -> str:
+        """The condition on an interval, given the names of its columns and what they are."""
+
+        def leaf(found: Leaf) -> str:
+            assert isinstance(found, GroupKey)  # noqa: S101 - the binder lets nothing else in
+            return columns[found.name]
+
+        return expression_text(condition, leaf, self.writer.values)
+
+    def _per(self, chosen: Sampling | None, told: dict[str, str]) -> list[str]:
+        """Return the texts of what rows are chosen of each of, given those of all columns by name."""
+        if chosen is None or chosen.per is None:
+            return []
+        assert isinstance(chosen.per, str)  # noqa: S101 - the binder knows the names of intervals only
+        per = [told[chosen.per]]
+        value = _per(self.result, chosen)
+        if isinstance(value, NodeValue):
+            profile = Profile.of(self.query.scope.kinds(value.node), self.writer.catalog)
             per.append(owner_text(per[0], profile, f'{_TRACE}."trace_id"', f'{_TRACE}."map_id"'))
-        shown = [quoted(name) for name in names]
-        keys = len(self.result.order)
-        text = _sampled(select, shown, sample.number, per, first, order, first=keys)
-        return finished(self.writer, _limited(text, self.result.limit), names)
+        return per
 
     def _told(self, value: Bound) -> str:
         """A value that is returned, in terms of the keys."""
@@ -630,9 +696,9 @@ def _directed(text: str, descending: bool) -> str:  # noqa: FBT001
     return f"{text} {'DESC' if descending else 'ASC'} NULLS LAST"
 
 
-def _sampled_by(result: Result) -> Bound | None:
-    """The value of each of which samples are taken; ``None`` if of none, or of what tells the frame."""
-    per = result.sample and result.sample.per
+def _per(result: Result, chosen: Sampling | None) -> Bound | None:
+    """The value of each of which rows are chosen; ``None`` if of none, or of what tells the frame."""
+    per = chosen and chosen.per
     if isinstance(per, str):
         return next((column.value for column in result.columns if column.name == per), None)
     return per
@@ -644,33 +710,39 @@ def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) ->
     return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
 
 
-def _sampled(
-    select: Select,
-    names: list[str],
-    number: int,
-    per: list[str],
-    frame: str,
-    keys: list[str],
-    *,
-    first: int,
-) -> str:
-    """At most ``number`` rows of each combination of ``per``.
+@dataclass(frozen=True, slots=True)
+class _Chosen:
+    """How many rows are chosen of each combination of some values.
 
-    The first ones by the order, if ``first`` of the keys are those of one; else they are chosen by a number
-    that depends on the frame alone.
+    Without a frame, or if ``first`` of the keys are those of an order, they are the first ones; else they are
+    chosen by a number that depends on the frame alone.
     """
-    mixed = f"{frame} % 1000003 * 48271 % 2147483647"
-    partition = [f'":per {place}"' for place in range(len(per))]
-    select.columns += [f'{mixed} AS ":mixed"']
-    select.columns += [f"{text} AS {name}" for text, name in zip(per, partition, strict=True)]
+
+    number: int
+    per: list[str]
+    frame: str | None = None
+    first: int = 0
+
+
+def _sampled(
+    select: Select, columns: list[str], names: list[str], keys: list[str], chosen: _Chosen
+) -> tuple[Select, list[str]]:
+    """The statement of the rows that are chosen, with some columns, and the keys of their order."""
+    partition = [f'":per {place}"' for place in range(len(chosen.per))]
+    if chosen.frame is not None:
+        select.columns.append(f'{chosen.frame} % 1000003 * 48271 % 2147483647 AS ":mixed"')
+    select.columns += [
+        f"{text} AS {name}" for text, name in zip(chosen.per, partition, strict=True)
+    ]
     order = _keyed(select, names, keys)
-    over = ", ".join(order if first else ['":mixed"', *order])
+    mixed = chosen.frame is not None and not chosen.first
+    over = ", ".join(['":mixed"', *order] if mixed else order)
     by = f"PARTITION BY {', '.join(partition)} " if partition else ""
     ranked = Select(["*", f'row_number() OVER ({by}ORDER BY {over}) AS ":rank"'])
     ranked.join(nested(select.text(), ":all"), [])
-    outer = Select(names, [nested(ranked.text(), ":ranked")], [f'":rank" <= {number}'])
-    outer.order = order
-    return outer.text()
+    outer = Select([*columns], [nested(ranked.text(), ":ranked")])
+    outer.where.append(f'":rank" <= {chosen.number}')
+    return outer, order
 
 
 def _keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
@@ -679,18 +751,19 @@ def _keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
     plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
     inner = [key if key in names else f'":key {i}"' for i, key in enumerate(plain)]
     select.columns += [
-        f"{key} AS {name}" for key, name in zip(plain, inner, strict=True) if key != name
+        f"{key} AS {name}" for key, name in zip(plain, inner, strict=True) if name not in names
     ]
     down = [key.endswith(" DESC") for key in ordered]
     return [_directed(name, descending) for name, descending in zip(inner, down, strict=True)]
 
 
-def _limited(text: str, limit: int | None) -> str:
-    return text if limit is None else f"{text}\nLIMIT {limit}"
+def _in_order(part: Bound) -> bool:
+    """Tell whether it depends on the order in which matches come."""
+    return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
 
 
 def _aggregates(column: ReturnColumn) -> bool:
-    return any(isinstance(part, Aggregate) for part in walk(column.value))
+    return is_counted(column.value)
 
 
 def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:

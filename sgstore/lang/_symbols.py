@@ -332,7 +332,7 @@ class SymbolTable:
     def visible(self) -> set[str]:
         """All names that may be used here, but those of frame and trace."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
-        return outside | set(self.meanings)
+        return outside | set(self.meanings) | set(self.aliases)
 
 
 def call_hint(name: str) -> str | None:

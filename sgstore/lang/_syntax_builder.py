@@ -130,6 +130,11 @@ def _call(span: TextSpan, children: Children) -> s.Call:
     return s.Call(name.text, arguments or (), distinct=False, name_span=name.span, span=span)
 
 
+def _call_of_distinct(span: TextSpan, children: Children) -> s.Call:
+    name, _, arguments = children
+    return s.Call(name.text, arguments, distinct=True, name_span=name.span, span=span)
+
+
 def _count_all(span: TextSpan, _: Children) -> s.CountAll:
     return s.CountAll(span)
 
@@ -175,6 +180,24 @@ def _arithmetic(span: TextSpan, children: Children) -> s.Arithmetic:
 def _sign(span: TextSpan, children: Children) -> s.Expression:
     sign, operand = children
     return s.Negative(operand, span) if sign.text == "-" else operand
+
+
+def _when(span: TextSpan, children: Children) -> s.When:
+    condition, value = children
+    return s.When(condition, value, span)
+
+
+def _case(span: TextSpan, children: Children) -> s.Case:
+    """``CASE x WHEN y THEN …`` asks ``x = y`` of each branch."""
+    subject, *branches, otherwise = children
+    if subject is not None:
+        branches = [
+            s.When(
+                s.Comparison("=", subject, one.condition, one.condition.span), one.value, one.span
+            )
+            for one in branches
+        ]
+    return s.Case(tuple(branches), otherwise, span)
 
 
 def _temporal(span: TextSpan, children: Children) -> s.Temporal:
@@ -379,10 +402,11 @@ def _sequence(span: TextSpan, children: Children) -> s.SequenceClause:
 
 
 def _match(span: TextSpan, children: Children) -> s.MatchClause:
-    settings, sequence, returns, order, sample, limit = children
-    if returns or order or sample or limit is not None:
-        distinct, items, at = returns or (False, (s.Item("all", None, None, 0, 0, span),), span)
-        returns = s.Returns(distinct, items, order or (), sample, limit, at)
+    settings, sequence, returns, order, sample, top, skip, limit = children
+    if any(part is not None for part in children[2:]):
+        every = (s.Item("all", None, None, 0, 0, span),)
+        distinct, items, having, at = returns or (False, every, None, span)
+        returns = s.Returns(distinct, items, order or (), sample, limit, at, having, top, skip or 0)
     return s.MatchClause(settings or (), sequence, returns, span)
 
 
@@ -471,13 +495,17 @@ def _sample(span: TextSpan, children: Children) -> s.Sample:
     return s.Sample(_whole(children[0]), children[1], span)
 
 
+def _top(span: TextSpan, children: Children) -> s.Sample:
+    return s.Sample(_whole(children[0]), children[1], span)
+
+
 def _limit(_: TextSpan, children: Children) -> int:
     return _whole(children[0])
 
 
-def _returns(span: TextSpan, children: Children) -> tuple[bool, tuple[s.Item, ...], TextSpan]:
-    distinct, items = children
-    return distinct is not None, items, span
+def _returns(span: TextSpan, children: Children) -> tuple[Any, ...]:
+    distinct, items, having = children
+    return distinct is not None, items, having, span
 
 
 BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
@@ -557,11 +585,15 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "parameter": _parameter,
     "variable": _variable,
     "call": _call,
+    "call_of_distinct": _call_of_distinct,
     "count_all": _count_all,
     "count_values": _count_values,
     "exists": partial(_block_expression, "EXISTS"),
     "count_block": partial(_block_expression, "COUNT"),
     "aggregate_block": _aggregate_block,
+    "case": _case,
+    "when": _when,
+    "otherwise": _only,
     "arguments": _all,
     "list": _list,
     "block": _only,
@@ -583,5 +615,8 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "order": _all,
     "sort": _sort,
     "sample": _sample,
+    "top": _top,
+    "skip": _limit,
     "limit": _limit,
+    "having": _only,
 }

@@ -251,11 +251,23 @@ class BlockValue:
 
 @dataclass(frozen=True, slots=True)
 class Aggregate:
-    """``COUNT(*)``, ``AVG(x)``, … over the matches of a query; ``COUNT(*)`` has no operand."""
+    """``COUNT(*)``, ``AVG(x)``, … over the matches of a query; ``COUNT(*)`` has no operand.
+
+    ``share`` is that of a percentile: 0.95 is the 95th.
+    """
 
     word: str
     operand: Bound | None
     distinct: bool
+    type: Type
+    share: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class GroupKey:
+    """A value by which matches are grouped, beside what is counted of them: the column that is called so."""
+
+    name: str
     type: Type
 
 
@@ -339,6 +351,7 @@ Bound = (
     | Operation
     | BlockValue
     | Aggregate
+    | GroupKey
     | Tense
     | SignalCall
     | StepTime
@@ -435,8 +448,14 @@ class Result:
     framed : bool
         Whether the frame is returned with the values.
     distinct : bool
+    having : Bound or None
+        What must be true of a group, or of an interval, so that it is returned.
     order : tuple of SortKey
     sample : Sampling or None
+    top : Sampling or None
+        How many of each value are returned: the first ones.
+    skip : int
+        How many rows are left out before the first.
     limit : int or None
     before, after : int
         Offsets of clips; ns, negative is earlier.
@@ -447,8 +466,11 @@ class Result:
     whole: bool = True
     framed: bool = False
     distinct: bool = False
+    having: Bound | None = None
     order: tuple[SortKey, ...] = ()
     sample: Sampling | None = None
+    top: Sampling | None = None
+    skip: int = 0
     limit: int | None = None
     before: int = 0
     after: int = 0
@@ -464,15 +486,23 @@ class Result:
 
     @property
     def values(self) -> list[Bound]:
-        """The expressions in it: what it returns, orders by and samples by."""
-        sample = self.sample and self.sample.per
+        """The expressions in it: what it returns, groups must fulfil, orders by and samples by."""
+        per = [chosen.per for chosen in (self.sample, self.top) if chosen is not None]
         values = [*(column.value for column in self.columns), *(key.value for key in self.order)]
-        return [v for v in (*values, sample) if v is not None and not isinstance(v, str)]
+        every = (*values, self.having, *per)
+        return [v for v in every if v is not None and not isinstance(v, str)]
 
     @property
     def aggregated(self) -> bool:
         """Tell whether it counts or sums over matches, rather than listing them."""
-        return any(isinstance(e, Aggregate) for c in self.columns for e in walk(c.value))
+        having = [] if self.having is None else [self.having]
+        values = (*(column.value for column in self.columns), *having)
+        return any(isinstance(e, Aggregate) for value in values for e in walk(value))
+
+    @property
+    def chooses(self) -> bool:
+        """Tell whether it lists some of the rows only, so many of them or so many of each value."""
+        return self.limit is not None or self.top is not None or self.skip > 0
 
     def changed(self, change: Callable[[Bound], Bound]) -> Result:
         """The same with a change made to every value."""
@@ -480,12 +510,16 @@ class Result:
         def key(value: Bound | str) -> Bound | str:
             return value if isinstance(value, str) else change(value)
 
-        sample = self.sample
+        def each(one: Sampling | None) -> Sampling | None:
+            return one and replace(one, per=one.per and key(one.per))
+
         return replace(
             self,
             columns=tuple(replace(column, value=change(column.value)) for column in self.columns),
+            having=self.having and change(self.having),
             order=tuple(replace(one, value=key(one.value)) for one in self.order),
-            sample=sample and replace(sample, per=sample.per and key(sample.per)),
+            sample=each(self.sample),
+            top=each(self.top),
         )
 
 
@@ -590,6 +624,11 @@ def is_angle(value: Bound) -> bool:
             return function in ANGLES
         case _:
             return False
+
+
+def is_counted(expression: Bound) -> bool:
+    """Tell whether an expression speaks of all matches, and not of one of them alone."""
+    return any(isinstance(part, Aggregate) for part in walk(expression))
 
 
 def nodes_of(expression: Bound) -> frozenset[str]:

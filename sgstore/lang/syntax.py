@@ -162,6 +162,24 @@ class BlockExpression:
 
 
 @dataclass(frozen=True, slots=True)
+class When:
+    """``WHEN condition THEN value``: a branch of a ``CASE``."""
+
+    condition: Expression
+    value: Expression
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """``CASE WHEN condition THEN value … ELSE value END``; ``CASE x WHEN y`` is ``CASE WHEN x = y``."""
+
+    branches: tuple[When, ...]
+    otherwise: Expression | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
 class Temporal:
     """An operator of the temporal layer with its operands and its bound: times from and to, or ``None``.
 
@@ -190,6 +208,7 @@ Expression = (
     | Arithmetic
     | Negative
     | BlockExpression
+    | Case
     | Temporal
 )
 
@@ -315,7 +334,10 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Returns:
-    """``RETURN DISTINCT items ORDER BY … SAMPLE … LIMIT …``."""
+    """``RETURN DISTINCT items HAVING … ORDER BY … SAMPLE … LIMIT n PER … SKIP … LIMIT …``.
+
+    ``top`` is ``LIMIT n PER value``.
+    """
 
     distinct: bool
     items: tuple[Item, ...]
@@ -323,6 +345,9 @@ class Returns:
     sample: Sample | None
     limit: int | None
     span: TextSpan
+    having: Expression | None = None
+    top: Sample | None = None
+    skip: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,151 @@
+"""Aggregates: what is counted, summed or collected of all matches, each declared once.
+
+They stand after ``RETURN``. Values that are unknown do not count; ``COUNT`` of none is 0, ``collect`` an empty list,
+and the others are NULL.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang import syntax as s
+from sgstore.lang._catalog import Type
+from sgstore.lang._symbols import SymbolTable
+from sgstore.records import dataclass
+from sgstore.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+PLACE: Final = '":rows".":place"'
+"""The column that says in which order matches come: what is collected keeps it."""
+
+
+@dataclass(frozen=True, slots=True)
+class AggregateFunction:
+    """An aggregate.
+
+    Attributes
+    ----------
+    sql : function
+        Its SQL, given that of what it is taken of (behind ``DISTINCT``, if it is taken of different values) and
+        its share.
+    of : frozenset of Type
+        Types that it is taken of.
+    gives : Type or None
+        Type of its value; ``None``: that of what it is taken of.
+    share : bool
+        Whether it takes a second argument: a percentage.
+    """
+
+    sql: Callable[[str, float], str]
+    of: frozenset[Type] = frozenset({Type.number})
+    gives: Type | None = Type.number
+    share: bool = False
+
+
+_VALUES: Final = frozenset({Type.number, Type.text, Type.boolean, Type.node})
+_ORDERED: Final = frozenset({Type.number, Type.text})
+
+
+def _called(form: str) -> Callable[[str, float], str]:
+    return lambda inner, _: form.format(inner)
+
+
+def _quantile(inner: str, share: float) -> str:
+    return f"quantile_cont({inner}, {share!r})"
+
+
+def _collected(inner: str, _: float) -> str:
+    """What is collected of no match is an empty list; of different values, each once in their own order."""
+    value = inner.removeprefix("DISTINCT ")
+    order = PLACE if value == inner else value
+    return f"coalesce(list({inner} ORDER BY {order}) FILTER (WHERE {value} IS NOT NULL), [])"
+
+
+AGGREGATES: Final[dict[str, AggregateFunction]] = {
+    "count": AggregateFunction(_called("count({0})"), _VALUES),
+    "min": AggregateFunction(_called("min({0})"), _ORDERED, None),
+    "max": AggregateFunction(_called("max({0})"), _ORDERED, None),
+    "avg": AggregateFunction(_called("avg({0})")),
+    "sum": AggregateFunction(_called("sum({0})")),
+    "stddev": AggregateFunction(_called("stddev_samp({0})")),
+    "median": AggregateFunction(lambda inner, _: _quantile(inner, 0.5)),
+    "percentile": AggregateFunction(_quantile, share=True),
+    "collect": AggregateFunction(_collected, _VALUES, Type.list),
+}
+"""Aggregates by folded name."""
+
+EXTREMES: Final = frozenset({"min", "max"})
+"""Those whose names are functions of two numbers or more as well."""
+
+
+def is_aggregate(e: s.Call) -> bool:
+    """Tell whether a call is of an aggregate, and not of a function of the same name."""
+    name = normalize_name(e.name)
+    return name in AGGREGATES and (name not in EXTREMES or len(e.arguments) == 1)
+
+
+def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
+    """A call of an aggregate, bound.
+
+    Raises
+    ------
+    QueryError
+        Its arguments do not fit.
+    """
+    name, session = normalize_name(e.name), names.session
+    function = AGGREGATES[name]
+    wanted = 2 if function.share else 1
+    if len(e.arguments) != wanted:
+        hint = (
+            f"the value below which 95 % lie is {e.name}(x.speed, 95)" if function.share else None
+        )
+        reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {len(e.arguments)}"
+        session.refuse(reason, e.span, hint)
+    inner = SymbolTable(session, names.scope, names.meanings, names.parent, aggregated=True)
+    if function.of == frozenset({Type.number}):
+        operand = inner.number(e.arguments[0])
+    else:
+        operand = inner.bind(e.arguments[0])
+        if name in EXTREMES and operand.type not in function.of:
+            session.refuse(f"{e.name}() takes numbers or texts", e.arguments[0].span)
+        if name == "collect" and operand.type not in function.of:
+            session.refuse(f"{e.name}() takes values", e.arguments[0].span)
+    share = _share(e.arguments[1], e, names) if function.share else 0.0
+    return b.Aggregate(name, operand, e.distinct, function.gives or operand.type, share)
+
+
+def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
+    """A percentage as a share of one."""
+    found = names.bind(written)
+    if not isinstance(found, b.Value) or isinstance(found.value, bool | str | None):
+        names.session.refuse(
+            f"the second argument of {e.name}() is a number, the same for all matches",
+            written.span,
+            f"the value below which 95 % lie is {e.name}(x.speed, 95)",
+        )
+    if not (math.isfinite(found.value) and 0 <= found.value <= 100):
+        names.session.refuse(f"{e.name}() takes a number from 0 to 100", written.span)
+    return found.value / 100
+
+
+def sql_of(one: b.Aggregate, inner: str) -> str:
+    """Return the SQL of an aggregate, given that of what it is taken of."""
+    if one.operand is not None and one.operand.type is Type.number and one.word in _REAL:
+        inner = f"CAST({inner} AS DOUBLE)"
+    if one.distinct:
+        inner = f"DISTINCT {inner}"
+    found = AGGREGATES[one.word].sql(inner, one.share)
+    owned = isinstance(one.operand, b.Operation) and one.operand.word == "whose"
+    if not owned or one.word != "collect":
+        return found
+    # Nodes of several traces are told apart by whose they are, and shown as their ids.
+    return f'list_sort([struct_extract("one", 2) FOR "one" IN {found}])'
+
+
+_REAL: Final = frozenset({"median", "percentile", "stddev"})
+"""Aggregates that interpolate or take roots: of whole numbers as of others."""
