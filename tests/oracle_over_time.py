@@ -531,7 +531,7 @@ COURSES = (
     "avg_over(e.speed, 0.2s) >= e.speed",
     "sum_over(e.x, 0.5s) > 3 * sum_over(e.speed, 2frames)",
     "CASE WHEN prev(e.speed) < e.speed THEN delta(e.x, 0.2s) WHEN ONCE e.speed > 2 THEN e.x END > 1",
-    "CASE run_length(e.speed > 0.5) WHEN 0 THEN prev(e.speed) ELSE 2 END > 1",
+    "CASE WHEN run_length(e.speed > 0.5) >= 2frames THEN prev(e.speed) ELSE 2 END > 1",
 )
 PAIR_COURSES = (
     "min_over(dist(e, v), 0.4s) < 6",

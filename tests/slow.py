@@ -56,6 +56,7 @@ SECONDS: Final = {
     "store_sharing": 9,
     "frozen": 9,
     "lang_after": 8,
+    "lang_own_names": 8,
     "lang_oracle": 8,
     "lang_match": 8,
     "query": 8,

@@ -464,7 +464,9 @@ def test_patterns_of_the_library_are_steps_by_their_names(store: Store) -> None:
     rows = store.find("MATCH hard_braking(decel = 0.1, hold = 0s) THEN MATCH (e)").rows()
 
     assert rows == store.find(f"{text} THEN MATCH (e)").rows()
-    with pytest.raises(QueryError, match="no parameter 'hardness'") as refused:
+    with pytest.raises(
+        QueryError, match="unknown parameter or variable of hard_braking 'hardness'"
+    ) as refused:
         store.find("MATCH hard_braking(hardness = 1)")
     assert refused.value.span is not None
 

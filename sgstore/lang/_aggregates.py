@@ -1,7 +1,7 @@
 """Aggregates: what is counted, summed or collected of all matches, each declared once.
 
-They stand after ``RETURN``. Values that are unknown do not count; ``COUNT`` of none is 0, ``collect`` an empty list,
-and the others are NULL.
+They stand after ``RETURN``. Values that are unknown do not count; of none ``COUNT`` is 0, ``collect`` an empty
+list, and the others NULL.
 """
 
 from __future__ import annotations

@@ -19,15 +19,17 @@ from sgstore.lang._bind_expressions import parameter
 from sgstore.lang._catalog import Type
 from sgstore.lang._operators import COMPARISONS
 from sgstore.lang._parse import parse
+from sgstore.lang._renaming import names_written, own_names, renamed, values_given
 from sgstore.lang._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
 from sgstore.lang.library import patterns
 from sgstore.records import dataclass
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 
     from sgstore.errors import TextSpan
+    from sgstore.lang.library import NamedPattern
 
 
 MAX_NS: Final = 10**18
@@ -453,6 +455,7 @@ def _spelled_out(
     """Steps and links, scenarios being what they stand for."""
     steps: list[_Written] = []
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = []
+    taken = names_written(sequence)
     for number, step in enumerate(sequence.steps):
         if number:
             links.append((sequence.links[number - 1], None))
@@ -462,6 +465,7 @@ def _spelled_out(
         shipped = _shipped(step, session)
         if shipped is not None:
             inner, between = _spelled_out(shipped, session, depth + 1)
+            inner = _with_own_names(step, inner, _parameters_shipped(step), taken, session)
             steps += [replace(w, name=step.name, called=step.name_span) for w in inner]
             links += [(link, {}) for link, _ in between]
             continue
@@ -472,6 +476,8 @@ def _spelled_out(
         assert isinstance(body, s.SequenceClause)  # noqa: S101 - it was found as a scenario
         values = _values(step, definition, session)
         inner, between = _spelled_out(body, session, depth + 1)
+        formals = (formal.name for formal in definition.parameters)
+        inner = _with_own_names(step, inner, formals, taken, session)
         steps += [
             replace(w, values={**values, **(w.values or {})}, name=definition.name) for w in inner
         ]
@@ -479,17 +485,39 @@ def _spelled_out(
     return steps, links
 
 
+def _with_own_names(
+    step: s.ScenarioStep,
+    inner: list[_Written],
+    parameters: Iterable[str],
+    taken: frozenset[str],
+    session: Session,
+) -> list[_Written]:
+    """The steps of a pattern, whose variables have the names that they are given."""
+    names = own_names(step, [written.step for written in inner], parameters, taken, session)
+    return [replace(written, step=renamed(written.step, names)) for written in inner]
+
+
+def _entry(step: s.ScenarioStep) -> NamedPattern | None:
+    """The pattern of the library that a step names."""
+    name = normalize_name(step.name)
+    like = (p for p in patterns().values() if normalize_name(p.name) == name)
+    return patterns().get(step.name) or next(like, None)  # CutIn and cut_in are two
+
+
+def _parameters_shipped(step: s.ScenarioStep) -> dict[str, str]:
+    """Parameters of a pattern of the library by name, with their defaults as they are written."""
+    entry = _entry(step)
+    return {} if entry is None else {p.name: p.default for p in entry.parameters.values()}
+
+
 def _shipped(step: s.ScenarioStep, session: Session) -> s.SequenceClause | None:
     """The sequence of a pattern of the library; ``None`` if the text defines the name, or nothing has it."""
-    name = normalize_name(step.name)
-    if name in session.predicates:
-        return None
-    like = (p for p in patterns().values() if normalize_name(p.name) == name)
-    entry = patterns().get(step.name) or next(like, None)  # CutIn and cut_in are two
+    entry = None if normalize_name(step.name) in session.predicates else _entry(step)
     if entry is None or entry.kind not in SEQUENCES:
         return None
     names = SymbolTable(session, ScopeBuilder(session))
-    values = {given.name: _given_text(given.value, names) for given in step.given}
+    chosen = values_given(step, _parameters_shipped(step), session)
+    values = {given.name: _given_text(given.value, names) for given in chosen}
     try:
         statements = parse(entry.written(**values))
     except QueryError as error:
@@ -503,10 +531,10 @@ def _shipped(step: s.ScenarioStep, session: Session) -> s.SequenceClause | None:
     return found
 
 
-def _given_text(value: s.Constant | s.Duration | s.Parameter, names: SymbolTable) -> Any:
+def _given_text(value: s.Given, names: SymbolTable) -> Any:
     if isinstance(value, s.Parameter):
         return parameter(value, names)
-    return value.value if isinstance(value, s.Constant) else f"{value.amount:g}{value.unit}"
+    return f"{value.amount:g}{value.unit}" if isinstance(value, s.Duration) else _value(value)
 
 
 def _scenario(step: s.ScenarioStep, session: Session) -> s.Define:
@@ -524,15 +552,14 @@ def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dic
     formals = {formal.name: formal for formal in definition.parameters}
     names = SymbolTable(session, ScopeBuilder(session))
     values: dict[str, Any] = {f.name: _value(f.default) for f in formals.values() if f.default}
-    for given in step.given:
-        if given.name not in formals:
-            session.unknown(f"parameter of {definition.name}", given.name, given.span, formals)
+    for given in values_given(step, dict.fromkeys(formals, ""), session):
         if isinstance(given.value, s.Parameter):
             values[given.name] = parameter(given.value, names)
         else:
             values[given.name] = _value(given.value)
     missing = [name for name in formals if name not in values]
-    if missing:
+    strange = (one for one in step.given if not isinstance(one.value, s.Variable))
+    if missing and all(one.name in formals for one in strange):  # the others are told later
         session.refuse(
             f"{definition.name} needs a value of {missing[0]}",
             step.span,
@@ -541,9 +568,10 @@ def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dic
     return values
 
 
-def _value(value: s.Constant | s.Duration) -> Any:
+def _value(value: s.Given) -> Any:
     if isinstance(value, s.Constant):
         return value.value
+    assert isinstance(value, s.Duration)  # noqa: S101 - the others were looked at before
     return f"{value.amount:g}frames" if value.unit == "frames" else value.ns / 1e9
 
 

@@ -368,7 +368,10 @@ def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
 def _given(span: TextSpan, children: Children) -> s.Argument:
     name, value = children
     if not isinstance(value, s.Constant | s.Duration):
-        value = s.Parameter(value.text[1:], value.span)
+        named = value.name == "NAME"
+        value = (
+            s.Variable(value.text, value.span) if named else s.Parameter(value.text[1:], value.span)
+        )
     return s.Argument(name.text, value, span)
 
 

@@ -213,6 +213,10 @@ Expression = (
 )
 
 
+Given = Constant | Duration | Parameter | Variable
+"""What a scenario may be given."""
+
+
 # Patterns -----------------------------------------------------------------------------------------
 
 
@@ -395,10 +399,10 @@ class ScenarioStep:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """``name = value``: the value of a parameter of a scenario."""
+    """``name = value``: the value of a parameter of a scenario, or another name for one of its variables."""
 
     name: str
-    value: Constant | Duration | Parameter
+    value: Given
     span: TextSpan
 
 
