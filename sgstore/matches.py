@@ -28,6 +28,7 @@ from sgstore.lang import (
     rewritten,
 )
 from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
+from sgstore.quoting import quoted
 from sgstore.records import dataclass
 from sgstore.store import (
     SEQ_BITS,
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, Compared, Gathered, SqlStatement
-    from sgstore.store import StoreFile
+    from sgstore.store import Given, StoreFile
 
 SHOWN: Final = 80
 """Characters of a query that the repr of its matches shows."""
@@ -379,6 +380,25 @@ class Matches(Tabular):
                         left = None if left is None else max(left - len(batch), 0)
                         if left == 0:
                             return
+
+    def as_table(self, name: str) -> list[Given]:
+        """What makes a table of all rows, for a statement that speaks of it by a name.
+
+        Raises
+        ------
+        QueryError
+            Its rows are graphs.
+        """
+        if self.graphs:
+            raise QueryError(
+                "a table has values, and SUBGRAPHS are graphs",
+                text=self._text,
+                hint="RETURN what the statement needs of them: v.id, dist(e, v)",
+            )
+        with self._compiled() as compiled:
+            asked = self._asked(compiled.rows())
+        made = f"CREATE OR REPLACE TEMP TABLE {quoted(name)} AS {asked['sql']}"
+        return [*asked["given"], (made, asked["parameters"])]
 
     def explain(self) -> str:
         """Explain the query, stage by stage: parse, bind, rewrite, emit."""

@@ -219,6 +219,9 @@ class Store:
     ) -> Rows:
         """The rows of a statement on the views of the store, which only reads and sees no files.
 
+        ``sgql('MATCH …')`` is a table of what a pattern returns, ``sgql('… $least …', least := 10)`` of one
+        with parameters.
+
         Of more than 10,000 rows the store is asked again when they are wanted, in the form in which they are:
         as values, as a table of Arrow, as a file.
 
@@ -234,8 +237,16 @@ class Store:
         ------
         SqlError
             It is not one statement that only reads, the database refuses it, or it runs for too long.
+        QueryError
+            A pattern in it is none.
         """
-        return self.file.user_rows(text, timeout_s=timeout_s, max_rows=max_rows)
+        with self.file.snapshot():
+            asked = UserStatement(self, text)
+            found = self.file.user_rows(
+                asked.sql, timeout_s=timeout_s, max_rows=max_rows, given=asked.given
+            )
+            found.reasons = asked.reasons
+            return found
 
     @overload
     def graph(self, frame: int | str | FrameRef) -> nx.MultiDiGraph[int]: ...
@@ -526,6 +537,49 @@ class Store:
             if node in graph.nodes:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
         return FrameView(graph, about, whole, classes, roles)
+
+
+class UserStatement:
+    """A statement of SQL in which patterns are tables.
+
+    Parameters
+    ----------
+    store : Store
+    text : str
+        It may have calls of ``sgql``.
+
+    Raises
+    ------
+    QueryError
+        A pattern in it is none, or a call.
+
+    Attributes
+    ----------
+    sql : str
+        The statement that is asked.
+    given : function or None
+        Makes the tables of its patterns: see :meth:`sgstore.store.StoreFile.user_sql`.
+    reasons : mapping of str to str
+        Why traces are left out by a pattern, by name.
+    notes : tuple of str
+        What may be a mistake in a pattern.
+    """
+
+    def __init__(self, store: Store, text: str) -> None:
+        self.sql, self.given = text, None
+        self.reasons: dict[str, str] = {}
+        self.notes: tuple[str, ...] = ()
+        if "sgql" not in text.lower():
+            return
+        from sgstore.lang import pattern_tables
+
+        self.sql, tables = pattern_tables(text, store.catalog().tables)
+        found = [(one.name, store.find(one.text, **dict(one.values))) for one in tables]
+        for _, matches in found:
+            self.reasons |= matches.reasons
+            self.notes += matches.notes
+        if found:
+            self.given = lambda: [part for name, of in found for part in of.as_table(name)]
 
 
 def _ref(frame: int | str | FrameRef) -> int | str:

@@ -160,6 +160,8 @@ class Sandbox:
         ------
         SqlError
             It is none, the database refuses it, or it takes too much time or memory.
+        QueryError
+            A pattern in it is none.
         """
         return self._ask({"sql": text}, SqlError)
 
@@ -326,7 +328,8 @@ def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
     graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
-        values, columns, truncated, reasons = rows.values, rows.columns, rows.truncated, {}
+        values, columns, truncated = rows.values, rows.columns, rows.truncated
+        reasons = dict(rows.reasons)
     else:
         matches = store.find(question["find"], **question["parameters"])
         values = list(_first(matches, most + 1))

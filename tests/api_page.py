@@ -27,7 +27,7 @@ PARTS: dict[str, tuple[str, ...]] = {
 
 LEFT_OUT = {
     "Store": {"catalog", "info"},
-    "Matches": {"for_people"},
+    "Matches": {"as_table", "for_people"},
     "Config": {"unknown", "mapped"},
 }
 """Public methods that are for other parts of sgstore."""

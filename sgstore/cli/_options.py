@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sgstore.config import Config
     from sgstore.coverage import ChosenFrames, ReportTable
     from sgstore.matches import Matches
-    from sgstore.query import Store
+    from sgstore.query import Store, UserStatement
     from sgstore.sandbox import Answer
 
 
@@ -662,7 +662,7 @@ def bytes_of(text: str, option: str) -> int:
     return size
 
 
-def say_left_out(matches: Matches | Answer | ChosenFrames) -> None:
+def say_left_out(matches: Matches | Answer | ChosenFrames | UserStatement) -> None:
     """Say which traces cannot answer a query, and why, and what may be a mistake in it."""
     of: dict[str, list[str]] = {}
     for name, reason in matches.reasons.items():

@@ -243,6 +243,7 @@ def sql(
     """Ask a store in SQL, read only.
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
+    What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
     """
     if safe:
         with _sandbox(store, ask, max_rows, tables) as box:
@@ -250,13 +251,22 @@ def sql(
         _say_all(answer)
         ask.write(answer.columns, answer.rows)
         return 0
-    opened, text = ask.opened(store, tables_of(tables)).file, query_of(statement, file)
-    if (form := ask.chosen) in BINARY:
-        write_binary(lambda to: opened.user_parquet(text, to), form, ask.output)
-        return 0
-    with opened.user_batches(text) as batches:
-        rows = chain.from_iterable(batch.values for batch in batches)
-        ask.write(batches.columns, rows, batches.types)
+    from sgstore.query import UserStatement
+
+    opened = ask.opened(store, tables_of(tables))
+    with opened.file.snapshot():
+        asked = UserStatement(opened, query_of(statement, file))
+        say_left_out(asked)
+        if (form := ask.chosen) in BINARY:
+            write_binary(
+                lambda to: opened.file.user_parquet(asked.sql, to, given=asked.given),
+                form,
+                ask.output,
+            )
+            return 0
+        with opened.file.user_batches(asked.sql, given=asked.given) as batches:
+            rows = chain.from_iterable(batch.values for batch in batches)
+            ask.write(batches.columns, rows, batches.types)
     return 0
 
 

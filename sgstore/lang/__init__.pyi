@@ -60,6 +60,8 @@ from ._results import about_frame as about_frame
 from ._rewrite import rewritten as rewritten
 from ._search import ScopeSearch as ScopeSearch
 from ._search import expression as expression
+from ._table_function import PatternTable as PatternTable
+from ._table_function import pattern_tables as pattern_tables
 from ._why_not import WhyNot as WhyNot
 from ._why_not import WhyNotSteps as WhyNotSteps
 from ._why_not import looked_up as looked_up
@@ -92,6 +94,7 @@ __all__ = [
     "NamedPattern",
     "Need",
     "Pattern",
+    "PatternTable",
     "RelationScope",
     "ScopeSearch",
     "SqlStatement",
@@ -126,6 +129,7 @@ __all__ = [
     "parse",
     "pattern_named",
     "pattern_of",
+    "pattern_tables",
     "patterns",
     "relation",
     "rewritten",

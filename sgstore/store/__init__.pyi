@@ -26,6 +26,7 @@ from ._rebuild import named_as as named_as
 from ._rebuild import remains_of as remains_of
 from ._rebuild import take_place as take_place
 from ._rows import Batches as Batches
+from ._rows import Given as Given
 from ._rows import GivenTable as GivenTable
 from ._rows import ParquetTable as ParquetTable
 from ._rows import Rows as Rows
@@ -54,6 +55,7 @@ __all__ = [
     "DIGEST_BYTES",
     "Folder",
     "FrameRef",
+    "Given",
     "GivenTable",
     "Identity",
     "Mark",

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from sgstore.store._graphs import Graphs
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
-    from sgstore.store._rows import ArrowStream, Parameters
+    from sgstore.store._rows import ArrowStream, Parameters, UserTablesGiven
     from sgstore.store._similarity import SimilarFrames
     from sgstore.store._staging import Sealed
     from sgstore.store._verify import Verification
@@ -216,7 +216,12 @@ class StoreFile:
             yield found
 
     def user_sql(
-        self, sql: str, *, timeout_s: float | None = None, max_rows: int | None = None
+        self,
+        sql: str,
+        *,
+        timeout_s: float | None = None,
+        max_rows: int | None = None,
+        given: UserTablesGiven | None = None,
     ) -> Rows:
         """All rows of a statement of a user's.
 
@@ -228,6 +233,9 @@ class StoreFile:
             When to stop it; s.
         max_rows : int, optional
             How many rows to give; ``Rows.truncated`` tells whether there are more.
+        given : function, optional
+            Says which tables it speaks of beside the views: statements of ours make them, from the store as it
+            is then.
 
         Raises
         ------
@@ -236,7 +244,7 @@ class StoreFile:
         """
         size = BATCH if max_rows is None else max(min(BATCH, max_rows + 1), 1)
         values: list[tuple[Any, ...]] = []
-        with self.user_batches(sql, timeout_s=timeout_s, size=size) as batches:
+        with self.user_batches(sql, timeout_s=timeout_s, size=size, given=given) as batches:
             for batch in batches:
                 values += batch.values
                 if max_rows is not None and len(values) > max_rows:
@@ -245,7 +253,12 @@ class StoreFile:
         return Rows(batches.columns, batches.types, values[:max_rows], truncated=more)
 
     def user_rows(
-        self, sql: str, *, timeout_s: float | None = None, max_rows: int | None = None
+        self,
+        sql: str,
+        *,
+        timeout_s: float | None = None,
+        max_rows: int | None = None,
+        given: UserTablesGiven | None = None,
     ) -> Rows:
         """As :meth:`user_sql`; but of more rows than a batch, all are asked for when they are wanted.
 
@@ -255,19 +268,29 @@ class StoreFile:
             As :meth:`user_sql`.
         """
         first = self.user_sql(
-            sql, timeout_s=timeout_s, max_rows=BATCH if max_rows is None else max_rows
+            sql,
+            timeout_s=timeout_s,
+            max_rows=BATCH if max_rows is None else max_rows,
+            given=given,
         )
         if max_rows is not None or not first.truncated:
             return first
 
         return rows.LaterRows(
             first,
-            partial(self.user_sql, sql, timeout_s=timeout_s),
-            lambda: self._user_step(sql, timeout_s, lambda at: rows.table_of(at, sql)),
-            partial(self.user_parquet, sql, timeout_s=timeout_s),
+            partial(self.user_sql, sql, timeout_s=timeout_s, given=given),
+            lambda: self._user_step(sql, timeout_s, lambda at: rows.table_of(at, sql), given),
+            partial(self.user_parquet, sql, timeout_s=timeout_s, given=given),
         )
 
-    def user_parquet(self, sql: str, to: Path, *, timeout_s: float | None = None) -> int:
+    def user_parquet(
+        self,
+        sql: str,
+        to: Path,
+        *,
+        timeout_s: float | None = None,
+        given: UserTablesGiven | None = None,
+    ) -> int:
         """Write the rows of a statement of a user's to a Parquet file, as they come; how many there are.
 
         Raises
@@ -282,19 +305,24 @@ class StoreFile:
             stream = rows.record_batches(connection, sql)
             return None if stream is None else rows.write_batches(stream, to)
 
-        number = self._user_step(sql, timeout_s, step)
+        number = self._user_step(sql, timeout_s, step, given)
         if number is not None:
             return number
-        with self.user_batches(sql, timeout_s=timeout_s) as batches:
+        with self.user_batches(sql, timeout_s=timeout_s, given=given) as batches:
             values = chain.from_iterable(batch.values for batch in batches)
             return rows.write_parquet(batches.columns, values, to, batches.types)
 
     def _user_step(
-        self, sql: str, timeout_s: float | None, step: Callable[[DuckDBPyConnection], T]
+        self,
+        sql: str,
+        timeout_s: float | None,
+        step: Callable[[DuckDBPyConnection], T],
+        given: UserTablesGiven | None,
     ) -> T:
         """Answer of a statement of a user's that is read at once."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
+            rows.give_to_user(connection, given, sql, timeout_s)
             of = partial(step, connection)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, of))
 
@@ -303,11 +331,17 @@ class StoreFile:
 
     @contextmanager
     def user_batches(
-        self, sql: str, *, timeout_s: float | None = None, size: int = BATCH
+        self,
+        sql: str,
+        *,
+        timeout_s: float | None = None,
+        size: int = BATCH,
+        given: UserTablesGiven | None = None,
     ) -> Generator[Batches]:
         """The rows of a statement of a user's as a stream; see :meth:`user_sql`."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
+            rows.give_to_user(connection, given, sql, timeout_s)
             begin = partial(Batches, connection, sql, size=size)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, begin))
 

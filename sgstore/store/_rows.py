@@ -6,7 +6,7 @@ import csv
 import json
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -22,10 +22,11 @@ from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.files import without_controls, working_folder, written_at, written_text
 from sgstore.quoting import literal, quoted
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
+from sgstore.store._schema import INSIDE
 from sgstore.store._steps import interruptible
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+    from collections.abc import Generator, Iterator, Sequence
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
@@ -151,6 +152,8 @@ class Rows(Tabular):
         Their types in the database: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``, …
     truncated : bool
         Whether there were more rows than asked for.
+    reasons : mapping of str to str
+        Why traces are left out by a pattern in the statement, by name.
     """
 
     def __init__(
@@ -162,6 +165,7 @@ class Rows(Tabular):
         truncated: bool = False,
     ) -> None:
         self.columns, self.types, self.truncated = columns, types, truncated
+        self.reasons: Mapping[str, str] = {}
         self._values = values
 
     @property
@@ -821,6 +825,31 @@ class GivenTable:
 
 Given = GivenTable | tuple[str, Mapping[str, object]]
 """A table that a statement is given: its rows, or a statement of ours that makes it, and its values."""
+
+
+UserTablesGiven = Callable[[], Iterable[Given]]
+"""The function of the tables that a statement of a user's speaks of: asked while the store is open."""
+
+
+def give_to_user(
+    connection: DuckDBPyConnection,
+    given: UserTablesGiven | None,
+    sql: str,
+    timeout_s: float | None,
+) -> None:
+    """Make tables for a statement of a user's, by statements of ours.
+
+    Raises
+    ------
+    SqlError
+        They take too long, or too much memory.
+    """
+    if given is None:
+        return
+    with _interrupted_after(connection, timeout_s), _refused(sql, timeout_s):
+        connection.execute(f"USE {INSIDE}")
+        give(connection, given())
+        connection.execute("USE main")
 
 
 def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:

@@ -1,0 +1,180 @@
+"""``sgql('MATCH …')`` in SQL: patterns as tables of a statement.
+
+A statement of SQL is not parsed here. Texts, quoted names and comments are passed over, so that only a call is
+taken for one.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from sgstore.errors import QueryError, TextSpan
+from sgstore.quoting import quoted
+from sgstore.records import dataclass
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+
+@dataclass(frozen=True, slots=True)
+class PatternTable:
+    """A call of ``sgql``.
+
+    Attributes
+    ----------
+    name : str
+        Of the table that stands for it in the statement.
+    text : str
+        The query.
+    values : tuple of (str, value)
+        Values of its parameters by name.
+    """
+
+    name: str
+    text: str
+    values: tuple[tuple[str, Any], ...]
+
+
+_TEXT: Final = r"'(?:[^']|'')*'"
+_DOLLARS: Final = r"\$(?P<tag>[A-Za-z_]\w*|)\$.*?\$(?P=tag)\$"
+_BLANK: Final = re.compile(r"(?:\s+|--[^\n]*|/\*.*?\*/)*", re.DOTALL)
+_PART: Final = re.compile(
+    rf"""\be'(?:[^'\\]|\\.|'')*'|{_TEXT}|"(?:[^"]|"")*"|{_DOLLARS}|--[^\n]*|/\*.*?\*/"""
+    r"|(?P<call>(?<![\w.\"])sgql\s*\()",
+    re.DOTALL | re.IGNORECASE,
+)
+_VALUE: Final = re.compile(
+    rf"(?P<text>{_TEXT})|{_DOLLARS}|(?P<number>[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)\b|(?P<word>true|false)\b",
+    re.DOTALL | re.IGNORECASE,
+)
+_NAME: Final = re.compile(r"([A-Za-z_]\w*)\s*(?::=|=>|=)")
+_EXAMPLE: Final = "SELECT * FROM sgql('MATCH (e:Ego) RETURN FRAMES')"
+
+
+def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[PatternTable, ...]]:
+    """A statement of SQL with tables in place of the calls of ``sgql``, and what these tables are.
+
+    Parameters
+    ----------
+    sql : str
+    taken : collection of str
+        Names that no such table may have.
+
+    Raises
+    ------
+    QueryError
+        A call is not ``sgql('…')`` or ``sgql('…', name := value)``; it says where.
+    """
+    found: dict[tuple[str, tuple[tuple[str, Any], ...]], PatternTable] = {}
+    parts: list[str] = []
+    end = 0
+    for call in _PART.finditer(sql):
+        if call["call"] is None or call.start() < end:
+            continue
+        arguments = _Arguments(sql, call.start(), call.end())
+        text, values = arguments.read()
+        table = found.get((text, values))
+        if table is None:
+            table = PatternTable(_free(taken, len(found)), text, values)
+            found[text, values] = table
+        parts += [sql[end : call.start()], quoted(table.name)]
+        end = arguments.at
+    return "".join([*parts, sql[end:]]), tuple(found.values())
+
+
+def _free(taken: Collection[str], number: int) -> str:
+    """A name for a table: the first one is called as the function, as in SQL."""
+    name = f"sgql {number + 1}" if number else "sgql"
+    while name in taken:
+        name += "_"
+    return name
+
+
+class _Arguments:
+    """Reads the arguments of a call, and ends behind its bracket.
+
+    Parameters
+    ----------
+    sql : str
+    start, at : int
+        Where the call begins, and where its arguments do.
+    """
+
+    def __init__(self, sql: str, start: int, at: int) -> None:
+        self.sql, self.start, self.at = sql, start, at
+
+    def read(self) -> tuple[str, tuple[tuple[str, Any], ...]]:
+        """Return the query and the values of its parameters."""
+        first = self._next()
+        text = self._value()
+        if not isinstance(text, str):
+            self._refuse("sgql() takes a query in quotes", first, _EXAMPLE)
+        values: list[tuple[str, Any]] = []
+        while self._sign() == ",":
+            self.at += 1
+            values.append(self._named())
+        if self._sign() != ")":
+            hint = "a quote within the text is doubled: 'x.name = ''bus'''; or write $$MATCH …$$"
+            self._refuse("expected ',' or ')' behind the query", self.at, hint)
+        self.at += 1
+        return text, tuple(values)
+
+    def _next(self) -> int:
+        found = _BLANK.match(self.sql, self.at)
+        self.at = found.end() if found else self.at
+        return self.at
+
+    def _sign(self) -> str:
+        return self.sql[self._next() : self.at + 1]
+
+    def _named(self) -> tuple[str, Any]:
+        name = _NAME.match(self.sql, self._next())
+        if name is None:
+            self._refuse(
+                "a value of a query has the name of a parameter",
+                self.at,
+                "sgql('… WHERE e.speed > $least', least := 10)",
+            )
+        self.at = name.end()
+        first = self._next()
+        value = self._list() if self._sign() == "[" else self._value()
+        if value is None:
+            self._refuse(
+                "expected a number, a text, true or false, or a list of these", first, None
+            )
+        return name[1], value
+
+    def _list(self) -> tuple[Any, ...]:
+        items: list[Any] = []
+        self.at += 1
+        while self._sign() != "]":
+            first = self._next()
+            item = self._value()
+            if item is None:
+                self._refuse("a list holds numbers, texts, true and false", first, None)
+            items.append(item)
+            if self._sign() == ",":
+                self.at += 1
+        self.at += 1
+        return tuple(items)
+
+    def _value(self) -> Any:
+        """A constant; ``None`` if there is none."""
+        found = _VALUE.match(self.sql, self._next())
+        if found is None:
+            return None
+        self.at = found.end()
+        if found["number"]:
+            number = float(found["number"])
+            return int(found["number"]) if found["number"].lstrip("+-").isdigit() else number
+        if found["word"]:
+            return found["word"].lower() == "true"
+        if found["text"]:
+            return found["text"][1:-1].replace("''", "'")
+        mark = len(found["tag"]) + 2
+        return found[0][mark:-mark]
+
+    def _refuse(self, reason: str, at: int, hint: str | None) -> NoReturn:
+        end = min(max(at + 1, self.start), len(self.sql))
+        raise QueryError(reason, text=self.sql, span=TextSpan(self.start, end), hint=hint)
