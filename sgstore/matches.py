@@ -13,6 +13,7 @@ from collections import namedtuple
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
+from heapq import merge
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -25,6 +26,7 @@ from sgstore.lang import (
     compile_query,
     extents,
     for_people,
+    joined_rows,
     rewritten,
 )
 from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
@@ -43,14 +45,14 @@ from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
     from typing import Self
 
     import networkx as nx
     import numpy as np
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Compared, Gathered, SqlStatement
+    from sgstore.lang import Catalog, Compared, Gathered, SqlStatement, UnionParts
     from sgstore.store import Given, StoreFile
 
 SHOWN: Final = 80
@@ -381,8 +383,10 @@ class Matches(Tabular):
                         if left == 0:
                             return
 
-    def as_table(self, name: str) -> list[Given]:
+    def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
         """What makes a table of all rows, for a statement that speaks of it by a name.
+
+        ``apart``: with columns that tell nodes of several traces apart which have the same number.
 
         Raises
         ------
@@ -396,7 +400,7 @@ class Matches(Tabular):
                 hint="RETURN what the statement needs of them: v.id, dist(e, v)",
             )
         with self._compiled() as compiled:
-            asked = self._asked(compiled.rows())
+            asked = self._asked((compiled.told_apart() if apart else compiled).rows())
         made = f"CREATE OR REPLACE TEMP TABLE {quoted(name)} AS {asked['sql']}"
         return [*asked["given"], (made, asked["parameters"])]
 
@@ -474,6 +478,184 @@ class Matches(Tabular):
                 steps.rows += len(block[0])
                 for low in range(0, len(block[0]), BLOCK):
                     yield [column[low : low + BLOCK] for column in block]
+
+
+class UnionMatches(Matches):
+    """Matches of several queries as one: of a ``UNION``, or of ``UNION ALL``.
+
+    Rows that are of frames, intervals or clips come by trace and time, and where one part has an order of its
+    own, part after part; other rows of a ``UNION`` by their values, of ``UNION ALL`` part after part.
+
+    Parameters
+    ----------
+    text : str
+        The query.
+    asked : UnionParts
+        Its parts as they are written.
+    parts : sequence of Matches
+        Their answers.
+
+    Raises
+    ------
+    QueryError
+        The parts return different columns.
+    """
+
+    def __init__(self, text: str, asked: UnionParts, parts: Sequence[Matches]) -> None:
+        first = parts[0]
+        self._file, self._text = first._file, text  # noqa: SLF001
+        self._parts, self._distinct, self._limit = tuple(parts), asked.distinct, None
+        self.columns, self.graphs = first.columns, first.graphs
+        self._results = [part._ready.bound.result for part in parts]  # noqa: SLF001
+        types = [[column.value.type for column in result.columns] for result in self._results]
+        for part, other, kinds in zip(asked.parts[1:], parts[1:], types[1:], strict=True):
+            hint = f"the first one returns {', '.join(first.columns)}"
+            if other.columns != first.columns:
+                reason = (
+                    f"the parts of a UNION return the same, and this one {', '.join(other.columns)}"
+                )
+                raise QueryError(reason, text=text, span=part.span, hint=f"{hint}; AS gives a name")
+            for column, one, kind in zip(self._results[0].columns, types[0], kinds, strict=True):
+                if one is not kind and "NULL" not in {one, kind}:
+                    reason = f"'{column.name}' is a {one} in the first part of the UNION, and a {kind} here"
+                    raise QueryError(reason, text=text, span=part.span)
+
+    def limit(self, most: int) -> Self:
+        """The same matches, but no more rows than so many."""
+        if most < 0:
+            raise ValueError(f"limit is {most}, expected 0 or more")
+        fewer = copy.copy(self)
+        fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
+        return fewer
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """The reasons of all parts for each of the traces in :attr:`left_out`, by name."""
+        found: dict[str, list[str]] = {}
+        for part in self._parts:
+            for name, reason in part.reasons.items():
+                found.setdefault(name, []).append(reason)
+        return {name: "; ".join(dict.fromkeys(reasons)) for name, reasons in found.items()}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on likely mistakes in any part."""
+        return tuple(dict.fromkeys(note for part in self._parts for note in part.notes))
+
+    def _rows(self, *, whole: bool) -> Iterator[Row]:
+        row = _row_type(self.columns)
+        with self._file.snapshot():
+            if self.graphs:
+                parts = [part._rows(whole=whole) for part in self._parts]  # noqa: SLF001
+                found = self._merged(parts, lambda row: (natural(row[1]), row[2]), repr)
+                yield from islice(found, self._limit)
+                return
+            with self._file.batches(**self._joined()) as batches:
+                for batch in batches:
+                    yield from map(row._make, batch.values)
+
+    def _merged(
+        self, parts: Sequence[Iterable[T]], key: Callable[[T], Any], told: Callable[[T], object]
+    ) -> Iterator[T]:
+        """What parts give in one order, as one; of a ``UNION`` each once, by what is told of it."""
+        last: Any = None
+        seen: set[object] = set()
+        for one in merge(*parts, key=key):
+            if key(one) != last:
+                last, seen = key(one), set()
+            if self._distinct and told(one) in seen:
+                continue
+            seen.add(told(one))
+            yield one
+
+    def _joined(self) -> dict[str, Any]:
+        """The statement of all rows, as :class:`StoreFile` takes it: the rows of each part are a table."""
+        given: list[Given] = []
+        tables = [f":part {number}" for number in range(len(self._parts))]
+        for name, part in zip(tables, self._parts, strict=True):
+            given += part.as_table(name, apart=True)
+        select, named = joined_rows(self.columns, tables, self._results, distinct=self._distinct)
+        select.limit = self._limit
+        traces = [trace.name for trace in self._parts[0]._ready.catalog.traces]  # noqa: SLF001
+        return {"sql": select.text(), "parameters": {"1": traces} if named else {}, "given": given}
+
+    def count(self) -> int:
+        """The number of distinct frames."""
+        return sum(1 for _ in self.frames())
+
+    def frames(self) -> Iterator[FrameRef]:
+        """The distinct frames of all parts, by name of the trace and number."""
+
+        def key(frame: FrameRef) -> tuple[Any, int]:
+            return natural(frame.trace), frame.seq
+
+        with self._file.snapshot():
+            parts = [
+                sorted(part.frames(), key=key) if result.chooses else part.frames()
+                for part, result in zip(self._parts, self._results, strict=True)
+            ]
+            last = None
+            for frame in merge(*parts, key=key):
+                if frame.frame_id != last:
+                    last = frame.frame_id
+                    yield frame
+
+    def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
+        """Return the node ids of the variables of each part in one frame by name, whatever ``RETURN`` says."""
+        return [binding for part in self._parts for binding in part.bindings(frame)]
+
+    def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
+        """Each match of each part as a graph; see :meth:`Matches.subgraphs`."""
+        with self._file.snapshot():
+            parts = [part.subgraphs() for part in self._parts]
+            yield from merge(*parts, key=lambda of: (natural(of.graph["trace"]), of.graph["seq"]))
+
+    def intervals(self) -> Iterator[Interval]:
+        """Intervals of all parts, by trace and start; see :meth:`Matches.intervals`."""
+        with self._file.snapshot():
+            parts = [self._in_time(part.intervals(), _begin) for part in self._parts]
+            yield from self._merged(parts, _begin, repr)
+
+    def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
+        """Clips around the frames that match a part, in log time; those that overlap are one."""
+        with self._file.snapshot():
+            parts = [part.clips(before, after) for part in self._parts]
+            found = merge(*parts, key=lambda clip: (natural(clip.trace), clip.start_ns))
+            yield from merged(found, self._parts[0]._slack)  # noqa: SLF001
+
+    def _in_time(
+        self, intervals: Iterator[Interval], key: Callable[[Any], Any]
+    ) -> Iterable[Interval]:
+        chosen = any(result.order or result.chooses for result in self._results)
+        return sorted(intervals, key=key) if chosen else intervals
+
+    def numpy(self) -> dict[str, NDArray[np.generic]]:
+        """All columns as arrays, masked where something is NULL."""
+        with self._file.snapshot():
+            return self._file.arrays(**self._joined())
+
+    def _table(self) -> Any:
+        return None
+
+    def _record_batches(self) -> Generator[Any]:
+        yield from ()
+
+    def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
+        """What makes a table of all rows; see :meth:`Matches.as_table`."""
+        if self.graphs:
+            return self._parts[0].as_table(name, apart=apart)  # which refuses
+        asked = self._joined()
+        made = f"CREATE OR REPLACE TEMP TABLE {quoted(name)} AS {asked['sql']}"
+        return [*asked["given"], (made, asked["parameters"])]
+
+    def explain(self) -> str:
+        """Explain each part, stage by stage."""
+        word = "UNION" if self._distinct else "UNION ALL"
+        return f"\n\n==== {word}\n\n".join(part.explain() for part in self._parts)
+
+
+def _begin(interval: Interval) -> tuple[Any, int]:
+    return natural(interval.trace), interval.start_seq
 
 
 class TooMuchError(QueryError):

@@ -15,7 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
 
-from sgstore.lang import CONSTANTS, about_frame, compile_query
+from sgstore.errors import QueryError
+from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
+from sgstore.matches import UnionMatches
 from sgstore.store import FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import normalize_name
 
@@ -179,7 +181,18 @@ class Store:
 
             pattern = query if isinstance(query, Pattern) else Pattern.of(query)
             query, parameters = str(pattern), {**pattern.parameters, **parameters}
-        return TemporalMatches(self.file, self.file.catalog, query, parameters)
+        asked = union_parts(query, parameters)
+        if asked is None:
+            return TemporalMatches(self.file, self.file.catalog, query, parameters)
+        try:
+            parts = [
+                TemporalMatches(self.file, self.file.catalog, part.text, part.values)
+                for part in asked.parts
+            ]
+        except QueryError as error:  # its text has blanks in place of the other parts
+            reason, span = error.reason, error.span
+            raise type(error)(reason, text=query, span=span, hint=error.hint) from None
+        return UnionMatches(query, asked, parts)
 
     def check(
         self,

@@ -58,6 +58,7 @@ SECONDS: Final = {
     "lang_after": 8,
     "lang_own_names": 8,
     "sql_patterns": 8,
+    "union": 8,
     "lang_oracle": 8,
     "lang_match": 8,
     "query": 8,

@@ -308,12 +308,13 @@ def monitor(
 
 def _called(asked: Mapping[str, list[str]]) -> list[str]:
     """Names of the patterns in events, in the order in which they are asked."""
-    from sgstore.lang import parse
+    from sgstore.lang import each_match, parse
     from sgstore.lang.syntax import MatchClause
 
     every: list[str] = []
     for name, texts in asked.items():
-        count = sum(isinstance(one, MatchClause) for text in texts for one in parse(text))
+        statements = (one for text in texts for one in each_match(parse(text)))
+        count = sum(isinstance(one, MatchClause) for one in statements)
         every += [name] if count == 1 else [f"{name} {number + 1}" for number in range(count)]
     return every
 

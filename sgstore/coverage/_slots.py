@@ -42,7 +42,7 @@ from sgstore.coverage._frames import (
     share,
 )
 from sgstore.errors import ConfigError, QueryError
-from sgstore.lang import parse, syntax
+from sgstore.lang import each_match, parse, syntax
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -84,19 +84,21 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
 
 def _with_frames(query: str) -> str:
     """Return a query that can be asked, with the frame of each match among what it returns."""
-    found = next((one for one in parse(query) if isinstance(one, syntax.MatchClause)), None)
-    if found is None or found.returns is None:
-        return query
-    returns = found.returns
-    chosen = (returns.limit, returns.sample, returns.top, returns.skip or None, returns.having)
-    if any(part is not None for part in chosen):
-        raise QueryError(
-            "a specification counts all matches, and has no LIMIT, SKIP, SAMPLE or HAVING",
-            text=query,
-            span=returns.span,
-        )
-    end = returns.items[-1].span.end
-    return f"{query[:end]}, FRAMES{query[end:]}"
+    found = [one for one in each_match(parse(query)) if isinstance(one, syntax.MatchClause)]
+    for part in reversed(found):  # what is put in moves what stands behind it
+        returns = part.returns
+        if returns is None:
+            return query
+        chosen = (returns.limit, returns.sample, returns.top, returns.skip or None, returns.having)
+        if any(one is not None for one in chosen):
+            raise QueryError(
+                "a specification counts all matches, and has no LIMIT, SKIP, SAMPLE or HAVING",
+                text=query,
+                span=returns.span,
+            )
+        end = returns.items[-1].span.end
+        query = f"{query[:end]}, FRAMES{query[end:]}"
+    return query
 
 
 def specification(

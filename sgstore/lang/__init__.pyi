@@ -62,6 +62,10 @@ from ._search import ScopeSearch as ScopeSearch
 from ._search import expression as expression
 from ._table_function import PatternTable as PatternTable
 from ._table_function import pattern_tables as pattern_tables
+from ._union import UnionParts as UnionParts
+from ._union import each_match as each_match
+from ._union import joined_rows as joined_rows
+from ._union import union_parts as union_parts
 from ._why_not import WhyNot as WhyNot
 from ._why_not import WhyNotSteps as WhyNotSteps
 from ._why_not import looked_up as looked_up
@@ -105,6 +109,7 @@ __all__ = [
     "TraceFacts",
     "Triple",
     "Type",
+    "UnionParts",
     "WhyNot",
     "WhyNotSteps",
     "Window",
@@ -115,12 +120,14 @@ __all__ = [
     "compared_in_query",
     "compile_checks",
     "compile_query",
+    "each_match",
     "entities",
     "expression",
     "extents",
     "for_people",
     "ir",
     "joined",
+    "joined_rows",
     "looked_up",
     "node_of_kind",
     "notes_on",
@@ -136,6 +143,7 @@ __all__ = [
     "syntax",
     "traces_of",
     "traces_with",
+    "union_parts",
     "unnumbered_text",
     "value_text",
     "why_not",

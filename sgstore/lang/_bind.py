@@ -149,8 +149,14 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchC
                 statement.span,
                 "ask for it by check: sgstore check STORE …",
             )
+        elif isinstance(statement, s.UnionClause):
+            session.refuse(
+                "a UNION joins the answers of several queries, and one is asked for here",
+                statement.span,
+                "ask of each part by itself",
+            )
         elif found is not None:
-            session.refuse("one MATCH at a time", statement.span)
+            session.refuse("one MATCH at a time", statement.span, "answers are joined by UNION")
         else:
             found = statement
     if found is None:
@@ -746,7 +752,7 @@ def bind_checks(
         session = Session(text, parameters, _BINDERS, dict(defined), used=used)
         if isinstance(statement, Define):
             defined[normalize_name(statement.name)] = statement
-        elif isinstance(statement, MatchClause):
+        elif isinstance(statement, MatchClause | s.UnionClause):
             session.refuse("a MATCH has matches, and no verdict", statement.span, "ask it by find")
         else:
             catalog = seen(statement)

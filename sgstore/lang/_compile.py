@@ -628,6 +628,19 @@ class Compiled:
             result = Result(form="clips", whole=False, before=-before_ns, after=after_ns)
         return self.rows(window, replace(self.query, result=result))
 
+    def told_apart(self) -> Compiled:
+        """The query with further columns: the owner of each node that it returns, where no frame tells it."""
+        result = self.query.result
+        if result.names:
+            return self
+        owners = (
+            ReturnColumn(f":owner {place}", results.owner_of(column.value.node))
+            for place, column in enumerate(result.columns)
+            if isinstance(column.value, NodeValue)
+        )
+        result = replace(result, columns=(*result.columns, *owners))
+        return replace(self, query=replace(self.query, result=result))
+
     def limited(self, most: int) -> Compiled:
         """The query with no more rows than so many, as if it ended in ``LIMIT``."""
 

@@ -424,7 +424,7 @@ _LATER: Final = frozenset(
         "RESET",
         "SEMICOLON",
     }
-    | {"_ARROW", "HAVING", "SKIP"}
+    | {"_ARROW", "HAVING", "SKIP", "UNION"}
 )
 """What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
 

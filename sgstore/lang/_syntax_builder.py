@@ -413,6 +413,14 @@ def _match(span: TextSpan, children: Children) -> s.MatchClause:
     return s.MatchClause(settings or (), sequence, returns, span)
 
 
+def _union(span: TextSpan, children: Children) -> s.UnionClause:
+    words = {" ".join(word.text.upper().split()): word for word in children[1::2]}
+    if len(words) > 1:
+        last = [*words.values()][-1]
+        raise BuildError("one of UNION and UNION ALL in a query", last.span)
+    return s.UnionClause(tuple(children[::2]), "UNION" in words, span)
+
+
 def _check(span: TextSpan, children: Children) -> s.CheckClause:
     settings, name, *quantifiers, formula, reset, robustness = children
     called = name and name.text
@@ -517,6 +525,7 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "params": _all,
     "param": _param,
     "match": _match,
+    "union": _union,
     "check": _check,
     "quantifier": _quantifier,
     "qvar": _quantified,

@@ -451,6 +451,15 @@ class MatchClause:
 
 
 @dataclass(frozen=True, slots=True)
+class UnionClause:
+    """``MATCH … UNION MATCH …``; not ``distinct``: ``UNION ALL``."""
+
+    parts: tuple[MatchClause, ...]
+    distinct: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
 class Formal:
     """A parameter of a definition; that of a scenario may have a value that it takes if none is given."""
 
@@ -503,4 +512,4 @@ class CheckClause:
     span: TextSpan
 
 
-Statement = MatchClause | Define | CheckClause
+Statement = MatchClause | UnionClause | Define | CheckClause

@@ -22,6 +22,7 @@ from sgstore.lang import (
     TraceFacts,
     bind_checks,
     bind_query,
+    each_match,
     of_check,
     of_query,
     parse,
@@ -441,7 +442,7 @@ def _bound(
     text: str, catalog: Catalog, parameters: Mapping[str, Any]
 ) -> tuple[list[BoundCheck], list[Query]]:
     """The checks and the patterns of a text."""
-    statements = parse(text)
+    statements = [*each_match(parse(text))]
     written = [one for one in statements if not isinstance(one, MatchClause)]
     named = {name for one in statements for name in _parameters(one)}
     unused = sorted(set(parameters) - named)
