@@ -495,6 +495,8 @@ def _listed(machine: Tables, names: list[str]) -> str:
     """Return the expected terminals in words; operators, and beginnings of values, count as one."""
     left = set(names) - _LATER or set(names)
     said: list[str] = []
+    if "RETURN" in left:  # a second MATCH may stand wherever RETURN may
+        left -= {"MATCH"}
     if left >= _EDGES:
         said.append("an edge")
         left -= _EDGES

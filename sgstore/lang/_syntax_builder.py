@@ -337,10 +337,25 @@ def _block_body(span: TextSpan, children: Children) -> s.Block:
 
 
 def _match_step(span: TextSpan, children: Children) -> s.StepClause:
-    paths, where, hold, name = children
+    paths, where, *further, hold, name = children
+    for more, condition in further:
+        paths += more
+        where = _both(where, condition)
     end = where.span.end if where else span.end
     block = s.Block(paths, where, TextSpan(span.start, end))
     return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
+
+
+def _further(_: TextSpan, children: Children) -> tuple[Any, Any]:
+    """A second ``MATCH`` about the same frame: its paths and its condition."""
+    paths, where = children
+    return paths, where
+
+
+def _both(one: s.Expression | None, other: s.Expression | None) -> s.Expression | None:
+    if one is None or other is None:
+        return one or other
+    return s.Logic("AND", (one, other), TextSpan(one.span.start, other.span.end))
 
 
 def _holds_step(span: TextSpan, children: Children) -> s.StepClause:
@@ -536,6 +551,7 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "sequence": _sequence,
     "absent_step": _absent_step,
     "match_step": _match_step,
+    "further": _further,
     "holds_step": _holds_step,
     "scenario_step": _scenario_step,
     "given": _given,
