@@ -181,6 +181,13 @@ def test_the_first_part_that_fails_is_shown_with_what_is_there(
     assert answer.held[0] == "(e:Ego)"
 
 
+def test_a_case_that_fails_is_told_as_it_is_written(town: Store) -> None:
+    case = "CASE WHEN e.speed < 1 THEN 'slow' WHEN e.speed < 2 THEN 'walk' ELSE 'fast' END = 'none'"
+    answer = town.why_not("town@20s", f"MATCH (e:Ego) WHERE {case}")
+
+    assert answer.failed == case
+
+
 def test_the_nearest_is_the_one_that_misses_by_the_least(town: Store) -> None:
     answer = town.why_not("town@20s", "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 1")
     distances = town.sql(

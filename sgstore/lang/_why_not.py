@@ -193,6 +193,11 @@ class Writer:
         word, operands = operation.word, operation.operands
         if word == "IS NOT NULL" and isinstance(operands[0], b.NodeValue):
             return f"known({self.expression(operands[0])})"
+        if word == "case":
+            *pairs, last = (self.expression(operand) for operand in operands)
+            cases = zip(pairs[::2], pairs[1::2], strict=True)
+            told = " ".join(f"WHEN {condition} THEN {value}" for condition, value in cases)
+            return f"CASE {told} ELSE {last} END"
         if word not in INFIX and word not in {"IS NULL", "IS NOT NULL", "NOT", "negative"}:
             return f"{word}({', '.join(self.expression(operand) for operand in operands)})"
         parts = [self.expression(operand, inner=True) for operand in operands]
