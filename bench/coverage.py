@@ -205,7 +205,7 @@ def made(path: Path, frames: int, seed: int, library: Library, road_map: RoadMap
             for first in range(0, len(scene), BLOCK):
                 some = scene[first : first + BLOCK]
                 segment.append(block(library, road_map, first + np.arange(len(some)), some))
-            segment.publish(TraceReport())
+            store.publish(segment.seal(TraceReport()))
     store.compact()
     return time.perf_counter() - start
 

@@ -94,7 +94,7 @@ def in_parts(path: Path, store: StoreFile) -> tuple[dict[str, float], int]:
                 segment.append(graph)
                 at = parts.timed("pack and insert", at)
             at = parts.timed("read", at)
-            segment.publish(trace.report)
+            store.publish(segment.seal(trace.report))
             parts.timed("publish", at)
         return parts.seconds, trace.report.frames
 

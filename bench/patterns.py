@@ -186,7 +186,7 @@ def built(path: Path, frames: int) -> tuple[float, float]:
                 graph = generator.block(kept)
                 graphs += time.perf_counter() - began
                 segment.append(graph)
-            segment.publish(TraceReport(frames=length))
+            store.publish(segment.seal(TraceReport(frames=length)))
     store.compact()
     return time.perf_counter() - start, graphs
 

@@ -180,7 +180,7 @@ def replicate(store: StoreFile, made: Sequence[Source], traces: int, *, seed: in
             for graph in source.graphs:
                 moved = segment.as_kept(motion.of(graph.frames))
                 segment.append(replace(graph, frames=moved))
-            segment.publish(source.report)
+            store.publish(segment.seal(source.report))
         frames += source.frames
     return frames
 

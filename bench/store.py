@@ -68,7 +68,7 @@ class Made:
         with store.segment(info, Config(), road_map=self.road_map, answers=self.answers) as segment:
             for graph in self.graphs:
                 segment.append(graph)
-            segment.publish(TraceReport())
+            store.publish(segment.seal(TraceReport()))
         return time.perf_counter() - start
 
 

@@ -280,7 +280,7 @@ def publish_long(store: StoreFile, frames: int, *, size: int = 240, moving: int 
     with store.segment(trace.info, Config(), road_map=trace.road_map) as segment:
         for first in range(0, frames, size):
             segment.append(trace.block(first, min(first + size, frames)))
-        segment.publish(TraceReport(frames=frames))
+        store.publish(segment.seal(TraceReport(frames=frames)))
 
 
 def publish(store: StoreFile, trace: RandomTrace, config: Config | None = None) -> str:
@@ -290,4 +290,4 @@ def publish(store: StoreFile, trace: RandomTrace, config: Config | None = None) 
     ) as segment:
         for graph in trace.blocks:
             segment.append(graph)
-        return segment.publish(TraceReport(frames=trace.frames))
+        return store.publish(segment.seal(TraceReport(frames=trace.frames)))

@@ -88,7 +88,7 @@ def test_a_trace_is_not_in_the_store_before_it_is_published(store: Any) -> None:
         for graph in trace.blocks:
             segment.append(graph)
             assert store.traces() == ()
-        segment.publish(TraceReport())
+        store.publish(segment.seal(TraceReport()))
 
     assert len(store.traces()) == 1
     assert beside(store) == []
@@ -232,7 +232,7 @@ def test_a_trace_that_comes_twice_at_once_comes_once(store: Any) -> None:
         before = content(store)
 
         with pytest.raises(StoreError, match="came into the store meanwhile, as 'drive'"):
-            late.publish(TraceReport())
+            store.publish(late.seal(TraceReport()))
 
     assert content(store) == before
 
@@ -372,7 +372,7 @@ def test_a_trace_without_frames_is_a_defect_of_the_caller(store: Any) -> None:
         store.segment(trace_info(), Config()) as segment,
         pytest.raises(ValueError, match="a trace without frames"),
     ):
-        segment.publish(TraceReport())
+        store.publish(segment.seal(TraceReport()))
 
 
 def test_texts_that_are_no_unicode_are_kept_as_far_as_they_are(store: Any) -> None:
@@ -388,7 +388,7 @@ def test_texts_that_are_no_unicode_are_kept_as_far_as_they_are(store: Any) -> No
     with store.segment(trace.info, Config()) as segment:
         for graph in trace.blocks:
             segment.append(graph)
-        segment.publish(TraceReport(warnings=["odd: \ud800"]))
+        store.publish(segment.seal(TraceReport(warnings=["odd: \ud800"])))
 
     found = store.rows("SELECT ident FROM entities ORDER BY node_id LIMIT 2").values
     assert found == [("?",), ("nul\0",)]
@@ -486,7 +486,7 @@ def test_what_a_dead_process_left_is_removed_and_what_a_living_one_has_is_not(st
         assert not dead.exists()
         assert len(beside(store)) == 1
         living.append(trace.blocks[0])
-        living.publish(TraceReport())
+        store.publish(living.seal(TraceReport()))
 
     assert {t.name for t in store.traces()} == {"a", "b"}
     assert beside(store) == []

@@ -592,7 +592,7 @@ class StoreFile:
         from sgstore.store._write import OnMap, Segment
 
         identity = Identity.of(info, config, road_map)
-        return Segment(self.path, info, identity, OnMap(road_map), answers, access=self.access)
+        return Segment(self.path, info, identity, OnMap(road_map), answers)
 
     def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
         """Bring a trace into the store, in one transaction.
@@ -613,9 +613,10 @@ class StoreFile:
         StoreError
             The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
         """
-        from sgstore.store._publish import publish_in
-
-        return publish_in(self.access, sealed, replace=replace)
+        (found,) = self.publish_each([sealed], replace=replace)
+        if isinstance(found, SgstoreError):
+            raise found
+        return found
 
     def publish_each(
         self, sealed: Sequence[Sealed], *, replace: bool = False

@@ -68,14 +68,6 @@ class PresentError(StoreError):
         self.name = name
 
 
-def publish_in(access: Access, sealed: Sealed, *, replace: bool = False) -> str:
-    """Bring a trace into a store, in one transaction; see :meth:`StoreFile.publish`."""
-    (found,) = publish_each(access, [sealed], replace=replace)
-    if isinstance(found, SgstoreError):
-        raise found
-    return found
-
-
 def publish_each(
     access: Access, sealed: Sequence[Sealed], *, replace: bool = False
 ) -> list[str | SgstoreError]:

@@ -18,7 +18,6 @@ from sgstore.errors import StoreError
 from sgstore.store._classes import IngestedClasses
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store._payloads import FrameTimes, Happenings
-from sgstore.store._publish import publish_in
 from sgstore.store._staging import Sealed, Staging
 from sgstore.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
-    from sgstore.store._locking import Access
     from sgstore.store._packing import Columns
     from sgstore.store._staging import StagedRows
     from sgstore.store._traces import Identity
@@ -79,8 +77,6 @@ class Segment:
     place : tuple, optional
         As :class:`Staging` takes it: where it is built. By default a folder beside the store, which goes with
         it.
-    access : Access, optional
-        To the store, for :meth:`publish`.
 
     Notes
     -----
@@ -96,10 +92,8 @@ class Segment:
         answers: tuple[str, ...],
         *,
         place: tuple[Path, int] | None = None,
-        access: Access | None = None,
     ) -> None:
         self._store = store
-        self._access = access
         self._info = info
         self._identity = identity
         self._answers = answers
@@ -213,26 +207,6 @@ class Segment:
                 "value": texts(value),
             }
             self._staging.insert("attribute", columns)
-
-    def publish(self, report: TraceReport) -> str:
-        """Bring the trace into the store, in one transaction.
-
-        Returns
-        -------
-        str
-            The name of the trace in the store.
-
-        Raises
-        ------
-        StoreError
-            The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
-        ValueError
-            There are no frames.
-        """
-        sealed = self.seal(report)
-        if self._access is None:
-            raise ValueError("a segment without a store is sealed, and published by one")
-        return publish_in(self._access, sealed)
 
     def seal(
         self,
