@@ -41,7 +41,6 @@ from sgstore.relations import (
     StillPairs,
     contacts,
     contacts_of,
-    functions,
     gaps,
     gathered,
     joined_pairs,
@@ -111,7 +110,7 @@ class SceneGraphGenerator:
         )
         computed = relations_under(config)
         computed = tuple(one for one in computed if road_map is not None or not one.needs_map)
-        self._functions = functions(computed)
+        self._functions = [*dict.fromkeys(one.edges for one in computed if one.edges is not None)]
         own = {one.edges for one in computed if one.name in OWN_RELATIONS}
         self._others = not own.issuperset(self._functions)
         self._of_pairs = frozenset(one.name for one in computed if one.of_pairs)

@@ -46,11 +46,6 @@ class TracePart:
     until: float | None = None
     rate: float = 0.0
 
-    @property
-    def is_whole(self) -> bool:
-        """Return whether it is all of the trace."""
-        return self == TracePart()
-
     def blocks(self, blocks: Iterator[FrameBlock], size: int) -> Iterator[FrameBlock]:
         """The frames of the part, ``size`` at a time; the last block, and those with many messages, have fewer.
 
@@ -61,7 +56,7 @@ class TracePart:
         TraceError
             No frame is in the part.
         """
-        if self.is_whole:
+        if self == TracePart():
             yield from blocks
             return
         clock = _Clock(self)

@@ -203,11 +203,6 @@ class GraphColumns:
             grounds=grounds,
         )
 
-    @cached_property
-    def is_entity(self) -> Bools:
-        """(N,): whether a node is an entity; else it is a part of the map."""
-        return are_entities(self.kind)
-
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
         """Edges among parts of the map, in each frame in which both their ends are present.
 
@@ -234,7 +229,7 @@ class GraphColumns:
     @cached_property
     def is_traffic(self) -> Bools:
         """(N,): whether a node is an entity that the literature has, which scenery is not."""
-        return self.is_entity & ~_SMALL[self.kind]
+        return are_entities(self.kind) & ~_SMALL[self.kind]
 
     @cached_property
     def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:

@@ -11,29 +11,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from sgstore import plugins
-from sgstore.abstractions._classes import Classes, classes_of
-from sgstore.abstractions._columns import GraphColumns, Labelled, MapColumns, lane_roles
 from sgstore.errors import AbstractionError
 from sgstore.vocabulary import normalize_name, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-
-__all__ = [
-    "ABSTRACTIONS",
-    "AT_INGEST",
-    "Abstraction",
-    "Classes",
-    "GraphColumns",
-    "Labelled",
-    "MapColumns",
-    "abstraction_named",
-    "abstractions",
-    "classes_of",
-    "lane_roles",
-    "register",
-]
+    from sgstore.abstractions._columns import GraphColumns, Labelled
 
 
 @dataclass(frozen=True, slots=True)

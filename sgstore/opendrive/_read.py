@@ -57,8 +57,6 @@ if TYPE_CHECKING:
     from collections.abc import Container, Mapping
 
 
-__all__ = ["parse_map", "read_map"]
-
 SIGNS: Final = Signs()
 """How signals are read if nobody says otherwise."""
 _ROUNDS: Final = 8

@@ -105,7 +105,8 @@ def open_trace(
                 pass
         for reader in readers():
             if reader.recognises(recording):
-                more = {"mapping": mapping} if _takes_mapping(reader) else {}
+                takes_mapping = "mapping" in inspect.signature(reader).parameters
+                more = {"mapping": mapping} if takes_mapping else {}
                 return reader(recording, ego=ego, digest=digest, **more)
         raise TraceError(_no_reader(recording), path=path)
     except TraceError as error:
@@ -126,10 +127,6 @@ def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
     tell = getattr(trace, "on_map", None)
     if tell is not None:
         tell(road_map)
-
-
-def _takes_mapping(reader: RecordingReader) -> bool:
-    return "mapping" in inspect.signature(reader).parameters
 
 
 def _is_single_channel(path: Path) -> bool:

@@ -21,7 +21,6 @@ from ._pairs import of_kinds as of_kinds
 from ._pairs import pieces as pieces
 from ._pairs import related_pairs as related_pairs
 from ._registry import as_markdown as as_markdown
-from ._registry import functions as functions
 from ._registry import relations as relations
 from ._registry import relations_under as relations_under
 from ._scene import IS_SIGNAL as IS_SIGNAL
@@ -58,7 +57,6 @@ __all__ = [
     "contacts_of",
     "edges_between",
     "edges_to_map",
-    "functions",
     "gaps",
     "gathered",
     "joined_pairs",

@@ -154,12 +154,13 @@ class Extent:
         on = self._driving[-1 - hits.lane] & (np.abs(hits.heading_error) < np.pi / 2)
         row, lane = hits.row[on], -2 - hits.lane[on]
         along = _along(road_map, lane, points[row, 0], points[row, 1])
-        reach, length = road_map.graph.downstream(self.settings.length), self.settings.length
-        source, way = joined(reach.lane, lane)
-        before = road_map.ribbons.lengths[lane[source]] - along[source] + reach.distance[way]
+        length = self.settings.length
+        ended, other, distance = road_map.downstream(length)
+        source, way = joined(ended, lane)
+        before = road_map.ribbons.lengths[lane[source]] - along[source] + distance[way]
         near = before < length
         frame = there[np.concatenate([row, row[source[near]]])]
-        lane = np.concatenate([lane, reach.other[way[near]]])
+        lane = np.concatenate([lane, other[way[near]]])
         begin = np.concatenate([along, np.zeros(np.count_nonzero(near))])
         end = np.concatenate([along + length, length - before[near]])
         order = np.lexsort((-end, begin, lane, frame))

@@ -37,7 +37,6 @@ from sgstore.vocabulary import RELATION_CODE, TRAFFIC
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sgstore.config import Config
     from sgstore.relations._scene import BlockScene, Bodies, MapContext, Standing
     from sgstore.roads import LaneHits, Ribbons, RoadMap
     from sgstore.world import Bools, Codes, Entities, Floats, Ints, States
@@ -364,7 +363,9 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
     if not limit > 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0)
     own = own_lanes(net, bodies, standing)
-    parts = [*_same_lane(own), *_beyond(net, own, limit)]
+    next_of = np.flatnonzero(own.key[1:] == own.key[:-1])  # in the same lane
+    parts = [(next_of, next_of + 1, own.along[next_of + 1] - own.along[next_of])]
+    parts += _beyond(net, own, limit)
     behind, ahead, distance = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     a, b = own.row[behind], own.row[ahead]
     kept = np.flatnonzero((distance <= limit) & bodies.moves[a])
@@ -420,11 +421,6 @@ def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
     return rows, (keys[order], distances[order])
 
 
-def _same_lane(own: OwnLanes) -> list[Column]:
-    behind = np.flatnonzero(own.key[1:] == own.key[:-1])
-    return [(behind, behind + 1, own.along[behind + 1] - own.along[behind])]
-
-
 def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
     """Pairs of a follower and the one it follows, by node ids, and the gaps."""
     none = np.zeros(0, np.intp)
@@ -442,17 +438,13 @@ def _edges(scene: BlockScene) -> Edges:
     )
 
 
-def _looks_ahead(config: Config) -> bool:
-    return config.lanes.ahead > 0
-
-
 LEADS, FOLLOWS = (
     Relation(
         name=name,
         doc=f"vehicle → vehicle: the next one {where} along the lanes, with `gap`, from bumper to bumper",
         edges=_edges,
         needs_map=True,
-        settings=_looks_ahead,
+        settings=lambda config: config.lanes.ahead > 0,
         legend=f"next one {where} along the lane",
     )
     for name, where in (("leads", "ahead"), ("follows", "behind"))

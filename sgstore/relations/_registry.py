@@ -26,17 +26,13 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Iterable, Mapping
 
     from sgstore.config import Config
     from sgstore.graph import Edges, LaneGaps, LaneStates
-    from sgstore.relations._scene import BlockScene
     from sgstore.roads import RoadMap
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Bools, Codes, Entities, Ints
-
-
-__all__ = ["as_markdown", "functions", "relations", "relations_under"]
 
 
 @cache
@@ -65,11 +61,6 @@ def relations_under(config: Config) -> tuple[Relation, ...]:
     own = [rung(name) for name in config.proximity.names if name not in known]
     own += [sector(name) for name in config.direction.names if name not in known]
     return tuple(one for one in (*relations(), *own) if one.asked(config))
-
-
-def functions(of: Iterable[Relation]) -> tuple[Callable[[BlockScene], Edges], ...]:
-    """Return the functions that compute relations, each once."""
-    return tuple(dict.fromkeys(one.edges for one in of if one.edges is not None))
 
 
 PAGE = """\

@@ -33,11 +33,12 @@ _MOST_AT_ONCE: Final = 1 << 22
 """Pairs of lanes whose distances are held at a time."""
 
 
-def _downstream(lengths: Floats, src: Ints, dst: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Lanes, those whose start lies within :data:`FARTHEST` of their end, and how far; some lanes at a time.
+def _downstream(
+    lengths: Floats, src: Ints, dst: Ints, limit: float
+) -> Iterator[tuple[Ints, Ints, Floats]]:
+    """Lanes, those whose start lies within a limit of their end, and how far; some lanes at a time.
 
-    Traffic flows on from ``src`` to ``dst``; lanes are counted from 0. A lane may reach itself. The fronts of
-    all lanes advance together, lane by lane.
+    Traffic flows on from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
     order = np.lexsort((dst, src))
     onward, first = dst[order], np.searchsorted(src[order], np.arange(len(lengths) + 1))
@@ -50,7 +51,7 @@ def _downstream(lengths: Floats, src: Ints, dst: Ints) -> Iterator[tuple[Ints, I
             of = np.repeat(np.arange(len(at)), counts)
             number = np.arange(len(of)) - (np.cumsum(counts) - counts)[of]
             source, at, distance = source[of], onward[first[at[of]] + number], distance[of]
-            better = np.flatnonzero((distance <= FARTHEST) & (distance < best[source, at]))
+            better = np.flatnonzero((distance <= limit) & (distance < best[source, at]))
             source, at, distance = source[better], at[better], distance[better]
             np.minimum.at(best, (source, at), distance)
             least = np.flatnonzero(distance == best[source, at])
@@ -96,20 +97,6 @@ def turn_words(turn: Floats) -> list[str]:
 # Nodes. Every part of a map that can be a node of a scene graph has a node id below zero: ``off_road`` is
 # -1, then come lanes, roads, junctions, crosswalks, signals and objects, in this order. ``nodes`` lists them
 # all.
-
-__all__ = [
-    "OFF_ROAD",
-    "STOREY",
-    "LaneChanges",
-    "LaneHits",
-    "LanePoints",
-    "MapEdges",
-    "MapNodes",
-    "Ribbons",
-    "RoadMap",
-    "first_sections",
-    "lanes_ref",
-]
 
 OFF_ROAD: Final = -1
 """Node id of the single node that stands for whatever is not a driving lane."""
@@ -316,6 +303,9 @@ class RoadMap:
         Defects of the map that were passed over, each with its road.
     """
 
+    _ways: tuple[float, tuple[Ints, Ints, Floats]] | None = None
+    """A limit, and what :meth:`downstream` answered."""
+
     def __init__(  # noqa: PLR0913 (a map is all of this)
         self,
         *,
@@ -510,6 +500,27 @@ class RoadMap:
             variant=f"{self._variant}{_MERGED}",
         )
 
+    def downstream(self, limit: float) -> tuple[Ints, Ints, Floats]:
+        """Lanes whose start lies at most ``limit`` metres beyond the end of lanes, along ``travelsTo``.
+
+        The last answer is kept: to ask again for the same limit costs nothing.
+
+        Returns
+        -------
+        lane, other : (n,) int64
+            Lanes, counted from 0; ``lane`` ascends. A lane may reach itself.
+        distance : (n,) float64
+            From the end of ``lane`` to the start of ``other``; m.
+        """
+        if self._ways is None or self._ways[0] != limit:
+            flow = self.edges.relation == RELATION_CODE["travelsTo"]
+            src, dst = _FIRST_LANE - self.edges.src[flow], _FIRST_LANE - self.edges.dst[flow]
+            lanes = (src >= 0) & (src < self._lanes)
+            ways = _downstream(self.ribbons.lengths, src[lanes], dst[lanes], limit)
+            lane, other, distance = map(np.concatenate, zip(*ways, strict=True))
+            self._ways = limit, (lane, other, distance)
+        return self._ways[1]
+
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
         """Starts of lanes, measured along other lanes from whose start one can drive there, or back.
@@ -528,13 +539,8 @@ class RoadMap:
         """
         if _MERGED in self._variant:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
-        every, lengths = np.arange(self._lanes), self.ribbons.lengths
-        flow = self.edges.relation == RELATION_CODE["travelsTo"]
-        src, dst = _FIRST_LANE - self.edges.src[flow], _FIRST_LANE - self.edges.dst[flow]
-        lanes = (src >= 0) & (src < self._lanes)
-        ways = zip(*_downstream(lengths, src[lanes], dst[lanes]), strict=True)
-        begun, reached, distance = (np.concatenate(columns) for columns in ways)
-        start = lengths[begun] + distance
+        begun, reached, distance = self.downstream(FARTHEST)
+        every, start = np.arange(self._lanes), self.ribbons.lengths[begun] + distance
         lane = np.concatenate([every, begun, reached])
         other = np.concatenate([every, reached, begun])
         starts = np.concatenate([np.zeros(len(every)), start, -start])
