@@ -6,7 +6,9 @@ question has a deadline, after which the process is killed (a database that is a
 and its answer a bounded number of rows and bytes. The process lives on between questions, because starting
 it takes a third of a second.
 
-Parent and child speak JSON, a line a message.
+Parent and child speak JSON, a line a message. Other rooms have questions of their own answered in such a
+process: a module that calls :func:`serve` with what answers them is the ``worker`` of a sandbox, and
+:meth:`Sandbox.ask` asks.
 """
 
 from __future__ import annotations
@@ -22,10 +24,13 @@ import tempfile
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from sgstore.errors import (
+    AbstractionError,
+    ConfigError,
     QueryError,
     QueryNameError,
     QuerySyntaxError,
@@ -38,7 +43,12 @@ from sgstore.files import new_place
 from sgstore.processes import command
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
+
+    from sgstore.query import Store
+
+    Answering = Callable[[Store, dict[str, Any], int], dict[str, Any]]
+    """Reply to a question: of the store, the question, and the most rows; see :func:`plain`."""
 
 TIMEOUT_S: Final = 5.0
 MEMORY: Final = 512 << 20
@@ -108,8 +118,12 @@ class Sandbox:
         Most memory that a question may take; bytes.
     max_rows : int
         Longest answer; rows.
+    max_bytes : int
+        Longest answer; bytes.
     tables : mapping of str to path, optional
         Tables of one's own that can be joined: Parquet, CSV or JSON files. They are read in that process too.
+    worker : str
+        Module that the process runs, which calls :func:`serve`.
 
     Raises
     ------
@@ -117,19 +131,23 @@ class Sandbox:
         There is no such file, it is no store, or one of another version; or a table cannot be read.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  its limits
         self,
         store: str | Path,
         *,
         timeout_s: float = TIMEOUT_S,
         memory: int = MEMORY,
         max_rows: int = MAX_ROWS,
+        max_bytes: int = MAX_BYTES,
         tables: Mapping[str, str | Path] | None = None,
+        worker: str = "sgstore.sandbox",
     ) -> None:
         self._store = Path(store)
+        self._worker = worker
         self._timeout_s = timeout_s
         self._memory = memory
         self._max_rows = max_rows
+        self._max_bytes = max_bytes
         self._tables = {name: str(Path(path).resolve()) for name, path in (tables or {}).items()}
         self._folder: Path | None = None
         self._turn = threading.Lock()
@@ -163,7 +181,7 @@ class Sandbox:
         QueryError
             A pattern in it is none.
         """
-        return self._ask({"sql": text}, SqlError)
+        return _answer(self.ask({"sql": text}, SqlError))
 
     def find(self, text: str, /, **parameters: object) -> Answer:
         """The rows of a pattern.
@@ -175,22 +193,39 @@ class Sandbox:
         SqlError
             It takes too much time or memory.
         """
-        return self._ask({"find": text, "parameters": parameters}, QueryError)
+        return _answer(self.ask({"find": text, "parameters": parameters}))
 
-    def _ask(self, question: Mapping[str, object], error: type[SgstoreError]) -> Answer:
+    def ask(
+        self, question: Mapping[str, object], error: type[SgstoreError] = QueryError
+    ) -> dict[str, Any]:
+        """The reply of the process to a question that its worker knows.
+
+        Parameters
+        ----------
+        question : mapping
+            What JSON can hold.
+        error : type
+            What is raised of a question that is too long.
+
+        Raises
+        ------
+        SgstoreError
+            What the worker raised.
+        SqlError
+            It takes too much time or memory.
+        """
         line = json.dumps(question)
         if len(line) > MAX_QUESTION:
             raise error(f"the question has {len(line)} characters; {MAX_QUESTION} are allowed")
         with self._turn:
-            reply = self._exchange(self._ready(), line, self._timeout_s)
-        return _answer(reply)
+            return _granted(self._exchange(self._ready(), line, self._timeout_s))
 
     def _ready(self) -> subprocess.Popen[bytes]:
         """The process, started if there is none."""
         if self._child is None or self._child.poll() is not None:
             self._kill()
             self._child = subprocess.Popen(  # noqa: S603  a module of ours
-                command("sgstore.sandbox"),
+                command(self._worker),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -208,7 +243,7 @@ class Sandbox:
             reply = self._exchange(self._child, json.dumps(settings), wait)
             if "error" in reply:
                 self._kill()
-            _answer(reply)
+            _granted(reply)
         return self._child
 
     def _exchange(self, child: subprocess.Popen[bytes], line: str, timeout_s: float) -> Any:
@@ -218,7 +253,9 @@ class Sandbox:
         """
         replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         talk = threading.Thread(
-            target=_sent_and_read, args=(child, line.encode(), replies), daemon=True
+            target=_sent_and_read,
+            args=(child, line.encode(), replies, self._max_bytes),
+            daemon=True,
         )
         talk.start()
         try:
@@ -232,8 +269,8 @@ class Sandbox:
         if reply.endswith(b"\n"):
             return json.loads(reply)
         self._kill()
-        if len(reply) > MAX_BYTES:
-            raise SqlError(f"stopped: the answer is longer than {MAX_BYTES} bytes")
+        if len(reply) > self._max_bytes:
+            raise SqlError(f"stopped: the answer is longer than {self._max_bytes} bytes")
         raise SqlError("stopped: it took more memory than is allowed")
 
     def _abandon(self) -> None:
@@ -261,7 +298,7 @@ def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
 
 
 def _sent_and_read(
-    child: subprocess.Popen[bytes], line: bytes, replies: queue.SimpleQueue[bytes]
+    child: subprocess.Popen[bytes], line: bytes, replies: queue.SimpleQueue[bytes], most: int
 ) -> None:
     """Put the line that a process answers with; one without an end if it died or says too much."""
     reply = b""
@@ -270,21 +307,28 @@ def _sent_and_read(
         if child.stdin is not None and child.stdout is not None:
             child.stdin.write(line + b"\n")
             child.stdin.flush()
-            reply = child.stdout.readline(MAX_BYTES + 1)
+            reply = child.stdout.readline(most + 1)
     replies.put(reply)
 
 
 _QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
-_ERRORS: Final = {"sql": SqlError, "store": StoreError}
+_ERRORS: Final = {
+    kind.__name__: kind for kind in (SqlError, StoreError, AbstractionError, ConfigError)
+}
 
 
-def _answer(reply: Any) -> Answer:
+def _granted(reply: Any) -> dict[str, Any]:
+    """A reply that is no refusal; that is raised."""
     if "query" in reply:
         span = TextSpan(*reply["span"]) if reply["span"] else None
         kind = _QUERY_ERRORS.get(reply["kind"], QueryError)
         raise kind(reply["reason"], text=reply["query"], span=span, hint=reply["hint"])
     if "error" in reply:
         raise _ERRORS[reply["kind"]](reply["error"])
+    return reply
+
+
+def _answer(reply: dict[str, Any]) -> Answer:
     rows = [tuple(row) for row in reply["rows"]]
     columns, reasons = tuple(reply["columns"]), dict(reply["reasons"])
     graphs, notes = reply.get("graphs", False), tuple(reply.get("notes", ()))
@@ -294,8 +338,21 @@ def _answer(reply: Any) -> Answer:
 # The process ------------------------------------------------------------------------------------------------
 
 
-def main() -> None:
-    """Answer the questions that come on stdin, until it ends."""
+def serve(answering: Answering) -> None:
+    """Answer the questions that come on stdin, until it ends, and end the process.
+
+    Parameters
+    ----------
+    answering : callable
+        Gives the reply to a question: what JSON can hold. Whatever of sgstore's errors it raises is told to who
+        asked.
+    """
+    with suppress(KeyboardInterrupt, BrokenPipeError):
+        _serve(answering)
+    os._exit(0)
+
+
+def _serve(answering: Answering) -> None:
     lines, replies = sys.stdin.buffer, sys.stdout.buffer
     settings = json.loads(lines.readline())
     tempfile.tempdir = settings["folder"]
@@ -319,12 +376,12 @@ def main() -> None:
     for line in lines:
         question = json.loads(line)
         try:
-            _send(replies, _found(store, question, settings["rows"]))
+            _send(replies, answering(store, question, settings["rows"]))
         except SgstoreError as error:
             _send(replies, _refusal(error))
 
 
-def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
+def _found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
     graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
@@ -332,28 +389,21 @@ def _found(store: Any, question: dict[str, Any], most: int) -> dict[str, Any]:
         reasons = dict(rows.reasons)
     else:
         matches = store.find(question["find"], **question["parameters"])
-        values = list(_first(matches, most + 1))
+        values = list(islice(matches, most + 1))
         truncated = len(values) > most
         values, columns, reasons = values[:most], matches.columns, matches.reasons
         graphs, notes = matches.graphs, matches.notes
-    plain = [[_plain(value) for value in row] for row in values]
+    rows = [[plain(value) for value in row] for row in values]
     about = {"truncated": truncated, "reasons": reasons, "graphs": graphs, "notes": notes}
-    return {"columns": columns, "rows": plain, **about}
+    return {"columns": columns, "rows": rows, **about}
 
 
-def _first(rows: Iterable[Any], most: int) -> Iterator[Any]:
-    for number, row in enumerate(rows):
-        if number == most:
-            return
-        yield row
-
-
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A value as JSON can hold it."""
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
+        return [plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
+        return {str(key): plain(item) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
     if isinstance(value, (bytes, bytearray)):
         return value.hex()
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
@@ -366,7 +416,7 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
         return {**about, "span": span, "hint": error.hint}
     if _spilled(error):
         error = SqlError("stopped: it took more memory than is allowed")
-    kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "sql")
+    kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "SqlError")
     return {"kind": kind, "error": str(error)}
 
 
@@ -398,6 +448,4 @@ def _limit(memory: int, *, files: int) -> None:
 
 
 if __name__ == "__main__":
-    with suppress(KeyboardInterrupt, BrokenPipeError):
-        main()
-    os._exit(0)
+    serve(_found)

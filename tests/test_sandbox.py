@@ -52,6 +52,12 @@ def test_a_pattern_gives_what_it_gives_outside(box: Sandbox, path: Path) -> None
     assert not inside.truncated
 
 
+def test_a_worker_is_asked_in_its_own_words(box: Sandbox) -> None:
+    assert box.ask({"sql": "SELECT 1 AS one"})["rows"] == [[1]]
+    with pytest.raises(SqlError, match="the question has"):
+        box.ask({"sql": "x" * 2_000_000}, SqlError)
+
+
 def test_values_that_json_has_not_come_as_texts(box: Sandbox) -> None:
     sql = "SELECT DATE '2026-01-02', 1.5::DECIMAL(3,1), 'ab'::BLOB, [1, NULL], {'a': 2}, 9007199254740993"
 
